@@ -1,0 +1,179 @@
+"""What the server's engine thread and the engine process say to each other: one JSON object a line, over a socket pair.
+
+The server's half of the pair is the thread's, the other half is the process's standard input (file descriptor 0, both
+directions). This module holds only the form of the messages: it opens, reads and starts nothing, so that a scripted
+engine process can be written against it.
+
+Order, as the process must keep it: `Configure` comes in once, first. Then `Ready` goes out, or `StartFailed` and the
+process ends. After that each `Say` gets one `Started`, any number of `Word` and `Alive`, and exactly one `Ended`.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+#: Seconds between two messages of an engine process that has a goal in hand. Far below `thread.HANG_AFTER`, so that one
+#: late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
+ALIVE_EVERY = 0.5
+
+# How a `Say` ended.
+COMPLETED = "completed"  # every sample was played and the player ended well
+STOPPED = "stopped"  # ended by a `Stop`, and silent now
+FAILED = "failed"  # ended by an error: `reason` and `message` say which
+
+
+@dataclass(frozen=True, slots=True)
+class Configure:
+    """What an engine process is told at its start."""
+
+    kind: ClassVar[str] = "configure"
+    #: process id of the server: a process whose parent is another one has been orphaned already, and ends.
+    server: int
+    #: name of a pyttsx3 driver, or None for the one that fits this system (`talk`'s own on Linux).
+    driver: str | None
+    #: "aplay", "pacat", "pw-cat", "null", "file:PATH", a command line, or None to take what is there and works.
+    player: str | None
+    #: device by the player's own name for it, or None for its default.
+    device: str | None
+    #: voice to check at the start, by id, name or language; None for the driver's default.
+    voice: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Say:
+    """Speak `text`. Settings are absolute; None leaves the driver's default."""
+
+    kind: ClassVar[str] = "say"
+    id: str
+    text: str
+    rate: int  # words per minute, 80 to 450
+    volume: float  # 0.0 to 1.0
+    voice: str | None  # id, name or language
+    pitch: int  # 0 to 100, 50 is the voice's own
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Be silent now. A stop for a goal that is not being spoken is ignored: it ended before the stop arrived."""
+
+    kind: ClassVar[str] = "stop"
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Quit:
+    """End the process; the sentence being spoken, if any, is stopped first."""
+
+    kind: ClassVar[str] = "quit"
+
+
+@dataclass(frozen=True, slots=True)
+class Voice:
+    """One voice of the driver's."""
+
+    id: str
+    language: str | None
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The engine is initialised and takes a `Say`."""
+
+    kind: ClassVar[str] = "ready"
+    driver: str
+    version: str | None  # of the synthesiser, for people: "eSpeak NG 1.51 (system)"
+    player: str | None  # what will be tried first, for people
+
+
+@dataclass(frozen=True, slots=True)
+class StartFailed:
+    """The engine cannot start; the process ends after this."""
+
+    kind: ClassVar[str] = "start_failed"
+    reason: str  # "engine_failed" or "unknown_voice"
+    message: str  # names what is missing and what to install
+
+
+@dataclass(frozen=True, slots=True)
+class Voices:
+    """All voices of the driver; sent once, after `Ready`, as soon as nothing else is to be done."""
+
+    kind: ClassVar[str] = "voices"
+    voices: tuple[Voice, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """The `Say` was taken in hand."""
+
+    kind: ClassVar[str] = "started"
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Alive:
+    """A sign of life from a process that has a goal in hand, at most `ALIVE_EVERY` seconds after the last message."""
+
+    kind: ClassVar[str] = "alive"
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """A word begins to be heard, now, by the playback clock."""
+
+    kind: ClassVar[str] = "word"
+    id: str
+    start: int  # character offset in the text
+    end: int  # offset after the word's last character
+    number: int  # of the word in the sentence, from 1
+    time: float  # seconds into the sentence's audio
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """The `Say` is over, and it is silent: the player is reaped, or its stream is closed."""
+
+    kind: ClassVar[str] = "ended"
+    id: str
+    outcome: str  # COMPLETED, STOPPED or FAILED
+    reason: str | None = None  # of FAILED: audio_device, audio_lost, audio_stalled, no_player, nothing_to_say, …
+    message: str | None = None  # of FAILED: the player's or engine's own words
+    duration: float | None = None  # seconds of audio, where all of it was synthesised
+
+
+Command = Configure | Say | Stop | Quit
+Event = Ready | StartFailed | Voices | Started | Alive | Word | Ended
+
+_COMMANDS = {each.kind: each for each in (Configure, Say, Stop, Quit)}
+_EVENTS = {each.kind: each for each in (Ready, StartFailed, Started, Alive, Word, Ended)}
+
+
+def encode(message: Command | Event) -> bytes:
+    """Return the message as a line."""
+    return json.dumps({"kind": message.kind, **asdict(message)}, ensure_ascii=True).encode() + b"\n"
+
+
+def decode_command(line: bytes) -> Command:
+    """Return the command in a line; ValueError, TypeError or KeyError if there is none."""
+    fields = _fields(line)
+    return _COMMANDS[fields.pop("kind")](**fields)
+
+
+def decode_event(line: bytes) -> Event:
+    """Return the event in a line; ValueError, TypeError or KeyError if there is none."""
+    fields = _fields(line)
+    kind = fields.pop("kind")
+    if kind == Voices.kind:
+        return Voices(tuple(Voice(**each) for each in fields["voices"]))
+    return _EVENTS[kind](**fields)
+
+
+def _fields(line: bytes) -> dict[str, Any]:
+    fields = json.loads(line)
+    if not isinstance(fields, dict):
+        raise TypeError("a message is a JSON object")
+    return fields

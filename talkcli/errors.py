@@ -1,0 +1,107 @@
+"""The errors of `talk`: one tree, each class with its code on the wire and the exit code of the command.
+
+Rules for this file: no imports of other modules of `talk`; a class is added where a program has to tell a case from
+another, with a code that is never used again for anything else. Texts are lower-case and name the thing and the next
+step. The exit codes are the table of the README.
+"""
+
+from __future__ import annotations
+
+EXIT_OK = 0
+EXIT_ERROR = 1
+EXIT_USAGE = 2
+EXIT_TIMEOUT = 124  # as timeout(1)
+EXIT_SIGNAL = 128  # plus the signal's number, as a shell reports it
+
+
+class TalkError(Exception):
+    """Anything that `talk` itself can say is wrong. `code` is for programs, the text for people."""
+
+    code = "error"
+    exit_code = EXIT_ERROR
+
+    @property
+    def message(self) -> str:
+        return str(self)
+
+
+class UsageError(TalkError):
+    """What was asked for has no meaning: an option's value, a combination."""
+
+    code = "usage"
+    exit_code = EXIT_USAGE
+
+
+class ServerUnavailable(TalkError):
+    """No server took the request: nothing was sent that it could act on later, so trying again is safe."""
+
+    code = "no_server"
+    exit_code = 3
+
+
+class AccessDenied(TalkError):
+    """There is a server, or something in its place, and this user may not use it or must not trust it."""
+
+    code = "permission_denied"
+    exit_code = 10
+
+
+class Lost(TalkError):
+    """The connection ended after a goal was sent: what became of it is not known, it may still be spoken."""
+
+    code = "lost"
+    exit_code = 12
+
+
+class AddressInUse(TalkError):
+    """`serve` cannot serve here: the socket is served already, or its directory is not safe."""
+
+    code = "address_in_use"
+    exit_code = 11
+
+
+class ProtocolMismatch(TalkError):
+    """Client and server speak different versions of the protocol."""
+
+    code = "protocol_mismatch"
+    exit_code = 9
+
+
+class RequestRefused(TalkError):
+    """The server answered a request with an error; `code` is the server's."""
+
+    code = "refused"
+
+    def __init__(self, message: str, code: str | None = None) -> None:
+        super().__init__(message)
+        if code is not None:
+            self.code = code
+
+
+class UnknownGoal(RequestRefused):
+    """No goal of that id is known: it was never sent, or was sent to an earlier server, or is too long ago."""
+
+    code = "unknown_goal"
+    exit_code = 8
+
+
+class Busy(RequestRefused):
+    """The server has as many clients as it takes."""
+
+    code = "busy"
+    exit_code = 5
+
+
+class BadRequest(RequestRefused):
+    """A line on the wire that is no request. `code` says in which way."""
+
+    code = "bad_request"
+
+
+#: Classes that a client raises for an error code of the server's; any other code is a RequestRefused.
+BY_CODE: dict[str, type[RequestRefused]] = {each.code: each for each in (UnknownGoal, Busy)}
+
+
+def refusal(code: str, message: str) -> RequestRefused:
+    """Return the error that a server's error reply stands for."""
+    return BY_CODE.get(code, RequestRefused)(message, code)

@@ -1,0 +1,71 @@
+"""The states of a goal, as a table: actionlib's names and numbers.
+
+A pair that is not in the table is an error and changes nothing. Nothing but the table decides; whoever wants another
+transition changes the table and the tests that list it.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from talkcli.errors import TalkError
+
+
+class State(IntEnum):
+    """State of a goal; the value is actionlib's number, the name is what is written everywhere."""
+
+    PENDING = 0  # in the queue
+    ACTIVE = 1  # handed to the engine
+    PREEMPTED = 2  # stopped while it was spoken, by a cancel or by another goal
+    SUCCEEDED = 3  # all of it was played
+    ABORTED = 4  # engine or audio failed, or nothing in the text can be spoken
+    REJECTED = 5  # never queued
+    PREEMPTING = 6  # told to stop, not yet silent
+    RECALLING = 7  # being taken out of the queue; never rests there
+    RECALLED = 8  # taken out of the queue before it was spoken
+    LOST = 9  # the client's alone: it was accepted, then the connection to the server ended
+
+    @property
+    def terminal(self) -> bool:
+        """Whether a goal in this state has ended."""
+        return not TRANSITIONS[self]
+
+
+#: What may follow what. A goal begins PENDING or REJECTED. PREEMPTING may end ABORTED only for the reason not_silent:
+#: the state machine allows it, the scheduler watches over the reason. LOST is what a client concludes for itself, from
+#: any state in which the goal had not ended; no server ever sets it.
+TRANSITIONS: dict[State, frozenset[State]] = {
+    State.PENDING: frozenset({State.ACTIVE, State.RECALLING, State.LOST}),
+    State.RECALLING: frozenset({State.RECALLED, State.LOST}),
+    State.ACTIVE: frozenset({State.PREEMPTING, State.SUCCEEDED, State.ABORTED, State.LOST}),
+    State.PREEMPTING: frozenset({State.PREEMPTED, State.SUCCEEDED, State.ABORTED, State.LOST}),
+    State.PREEMPTED: frozenset(),
+    State.SUCCEEDED: frozenset(),
+    State.ABORTED: frozenset(),
+    State.REJECTED: frozenset(),
+    State.RECALLED: frozenset(),
+    State.LOST: frozenset(),
+}
+
+#: Exit code of a command whose goal ended in this state.
+EXIT_CODES: dict[State, int] = {
+    State.SUCCEEDED: 0,
+    State.ABORTED: 4,
+    State.REJECTED: 5,
+    State.RECALLED: 6,
+    State.PREEMPTED: 7,
+    State.LOST: 12,
+}
+
+
+class IllegalTransition(TalkError):
+    """A change of state that the table does not allow. It is a bug of whoever asked for it, and it changed nothing."""
+
+    code = "illegal_transition"
+
+
+def follow(state: State, target: State) -> State:
+    """Return `target` if it may follow `state`, else raise IllegalTransition."""
+    if target not in TRANSITIONS[state]:
+        raise IllegalTransition(f"a goal that is {state.name} can't become {target.name}")
+    return target
