@@ -68,12 +68,13 @@ class ProtocolMismatch(TalkError):
 
 
 class RequestRefused(TalkError):
-    """The server answered a request with an error; `code` is the server's."""
+    """The server answered a request with an error; `code` is the server's, `items` what it listed before."""
 
     code = "refused"
 
     def __init__(self, message: str, code: str | None = None) -> None:
         super().__init__(message)
+        self.items: list[dict[str, object]] = []
         if code is not None:
             self.code = code
 

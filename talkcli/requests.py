@@ -73,11 +73,13 @@ def _optional(check: Check) -> Check:
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """The first request of a client that stays: it says who it is, and that it is alive."""
+    """The first request of a client: it says who it is, and that it is alive."""
 
     kind: ClassVar[str] = "hello"
-    fields: ClassVar[Mapping[str, Check]] = {"name": _optional(_name)}
+    fields: ClassVar[Mapping[str, Check]] = {"name": _optional(_name), "urgent": _flag}
     name: str | None = None
+    #: only `status` and `cancel` will follow: a full server keeps some places for these
+    urgent: bool = False
 
 
 @dataclass(frozen=True, slots=True)

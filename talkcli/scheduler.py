@@ -182,10 +182,13 @@ class Scheduler:
         return self._end(record, State.SUCCEEDED, None, SUCCEEDED_MESSAGE, None, now)
 
     def failed(self, goal_id: str, reason: str, words: str, duration: float | None, now: Now) -> list[Effect]:
-        """End the active goal: engine or audio failed. One that was being stopped is silent now, so it is PREEMPTED."""
+        """End the active goal: engine or audio failed.
+
+        One that was being stopped is silent now, so it is PREEMPTED, unless the silence is what failed (not_silent).
+        """
         record = self._spoken(goal_id)
         record.duration = duration
-        if record.state is State.PREEMPTING:
+        if record.state is State.PREEMPTING and reason != "not_silent":
             return self.stopped(goal_id, now)
         return self._end(record, State.ABORTED, reason, f"Talk aborted: {words}", None, now)
 

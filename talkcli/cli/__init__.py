@@ -1,0 +1,123 @@
+"""The command line. Only this package and `completion` know click, and only here is anything printed or exited.
+
+A command's module is imported when the command is run, so that no command pays for another.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from typing import NoReturn
+
+import click
+
+from talkcli import __version__
+from talkcli.cli.common import Common, common_options, note, show_error
+from talkcli.errors import EXIT_ERROR, EXIT_SIGNAL, EXIT_USAGE, TalkError, UsageError
+
+#: The commands, in the order in which help lists them: what a newcomer needs first comes first.
+COMMANDS = {
+    "serve": "Run the server, in the foreground.",
+    "say": "Speak a sentence.",
+    "wait": "Wait until goals have ended.",
+    "cancel": "Stop speaking: everything, or what is named.",
+    "status": "What is being said, what will be, what was.",
+    "voices": "List the voices.",
+}
+
+
+class _Commands(click.Group):
+    """Loads the module of a command when it is needed; lists them all without."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = importlib.import_module(f"talkcli.cli.{cmd_name}").command
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0] if args else ""
+        if name and not name.startswith("-") and name not in COMMANDS:
+            import difflib
+
+            near = difflib.get_close_matches(name, COMMANDS, n=1)
+            hint = f"Did you mean {near[0]!r}?" if near else f'To speak it, write: talk say "{" ".join(args)}"'
+            raise click.UsageError(f"No such command {name!r}. {hint}", ctx)
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.group(
+    cls=_Commands,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="'talk COMMAND --help' says more. Exit codes: 0 succeeded, 3 no server, 4 aborted, 5 rejected, 6 recalled, "
+    "7 preempted, 124 timed out; all of them are in the README.",
+)
+@common_options
+@click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
+@click.pass_context
+def talk(context: click.Context) -> None:
+    """Speech for robots: sentences as goals that can be awaited, cancelled and preempted.
+
+    \b
+      talk serve &                      one server on the robot
+      talk say --wait -- "battery low"  the exit code tells whether it was heard
+      talk cancel                       silence, now
+      talk status                       what it says, will say, has said
+    """
+    context.ensure_object(Common)
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
+
+
+def main() -> NoReturn:
+    """Run the command line, and exit."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run a command line, and return its exit code."""
+    options = Common()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        code = talk.main(arguments, prog_name="talk", standalone_mode=False, obj=options)
+        sys.stdout.flush()
+    except click.ClickException as error:
+        _show_click_error(error, options)
+        return error.exit_code
+    except TalkError as error:
+        show_error(error, json=options.json)
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        return EXIT_SIGNAL + signal.SIGINT
+    except BrokenPipeError:
+        # Whoever read standard output has gone; nothing more may be written to it, not even at the interpreter's end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return EXIT_SIGNAL + signal.SIGPIPE
+    except Exception as error:
+        if os.environ.get("TALK_DEBUG"):
+            raise
+        note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
+        return EXIT_ERROR
+    return code if isinstance(code, int) else 0
+
+
+def _show_click_error(error: click.ClickException, options: Common) -> None:
+    if options.json:
+        show_error(UsageError(error.format_message()), json=True)
+    else:
+        error.show()
+    assert error.exit_code in {EXIT_ERROR, EXIT_USAGE}

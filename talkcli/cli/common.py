@@ -1,0 +1,105 @@
+"""What all commands share: the options before and after the command, how they print, how they connect."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from talkcli import wire
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from talkcli.client import Client
+    from talkcli.errors import TalkError
+    from talkcli.messages import JsonObject
+
+_F = TypeVar("_F", bound="Callable[..., Any]")
+
+
+@dataclass(slots=True)
+class Common:
+    """The options that every command has."""
+
+    socket: str | None = None
+    json: bool = False
+    quiet: bool = False
+
+    def connect(self, **options: Any) -> Client:
+        """Return a client connected to the server; see `Client` for the options."""
+        from talkcli.client import Client
+
+        return Client(self.socket, **options)
+
+
+def common(context: click.Context) -> Common:
+    """Return the options that hold for this run of the command."""
+    return context.find_root().ensure_object(Common)
+
+
+def _store(context: click.Context, parameter: click.Parameter, value: object) -> None:
+    if value:
+        setattr(common(context), parameter.name or "", value)
+
+
+def common_options(command: _F) -> _F:
+    """Add the options that may stand before and after a command."""
+    for option in reversed(
+        (
+            click.option(
+                "--socket",
+                metavar="PATH",
+                type=click.Path(),
+                expose_value=False,
+                callback=_store,
+                help="Socket of the server. [env: TALK_SOCKET; default: the usual places, see the README]",
+            ),
+            click.option("--json", is_flag=True, expose_value=False, callback=_store, help="One JSON object a line."),
+            click.option(
+                "-q",
+                "--quiet",
+                is_flag=True,
+                expose_value=False,
+                callback=_store,
+                help="No ids, no notes.",
+            ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+def show(line: str) -> None:
+    """Write a line of data to standard output, at once."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def show_json(message: JsonObject) -> None:
+    """Write an object as a line of JSON, in UTF-8 whatever the locale is."""
+    sys.stdout.flush()
+    sys.stdout.buffer.write(wire.encode(message))
+    sys.stdout.buffer.flush()
+
+
+def note(words: str) -> None:
+    """Write something for people to standard error."""
+    click.echo(f"talk: {words}", err=True)
+
+
+def show_error(error: TalkError, *, json: bool) -> None:
+    """Write an error to standard error."""
+    if json:
+        fields = {"code": error.code, "exit": error.exit_code, "message": error.message}
+        click.echo(wire.encode({"error": fields}), err=True, nl=False)
+    else:
+        note(error.message)
+
+
+def colourful() -> bool:
+    """Whether standard output takes colour."""
+    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"

@@ -1,0 +1,117 @@
+"""`talk serve`."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import click
+
+from talkcli.cli.common import common, common_options
+from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE, Settings
+
+
+def _volume(context: click.Context, parameter: click.Parameter, value: float) -> float:
+    """Refuse NaN, which compares with nothing and so is in any range."""
+    if math.isnan(value):
+        raise click.BadParameter(f"{value!r} is not a number from 0 to 1.", context, parameter)
+    return value
+
+
+def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int:
+    """Return the mode of a file; the owner must be able to use the socket, and nobody executes it."""
+    mode = int(value, 8) if re.fullmatch("[0-7]{3,4}", value) else 0
+    if mode & ~0o666 or mode & 0o600 != 0o600:
+        words = f"{value!r} is not a mode such as 0600 (mine alone), 0660 (my group's) or 0666."
+        raise click.BadParameter(words, context, parameter)
+    return mode
+
+
+@click.command("serve")
+@click.option(
+    "--rate",
+    type=click.IntRange(80, 450),
+    default=200,
+    show_default=True,
+    envvar="TALK_RATE",
+    show_envvar=True,
+    help="Words per minute.",
+)
+@click.option(
+    "--volume",
+    type=click.FloatRange(0, 1),
+    callback=_volume,
+    default=1.0,
+    show_default=True,
+    envvar="TALK_VOLUME",
+    show_envvar=True,
+    help="Loudness.",
+)
+@click.option(
+    "--voice",
+    envvar="TALK_VOICE",
+    show_envvar=True,
+    help="Voice by id, name or language: see 'talk voices'.",
+)
+@click.option("--pitch", type=click.IntRange(0, 100), default=50, show_default=True, help="Pitch of the voice.")
+@click.option("--preempt", is_flag=True, help="Every goal stops the one before it, unless it says --queue.")
+@click.option(
+    "--max-queue",
+    type=click.IntRange(1),
+    default=MAX_QUEUE,
+    show_default=True,
+    help="Goals that may wait.",
+)
+@click.option(
+    "--max-text",
+    type=click.IntRange(1, 10_000),
+    default=10_000,
+    show_default=True,
+    help="Characters of one text.",
+)
+@click.option(
+    "--max-clients",
+    type=click.IntRange(1),
+    default=MAX_CLIENTS,
+    show_default=True,
+    help="Clients at once.",
+)
+@click.option(
+    "--player",
+    metavar="PLAYER",
+    envvar="TALK_PLAYER",
+    show_envvar=True,
+    help="aplay, pacat or pw-cat; null (silent, in real time); file:PATH.wav; or a command that reads 16-bit mono PCM, "
+    "with {rate} for its rate. [default: the first of the three that works]",
+)
+@click.option("--device", metavar="NAME", help="Device, by the player's own name for it.")
+@click.option("--driver", metavar="NAME", help="pyttsx3 driver. [default: the one for this system]")
+@click.option(
+    "--socket-mode",
+    metavar="MODE",
+    callback=_mode,
+    default="0600",
+    show_default=True,
+    help="Who may connect: the socket's file mode.",
+)
+@click.option("--greeting", metavar="TEXT", help="A sentence to speak at the start.")
+@common_options
+@click.pass_context
+def command(context: click.Context, /, **options: object) -> int:
+    """Run the server, in the foreground, until SIGTERM or Ctrl-C.
+
+    It queues sentences and speaks one at a time; its log is on standard error. Under systemd, run it as a service.
+
+    \b
+      talk serve --rate 150
+      talk serve --player null      no sound, same timing: for simulation and CI
+
+    Exit codes: 0 ended by SIGTERM or SIGINT; 2 usage; 11 another server serves already, or the socket's directory is
+    not safe.
+    """
+    from talkcli import paths
+    from talkcli.server.run import serve
+
+    if options["device"] and str(options["player"] or "").startswith(("null", "file:")):
+        raise click.UsageError(f"--device means nothing to the player {options['player']}", context)
+    return serve(Settings(socket=paths.named_socket(common(context).socket), **options))  # type: ignore[arg-type]

@@ -1,0 +1,225 @@
+"""A client's connection to a server: requests go out, replies and events come in. Any number of threads may use it.
+
+There is no thread behind it: whoever waits for something reads for all, and hands on what is for others. It holds no
+lock while it waits for the server.
+"""
+
+from __future__ import annotations
+
+import itertools
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from talkcli import wire
+from talkcli.dial import ANSWER_LIMIT, dial, ready
+from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
+from talkcli.requests import Say, write_request
+
+if TYPE_CHECKING:
+    from talkcli.messages import JsonObject
+    from talkcli.requests import Hello, Request
+
+#: Seconds of silence from a server that somebody waits for; it says that it is alive every 5.
+SILENCE_LIMIT = 15.0
+
+
+OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
+
+
+class Interrupted(Exception):
+    """The caller's own interrupt descriptor became readable while a reply or an event was awaited."""
+
+
+def _refusal(reply: JsonObject, items: list[JsonObject]) -> RequestRefused:
+    error = reply.get("error")
+    code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
+    refused = refusal(str(code), str(message))
+    refused.items = items
+    return refused
+
+
+class _Exchange:
+    """One request on its way: the lines of its list, and at last its reply."""
+
+    __slots__ = ("items", "on_reply", "reply", "touched")
+
+    def __init__(self, on_reply: OnReply | None) -> None:
+        self.items: list[JsonObject] = []
+        self.reply: JsonObject | None = None
+        self.on_reply = on_reply
+        self.touched = time.monotonic()
+
+
+class Connection:
+    """`on_event` gets every event, in the server's order, in the thread that happens to read."""
+
+    def __init__(
+        self,
+        socket: str | None,
+        hello: Hello,
+        version: str,
+        on_event: Callable[[JsonObject], None],
+        interrupt: int | None = None,
+        patience: float = ANSWER_LIMIT,
+    ) -> None:
+        self.line = dial(socket, hello, version, patience)
+        self._on_event = on_event
+        self._interrupt = interrupt
+        self._interruptible = True
+        self._lines: deque[bytes] = deque(self.line.lines)
+        self._exchanges: dict[int, _Exchange] = {}
+        self._numbers = itertools.count(1)
+        self._changed = threading.Condition()
+        self._sending = threading.Lock()
+        self._reading = False
+        self._heard = time.monotonic()
+        #: why there is nothing more to come, once that is so
+        self.ended: str | None = None
+
+    def close(self) -> None:
+        """Close the connection; goals that were sent are spoken all the same."""
+        with self._changed:
+            self.ended = self.ended or "the connection was closed"
+            self.line.socket.close()
+            self._changed.notify_all()
+
+    def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
+        """Send a request and return its reply and the lines of its list.
+
+        RequestRefused or a class of it if the server says no; ServerUnavailable or Lost if it says nothing in time.
+        `on_reply` is called with both, once the server said yes, before any event that comes after the reply.
+        """
+        number = next(self._numbers)
+        exchange = _Exchange(on_reply)
+        self._exchanges[number] = exchange
+        # A goal whose sender was interrupted before it knew the goal's id could not be cancelled any more.
+        self._interruptible = not isinstance(request, Say)
+        try:
+            self._send(wire.encode({"seq": number, **write_request(request)}))
+            self.wait_until(lambda: exchange.reply is not None, lambda: exchange.touched + ANSWER_LIMIT)
+        finally:
+            self._interruptible = True
+            del self._exchanges[number]
+        if exchange.reply is None:
+            raise self._no_reply(request)
+        if exchange.reply.get("ok") is not True:
+            raise _refusal(exchange.reply, exchange.items)
+        return exchange.reply, exchange.items
+
+    def post(self, request: Request) -> None:
+        """Send a request whose reply nobody waits for."""
+        self._send(wire.encode({"seq": next(self._numbers), **write_request(request)}))
+
+    def _no_reply(self, request: Request) -> TalkError:
+        why = self.ended or f"it did not reply within {ANSWER_LIMIT:g} s"
+        words = f"{request.kind} was sent to the server at {self.line.path}, but {why}"
+        # Only a goal can still have an effect that the sender does not know of.
+        return Lost(f"{words}; it may still be spoken") if isinstance(request, Say) else ServerUnavailable(words)
+
+    def wait_until(
+        self, done: Callable[[], bool], deadline: Callable[[], float | None], silence: float | None = None
+    ) -> bool:
+        """Read until `done()`, and return True; False at the deadline (monotonic), or once the connection ended.
+
+        `silence`: seconds without a line from the server after which the connection counts as ended.
+        """
+        began = time.monotonic()
+        while True:
+            with self._changed:
+                if done():
+                    return True
+                if self.ended is not None:
+                    return False
+                now = time.monotonic()
+                limit = deadline()
+                if limit is not None and now >= limit:
+                    return False
+                if silence is not None:
+                    quiet = max(began, self._heard) + silence
+                    if now >= quiet:
+                        self.ended = f"it has said nothing for {silence:g} s"
+                        continue
+                    limit = quiet if limit is None else min(limit, quiet)
+                rest = None if limit is None else limit - now
+                if self._reading:
+                    self._changed.wait(rest)
+                    continue
+                self._reading = True
+            try:
+                self._read(rest)
+            finally:
+                with self._changed:
+                    self._reading = False
+                    self._changed.notify_all()
+
+    def _read(self, timeout: float | None) -> None:
+        """Read what there is, or wait for it, and hand it out."""
+        if not self._lines and not self._fill(timeout):
+            return
+        while self._lines:
+            try:
+                message = wire.decode(self._lines.popleft())
+            except BadRequest as error:
+                self.ended = f"it sent what is no message: {error}"
+                return
+            with self._changed:
+                self._dispatch(message)
+
+    def _fill(self, timeout: float | None) -> bool:
+        watched = {self.line.socket.fileno(): select.POLLIN}
+        if self._interrupt is not None and self._interruptible:
+            watched[self._interrupt] = select.POLLIN
+        try:
+            readable = ready(watched, timeout)
+            if self._interrupt in readable:
+                raise Interrupted
+            if not readable:
+                return False
+            data = self.line.socket.recv(262144)
+        except BlockingIOError:
+            return False
+        except (OSError, ValueError) as error:  # ValueError: another thread closed it meanwhile
+            data = b""
+            self.ended = self.ended or f"the connection broke: {error}"
+        if not data:
+            self.ended = self.ended or "the server went away"
+            return False
+        self._heard = time.monotonic()
+        self._lines.extend(self.line.splitter.feed(data))
+        return bool(self._lines)
+
+    def _dispatch(self, message: JsonObject) -> None:
+        if "event" in message:
+            self._on_event(message)
+            return
+        number = message.get("seq")
+        exchange = self._exchanges.get(number) if isinstance(number, int) else None
+        if exchange is None:
+            return
+        exchange.touched = time.monotonic()
+        if "ok" not in message:
+            exchange.items.append(message)
+            return
+        exchange.reply = message
+        if exchange.on_reply and message.get("ok") is True:
+            exchange.on_reply(message, exchange.items)
+
+    def _send(self, data: bytes) -> None:
+        end = time.monotonic() + ANSWER_LIMIT
+        with self._sending:
+            rest = memoryview(data)
+            while rest:
+                try:
+                    rest = rest[self.line.socket.send(rest) :]
+                except BlockingIOError:
+                    if not ready({self.line.socket.fileno(): select.POLLOUT}, end - time.monotonic()):
+                        # Half a line may be out: nothing that follows could be understood.
+                        self.ended = self.ended or f"it took nothing for {ANSWER_LIMIT:g} s"
+                        raise ServerUnavailable(f"the server at {self.line.path} does not answer") from None
+                except OSError as error:
+                    self.ended = self.ended or "the server went away"
+                    raise ServerUnavailable(f"the server at {self.line.path} went away: {error.strerror}") from None

@@ -1,0 +1,177 @@
+"""How a client gets from nothing to a server that has greeted it: every place tried, and why each failed.
+
+It sends nothing but `hello`, so whatever fails here is safe to try again.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import random
+import select
+import socket
+import time
+from dataclasses import dataclass
+
+from talkcli import paths, peers, wire
+from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
+from talkcli.requests import Hello, write_request
+
+#: Seconds in which a server greets, and answers each request.
+ANSWER_LIMIT = 5.0
+#: Seconds for which a client tries again where the server is full or its backlog is; with jitter, so that many clients
+#: that were turned away together don't come back together.
+BUSY_LIMIT = 5.0
+_BUSY_PAUSE = (0.02, 0.2)
+
+
+@dataclass(slots=True)
+class Line:
+    """A connection to a server that has greeted, and what was read of it beyond the greeting."""
+
+    socket: socket.socket
+    path: str
+    #: the server's boot id: the first half of its goals' ids
+    boot: str
+    #: the server's process id and version
+    pid: int | None
+    version: str | None
+    splitter: wire.LineSplitter
+    #: lines that came with the greeting
+    lines: list[bytes]
+
+
+class _BacklogFull(ServerUnavailable):
+    """More clients connect than the server takes at this moment."""
+
+
+def dial(named: str | None, hello: Hello, version: str, patience: float = ANSWER_LIMIT) -> Line:
+    """Return a connection to the first server that answers.
+
+    `named`: the only socket to try, or None for the list; `hello`: what is said to it; `version`: the client's own;
+    `patience`: seconds in which the server must greet.
+
+    ServerUnavailable, AccessDenied, ProtocolMismatch or Busy where there is none.
+    """
+    end = time.monotonic() + min(BUSY_LIMIT, patience)
+    while True:
+        try:
+            return _try_all(named, hello, version, patience)
+        except (Busy, _BacklogFull):
+            if time.monotonic() >= end:
+                raise
+            time.sleep(random.uniform(*_BUSY_PAUSE))
+
+
+def ready(watched: dict[int, int], timeout: float | None) -> set[int]:
+    """Return the descriptors that are ready for what they are watched for, waiting at most `timeout` seconds."""
+    poll = select.poll()  # not select(), which fails in a program that has more than 1,024 descriptors
+    for fd, events in watched.items():
+        poll.register(fd, events)
+    return {fd for fd, _ in poll.poll(None if timeout is None else max(0, math.ceil(timeout * 1000)))}
+
+
+def _try_all(named: str | None, hello: Hello, version: str, patience: float) -> Line:
+    failures = []
+    denied = False
+    for path in paths.client_sockets(named):
+        try:
+            connected = _connect(path)
+        except OSError as error:
+            denied = denied or error.errno in {errno.EACCES, errno.EPERM}
+            failures.append(f"{path}: {_why(error)}")
+            continue
+        try:
+            _check_owner(connected, path, named is not None)
+            return _greet(connected, path, hello, version, patience)
+        except AccessDenied as error:
+            connected.close()
+            denied = True
+            failures.append(f"{path}: {error}")
+        except BaseException:
+            connected.close()
+            raise
+    raise _nobody(failures, denied)
+
+
+def _connect(path: str) -> socket.socket:
+    connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        # Not blocking: a server that is stopped and whose backlog is full would hold the client for ever.
+        connected.setblocking(False)
+        connected.connect(path)
+    except BlockingIOError:
+        connected.close()
+        raise _BacklogFull(f"the server at {path} does not take up connections: restart it if it hangs") from None
+    except BaseException:
+        connected.close()
+        raise
+    return connected
+
+
+def _why(error: OSError) -> str:
+    if error.errno in {errno.ENOENT, errno.ENOTDIR}:
+        return "not there"
+    if error.errno == errno.ECONNREFUSED:
+        return "nobody answers (left over from a server that ended)"
+    if error.errno in {errno.EACCES, errno.EPERM}:
+        return "no permission"
+    return error.strerror or str(error)
+
+
+def _check_owner(connected: socket.socket, path: str, named: bool) -> None:
+    """Refuse a server that somebody else has put where ours would be: it would hear every sentence."""
+    _, uid = peers.credentials(connected)
+    if uid not in {os.getuid(), 0} and not named and path != paths.SYSTEM_SOCKET:
+        raise AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
+
+
+def _greet(connected: socket.socket, path: str, hello: Hello, version: str, patience: float) -> Line:
+    splitter = wire.LineSplitter(limit=None)
+    lines: list[bytes] = []
+    try:
+        connected.send(wire.encode(write_request(hello)))
+        end = time.monotonic() + patience
+        while not lines:
+            if not ready({connected.fileno(): select.POLLIN}, end - time.monotonic()):
+                raise ServerUnavailable(f"the server at {path} does not answer; {_next_step(connected)}")
+            data = connected.recv(65536)
+            if not data:
+                raise ServerUnavailable(f"the server at {path} closed the connection before it answered")
+            lines = splitter.feed(data)
+    except (BrokenPipeError, ConnectionResetError):
+        raise ServerUnavailable(f"the server at {path} closed the connection before it answered") from None
+    try:
+        greeting = wire.decode(lines.pop(0))
+    except BadRequest:
+        raise ServerUnavailable(f"what answers at {path} is no talk server") from None
+    wire.check_greeting(greeting, version)
+    if "error" in greeting:
+        raise AccessDenied(f"the server refuses: {greeting.get('message') or greeting['error']}")
+    boot, pid, server_version = greeting.get("boot"), greeting.get("pid"), greeting.get("version")
+    return Line(
+        connected,
+        path,
+        boot if isinstance(boot, str) else "",
+        pid if isinstance(pid, int) else None,
+        server_version if isinstance(server_version, str) else None,
+        splitter,
+        lines,
+    )
+
+
+def _next_step(connected: socket.socket) -> str:
+    pid, _ = peers.credentials(connected)
+    return f"look at process {pid}, and restart it if it hangs"
+
+
+def _nobody(failures: list[str], denied: bool) -> TalkError:
+    tried = "\n".join(f"  {each}" for each in failures)
+    hint = paths.sudo_hint()
+    step = "start one with: talk serve"
+    if hint and not os.environ.get("TALK_SOCKET"):
+        step += f"\nthe server of the user who called sudo would be reached with: talk --socket {hint}"
+    if denied:
+        return AccessDenied(f"no server that may be used, tried:\n{tried}\n{step}")
+    return ServerUnavailable(f"no server, tried:\n{tried}\n{step}")

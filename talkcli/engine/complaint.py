@@ -1,0 +1,58 @@
+"""What a player says on standard error: keeps the one line that names the error.
+
+Pure: bytes go in as they come, one readable line comes out. A player can talk for hours (underruns), so only the line
+that is wanted is kept. It is not the last one, as after the error a player may dump its parameters.
+"""
+
+from __future__ import annotations
+
+import re
+
+#: Bytes of one line that are kept; error lines are shorter, and a message must stay readable.
+LONGEST_LINE = 300
+
+#: What is no error, or none that a user can read: the library's chatter around it, gaps in the sound, and what was
+#: meant kindly.
+_NOISE = re.compile(
+    r"ALSA lib |underrun|overrun|Playing |Warning:|please, try |Stream (suspended|successfully|started)|^Got signal",
+    re.IGNORECASE,
+)
+_ERROR = re.compile(
+    r"error|fail|cannot|can't|could ?n[o']t|unable|no such|not found|not available|refused|denied|invalid|unknown"
+    r"|disconnected|busy|broken|terminated|killed|lost",
+    re.IGNORECASE,
+)
+#: `aplay: main:831: text`: function and line mean nothing to a user.
+_PLACE = re.compile(r"^(?P<program>[^\s:]+): \w+:\d+: ")
+
+
+class Complaint:
+    """The line of a player's standard error that names the error."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._named: str | None = None
+        self._first: str | None = None
+
+    def feed(self, data: bytes) -> None:
+        """Take what the player wrote."""
+        *lines, rest = (self._rest + data).split(b"\n")
+        self._rest = rest[:LONGEST_LINE]
+        for line in lines:
+            self._look(line)
+
+    def line(self) -> str | None:
+        """Return the line that names the error, None if nothing was said that could."""
+        self._look(self._rest)
+        self._rest = b""
+        return self._named or self._first
+
+    def _look(self, raw: bytes) -> None:
+        line = raw[:LONGEST_LINE].decode("utf-8", "replace").strip()
+        if not line or _NOISE.search(line):
+            return
+        line = _PLACE.sub(r"\g<program>: ", line)
+        if self._named is None and _ERROR.search(line):
+            self._named = line
+        if self._first is None:
+            self._first = line

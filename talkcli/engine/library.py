@@ -1,0 +1,69 @@
+"""Loads libespeak-ng and pyttsx3's binding of it: the system's library where there is one, else the wheel's.
+
+Linux only; elsewhere pyttsx3's own drivers find their libraries themselves. It must run before anything imports
+`pyttsx3.drivers._espeak`, which loads the library when it is imported.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any
+
+_LIBRARY = "libespeak-ng.so.1"
+
+#: Milliseconds of sound that the library hands over at once. It rounds up to 49 at 22,050 Hz; more would only delay
+#: the first sound.
+_BUFFER_MS = 20
+
+#: Without this option the library calls exit() where its data is missing.
+_DONT_EXIT = 0x8000
+
+
+class LibraryMissing(Exception):
+    """The library or its data is not there; the text names what to install."""
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """libespeak-ng, loaded and initialised."""
+
+    #: pyttsx3's ctypes binding, the module.
+    espeak: Any
+    #: for people: "eSpeak NG 1.51 (system)".
+    version: str
+    #: samples per second until a voice says otherwise.
+    rate: int
+
+
+def load() -> Library:
+    """Load and initialise the library, once a process; LibraryMissing if that is impossible."""
+    origin, data = _preload()
+    from pyttsx3.drivers import _espeak
+
+    rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _BUFFER_MS, data, _DONT_EXIT)
+    if rate <= 0:
+        raise LibraryMissing("there is no espeak-ng data: install espeak-ng-data, or pip install espeakng-loader")
+    version = (_espeak.Info(None) or b"").decode("utf-8", "replace").split(" ")[0]
+    return Library(_espeak, f"eSpeak NG {version} ({origin})", rate)
+
+
+def _preload() -> tuple[str, bytes | None]:
+    """Have the library in the process, so that the binding finds it; return its origin and its data's directory."""
+    try:
+        ctypes.CDLL(_LIBRARY)
+    except OSError as missing:
+        return _preload_wheel(missing)
+    return "system", None
+
+
+def _preload_wheel(missing: OSError) -> tuple[str, bytes]:
+    try:
+        import espeakng_loader
+
+        # Global, as the binding asks for the name that the system's library would have, and gets the one that is there.
+        ctypes.CDLL(espeakng_loader.get_library_path(), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError) as error:
+        text = "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader"
+        raise LibraryMissing(f"{text} ({missing})") from error
+    return "espeakng-loader", str(espeakng_loader.get_data_path()).encode()

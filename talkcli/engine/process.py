@@ -1,0 +1,72 @@
+"""The engine process: what the server starts, in a session of its own, to speak through pyttsx3.
+
+Standard input is the socket to the server, both directions. It holds no state that outlives it, so the server may kill
+it at any moment; and it must be gone, with its player, when the server is.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+
+from talkcli.engine import protocol
+from talkcli.engine.channel import Channel
+from talkcli.engine.orphan import die_with_parent
+
+#: Names the descriptor that the player must inherit: the server sees by its end that process and player are gone.
+LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
+
+
+def main() -> None:
+    """Run the engine process to its end."""
+    die_with_parent()
+    # Ctrl-C in the server's terminal and the terminal's end are the server's business. A server or a player that stops
+    # reading is seen by the write that fails.
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
+        signal.signal(number, signal.SIG_IGN)
+    channel = Channel()
+    configure = _configuration(channel)
+    # The server may have died before the kernel was asked to tell.
+    if configure is None or os.getppid() != configure.server:
+        return
+    _serve(channel, configure)
+
+
+def _configuration(channel: Channel) -> protocol.Configure | None:
+    """Wait for the first command; None if the server is gone, or says something else."""
+    while not channel.closed:
+        for command in channel.receive():
+            return command if isinstance(command, protocol.Configure) else None
+    return None
+
+
+def _serve(channel: Channel, configure: protocol.Configure) -> None:
+    from talkcli.engine.outlet import Outlet
+    from talkcli.engine.session import Session
+    from talkcli.engine.start import CannotStart, start
+
+    outlet = Outlet(configure.player, configure.device, _inherited())
+    session = Session(channel)
+    try:
+        started = start(configure.driver, configure.voice, outlet, session.wait)
+    except CannotStart as error:
+        channel.send(protocol.StartFailed(error.reason, str(error)))
+        return
+    session.open(started.engine, started.settings, started.pump)
+    own = started.pump is None
+    channel.send(protocol.Ready(started.driver, started.version, outlet.first() if own else None))
+    try:
+        session.run()
+    finally:
+        started.engine.endLoop()
+
+
+def _inherited() -> list[int]:
+    """Return the descriptors that a player must inherit; none when the process was started by hand."""
+    value = os.environ.get(LIVENESS_VARIABLE)
+    if value is None:
+        return []
+    descriptor = int(value)
+    os.fstat(descriptor)  # one that is not open would fail every sentence: better to fail now
+    os.set_inheritable(descriptor, False)
+    return [descriptor]

@@ -1,0 +1,232 @@
+"""The engine process's loop: one goal after the other through pyttsx3's engine, with commands in between and during.
+
+One thread. While a goal is spoken by `talk`'s own driver, the driver waits in `Session.wait`; a `Stop` that comes in
+there is carried out at once, by `engine.stop()`. Nothing may leave a goal without its `Ended`: pyttsx3 swallows what
+its callbacks raise, ignores blank text and turns errors into notifications.
+"""
+
+from __future__ import annotations
+
+import select
+import sys
+import time
+import traceback
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from talkcli.engine import protocol
+from talkcli.engine.settings import SettingFailed
+from talkcli.engine.sink import AudioFailed
+from talkcli.engine.voices import list_voices
+from talkcli.engine.words import Words
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from talkcli.engine.channel import Channel
+    from talkcli.engine.protocol import Command
+    from talkcli.engine.settings import Settings
+    from talkcli.engine.sink import Interest
+
+#: Seconds between two steps of a driver that is not ours while it has a goal in hand: it has no way to wake us.
+STEP = 0.05
+
+#: Seconds without a command before the voices are listed: a goal that waited for this process comes at once, and
+#: listing takes up to 40 ms.
+QUIET = 0.2
+
+
+@dataclass(slots=True)
+class InHand:
+    """The goal that is being spoken."""
+
+    id: str
+    words: Words
+    began: float
+    stop_asked: bool = False
+    error: Exception | None = None
+
+
+class Session:
+    """The loop. `open` gives it its engine, `run` runs it."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self._backlog: deque[Command] = deque()
+        self._leaving = False
+        self._goal: InHand | None = None
+        self._engine: Any = None
+        self._settings: Settings | None = None
+        self._pump: Callable[[], None] | None = None
+
+    def open(self, engine: Any, settings: Settings, pump: Callable[[], None] | None) -> None:
+        """Take the engine; `pump` is called about 20 times a second while a goal is spoken by a foreign driver."""
+        self._engine = engine
+        self._settings = settings
+        self._pump = pump
+        engine.connect("started-word", self._word)
+        engine.connect("finished-utterance", self._finished)
+        engine.connect("error", self._error)
+
+    def run(self) -> None:
+        """Carry out commands until the server leaves or says so."""
+        voices_told = False
+        while not (self._leaving or self._channel.closed):
+            if self._backlog:
+                self._carry_out(self._backlog.popleft())
+                continue
+            if not voices_told and not self._readable(QUIET):
+                voices_told = True
+                self._channel.send(protocol.Voices(self._voices()))
+                continue
+            self._backlog.extend(self._channel.receive())
+
+    def wait(self, interests: Sequence[Interest], until: float | None) -> None:
+        """Wait for one of the interests, a command or a monotonic time, and carry out what the server wants now."""
+        poll = select.poll()
+        if not self._channel.closed:
+            poll.register(self._channel.descriptor, select.POLLIN)
+        for descriptor, events in interests:
+            poll.register(descriptor, events)
+        moments = [moment for moment in (until, self._alive_due()) if moment is not None]
+        timeout = max(0.0, min(moments) - time.monotonic()) * 1000 if moments else None
+        ready = [descriptor for descriptor, _ in poll.poll(timeout)]
+        if self._channel.descriptor in ready:
+            self._take_commands()
+        self._tell_alive()
+
+    def _take_commands(self) -> None:
+        """Read what came during a goal; a stop is carried out, the rest has to wait."""
+        for command in self._channel.receive():
+            if isinstance(command, protocol.Stop):
+                self._stop(command)
+            else:
+                self._leaving = self._leaving or isinstance(command, protocol.Quit)
+                self._backlog.append(command)
+        if self._leaving or self._channel.closed:
+            self._silence()
+
+    def _stop(self, command: protocol.Stop) -> None:
+        if self._goal is not None and self._goal.id == command.id:
+            self._silence()
+            return
+        for waiting in self._backlog:
+            if isinstance(waiting, protocol.Say) and waiting.id == command.id:
+                self._backlog.remove(waiting)
+                self._channel.send(protocol.Started(waiting.id))
+                self._channel.send(protocol.Ended(waiting.id, protocol.STOPPED))
+                return
+
+    def _silence(self) -> None:
+        if self._goal is not None and not self._goal.stop_asked:
+            self._goal.stop_asked = True
+            self._engine.stop()
+
+    def _carry_out(self, command: Command) -> None:
+        if isinstance(command, protocol.Say):
+            self._say(command)
+        elif isinstance(command, protocol.Quit):
+            self._leaving = True
+        # A Stop out of a goal came too late, a second Configure has nothing to change.
+
+    def _say(self, say: protocol.Say) -> None:
+        """Speak a goal to its end."""
+        assert self._settings is not None
+        self._goal = InHand(say.id, Words(say.text), time.monotonic())
+        self._channel.send(protocol.Started(say.id))
+        try:
+            self._settings.apply(say)
+        except SettingFailed as error:
+            self._end(protocol.FAILED, error.reason, str(error))
+            return
+        self._goal.error = None
+        if self._engine.say(say.text, say.id) is not None:
+            self._end(protocol.FAILED, "nothing_to_say", "nothing in the text can be spoken")
+            return
+        while self._goal is not None and not self._leaving:
+            self._step()
+
+    def _step(self) -> None:
+        """Let the driver go on. Ours speaks to the end in one step, others are asked again and again."""
+        self._engine.iterate()
+        if self._goal is None:
+            return
+        if self._pump is None:
+            self._end(protocol.FAILED, "engine_failed", "the driver lost the sentence")
+            return
+        if self._goal.error is not None and not self._engine.isBusy():
+            self._finished(self._goal.id, completed=False)
+            return
+        self.wait((), time.monotonic() + STEP)
+        self._pump()
+
+    def _word(self, location: int, length: int, time: float | None = None, **_: object) -> None:
+        """Report a word. Other drivers give the word as the notification's name, so that says nothing."""
+        goal = self._goal
+        if goal is None or goal.stop_asked:
+            return
+        found = goal.words.next(location, length)
+        if found is not None:
+            seconds = _since(goal.began) if time is None else time
+            self._channel.send(protocol.Word(goal.id, found.start, found.end, found.number, round(seconds, 3)))
+
+    def _error(self, exception: Exception, **_: object) -> None:
+        if self._goal is not None and self._goal.error is None:
+            self._goal.error = exception
+
+    def _finished(self, name: str | None, completed: bool, duration: float | None = None, **_: object) -> None:
+        goal = self._goal
+        if goal is None or name != goal.id:  # of a goal that ended before
+            return
+        if completed:
+            self._end(protocol.COMPLETED, duration=None if duration is None else round(duration, 3))
+        elif goal.stop_asked and not isinstance(goal.error, AudioFailed):
+            self._end(protocol.STOPPED)
+        elif isinstance(goal.error, AudioFailed):
+            self._end(protocol.FAILED, goal.error.reason, str(goal.error))
+        else:
+            _log(goal.error)
+            text = "the driver did not complete the sentence" if goal.error is None else _describe(goal.error)
+            self._end(protocol.FAILED, "engine_failed", text)
+
+    def _end(
+        self, outcome: str, reason: str | None = None, message: str | None = None, duration: float | None = None
+    ) -> None:
+        assert self._goal is not None
+        goal, self._goal = self._goal, None
+        self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration))
+
+    def _alive_due(self) -> float | None:
+        return None if self._goal is None else self._channel.sent_at + protocol.ALIVE_EVERY
+
+    def _tell_alive(self) -> None:
+        due = self._alive_due()
+        if due is not None and self._goal is not None and time.monotonic() >= due:
+            self._channel.send(protocol.Alive(self._goal.id))
+
+    def _readable(self, seconds: float) -> bool:
+        poll = select.poll()
+        poll.register(self._channel.descriptor, select.POLLIN)
+        return bool(poll.poll(seconds * 1000))
+
+    def _voices(self) -> tuple[protocol.Voice, ...]:
+        try:
+            return list_voices(self._engine)
+        except Exception as error:  # noqa: BLE001 - any driver's; a voice can be spoken with without the list
+            _log(error)
+            return ()
+
+
+def _since(began: float) -> float:
+    return time.monotonic() - began
+
+
+def _describe(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _log(error: Exception | None) -> None:
+    """Leave a trace for the server's log."""
+    if error is not None:
+        traceback.print_exception(type(error), error, error.__traceback__, file=sys.stderr)

@@ -1,0 +1,154 @@
+"""One engine process as its parent sees it: started, written to, read, killed, reaped. It decides nothing.
+
+What makes "silent" provable is one pipe that nobody writes to: the engine process and its player inherit the writing
+end, so its reading end shows end of file exactly when both are gone, however they went.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+from talkcli.engine import protocol
+from talkcli.wire import LineSplitter
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+#: The variable that tells the engine process which descriptor its player has to inherit.
+LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
+#: Variables of the server's own supervisor, which its children must not answer to.
+_NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
+#: Bytes that may wait to be read by the process: the longest text, escaped, fits several times.
+_SEND_BUFFER = 512 * 1024
+#: Bytes of standard error kept: its last line goes into the message of a crash.
+_STDERR_KEPT = 4096
+#: Seconds a process that closed its connection is given to end by itself, so that its own exit status is seen.
+_LAST_BREATH = 0.2
+
+
+def engine_command() -> list[str]:
+    """Return the command line of the engine process: this interpreter, with this process's own import path."""
+    code = f"import sys; sys.path[:] = {sys.path!r}; from talkcli.engine.process import main; main()"
+    return [sys.executable, "-c", code]
+
+
+class EngineProcess:
+    """A running engine process, with the descriptors that the engine thread has to watch.
+
+    OSError from the constructor if it cannot be started.
+    """
+
+    def __init__(self, command: list[str], configure: protocol.Configure) -> None:
+        self.ready = False
+        #: whether the process said itself why it cannot start
+        self.explained = False
+        self._lines = LineSplitter(limit=None)
+        self._stderr_tail = b""
+        with contextlib.ExitStack() as opened:
+            self.socket, theirs = socket.socketpair()
+            opened.callback(self.socket.close)
+            with theirs:
+                self.socket.setblocking(False)
+                self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+                self.liveness, inherited = os.pipe()
+                opened.callback(os.close, self.liveness)
+                self.stderr, stderr = os.pipe()
+                opened.callback(os.close, self.stderr)
+                os.set_blocking(self.stderr, False)
+                try:
+                    environment = {name: value for name, value in os.environ.items() if name not in _NOT_INHERITED}
+                    self._process: subprocess.Popen[bytes] = subprocess.Popen(
+                        command,
+                        stdin=theirs.fileno(),
+                        stdout=subprocess.DEVNULL,
+                        stderr=stderr,
+                        env={**environment, LIVENESS_VARIABLE: str(inherited)},
+                        pass_fds=[inherited],
+                        # Ctrl-C in the server's terminal must not reach it; and one kill reaches all of a session.
+                        start_new_session=True,
+                    )
+                finally:
+                    os.close(inherited)
+                    os.close(stderr)
+            opened.pop_all()
+        self.send(configure)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def send(self, command: protocol.Command) -> bool:
+        """Write a command; False if the process is gone or takes nothing any more."""
+        line = protocol.encode(command)
+        try:
+            return self.socket.send(line) == len(line)
+        except (BlockingIOError, BrokenPipeError, ConnectionResetError):
+            return False
+
+    def receive(self) -> Iterator[protocol.Event | None]:
+        """Return what the process said; None as the last one if it closed the connection or said what can't be read."""
+        try:
+            data = self.socket.recv(65536)
+        except BlockingIOError:
+            return
+        except ConnectionResetError:
+            data = b""
+        if not data:
+            yield None
+        for line in self._lines.feed(data):
+            try:
+                yield protocol.decode_event(line)
+            except (ValueError, TypeError, KeyError):
+                yield None
+                return
+
+    def read_stderr(self) -> bool:
+        """Keep the end of what the process wrote to standard error; False once that is closed."""
+        try:
+            data = os.read(self.stderr, 65536)
+        except BlockingIOError:
+            return True
+        self._stderr_tail = (self._stderr_tail + data)[-_STDERR_KEPT:]
+        return bool(data)
+
+    def kill(self) -> None:
+        """Kill the process and its player. The process isn't reaped yet, so its group can't be anybody else's."""
+        if self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+
+    def last_words(self) -> str:
+        """Return how a process that closed its connection ended, for people. Waits a moment for it to be gone."""
+        try:
+            status = self._process.wait(_LAST_BREATH)
+        except subprocess.TimeoutExpired:
+            return "it closed its connection"
+        self.read_stderr()
+        lines = [line.strip() for line in self._stderr_tail.decode(errors="replace").splitlines() if line.strip()]
+        how = f"it was killed by {_signal_name(-status)}" if status < 0 else f"it exited with status {status}"
+        return f"{how} ({lines[-1]})" if lines else how
+
+    def silent(self) -> bool:
+        """Whether process and player are gone. Call where `liveness` is readable: nothing is ever written there."""
+        return os.read(self.liveness, 1) == b""
+
+    def close(self) -> None:
+        """Reap the process, which must be gone or ignore a kill, and close the descriptors."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_LAST_BREATH)
+        self.socket.close()
+        os.close(self.liveness)
+        os.close(self.stderr)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

@@ -1,0 +1,121 @@
+"""Builds the pyttsx3 engine of an engine process: which driver, from where, and what to install if it is missing.
+
+It starts no goal. Everything heavy is imported inside, so that a missing part is an answer and no traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from talkcli.engine.settings import SettingFailed, Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from talkcli.engine.outlet import Outlet
+    from talkcli.engine.sink import Wait
+
+#: The drivers of macOS that speak in Apple's run loop, which somebody has to run.
+_RUN_LOOP_DRIVERS = ("nsss", "avspeech")
+
+
+class CannotStart(Exception):
+    """The engine cannot start: `reason` is for programs, the text names what to install or to change."""
+
+    def __init__(self, message: str, reason: str = "engine_failed") -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True)
+class OpenEngine:
+    """An engine that is ready."""
+
+    engine: Any
+    settings: Settings
+    driver: str
+    version: str | None
+    #: what a foreign driver needs between two steps; None for our own driver, which needs no steps.
+    pump: Callable[[], None] | None
+
+
+def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait) -> OpenEngine:
+    """Build the engine, with its loop started; CannotStart."""
+    try:
+        import pyttsx3
+    except ImportError as error:
+        raise CannotStart(f"pyttsx3 is missing: pip install pyttsx3 ({error})") from error
+    own = _is_own(driver)
+    version = _register_own(outlet, wait) if own else None
+    from talkcli.engine.espeak import DRIVER
+
+    name = DRIVER if own else driver or pyttsx3.engine.default_engine_by_sys_platform()
+    engine = _init(pyttsx3, name)
+    settings = Settings(engine, name, own)
+    _start_loop(engine, name)
+    try:
+        settings.set_voice(voice)
+    except SettingFailed as error:
+        raise CannotStart(str(error), error.reason) from error
+    return OpenEngine(engine, settings, name, version, None if own else _pump(name))
+
+
+def _is_own(driver: str | None) -> bool:
+    from talkcli.engine.espeak import DRIVER
+
+    return driver == DRIVER or (sys.platform.startswith("linux") and driver in (None, "espeak"))
+
+
+def _register_own(outlet: Outlet, wait: Wait) -> str:
+    from talkcli.engine.espeak import register
+    from talkcli.engine.library import LibraryMissing, load
+
+    try:
+        library = load()
+    except LibraryMissing as error:
+        raise CannotStart(str(error)) from error
+    register(library, outlet, wait)
+    return library.version
+
+
+def _init(pyttsx3: Any, name: str) -> Any:
+    try:
+        # With debug, what a callback raises is at least printed: pyttsx3 would drop it.
+        return pyttsx3.init(name, debug=True)
+    except ModuleNotFoundError as error:
+        if error.name == f"pyttsx3.drivers.{name}":
+            raise CannotStart(f'unknown driver "{name}": there are {", ".join(_driver_names(pyttsx3))}') from error
+        raise CannotStart(f'the driver "{name}" cannot be loaded: {error}') from error
+    except Exception as error:
+        raise CannotStart(f'the driver "{name}" cannot be started: {type(error).__name__}: {error}') from error
+
+
+def _start_loop(engine: Any, name: str) -> None:
+    """Start the loop and take its first step: some drivers cannot, and would hang at the first goal."""
+    try:
+        engine.startLoop(False)
+        engine.iterate()
+    except TypeError as error:
+        text = f'the driver "{name}" cannot be stepped (its iterate() is no generator)'
+        raise CannotStart(f"{text}: leave --driver out") from error
+
+
+def _driver_names(pyttsx3: Any) -> list[str]:
+    import os
+    import pkgutil
+
+    folder = os.path.join(os.path.dirname(pyttsx3.__file__), "drivers")
+    return sorted(module.name for module in pkgutil.iter_modules([folder]) if not module.name.startswith("_"))
+
+
+def _pump(name: str) -> Callable[[], None]:
+    if sys.platform != "darwin" or name not in _RUN_LOOP_DRIVERS:
+        return lambda: None
+    from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
+
+    def run_loop() -> None:
+        NSRunLoop.currentRunLoop().runUntilDate_(NSDate.dateWithTimeIntervalSinceNow_(0))
+
+    return run_loop

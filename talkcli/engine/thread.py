@@ -1,0 +1,305 @@
+"""The engine thread: owns the engine process, hands it one goal at a time, and is its watchdog.
+
+Whatever the process does, a goal that was handed in ends with exactly one `Ended`, unless it was given up. The thread
+holds no lock while it waits, and everything it learns goes out through `post`. It knows no client and no queue.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from talkcli.engine import protocol, spawn
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+#: Seconds until a process that was started must be ready: a cold start from an SD card takes two or three.
+START_LIMIT = 10.0
+#: Seconds without a sign of life from a process that has a goal in hand; it sends one each `protocol.ALIVE_EVERY`.
+HANG_AFTER = 3.0
+#: Seconds after which a stop that isn't confirmed becomes a kill.
+STOP_LIMIT = 0.15
+#: Seconds after a kill in which process and player must be gone.
+SILENCE_LIMIT = 2.0
+#: Seconds before the next start, by the number of processes in a row that died before they were of use.
+BACK_OFF = (0.0, 0.1, 0.5, 2.0, 10.0)
+#: A ready process that dies sooner than this, with no goal in hand, was of no use.
+SHORT_LIFE = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class EngineDied:
+    """The engine process ended, or had to be ended; for the log."""
+
+    words: str
+
+
+Report = protocol.Event | EngineDied
+
+
+class EngineThread(threading.Thread):
+    """`post` is called in this thread, with what the engine process says and with an `Ended` for each goal."""
+
+    def __init__(self, configure: protocol.Configure, post: Callable[[Report], None]) -> None:
+        super().__init__(name="engine", daemon=True)
+        self._configure = configure
+        self._post = post
+        self._inbox: deque[Callable[[], None]] = deque()
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._wake_read, selectors.EVENT_READ)
+        self._process: spawn.EngineProcess | None = None
+        self._started_at = 0.0
+        self._start_at = 0.0
+        self._failures = 0
+        #: why no process becomes ready, while that is so
+        self._start_error: str | None = None
+        self._goal: protocol.Say | None = None
+        #: when the process last gave a sign of life for the goal; None while the goal waits for a process
+        self._heard_at: float | None = None
+        self._stop_at: float | None = None
+        self._verdict: protocol.Ended | None = None
+        #: killed, not yet known to be gone, with the time by which they must be
+        self._dying: dict[spawn.EngineProcess, float] = {}
+        self._closing = False
+
+    # -- called from other threads
+
+    def say(self, goal: protocol.Say) -> None:
+        """Hand in a goal; the one before must have ended or been given up."""
+        self._call(lambda: self._take(goal))
+
+    def stop(self, goal_id: str) -> None:
+        """Make the goal end, silent."""
+        self._call(lambda: self._begin_stop(goal_id))
+
+    def give_up(self, goal_id: str) -> None:
+        """Let go of a goal that didn't end in time: its process is left behind, there will be no `Ended`."""
+        self._call(lambda: self._abandon(goal_id))
+
+    def close(self) -> None:
+        """End the process and this thread."""
+        self._call(self._begin_close)
+
+    def _call(self, action: Callable[[], None]) -> None:
+        self._inbox.append(action)
+        # Where the pipe is full, a wake-up that was not seen yet does for this one, too.
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._wake_write, b"\0")
+
+    # -- the loop
+
+    def run(self) -> None:
+        """Serve until `close`."""
+        while not self._closing:
+            self._keep_limits(time.monotonic())
+            for key, _ in self._selector.select(self._timeout()):
+                self._handle(key)
+        self._shut_down()
+
+    def _timeout(self) -> float | None:
+        due = [each for each in self._deadlines() if each is not None]
+        return max(0.0, min(due) - time.monotonic()) if due else None
+
+    def _deadlines(self) -> list[float | None]:
+        if self._process is None:
+            first: list[float | None] = [self._start_at]
+        else:
+            first = [None if self._process.ready else self._started_at + START_LIMIT]
+        first.append(None if self._heard_at is None else self._heard_at + HANG_AFTER)
+        first.append(None if self._stop_at is None else self._stop_at + STOP_LIMIT)
+        return first + [limit for limit in self._dying.values() if limit != float("inf")]
+
+    def _keep_limits(self, now: float) -> None:
+        if self._process is None and now >= self._start_at:
+            self._start()
+        elif self._process and not self._process.ready and now >= self._started_at + START_LIMIT:
+            self._lose_process(f"the engine was not ready after {START_LIMIT:g} s", "engine_failed")
+        elif self._stop_at is not None and now >= self._stop_at + STOP_LIMIT:
+            self._lose_process(f"the engine did not confirm a stop within {STOP_LIMIT * 1000:.0f} ms", "engine_hung")
+        elif self._heard_at is not None and now >= self._heard_at + HANG_AFTER:
+            self._lose_process(f"the engine gave no sign of life for {HANG_AFTER:g} s", "engine_hung")
+        for process, limit in list(self._dying.items()):
+            if now >= limit:
+                self._dying[process] = float("inf")  # kept, to be reaped when it goes after all
+                if self._verdict:
+                    words = f"the player could not be ended within {SILENCE_LIMIT:g} s"
+                    self._finish(protocol.Ended(self._verdict.id, protocol.FAILED, "not_silent", words))
+
+    def _handle(self, key: selectors.SelectorKey) -> None:
+        if key.fd == self._wake_read:
+            self._run_inbox()
+            return
+        if key.fd not in self._selector.get_map():
+            return  # closed by what was handled before it
+        process: spawn.EngineProcess = key.data
+        if key.fd == process.liveness:
+            if process is self._process:
+                self._hear(process)  # its last messages, before its end is acted upon
+            if process is self._process:
+                self._crashed(process)
+            if process.silent():
+                self._bury(process)
+        elif key.fd == process.stderr:
+            if not process.read_stderr():
+                self._selector.unregister(process.stderr)
+        elif process is self._process:
+            self._hear(process)
+
+    def _run_inbox(self) -> None:
+        os.read(self._wake_read, 4096)
+        while self._inbox:
+            self._inbox.popleft()()
+
+    # -- goals
+
+    def _take(self, goal: protocol.Say) -> None:
+        self._goal, self._heard_at, self._stop_at, self._verdict = goal, None, None, None
+        if self._start_error is not None:
+            self._finish(protocol.Ended(goal.id, protocol.FAILED, "engine_failed", self._start_error))
+        else:
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        if self._goal and self._heard_at is None and self._process and self._process.ready:
+            self._heard_at = time.monotonic()
+            if not self._process.send(self._goal):
+                self._lose_process("the engine takes no commands", "engine_hung")
+
+    def _begin_stop(self, goal_id: str) -> None:
+        if self._goal is None or self._goal.id != goal_id or self._stop_at is not None:
+            return  # it ended while the stop was on its way
+        if self._verdict:
+            self._verdict = protocol.Ended(goal_id, protocol.STOPPED)
+        elif self._heard_at is None:
+            self._finish(protocol.Ended(goal_id, protocol.STOPPED))
+        elif self._process:
+            self._stop_at = time.monotonic()
+            self._process.send(protocol.Stop(goal_id))
+
+    def _abandon(self, goal_id: str) -> None:
+        if self._goal and self._goal.id == goal_id:
+            self._goal = self._heard_at = self._stop_at = self._verdict = None
+            if self._process and self._process.ready:
+                self._lose_process("the engine could not be silenced", "not_silent")
+
+    def _finish(self, ended: protocol.Ended) -> None:
+        self._goal = self._heard_at = self._stop_at = self._verdict = None
+        self._post(ended)
+
+    # -- the process
+
+    def _start(self) -> None:
+        self._started_at = time.monotonic()
+        try:
+            process = spawn.EngineProcess(spawn.engine_command(), self._configure)
+        except OSError as error:
+            self._start_failed(f"the engine process cannot be started: {error}")
+            return
+        self._process = process
+        for fd in (process.socket.fileno(), process.liveness, process.stderr):
+            self._selector.register(fd, selectors.EVENT_READ, process)
+
+    def _hear(self, process: spawn.EngineProcess) -> None:
+        for event in process.receive():
+            if event is None:
+                self._crashed(process)
+                return
+            self._note(process, event)
+
+    def _crashed(self, process: spawn.EngineProcess) -> None:
+        self._lose_process(f"the engine crashed: {process.last_words()}", "engine_crashed")
+
+    def _note(self, process: spawn.EngineProcess, event: protocol.Event) -> None:
+        if isinstance(event, protocol.Started | protocol.Alive | protocol.Word | protocol.Ended):
+            if self._goal is None or self._heard_at is None or event.id != self._goal.id:
+                return  # of a goal that has ended already
+            self._heard_at = time.monotonic()
+            if isinstance(event, protocol.Ended):
+                self._finish(event)
+            elif isinstance(event, protocol.Word):
+                self._post(event)
+            return
+        if isinstance(event, protocol.Ready):
+            process.ready = True
+            self._start_error = None
+        elif isinstance(event, protocol.StartFailed):
+            self._start_error = event.message
+            process.explained = True
+        self._post(event)
+        self._hand_over()
+
+    def _lose_process(self, words: str, reason: str) -> None:
+        """Kill the process, end its goal once it is silent, and plan the next start."""
+        process, now = self._process, time.monotonic()
+        if process is None:
+            return
+        self._process = None
+        process.kill()
+        self._selector.unregister(process.socket.fileno())
+        self._dying[process] = now + SILENCE_LIMIT
+        had_goal = self._goal is not None and self._heard_at is not None
+        if self._goal and had_goal:
+            stopped = self._stop_at is not None
+            self._verdict = (
+                protocol.Ended(self._goal.id, protocol.STOPPED)
+                if stopped
+                else protocol.Ended(self._goal.id, protocol.FAILED, reason, words)
+            )
+            self._heard_at = self._stop_at = None
+        if not (self._closing or process.explained):
+            self._post(EngineDied(words))
+        if not process.ready:
+            self._start_failed(self._start_error if process.explained and self._start_error else words)
+        elif had_goal or now - self._started_at > SHORT_LIFE:
+            self._failures = 0
+            self._start_at = now
+        else:
+            self._wait_longer(now)
+
+    def _start_failed(self, words: str) -> None:
+        self._start_error = words
+        self._wait_longer(time.monotonic())
+        if self._goal and not self._verdict:
+            self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "engine_failed", words))
+
+    def _wait_longer(self, now: float) -> None:
+        self._start_at = now + BACK_OFF[min(self._failures, len(BACK_OFF) - 1)]
+        self._failures += 1
+
+    def _bury(self, process: spawn.EngineProcess) -> None:
+        """Process and player are gone: what was being spoken is silent."""
+        self._selector.unregister(process.liveness)
+        if process.stderr in self._selector.get_map():
+            self._selector.unregister(process.stderr)
+        process.close()
+        limit = self._dying.pop(process)
+        if self._verdict and limit != float("inf"):
+            self._finish(self._verdict)
+
+    # -- the end
+
+    def _begin_close(self) -> None:
+        self._closing = True
+
+    def _shut_down(self) -> None:
+        """Leave no process behind; one that cannot be ended within the limit is left to the system."""
+        self._lose_process("the server ends", "shutdown")
+        limit = time.monotonic() + SILENCE_LIMIT / 4
+        while self._dying and time.monotonic() < limit:
+            for key, _ in self._selector.select(max(0.0, limit - time.monotonic())):
+                self._handle(key)
+        for process in list(self._dying):
+            process.close()
+        self._selector.close()
+        os.close(self._wake_read)
+        os.close(self._wake_write)

@@ -1,0 +1,73 @@
+"""Where the socket is: the one place for it.
+
+A client looks in the places of a list that is made without platformdirs, which would double its start; a server takes
+the place that platformdirs gives, after its checks of owner and mode. A test compares the two. cron, sudo, systemd and
+ssh commands run without XDG_RUNTIME_DIR, so both know what to do without it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from talkcli.errors import AddressInUse
+
+#: The name of the socket in its directory.
+SOCKET = "talk.sock"
+#: The directory of a server for the whole machine: what systemd makes for `RuntimeDirectory=talk`.
+SYSTEM_DIRECTORY = "/run/talk"
+SYSTEM_SOCKET = f"{SYSTEM_DIRECTORY}/{SOCKET}"
+
+
+def named_socket(option: str | None) -> str | None:
+    """Return the socket that the user named, by option or by variable."""
+    return option or os.environ.get("TALK_SOCKET") or None
+
+
+def client_sockets(named: str | None) -> list[str]:
+    """Return the places where a client looks for a server, in this order: the one that was named and no other."""
+    if named:
+        return [named]
+    directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]
+    places = [f"{each.rstrip('/')}/talk/{SOCKET}" for each in directories if each and os.path.isabs(each)]
+    return list(dict.fromkeys([*places, SYSTEM_SOCKET]))
+
+
+def _runtime_directories(uid: int) -> list[str]:
+    if sys.platform == "darwin":
+        return [os.path.expanduser("~/Library/Caches/TemporaryItems")]
+    # Without a directory of systemd's, platformdirs falls back to one under the temporary directory, which is the first
+    # of these that can be written; the client can't know which one that was for the server, so it tries them all.
+    temporary = [os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP")]
+    fallbacks = [
+        os.path.join(os.path.abspath(each), f"runtime-{uid}") for each in [*temporary, "/tmp", "/var/tmp"] if each
+    ]
+    return [f"/run/user/{uid}", *fallbacks]
+
+
+def sudo_hint() -> str | None:
+    """Return the socket that the user who called sudo would have, if root was reached that way."""
+    caller = os.environ.get("SUDO_UID", "")
+    if os.getuid() != 0 or not caller.isdecimal():
+        return None
+    return f"/run/user/{caller}/talk/{SOCKET}"
+
+
+def server_socket(named: str | None) -> str:
+    """Return where a server listens, with its directory made; AddressInUse where that directory is not safe."""
+    if named:
+        return os.path.abspath(named)
+    given = os.environ.get("RUNTIME_DIRECTORY")
+    if given:
+        return os.path.join(given.split(":")[0], SOCKET)
+    import warnings
+
+    import platformdirs
+
+    with warnings.catch_warnings():
+        # It warns where XDG_RUNTIME_DIR isn't set; clients know the place that it takes then.
+        warnings.simplefilter("ignore", platformdirs.RuntimeDirWarning)
+        try:
+            return str(platformdirs.PlatformDirs("talk", appauthor=False).place_runtime_file(SOCKET))
+        except OSError as error:
+            raise AddressInUse(f"no directory for the socket: {error}; name a socket with --socket PATH") from error

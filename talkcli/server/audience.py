@@ -1,0 +1,109 @@
+"""Who is told what: those who wait for a goal, those who watch all, and that the server is alive while they do.
+
+It knows connections and goals, nothing of requests or the engine.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from talkcli.messages import JsonObject
+    from talkcli.record import Record
+    from talkcli.server.connection import Connection
+    from talkcli.states import State
+
+#: Seconds between signs of life to those who wait; a client gives a server up after three of them.
+ALIVE_EVERY = 5.0
+
+
+class Audience:
+    """The connections that have asked to be told."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        #: events published so far: a watcher sees by a gap that feedback was dropped
+        self._count = 0
+        self._waiters: dict[str, dict[Connection, None]] = {}
+        self._awaited: dict[Connection, set[str]] = {}
+        self._watchers: dict[Connection, None] = {}
+        self._alive: asyncio.TimerHandle | None = None
+
+    def await_result(self, goal_id: str, connection: Connection) -> None:
+        """Tell this connection of the goal's states, and at last its result."""
+        waiting = self._waiters.setdefault(goal_id, {})
+        if connection not in waiting:
+            waiting[connection] = None
+            self._awaited.setdefault(connection, set()).add(goal_id)
+            connection.owed += 1
+            self._keep_alive()
+
+    def watch(self, connection: Connection) -> None:
+        """Tell this connection of everything."""
+        if connection not in self._watchers:
+            self._watchers[connection] = None
+            connection.owed += 1
+            self._keep_alive()
+
+    def left(self, connection: Connection) -> None:
+        """Forget a connection that is gone."""
+        self._watchers.pop(connection, None)
+        for goal_id in self._awaited.pop(connection, ()):
+            waiting = self._waiters[goal_id]
+            del waiting[connection]
+            if not waiting:
+                del self._waiters[goal_id]
+
+    def changed(self, record: Record, state: State, at: float) -> None:
+        """Publish a goal's new state; with its last one, its result."""
+        self._count += 1
+        waiting = list(self._waiters.get(record.id, ()))
+        if waiting or self._watchers:
+            event: JsonObject = {"event": "state", "id": record.id, "state": state.name, "n": self._count, "at": at}
+            for connection in waiting:
+                connection.publish(event)
+            self._tell_watchers(record, event)
+        if state.terminal and waiting:
+            self._send_result(record, waiting)
+
+    def heard(self, goal_id: str, word: JsonObject, at: float) -> None:
+        """Publish that a word of a goal is being heard."""
+        self._count += 1
+        if self._watchers:
+            event = {"event": "word", "id": goal_id, **word, "n": self._count, "at": at}
+            for connection in list(self._watchers):
+                connection.publish(event, feedback=True)
+
+    def _tell_watchers(self, record: Record, event: JsonObject) -> None:
+        if not self._watchers:
+            return
+        if record.started_at is None or record.state.terminal:
+            event = {**event, "goal": record.snapshot().to_json()}  # its first state, and its last
+        for connection in list(self._watchers):
+            connection.publish(event)
+
+    def _send_result(self, record: Record, waiting: list[Connection]) -> None:
+        result: JsonObject = {"event": "result", "goal": record.snapshot().to_json()}
+        for connection in waiting:
+            connection.publish(result)
+        del self._waiters[record.id]
+        for connection in waiting:
+            awaited = self._awaited[connection]
+            awaited.discard(record.id)
+            if not awaited:
+                del self._awaited[connection]
+            connection.settle()
+
+    def _keep_alive(self) -> None:
+        if self._alive is None:
+            self._alive = self._loop.call_later(ALIVE_EVERY, self._say_alive)
+
+    def _say_alive(self) -> None:
+        self._alive = None
+        listening = dict.fromkeys([*self._awaited, *self._watchers])
+        for connection in listening:
+            connection.publish({"event": "alive"})
+        if listening:
+            self._keep_alive()

@@ -1,0 +1,275 @@
+"""One client's connection: lines in, objects out, and its limits. It neither decides nor waits.
+
+What is asked goes to a `Handler` and comes back through `reply`, `stream` and `publish`. A client that doesn't read is
+not read from either; feedback for it is dropped, and at last the client itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from dataclasses import replace
+from itertools import chain
+from typing import TYPE_CHECKING, Protocol, cast
+
+from talkcli import wire
+from talkcli.errors import BadRequest
+from talkcli.requests import Cancel, Hello, Request, Status, read_request
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from talkcli.messages import JsonObject, Sender
+
+#: Bytes that may wait for a client before feedback for it is dropped, and before its requests are left unread.
+SOFT_OUTPUT = 256 * 1024
+#: Bytes that may wait for a client that doesn't read its results, before it is let go.
+HARD_OUTPUT = 4 * 1024 * 1024
+#: Events held back while a list is sent to a client that reads it slowly, before it is let go.
+MAX_HELD = 10_000
+#: Seconds from connecting to the first complete request: clients send `hello` at once.
+FIRST_REQUEST = 5.0
+#: Seconds in which a line that was begun must end.
+LINE_LIMIT = 10.0
+#: Lines in a row that aren't JSON, after which the other end is taken for something that is no client.
+MAX_BAD_LINES = 10
+#: Lines taken from one client before the others have their turn.
+TURN = 64
+
+
+class Handler(Protocol):
+    """What a connection needs of the server."""
+
+    def greeting(self) -> JsonObject:
+        """Return the first line for a client that is let in."""
+
+    def joined(self, connection: Connection, transport: asyncio.Transport) -> None:
+        """Look who it is: admit a client, let it wait at the door, or close."""
+
+    def left(self, connection: Connection) -> None:
+        """Forget a client that is gone."""
+
+    def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
+        """Carry out a request, and answer it now or later."""
+
+    def failed(self, what: str, error: Exception) -> None:
+        """Note a request whose handling failed for a reason of the server's own."""
+
+
+class Connection(asyncio.Protocol):
+    """A client. One that is not `admitted` waits at the door of a full server until it says that it is urgent."""
+
+    def __init__(self, handler: Handler, loop: asyncio.AbstractEventLoop) -> None:
+        #: set by the handler when the client joins
+        self.sender: Sender
+        self.admitted = True
+        #: answers that are still to come for requests taken: the connection stays open for them
+        self.owed = 0
+        self._handler = handler
+        self._loop = loop
+        self._transport: asyncio.Transport | None = None
+        self._splitter = wire.LineSplitter()
+        self._lines: deque[bytes] = deque()
+        self._list: Iterator[JsonObject] | None = None
+        self._held: deque[JsonObject] = deque()
+        self._newest: JsonObject | None = None
+        self._congested = self._half_closed = self._turn_is_due = self._working = False
+        self._bad_lines = 0
+        self._first_limit: asyncio.TimerHandle | None = None
+        self._line_limit: asyncio.TimerHandle | None = None
+
+    # -- what asyncio calls
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = transport = cast("asyncio.Transport", transport)
+        transport.set_write_buffer_limits(high=SOFT_OUTPUT)
+        self._handler.joined(self, transport)
+        if transport.is_closing():
+            return
+        self._first_limit = self._loop.call_later(
+            FIRST_REQUEST, self.refuse, "too_slow", f"no request came within {FIRST_REQUEST:g} s"
+        )
+        if self.admitted:
+            self._write(self._handler.greeting())
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
+        for limit in (self._first_limit, self._line_limit):
+            if limit:
+                limit.cancel()
+        self._transport = self._list = None
+        self._lines.clear()
+        self._held.clear()
+        self._handler.left(self)
+
+    def data_received(self, data: bytes) -> None:
+        try:
+            self._lines.extend(self._splitter.feed(data))
+        except BadRequest as error:
+            self.refuse(error.code, str(error))
+            return
+        if self._line_limit and (b"\n" in data or not self._splitter.unfinished):
+            self._line_limit.cancel()
+            self._line_limit = None
+        if self._splitter.unfinished and not self._line_limit:
+            self._line_limit = self._loop.call_later(
+                LINE_LIMIT, self.refuse, "too_slow", f"a line took more than {LINE_LIMIT:g} s"
+            )
+        self._work()
+
+    def eof_received(self) -> bool:
+        self._half_closed = True
+        self._work()
+        return self._open
+
+    def pause_writing(self) -> None:
+        self._congested = True
+        if self._transport:
+            self._transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        self._congested = False
+        if self._transport and self._open:
+            self._transport.resume_reading()
+        self._work()
+
+    # -- what the handler calls
+
+    def reply(self, message: JsonObject) -> None:
+        """Answer a request."""
+        self._write(message)
+
+    def stream(self, items: Iterable[JsonObject], reply: JsonObject) -> None:
+        """Send a list, as fast as the client reads, and its reply; what comes after it waits."""
+        self._list = chain(items, [reply])
+        self._work()
+
+    def publish(self, event: JsonObject, *, feedback: bool = False) -> None:
+        """Send an event. Feedback is dropped, all but the newest, while the client doesn't read."""
+        if self._list is not None or self._held:
+            self._held.append(event)
+            if len(self._held) > MAX_HELD:
+                self.drop()
+        elif feedback and self._congested:
+            self._newest = event
+        else:
+            self._write(event)
+
+    def settle(self) -> None:
+        """Note that an answer that was owed has been given."""
+        self.owed -= 1
+        self._work()
+
+    def refuse(self, code: str, words: str) -> None:
+        """Say why, and close."""
+        self._write(wire.failure(None, code, words))
+        self.close()
+
+    def close(self) -> None:
+        """Close once what was written is sent."""
+        if self._transport:
+            self._transport.close()
+
+    def drop(self) -> None:
+        """Close at once."""
+        if self._transport:
+            self._transport.abort()
+
+    # -- inside
+
+    @property
+    def _open(self) -> bool:
+        """Whether more can be sent."""
+        return self._transport is not None and not self._transport.is_closing()
+
+    def _write(self, message: JsonObject) -> None:
+        if self._transport is None or self._transport.is_closing():
+            return
+        self._transport.write(wire.encode(message))
+        if self._transport.get_write_buffer_size() > HARD_OUTPUT:
+            self.drop()
+
+    def _work(self) -> None:
+        """Do what can be done now: send the list, then what was held back, then take requests."""
+        if self._working:
+            return  # a request is being carried out, in a call further up
+        self._working = True
+        try:
+            steps = 0
+            while self._open and not self._congested and self._step():
+                steps += 1
+                if steps == TURN:
+                    self._ask_for_a_turn()
+                    return
+        finally:
+            self._working = False
+        idle = not (self._list or self._held or self._lines or self.owed or self._congested)
+        if self._half_closed and idle:
+            self.close()
+
+    def _ask_for_a_turn(self) -> None:
+        if not self._turn_is_due:
+            self._turn_is_due = True
+            self._loop.call_soon(self._next_turn)
+
+    def _next_turn(self) -> None:
+        self._turn_is_due = False
+        self._work()
+
+    def _step(self) -> bool:
+        if self._list is not None:
+            message = next(self._list, None)
+            if message is None:
+                self._list = None
+            else:
+                self._write(message)
+        elif self._held:
+            self._write(self._held.popleft())
+        elif self._newest:
+            newest, self._newest = self._newest, None
+            self._write(newest)
+        elif self._lines:
+            self._take(self._lines.popleft())
+        else:
+            return False
+        return True
+
+    def _take(self, line: bytes) -> None:
+        seq = None
+        try:
+            message = wire.decode(line)
+            self._bad_lines = 0
+            seq = wire.take_seq(message)
+            request = read_request(message)
+        except BadRequest as error:
+            self._bad_lines += 1
+            self.reply(wire.failure(seq, error.code, str(error)))
+            if self._bad_lines >= MAX_BAD_LINES or not self.admitted:
+                self.close()
+            return
+        if self._first_limit:
+            self._first_limit.cancel()
+            self._first_limit = None
+        if not self.admitted and not self._let_in(request):
+            return
+        try:
+            self._carry_out(seq, request)
+        except Exception as error:  # noqa: BLE001 - one client's request must not take the voice from the others
+            self._handler.failed(request.kind, error)
+            self.reply(wire.failure(seq, "internal_error", f"{request.kind} failed: a bug of talk's, see its log"))
+
+    def _let_in(self, request: Request) -> bool:
+        """Let a client in whose business is urgent; send the others away from a full server."""
+        if isinstance(request, Status | Cancel) or (isinstance(request, Hello) and request.urgent):
+            self.admitted = True
+            self._write(self._handler.greeting())
+            return True
+        self._write(wire.busy_greeting())
+        self.close()
+        return False
+
+    def _carry_out(self, seq: int | None, request: Request) -> None:
+        if isinstance(request, Hello):
+            self.sender = replace(self.sender, name=request.name)
+            self.reply(wire.ok(seq))
+        else:
+            self._handler.handle(self, seq, request)

@@ -1,0 +1,87 @@
+"""The server's log: lines on standard error, for people and for journald. It never blocks and never fails.
+
+Nothing that a client sends can forge a line or reach a terminal raw: all of it goes through `printable`.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+from typing import TYPE_CHECKING
+
+from talkcli.printable import printable
+from talkcli.states import State
+
+if TYPE_CHECKING:
+    from talkcli.messages import By, Sender
+    from talkcli.record import Record
+
+#: Bytes of one line at most: a pipe that poll calls writable takes as many without blocking (PIPE_BUF on Linux).
+_MAX_LINE = 4096
+#: Characters of a text in the log.
+_MAX_TEXT = 200
+#: Characters of a program's name or command line in the log.
+_MAX_COMMAND = 80
+
+_lost = 0
+
+
+def line(words: str) -> None:
+    """Write one line; where standard error is closed or its reader is stuck, the line is lost and speech goes on."""
+    global _lost  # noqa: PLW0603
+    if _lost:
+        words = f"{words} ({_lost} lines before this one could not be written)"
+    data = f"talk: {words}\n".encode(errors="backslashreplace")
+    if len(data) > _MAX_LINE:
+        data = data[: _MAX_LINE - 1] + b"\n"
+    try:
+        fd = sys.stderr.fileno() if sys.stderr else 2
+        poll = select.poll()
+        poll.register(fd, select.POLLOUT)
+        if not poll.poll(0):
+            _lost += 1
+            return
+        os.write(fd, data)
+        _lost = 0
+    except (OSError, ValueError):
+        _lost += 1
+
+
+def ended(record: Record, seconds: float | None) -> None:
+    """Write the line of a goal that has ended."""
+    took = "" if seconds is None else f" after {seconds:.1f} s"
+    how = f"{record.id} {record.state.name}{took}"
+    if record.state is not State.SUCCEEDED:
+        how += f" ({record.reason}{_by(record.by)})"
+    text = shown(record.text or "")
+    line(f'{how}: "{text}" from {who(record.sender)}{_detail(record)}')
+
+
+def shown(words: str) -> str:
+    """Return words that may hold text from elsewhere, fit for one line of the log."""
+    return printable(words, _MAX_TEXT)
+
+
+def who(sender: Sender) -> str:
+    """Return the sender in a few words."""
+    parts = [] if sender.uid is None else [f"uid {sender.uid}"]
+    if sender.pid is not None:
+        parts.append(f"pid {sender.pid}")
+    if sender.command:
+        parts.append(printable(sender.command, _MAX_COMMAND))
+    if sender.parent:
+        parts.append(f"started by {printable(sender.parent, _MAX_COMMAND)}")
+    if sender.name:
+        parts.append(f'calls itself "{printable(sender.name)}"')
+    return ", ".join(parts) or "nobody known"
+
+
+def _by(by: By | None) -> str:
+    if by is None:
+        return ""
+    return f" by {by.goal}" if by.goal else f" by {who(by.client)}" if by.client else ""
+
+
+def _detail(record: Record) -> str:
+    return f"; {shown(record.message)}" if record.state is State.ABORTED and record.message else ""

@@ -1,0 +1,30 @@
+"""What `talk serve` is told by its command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+#: Clients at once. Each takes a descriptor of the 1,024 that a process usually has.
+MAX_CLIENTS = 256
+#: Goals that may wait: at two seconds a sentence, more than three minutes of speech that nobody can still want to hear.
+MAX_QUEUE = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Options of `serve`, with their defaults."""
+
+    rate: int = 200  # words per minute
+    volume: float = 1.0  # 0.0 to 1.0
+    voice: str | None = None  # id, name or language
+    pitch: int = 50  # 0 to 100
+    preempt: bool = False
+    max_queue: int = MAX_QUEUE
+    max_text: int = 10_000  # characters
+    max_clients: int = MAX_CLIENTS
+    player: str | None = None
+    device: str | None = None
+    driver: str | None = None
+    socket: str | None = None
+    socket_mode: int = 0o600
+    greeting: str | None = None
