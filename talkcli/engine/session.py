@@ -65,9 +65,9 @@ class Session:
         self._engine = engine
         self._settings = settings
         self._pump = pump
-        engine.connect("started-word", self._word)
-        engine.connect("finished-utterance", self._finished)
-        engine.connect("error", self._error)
+        engine.connect("started-word", _told(self._word))
+        engine.connect("finished-utterance", _told(self._finished))
+        engine.connect("error", _told(self._error))
 
     def run(self) -> None:
         """Carry out commands until the server leaves or says so."""
@@ -155,11 +155,18 @@ class Session:
         if self._pump is None:
             self._end(protocol.FAILED, "engine_failed", "the driver lost the sentence")
             return
-        if self._goal.error is not None and not self._engine.isBusy():
-            self._finished(self._goal.id, completed=False)
+        if self._goal.error is not None:
+            self._give_up(self._goal.id)
             return
         self.wait((), time.monotonic() + STEP)
         self._pump()
+
+    def _give_up(self, goal: str) -> None:
+        """End a goal whose driver failed: one that raises in `say` never tells that it is finished."""
+        self._engine.stop()
+        if self._goal is not None:
+            self._engine.proxy.setBusy(False)  # else pyttsx3 would keep the next sentence to itself
+            self._finished(goal, completed=False)
 
     def _word(self, location: int, length: int, time: float | None = None, **_: object) -> None:
         """Report a word. Other drivers give the word as the notification's name, so that says nothing."""
@@ -180,7 +187,7 @@ class Session:
         if goal is None or name != goal.id:  # of a goal that ended before
             return
         if completed:
-            self._end(protocol.COMPLETED, duration=None if duration is None else round(duration, 3))
+            self._end(protocol.COMPLETED, duration=None if duration is None else round(duration, 6))
         elif goal.stop_asked and not isinstance(goal.error, AudioFailed):
             self._end(protocol.STOPPED)
         elif isinstance(goal.error, AudioFailed):
@@ -216,6 +223,19 @@ class Session:
         except Exception as error:  # noqa: BLE001 - any driver's; a voice can be spoken with without the list
             _log(error)
             return ()
+
+
+def _told(callback: Callable[..., None]) -> Callable[..., None]:
+    """Return the callback with its errors printed: pyttsx3 drops them."""
+
+    def call(**values: Any) -> None:
+        try:
+            callback(**values)
+        except Exception:
+            traceback.print_exc()
+            raise
+
+    return call
 
 
 def _since(began: float) -> float:

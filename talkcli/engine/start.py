@@ -82,8 +82,7 @@ def _register_own(outlet: Outlet, wait: Wait) -> str:
 
 def _init(pyttsx3: Any, name: str) -> Any:
     try:
-        # With debug, what a callback raises is at least printed: pyttsx3 would drop it.
-        return pyttsx3.init(name, debug=True)
+        return pyttsx3.init(name)
     except ModuleNotFoundError as error:
         if error.name == f"pyttsx3.drivers.{name}":
             raise CannotStart(f'unknown driver "{name}": there are {", ".join(_driver_names(pyttsx3))}') from error
