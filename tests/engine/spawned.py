@@ -1,0 +1,131 @@
+"""An engine process started the way the server starts it, driven by the protocol's messages."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING, TypeVar
+
+from talkcli.engine import protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from types import TracebackType
+
+_E = TypeVar("_E", bound=protocol.Event)
+
+#: Seconds after which a message is late on the busiest machine.
+PATIENCE = 20.0
+
+
+class Spawned:
+    """A running engine process. Leaving the context kills what is left of it."""
+
+    def __init__(
+        self,
+        player: str | None = "null",
+        *,
+        driver: str | None = None,
+        device: str | None = None,
+        voice: str | None = None,
+        server: int | None = None,
+        limits: Mapping[str, float] | None = None,
+        before: str = "",
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        """`limits` replaces constants of the playback, `before` is code that runs in the process first."""
+        self.events: list[protocol.Event] = []
+        self._rest = b""
+        self._socket, theirs = socket.socketpair()
+        self._socket.settimeout(PATIENCE)
+        self.liveness, inherited = os.pipe()
+        settings = "".join(f"playback.{name} = {value}\n" for name, value in (limits or {}).items())
+        path = f"import sys\nsys.path[:] = {sys.path!r}\n"
+        code = f"{path}{before}\nfrom talkcli.engine import playback\n{settings}"
+        with theirs:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", f"{code}from talkcli.engine.process import main\nmain()"],
+                stdin=theirs.fileno(),
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                pass_fds=[inherited],
+                env={**os.environ, **(environment or {}), "TALK_LIVENESS_FD": str(inherited)},
+                start_new_session=True,
+            )
+        os.close(inherited)
+        self.send(protocol.Configure(server or os.getpid(), driver, player, device, voice))
+
+    def __enter__(self) -> Spawned:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._socket.close()
+        os.close(self.liveness)
+        if self.process.stderr is not None:
+            self.process.stderr.close()
+
+    def send(self, command: protocol.Command) -> None:
+        self._socket.sendall(protocol.encode(command))
+
+    def hang_up(self) -> None:
+        """Do what the kernel does when the server dies."""
+        self._socket.shutdown(socket.SHUT_RDWR)
+
+    def say(self, text: str, goal: str = "g1", *, rate: int = 200, voice: str | None = None, pitch: int = 50) -> None:
+        self.send(protocol.Say(goal, text, rate, 1.0, voice, pitch))
+
+    def event(self) -> protocol.Event | None:
+        """Return the next event, None at the end of the connection."""
+        while b"\n" not in self._rest:
+            data = self._socket.recv(65536)
+            if not data:
+                return None
+            self._rest += data
+        line, self._rest = self._rest.split(b"\n", 1)
+        event = protocol.decode_event(line)
+        self.events.append(event)
+        return event
+
+    def until(self, kind: type[_E]) -> _E:
+        """Return the next event of this kind."""
+        while (event := self.event()) is not None:
+            if isinstance(event, kind):
+                return event
+        raise AssertionError(f"no {kind.__name__} before the process ended: {self.errors()}")
+
+    def spoken(self, text: str, goal: str = "g1", *, rate: int = 200, voice: str | None = None) -> protocol.Ended:
+        """Say a sentence and return how it ended."""
+        self.say(text, goal, rate=rate, voice=voice)
+        return self.until(protocol.Ended)
+
+    def words(self, goal: str = "g1") -> list[protocol.Word]:
+        return [event for event in self.events if isinstance(event, protocol.Word) and event.id == goal]
+
+    def errors(self) -> str:
+        """Return what the process wrote to standard error; waits for its end."""
+        assert self.process.stderr is not None
+        return self.process.stderr.read().decode()
+
+    def all_gone(self, seconds: float = 2.0) -> bool:
+        """Return whether the process and its player are gone within that time."""
+        os.set_blocking(self.liveness, False)
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            try:
+                return os.read(self.liveness, 1) == b""
+            except BlockingIOError:
+                time.sleep(0.002)
+        return False
+
+
+def children(pid: int) -> list[int]:
+    """Return the child processes of a process."""
+    with open(f"/proc/{pid}/task/{pid}/children") as file:
+        return [int(word) for word in file.read().split()]

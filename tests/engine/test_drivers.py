@@ -1,0 +1,176 @@
+"""Starting the engine: other drivers of pyttsx3, and what is said when a part is missing."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from talkcli.engine import protocol
+from tests.engine.spawned import Spawned
+
+#: A driver like macOS's: it speaks by itself, gives words as names, and confirms a stop some time later.
+SLOW_DRIVER = """
+import time, types
+class Driver:
+    def __init__(self, proxy):
+        self.proxy, self.due, self.words, self.completed = proxy, None, [], True
+    def destroy(self): pass
+    def iterate(self):
+        self.proxy.setBusy(False)
+        while True:
+            if self.words:
+                word, at = self.words.pop(0)
+                self.proxy.notify("started-word", name=word, location=at, length=len(word))
+            if self.due is not None and time.monotonic() >= self.due:
+                self.due = None
+                self.proxy.notify("finished-utterance", completed=self.completed)
+                self.proxy.setBusy(False)
+            yield
+    def say(self, text):
+        self.proxy.setBusy(True)
+        if text == "raise":
+            raise RuntimeError("no tongue")
+        self.completed, self.due = True, time.monotonic() + 0.4
+        self.words = [(word, text.index(word)) for word in text.split()]
+    def stop(self):
+        self.completed = False
+        if self.due is not None:
+            self.due = time.monotonic() + 0.03
+    def getProperty(self, name):
+        return {"voices": [], "voice": "only"}[name]
+    def setProperty(self, name, value):
+        raise KeyError(f"unknown property {name}")
+module = types.ModuleType("pyttsx3.drivers.slow")
+module.buildDriver = Driver
+sys.modules[module.__name__] = module
+"""
+
+#: A system whose library is not there.
+NO_LIBRARY = """
+import ctypes
+class Missing(ctypes.CDLL):
+    def __init__(self, name, *rest, **options):
+        if name == "libespeak-ng.so.1":
+            raise OSError("libespeak-ng.so.1: cannot open shared object file: No such file or directory")
+        super().__init__(name, *rest, **options)
+ctypes.CDLL = Missing
+"""
+
+
+def _start_failure(driver: str | None = None, voice: str | None = None, before: str = "") -> protocol.StartFailed:
+    with Spawned(driver=driver, voice=voice, before=before) as engine:
+        failed = engine.until(protocol.StartFailed)
+        assert engine.event() is None
+        assert engine.process.wait(5) == 0
+        return failed
+
+
+def test_the_dummy_driver_speaks_and_reports_words() -> None:
+    with Spawned(driver="dummy") as engine:
+        ready = engine.until(protocol.Ready)
+        assert (ready.driver, ready.player) == ("dummy", None)
+        for goal in ("g1", "g2"):
+            assert engine.spoken("battery low", goal).outcome == protocol.COMPLETED
+            assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
+        assert engine.until(protocol.Voices).voices[0].id == "dummy.voice1"
+
+
+def test_a_driver_without_pitch_fails_only_who_asks_for_it() -> None:
+    with Spawned(driver="dummy") as engine:
+        engine.until(protocol.Ready)
+        engine.say("yes", pitch=80)
+        ended = engine.until(protocol.Ended)
+        assert (ended.outcome, ended.reason) == (protocol.FAILED, "bad_option")
+        assert ended.message == "the driver dummy cannot set pitch to 80: unknown property pitch"
+        assert engine.spoken("yes", "g2", rate=150).outcome == protocol.COMPLETED
+
+
+def test_an_unknown_voice_of_another_driver_fails() -> None:
+    with Spawned(driver="dummy") as engine:
+        engine.until(protocol.Ready)
+        ended = engine.spoken("yes", voice="dummy.voice9")
+        assert ended.reason == "unknown_voice"
+        assert ended.message is not None
+        assert "'dummy.voice2'" in ended.message
+
+
+def test_a_driver_that_speaks_by_itself_is_stepped_to_its_end() -> None:
+    with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
+        engine.until(protocol.Ready)
+        for goal in ("g1", "g2"):
+            assert engine.spoken("battery low", goal).outcome == protocol.COMPLETED
+            assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
+
+
+def test_a_stop_of_a_slow_driver_ends_when_it_says_so() -> None:
+    with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
+        engine.until(protocol.Ready)
+        engine.say("battery low")
+        engine.until(protocol.Word)
+        asked = time.monotonic()
+        engine.send(protocol.Stop("g1"))
+        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        assert time.monotonic() - asked < 0.15
+        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+
+
+def test_a_driver_that_raises_fails_the_goal_and_not_the_next() -> None:
+    with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
+        engine.until(protocol.Ready)
+        ended = engine.spoken("raise")
+        assert (ended.reason, ended.message) == ("engine_failed", "RuntimeError: no tongue")
+        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+
+
+def test_the_wheels_library_serves_where_the_system_has_none() -> None:
+    with Spawned(before=NO_LIBRARY) as engine:
+        version = engine.until(protocol.Ready).version
+        assert version is not None
+        assert version.endswith("(espeakng-loader)")
+        assert engine.spoken("yes").outcome == protocol.COMPLETED
+
+
+def test_no_library_at_all_says_what_to_install() -> None:
+    failed = _start_failure(before=NO_LIBRARY + "sys.modules['espeakng_loader'] = None")
+    assert failed.reason == "engine_failed"
+    assert failed.message.startswith(
+        "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader (libespeak-ng.so.1: "
+    )
+
+
+def test_no_pyttsx3_says_what_to_install() -> None:
+    failed = _start_failure(before="sys.modules['pyttsx3'] = None")
+    assert failed.message.startswith("pyttsx3 is missing: pip install pyttsx3")
+
+
+def test_an_unknown_driver_is_named_with_those_there_are() -> None:
+    failed = _start_failure("parrot")
+    assert failed.reason == "engine_failed"
+    assert failed.message.startswith('unknown driver "parrot": there are ')
+    assert "dummy" in failed.message
+
+
+def test_a_driver_for_another_system_says_what_it_lacks() -> None:
+    failed = _start_failure("nsss")
+    assert failed.message == "the driver \"nsss\" cannot be loaded: No module named 'objc'"
+
+
+def test_a_driver_that_cannot_be_stepped_is_refused_at_once() -> None:
+    before = SLOW_DRIVER + "\nDriver.iterate = lambda self: None"
+    failed = _start_failure("slow", before=before)
+    assert failed.message.startswith('the driver "slow" cannot be stepped')
+    assert "leave --driver out" in failed.message
+
+
+@pytest.mark.parametrize("driver", ["espeak", "talk_espeak"])
+def test_espeak_means_talks_own_driver(driver: str) -> None:
+    with Spawned(driver=driver) as engine:
+        assert engine.until(protocol.Ready).driver == "talk_espeak"
+        assert engine.spoken("yes").outcome == protocol.COMPLETED
+
+
+def test_an_unknown_voice_at_the_start_is_an_error() -> None:
+    failed = _start_failure(voice="en-uss")
+    assert failed.reason == "unknown_voice"
+    assert "did you mean 'en-us'" in failed.message

@@ -1,0 +1,223 @@
+"""The engine process speaks through talk's own driver, as the server sees it."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import time
+import wave
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine import protocol
+from tests.engine.spawned import Spawned, children
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_a_process_gets_ready_and_lists_its_voices_when_it_is_idle() -> None:
+    with Spawned() as engine:
+        ready = engine.until(protocol.Ready)
+        assert ready.driver == "talk_espeak"
+        assert ready.version is not None
+        assert ready.version.startswith("eSpeak NG ")
+        assert ready.player == "null"
+        voices = engine.until(protocol.Voices).voices
+        assert any(voice.language == "en-us" and voice.id == "gmw/en-US" for voice in voices)
+
+
+def test_a_sentence_lasts_as_long_as_its_audio() -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        began = time.monotonic()
+        ended = engine.spoken("battery low")
+        took = time.monotonic() - began
+        assert ended.outcome == protocol.COMPLETED
+        assert ended.duration is not None
+        assert ended.duration <= took < ended.duration + 0.3
+
+
+def test_words_come_as_they_are_heard_and_only_forward() -> None:
+    text = "this one é 日本 😀 battery low, please."
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        began = time.monotonic()
+        engine.say(text)
+        late = []
+        while not isinstance(event := engine.event(), protocol.Ended):
+            if isinstance(event, protocol.Word):
+                late.append(time.monotonic() - began - event.time)
+        words = engine.words()
+        assert [text[word.start : word.end] for word in words][1:] == ["é", "日本", "😀", "battery", "low", "please"]
+        assert [word.number for word in words] == list(range(1, len(words) + 1))
+        assert all(first.end <= second.start for first, second in itertools.pairwise(words))
+        assert max(late) - min(late) < 0.1
+        assert min(late) >= 0
+
+
+@pytest.mark.parametrize("goals", [1, 3])
+def test_the_first_sentence_is_what_espeak_ng_makes(tmp_path: Path, goals: int) -> None:
+    reference = tmp_path / "reference.wav"
+    subprocess.run(["espeak-ng", "-s", "200", "-w", str(reference), "battery low, please recharge"], check=True)
+    target = tmp_path / "talk.wav"
+    with Spawned(f"file:{target}") as engine:
+        engine.until(protocol.Ready)
+        for number in range(goals):
+            assert engine.spoken("battery low, please recharge", f"g{number}").outcome == protocol.COMPLETED
+    expected = _samples(reference)
+    assert _samples(target)[: len(expected)] == expected
+    assert (len(_samples(target)) == len(expected)) == (goals == 1)
+
+
+def test_a_stop_is_silent_within_20_ms_and_the_next_sentence_is_spoken() -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        for number in range(5):
+            engine.say("one two three four five six seven eight nine ten", f"g{number}")
+            engine.until(protocol.Word)
+            asked = time.monotonic()
+            engine.send(protocol.Stop(f"g{number}"))
+            ended = engine.until(protocol.Ended)
+            assert time.monotonic() - asked < 0.02
+            assert ended == protocol.Ended(f"g{number}", protocol.STOPPED)
+        assert engine.spoken("yes", "last").outcome == protocol.COMPLETED
+
+
+def test_a_stop_for_another_goal_is_ignored() -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        engine.send(protocol.Stop("g0"))
+        engine.say("yes")
+        engine.until(protocol.Started)
+        engine.send(protocol.Stop("g0"))
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+
+
+def test_a_goal_in_hand_is_told_to_be_alive() -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        last = time.monotonic()
+        engine.say("aaaaaah.\n\n\n\nwell", rate=80)
+        while not isinstance(engine.event(), protocol.Ended):
+            now = time.monotonic()
+            assert now - last < protocol.ALIVE_EVERY + 0.2
+            last = now
+
+
+@pytest.mark.parametrize("text", ["", "  \n", "...", "\x01\x02", "«»"])
+def test_what_cannot_be_spoken_ends_with_nothing_to_say(text: str) -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        ended = engine.spoken(text)
+        assert (ended.outcome, ended.reason) == (protocol.FAILED, "nothing_to_say")
+        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+
+
+def test_control_characters_are_no_commands_and_keep_the_offsets(tmp_path: Path) -> None:
+    with Spawned(f"file:{tmp_path / 'x.wav'}") as engine:
+        engine.until(protocol.Ready)
+        plain = engine.spoken("a    b one two", "g1").duration
+        assert engine.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.COMPLETED
+        assert engine.words("g1")[-1].start == engine.words("g2")[-1].start == len("a    b one ")
+        # 0x01 would have made it speak at 80 words per minute
+        loud = engine.spoken("a \x0180Sb one two", "g3").duration
+        assert plain is not None
+        assert loud is not None
+        assert loud < plain * 2.5
+
+
+def test_settings_belong_to_their_goal(tmp_path: Path) -> None:
+    with Spawned(f"file:{tmp_path / 'x.wav'}") as engine:
+        engine.until(protocol.Ready)
+        text = "the battery is low, please come home"
+        fast = engine.spoken(text, "g1", rate=400).duration
+        slow = engine.spoken(text, "g2", rate=100, voice="en-us").duration
+        again = engine.spoken(text, "g3", rate=400).duration
+        assert fast is not None
+        assert slow is not None
+        assert again is not None
+        assert slow > 2 * fast
+        assert abs(again - fast) < 0.15
+
+
+def test_an_unknown_voice_fails_with_near_matches_and_the_next_goal_is_spoken() -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        ended = engine.spoken("yes", voice="en-uss")
+        assert (ended.outcome, ended.reason) == (protocol.FAILED, "unknown_voice")
+        assert ended.message is not None
+        assert "'en-us'" in ended.message
+        assert "talk voices" in ended.message
+        assert engine.spoken("yes", "g2", voice="en-us").outcome == protocol.COMPLETED
+
+
+def test_an_orphan_ends_before_it_starts() -> None:
+    with Spawned(server=1) as engine:
+        assert engine.event() is None
+        assert engine.process.wait(5) == 0
+
+
+def test_the_process_ends_with_its_server(tmp_path: Path) -> None:
+    with Spawned(f"{_sleeper(tmp_path)}") as engine:
+        engine.until(protocol.Ready)
+        engine.say("one two three")
+        engine.until(protocol.Started)
+        while not children(engine.process.pid):
+            time.sleep(0.002)
+        engine.hang_up()
+        assert engine.all_gone()
+        assert engine.process.wait(5) == 0
+
+
+def test_the_player_dies_with_a_killed_process(tmp_path: Path) -> None:
+    with Spawned(f"{_sleeper(tmp_path)}") as engine:
+        engine.until(protocol.Ready)
+        engine.say("one two three")
+        engine.until(protocol.Started)
+        while not children(engine.process.pid):
+            time.sleep(0.002)
+        os.kill(engine.process.pid, signal.SIGKILL)
+        assert engine.all_gone()
+
+
+def test_quit_stops_the_sentence_and_ends_the_process() -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        engine.say("one two three four five")
+        engine.until(protocol.Word)
+        engine.send(protocol.Quit())
+        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        assert engine.event() is None
+        assert engine.process.wait(5) == 0
+        assert engine.errors() == ""
+
+
+def test_an_idle_process_does_not_wake_up() -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        engine.until(protocol.Voices)
+        time.sleep(0.05)
+        before = _switches(engine.process.pid)
+        time.sleep(1)
+        assert _switches(engine.process.pid) == before
+
+
+def _sleeper(folder: Path) -> str:
+    script = folder / "sleeper"
+    script.write_text("#!/bin/sh\nexec sleep 100\n")
+    script.chmod(0o755)
+    return str(script)
+
+
+def _switches(pid: int) -> str:
+    with open(f"/proc/{pid}/status") as file:
+        return next(line for line in file if line.startswith("voluntary_ctxt_switches"))
+
+
+def _samples(path: Path) -> bytes:
+    with wave.open(str(path), "rb") as file:
+        return file.readframes(file.getnframes())

@@ -1,0 +1,113 @@
+"""A raw connection to a server: one JSON object a line, sent and received as it stands, whatever it says.
+
+It knows nothing of talk's own client or wire module, so that it tests them instead of repeating them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import time
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+#: Seconds in which anything that a server owes must have come.
+PATIENCE = 5.0
+
+Message = dict[str, Any]
+
+
+class Wire(contextlib.AbstractContextManager["Wire"]):
+    """A connection, greeted. `greeting` is the server's first line. Close it, or use `with`."""
+
+    def __init__(self, path: str, timeout: float = PATIENCE) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._buffer = bytearray()
+        self._seq = 0
+        #: what came before the reply to a `request`: events in `events`, items of lists in `items`
+        self.events: list[Message] = []
+        self.items: list[Message] = []
+        try:
+            self._socket.settimeout(timeout)
+            self._socket.connect(path)
+            self.greeting = self.receive(timeout)
+        except BaseException:
+            self._socket.close()
+            raise
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def send(self, message: Mapping[str, object]) -> None:
+        """Send an object as a line."""
+        self.send_raw(json.dumps(message, ensure_ascii=False).encode() + b"\n")
+
+    def send_raw(self, data: bytes) -> None:
+        """Send bytes as they are."""
+        self._socket.settimeout(PATIENCE)
+        self._socket.sendall(data)
+
+    def receive(self, timeout: float | None = PATIENCE) -> Message:
+        """Return the next line's object. TimeoutError if none comes, EOFError if the server has closed."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while b"\n" not in self._buffer:
+            self._socket.settimeout(None if end is None else max(0.001, end - time.monotonic()))
+            try:
+                data = self._socket.recv(65536)
+            except TimeoutError:
+                raise TimeoutError(f"nothing from the server within {timeout} s") from None
+            except ConnectionResetError:
+                data = b""
+            if not data:
+                raise EOFError(f"the server closed the connection; unfinished line: {bytes(self._buffer)!r}")
+            self._buffer += data
+        line, _, rest = self._buffer.partition(b"\n")
+        self._buffer = rest
+        message = json.loads(line)
+        assert isinstance(message, dict), f"not an object: {bytes(line)!r}"
+        return message
+
+    def request(self, request: str, /, timeout: float = PATIENCE, **fields: object) -> Message:
+        """Send a request and return its reply; what comes before that is kept in `events` and `items`."""
+        self._seq += 1
+        self.send({"seq": self._seq, "request": request, **fields})
+        end = time.monotonic() + timeout
+        while True:
+            message = self.receive(max(0.001, end - time.monotonic()))
+            if message.get("seq") == self._seq and "ok" in message:
+                return message
+            (self.events if "event" in message else self.items).append(message)
+
+    def receive_event(self, event: str, timeout: float = PATIENCE, **fields: object) -> Message:
+        """Return the next event of that kind whose fields are these, one that came already included.
+
+        Events that come before it are dropped, `alive` and those of other goals among them.
+        """
+        end = time.monotonic() + timeout
+        while True:
+            message = self.events.pop(0) if self.events else self.receive(max(0.001, end - time.monotonic()))
+            if message.get("event") == event and all(message.get(name) == value for name, value in fields.items()):
+                return message
+
+    def closed_by_server(self, timeout: float = PATIENCE) -> bool:
+        """Return whether the server closes the connection in time; what it still says is dropped."""
+        end = time.monotonic() + timeout
+        try:
+            while True:
+                self.receive(max(0.001, end - time.monotonic()))
+        except EOFError:
+            return True
+        except TimeoutError:
+            return False
+
+    def shut_down(self) -> None:
+        """End the connection for both sides; a `receive` in another thread returns at once, with EOFError."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()

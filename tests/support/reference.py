@@ -1,0 +1,95 @@
+"""Reference renderings: what sentences sound like, by libespeak-ng itself, never by talk.
+
+libespeak-ng does not repeat itself within a process, but a fresh process makes the same samples each time. So a
+reference is the same texts, in the same order, with the same settings, in one fresh process.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tests.support.espeak import RATE
+from tests.support.surroundings import clean_environment
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    Samples = npt.NDArray[np.int16]
+
+__all__ = ["RATE", "Rendering", "Sentence", "render", "render_with_words"]
+
+_PROGRAM = os.path.join(os.path.dirname(os.path.abspath(__file__)), "espeak.py")
+
+
+@dataclass(frozen=True, slots=True)
+class Sentence:
+    """A text and how it is spoken; the defaults are talk's."""
+
+    text: str
+    rate: int = 200  # words per minute
+    volume: float = 1.0  # 0 to 1
+    voice: str = "en"
+    pitch: int = 50  # 0 to 100
+
+
+@dataclass(frozen=True, slots=True)
+class Rendering:
+    """What a sentence sounds like, and where its words are in that sound."""
+
+    samples: Samples
+    #: of each word that libespeak-ng tells: offset of its first character in the text, the one after its last, and its
+    #: seconds into the samples; neighbours that it merges are one
+    words: tuple[tuple[int, int, float], ...]
+
+
+def render(
+    sentences: Sequence[str | Sentence],
+    *,
+    rate: int = 200,
+    volume: float = 1.0,
+    voice: str = "en",
+    pitch: int = 50,
+    timeout: float = 30,
+) -> list[Samples]:
+    """Return the samples of each sentence (22,050 Hz), rendered in order in one fresh process.
+
+    The settings are those of every sentence that is a plain string; a `Sentence` brings its own.
+    """
+    plain = Sentence("", rate, volume, voice, pitch)
+    asked = [replace(plain, text=each) if isinstance(each, str) else each for each in sentences]
+    return [each.samples for each in render_with_words(asked, timeout=timeout)]
+
+
+def render_with_words(sentences: Sequence[str | Sentence], *, timeout: float = 30) -> list[Rendering]:
+    """Return the rendering of each sentence, as `render` does, with its words."""
+    asked = [Sentence(each) if isinstance(each, str) else each for each in sentences]
+    done = subprocess.run(
+        [sys.executable, _PROGRAM],
+        input=json.dumps([asdict(each) for each in asked]).encode(),
+        capture_output=True,
+        timeout=timeout,
+        env=clean_environment(tempfile.gettempdir()),
+        check=False,
+    )
+    if done.returncode != 0:
+        raise AssertionError(f"no reference rendering: {done.stderr.decode(errors='replace').strip()}")
+    result: list[Rendering] = []
+    rest = done.stdout
+    for _ in asked:
+        line, _newline, rest = rest.partition(b"\n")
+        head = json.loads(line)
+        end = head["samples"] * 2
+        samples = np.frombuffer(rest[:end], dtype="<i2").astype(np.int16)
+        result.append(Rendering(samples, tuple((start, stop, at) for start, stop, at in head["words"])))
+        rest = rest[end:]
+    return result

@@ -1,0 +1,101 @@
+"""The grammar with which the text of a goal, or a start, tells the scripted engine what to do.
+
+Words of a goal's text, in any order; any other word, one that lacks its value too, is ordinary text, so that plain
+sentences are spoken plainly:
+
+| word | the engine |
+| --- | --- |
+| `length=SECONDS` | takes that long (0.1) |
+| `words=N` | reports only the first N words of the text (all), evenly in time |
+| `silent-start` | never sends `Started`, and no word |
+| `at=PART` | does what the words below say after that part of the length (0.5) |
+| `fail=REASON` | fails with that reason |
+| `message=WORDS` | … and with that message, `_` for a blank ("scripted REASON") |
+| `crash` | dies of SIGSEGV |
+| `exit` or `exit=CODE` | exits without a result (0) |
+| `hang` | says nothing any more, and ignores everything: stop, quit, SIGTERM, the end of its input |
+| `never-ends` | goes on until it is stopped |
+| `ignore-stop` | ignores stop and ends by its length; with `never-ends`, never, but shows that it is alive |
+| `slow-stop=SECONDS` | ends that long after it was told to stop |
+| `on-stop=crash`, `=exit`, `=hang`, `=fail`, `=complete` | does that when it is told to stop |
+| `linger=SECONDS` | leaves a process that holds the pipe of `TALK_LIVENESS_FD` open so long, whatever happens |
+
+A start is `fail`, `fail=REASON`, `hang`, `slow`, `slow=SECONDS` (0.5), `crash` or `exit=CODE`, in the environment
+variable SCRIPTED_START or, read anew by each start, in the file that SCRIPTED_START_FILE names; else it is ready at
+once.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+
+#: No scripted process outlives this many seconds of hanging or lingering, whatever happens to the test.
+LONGEST = 30.0
+_FLAGS = frozenset({"silent-start", "crash", "exit", "hang", "never-ends", "ignore-stop"})
+_VALUED = frozenset({"length", "words", "at", "fail", "message", "exit", "slow-stop", "on-stop", "linger"})
+
+
+@dataclass(frozen=True, slots=True)
+class Script:
+    """What a goal's text asks of the engine; see the table above."""
+
+    text: str
+    length: float = 0.1
+    started: bool = True
+    at: float = 0.5
+    act: str | None = None  # fail, crash, exit, hang
+    reason: str = "engine_failed"
+    message: str | None = None
+    code: int = 0
+    never_ends: bool = False
+    ignore_stop: bool = False
+    slow_stop: float = 0.0
+    on_stop: str | None = None
+    linger: float = 0.0
+    words: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def said(self) -> str:
+        """The message of a failure."""
+        return self.message or f"scripted {self.reason}"
+
+
+def parse(text: str) -> Script:
+    """Return what a goal's text asks for."""
+    asked: dict[str, str] = {}
+    spans = [match.span() for match in re.finditer(r"\S+", text)]
+    for start, end in spans:
+        name, equals, value = text[start:end].partition("=")
+        if name in (_VALUED if equals else _FLAGS):
+            asked[name] = value
+    count = int(asked["words"]) if "words" in asked else len(spans)
+    act = next((each for each in ("fail", "crash", "exit", "hang") if each in asked), None)
+    return Script(
+        text=text,
+        length=float(asked.get("length", "0.1")),
+        started="silent-start" not in asked,
+        at=float(asked.get("at", "0.5")),
+        act=act,
+        reason=asked.get("fail") or "engine_failed",
+        message=asked["message"].replace("_", " ") if asked.get("message") else None,
+        code=int(asked.get("exit") or 0),
+        never_ends="never-ends" in asked,
+        ignore_stop="ignore-stop" in asked,
+        slow_stop=float(asked.get("slow-stop", "0")),
+        on_stop=asked.get("on-stop"),
+        linger=min(LONGEST, float(asked.get("linger", "0"))),
+        words=tuple(spans[:count]) if "silent-start" not in asked else (),
+    )
+
+
+def start() -> tuple[str, str]:
+    """Return what this start shall be and its value, by the environment: ("", "") for a plain one."""
+    asked = os.environ.get("SCRIPTED_START", "")
+    name = os.environ.get("SCRIPTED_START_FILE")
+    if name and os.path.exists(name):
+        with open(name, encoding="utf-8") as file:
+            asked = file.read().strip()
+    what, _, value = asked.partition("=")
+    return what, value

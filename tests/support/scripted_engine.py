@@ -1,0 +1,209 @@
+"""An engine process that does what the text of a goal tells it to: it fails, hangs, crashes, ignores stop, on request.
+
+It stands in for `talkcli.engine.process` where the real one can't be made to misbehave, and speaks the same protocol on
+file descriptor 0. What it can be told is in `script`. Of talk it knows `talkcli.engine.protocol` alone.
+
+One loop: it waits for a command or for the next thing that the goal in hand has planned, whichever comes first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import select
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+sys.path.insert(1, os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
+
+from talkcli.engine import protocol
+from tests.support import script
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_FD = 0
+_LINGER = "import time; time.sleep({seconds})"
+
+
+class Goal:
+    """The goal in hand: what it was told, and what it will do when."""
+
+    def __init__(self, say: protocol.Say) -> None:
+        self.id = say.id
+        self.script = script.parse(say.text)
+        self.plan: list[tuple[float, Callable[[], None]]] = []
+        self.stopped = False
+
+    def then(self, due: float, action: Callable[[], None]) -> None:
+        """Plan an action for a monotonic time, after those that are planned for the same one."""
+        self.plan.append((due, action))
+        self.plan.sort(key=lambda each: each[0])
+
+
+class Engine:
+    """Reads commands, and does what they say."""
+
+    def __init__(self) -> None:
+        self._goal: Goal | None = None
+        self._last = time.monotonic()
+        self._buffer = b""
+
+    def run(self) -> None:
+        """Serve until the other side closes, or tells it to quit."""
+        while True:
+            ready, _, _ = select.select([_FD], [], [], self._patience())
+            if ready and not self._read():
+                return
+            self._work()
+
+    def _patience(self) -> float | None:
+        if self._goal is None:
+            return None
+        due = self._last + protocol.ALIVE_EVERY
+        if self._goal.plan:
+            due = min(due, self._goal.plan[0][0])
+        return max(0.0, due - time.monotonic())
+
+    def _read(self) -> bool:
+        data = os.read(_FD, 65536)
+        if not data:
+            return False
+        *lines, self._buffer = (self._buffer + data).split(b"\n")
+        return all(self._take(protocol.decode_command(line)) for line in lines)
+
+    def _take(self, command: protocol.Command) -> bool:
+        if isinstance(command, protocol.Configure):
+            self._start()
+        elif isinstance(command, protocol.Say):
+            self._say(command)
+        elif isinstance(command, protocol.Stop):
+            self._stop(command)
+        else:
+            return not self._quit()
+        return True
+
+    def _start(self) -> None:
+        what, value = script.start()
+        if what == "fail":
+            self._send(protocol.StartFailed(value or "engine_failed", "scripted start failure"))
+            sys.exit(1)
+        elif what == "slow":
+            time.sleep(float(value or 0.5))
+        elif what:
+            self._act(what, int(value or 0))
+        self._send(protocol.Ready("scripted", "scripted engine", "none"))
+        self._send(protocol.Voices((protocol.Voice("en", "en", "scripted"),)))
+
+    def _say(self, say: protocol.Say) -> None:
+        if self._goal:
+            sys.exit(f"told to say {say.id} while {self._goal.id} is in hand")
+        goal = self._goal = Goal(say)
+        asked = goal.script
+        began = self._last = time.monotonic()
+        if "hang" in (asked.act, asked.on_stop):
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # before anybody can know that the goal has started
+        if asked.linger:
+            self._linger(asked.linger)
+        if asked.started:
+            self._send(protocol.Started(goal.id))
+        for number, (start, end) in enumerate(asked.words):
+            at = asked.length * number / len(asked.words)
+            word = protocol.Word(goal.id, start, end, number + 1, round(at, 3))
+            goal.then(began + at, lambda word=word: self._send(word))  # type: ignore[misc]
+        if asked.act:
+            goal.then(began + asked.length * asked.at, lambda: self._act(str(asked.act), asked.code))
+        elif not asked.never_ends:
+            goal.then(began + asked.length, lambda: self._end(protocol.COMPLETED))
+
+    def _stop(self, stop: protocol.Stop) -> None:
+        goal = self._goal
+        if goal is None or goal.id != stop.id or goal.script.ignore_stop or goal.stopped:
+            return
+        goal.stopped = True
+        goal.plan.clear()
+        act = goal.script.on_stop
+        action = (lambda: self._act(act, goal.script.code)) if act else (lambda: self._end(protocol.STOPPED))
+        goal.then(time.monotonic() + goal.script.slow_stop, action)
+
+    def _quit(self) -> bool:
+        if self._goal:
+            if self._goal.script.ignore_stop:
+                return False
+            self._end(protocol.STOPPED)
+        return True
+
+    def _work(self) -> None:
+        while self._goal and self._goal.plan and self._goal.plan[0][0] <= time.monotonic():
+            _, action = self._goal.plan.pop(0)
+            action()
+        if self._goal and time.monotonic() - self._last >= protocol.ALIVE_EVERY:
+            self._send(protocol.Alive(self._goal.id))
+
+    def _act(self, what: str, code: int) -> None:
+        if what == "crash":
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            signal.signal(signal.SIGSEGV, signal.SIG_DFL)
+            os.kill(os.getpid(), signal.SIGSEGV)
+        elif what == "exit":
+            os._exit(code)
+        elif what == "hang":
+            _hang()
+        elif what == "fail":
+            self._end(protocol.FAILED)
+        elif what == "complete":
+            self._end(protocol.COMPLETED)
+        else:
+            sys.exit(f"the script asks for {what!r}, which is not in its grammar")
+
+    def _end(self, outcome: str) -> None:
+        goal, self._goal = self._goal, None
+        assert goal
+        failed = outcome == protocol.FAILED
+        self._send(
+            protocol.Ended(
+                goal.id,
+                outcome,
+                goal.script.reason if failed else None,
+                goal.script.said if failed else None,
+                goal.script.length if outcome == protocol.COMPLETED else None,
+            )
+        )
+
+    def _send(self, event: protocol.Event) -> None:
+        line = protocol.encode(event)
+        while line:
+            line = line[os.write(_FD, line) :]
+        self._last = time.monotonic()
+
+    def _linger(self, seconds: float) -> None:
+        fd = os.environ.get("TALK_LIVENESS_FD")
+        # Blocked signals are inherited: it ignores them from its first moment.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        subprocess.Popen(
+            [sys.executable, "-S", "-c", _LINGER.format(seconds=seconds)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            pass_fds=[int(fd)] if fd else [],
+            start_new_session=True,
+        )
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def _hang() -> None:
+    """Ignore everything until killed, orphaned or `script.LONGEST` seconds old, so that nothing is left for ever."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    parent, end = os.getppid(), time.monotonic() + script.LONGEST
+    while os.getppid() == parent and time.monotonic() < end:
+        time.sleep(0.1)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+        Engine().run()

@@ -1,0 +1,27 @@
+"""Runs the real `talk serve`, with the scripted engine in the place of the engine process; arguments as of `serve`."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from talkcli.cli import main as run_talk
+from talkcli.engine import spawn
+
+_ENGINE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "scripted_engine.py")
+
+
+def engine_command() -> list[str]:
+    """Return the command line of the scripted engine process."""
+    return [sys.executable, _ENGINE]
+
+
+def main() -> None:
+    """Run `talk serve`."""
+    spawn.engine_command = engine_command
+    sys.argv = ["talk", "serve", *sys.argv[1:]]
+    run_talk()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""Where and in what environment tests start programs: short private directories, clean environments, no leftovers."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import site
+import sys
+import tempfile
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+import talkcli
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+#: A Unix socket's path has at most 107 bytes: a temporary directory above this length leaves no room for its own.
+LONGEST_TEMPORARY = 50
+#: The variable that marks a test's processes, so that what is left of them is found whoever their parent is now.
+MARK = "TALK_TEST_ID"
+#: What a child may take from the environment of the tests; the user's audio, runtime directory and settings stay out.
+_KEPT = ("PATH", "TMPDIR", "SYSTEMROOT", "LD_LIBRARY_PATH", "COVERAGE_PROCESS_START")
+
+#: Seconds in which a killed process must be gone.
+_KILL_LIMIT = 2.0
+
+_DIE_WITH_PARENT = (
+    "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, signal.SIGKILL); os.execvp(sys.argv[1], sys.argv[1:])"
+)
+
+
+def needs(*programs: str) -> None:
+    """Skip the test if one of the programs is missing; where CI is set, fail it: there nothing may be skipped."""
+    missing = [each for each in programs if shutil.which(each) is None]
+    if not missing:
+        return
+    reason = f"needs {', '.join(missing)}, which is not installed"
+    if os.environ.get("CI"):
+        pytest.fail(reason, pytrace=False)
+    pytest.skip(reason)
+
+
+@contextlib.contextmanager
+def short_directory(prefix: str = "talk-") -> Iterator[str]:
+    """Give a private directory with a path short enough for sockets, removed at the end."""
+    base = tempfile.gettempdir()
+    if len(os.fsencode(base)) > LONGEST_TEMPORARY:
+        base = "/tmp"
+    path = os.path.realpath(tempfile.mkdtemp(prefix=prefix, dir=base))
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def clean_environment(home: str, extra: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return an environment for a child: its home, UTF-8, this checkout's talkcli, no sound of the user's, `extra`."""
+    result = {name: os.environ[name] for name in _KEPT if name in os.environ}
+    result |= {
+        "HOME": home,
+        "LANG": "C.UTF-8",
+        "PULSE_SERVER": f"unix:{home}/no-sound-server",
+        "PULSE_RUNTIME_PATH": home,
+        "PIPEWIRE_RUNTIME_DIR": home,
+    }
+    root = os.path.dirname(os.path.dirname(os.path.abspath(talkcli.__file__)))
+    if root not in site.getsitepackages():
+        result["PYTHONPATH"] = root
+    return result | dict(extra or {})
+
+
+def dying_with_parent(command: list[str]) -> list[str]:
+    """Return the command so that it is killed with the thread that starts it: killed tests leave nothing running."""
+    if sys.platform != "linux":
+        return command
+    return [sys.executable, "-S", "-c", _DIE_WITH_PARENT, *command]
+
+
+def marked(mark: str) -> list[int]:
+    """Return the ids of the living processes whose environment has this mark (none where there is no /proc)."""
+    wanted = f"{MARK}={mark}".encode()
+    found = []
+    for name in os.listdir("/proc") if os.path.isdir("/proc") else []:
+        if not name.isdigit():
+            continue
+        try:
+            with open(f"/proc/{name}/environ", "rb") as environ:
+                if wanted in environ.read().split(b"\0"):
+                    found.append(int(name))
+        except OSError:  # ended meanwhile, or another user's
+            continue
+    return found
+
+
+def command_line(pid: int) -> str:
+    """Return the command line of a process, for messages."""
+    try:
+        with open(f"/proc/{pid}/cmdline", "rb") as file:
+            return file.read().replace(b"\0", b" ").decode(errors="replace").strip()
+    except OSError:
+        return "ended"
+
+
+def assert_none_left(mark: str, within: float) -> None:
+    """Assert that all processes with this mark end within some seconds; those that don't are killed, and gone then."""
+    left = _left(mark, within)
+    if not left:
+        return
+    lines = [f"{pid}: {command_line(pid)}" for pid in left]
+    for pid in left:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    lines += [f"{pid}: cannot be killed" for pid in _left(mark, _KILL_LIMIT)]
+    raise AssertionError("left running:\n" + "\n".join(lines))
+
+
+def _left(mark: str, within: float) -> list[int]:
+    end = time.monotonic() + within
+    while (left := marked(mark)) and time.monotonic() < end:
+        time.sleep(0.01)  # the end of a process that is no child of ours is no event
+    return left

@@ -1,0 +1,156 @@
+"""The comparison of what was heard: it passes what is right, and nothing else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tests.support.compare import (
+    assert_begun,
+    assert_heard,
+    assert_resumed,
+    assert_silent,
+    compare,
+    extent,
+)
+from tests.support.reference import RATE, render
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    Samples = npt.NDArray[np.int16]
+
+LOW = "The battery is low, please charge me."
+LOW_IT = "The battery is low, please charge it."
+LEFT = "Please move the arm to the left."
+RIGHT = "Please move the arm to the right."
+SILENCE = np.zeros(RATE // 4, np.int16)
+
+
+def recorded(*parts: Samples) -> Samples:
+    return np.concatenate([SILENCE, *parts, SILENCE])
+
+
+def without_end(samples: Samples, seconds: float) -> Samples:
+    found = extent(samples)
+    assert found
+    result: Samples = samples.copy()
+    result[found[1] - round(seconds * RATE) :] = 0
+    return result
+
+
+@pytest.fixture(scope="module")
+def low() -> Samples:
+    return render([LOW])[0]
+
+
+def test_the_right_sentence_is_recognised(low: Samples) -> None:
+    (result,) = assert_heard(recorded(low), [low])
+    assert result.correlation > 0.999
+    assert result.heard == result.expected
+    assert compare(recorded(low), low).same
+
+
+def test_what_the_monitor_drops_is_forgiven(low: Samples) -> None:
+    assert_heard(recorded(np.delete(low, slice(9000, 9041))), [low])
+
+
+def test_half_the_volume_is_the_same_sentence(low: Samples) -> None:
+    assert_heard(recorded((low // 2).astype(np.int16)), [low])
+
+
+@pytest.mark.parametrize("seconds", [0.03, 0.1, 0.3])
+def test_a_cut_end_is_noticed(low: Samples, seconds: float) -> None:
+    heard = recorded(without_end(low, seconds))
+    assert not compare(heard, low).same
+    with pytest.raises(AssertionError, match="not heard as it should"):
+        assert_heard(heard, [low])
+
+
+def test_a_gap_in_the_middle_is_noticed(low: Samples) -> None:
+    gap = low.copy()
+    gap[9000:12000] = 0
+    with pytest.raises(AssertionError, match="not heard as it should"):
+        assert_heard(recorded(gap), [low])
+
+
+def test_a_stutter_is_noticed(low: Samples) -> None:
+    with pytest.raises(AssertionError, match="not heard as it should"):
+        assert_heard(recorded(low[:20000], low[19000:]), [low])
+
+
+@pytest.mark.parametrize(("right", "wrong"), [(LOW, LOW_IT), (LEFT, RIGHT)])
+def test_one_other_word_is_noticed(right: str, wrong: str) -> None:
+    reference, heard = render([right])[0], recorded(render([wrong])[0])
+    assert not compare(heard, reference).same
+    with pytest.raises(AssertionError, match="not heard as it should"):
+        assert_heard(heard, [reference])
+
+
+def test_nothing_heard_is_noticed(low: Samples) -> None:
+    assert compare(SILENCE, low).correlation == 0
+    with pytest.raises(AssertionError, match="was not heard"):
+        assert_heard(SILENCE, [low])
+    assert_silent(SILENCE)
+
+
+def test_silence_without_a_recording_is_no_silence() -> None:
+    with pytest.raises(AssertionError, match="nothing was recorded"):
+        assert_silent(SILENCE[:0])
+
+
+def test_a_sentence_heard_twice_is_noticed(low: Samples) -> None:
+    with pytest.raises(AssertionError, match="more was heard"):
+        assert_heard(recorded(low, low), [low])
+    with pytest.raises(AssertionError, match="not heard as it should"):
+        assert_heard(recorded(*render([LOW, LOW])), render([LOW, LEFT]))
+
+
+def test_sentences_are_recognised_in_order_and_only_so() -> None:
+    first, second, third = references = render([LOW, LEFT, LOW_IT])
+    assert_heard(recorded(*references), references)
+    # A pause that ends a sentence may be cut, nothing else.
+    found = extent(first)
+    assert found
+    assert_heard(recorded(first[: found[1] + 100], second, SILENCE, third), references)
+    for wrong in [(second, first, third), (first, third), (first, second), (first, second, third, third)]:
+        with pytest.raises(AssertionError):
+            assert_heard(recorded(*wrong), references)
+
+
+def test_a_click_between_sentences_is_noticed() -> None:
+    first, second = references = render([LOW, LEFT])
+    click = np.full(40, 5000, np.int16)
+    with pytest.raises(AssertionError):
+        assert_heard(recorded(first, SILENCE, click, SILENCE, second), references)
+
+
+def test_a_stopped_sentence_is_recognised_by_its_beginning(low: Samples) -> None:
+    assert assert_begun(recorded(low[:20000]), low) == pytest.approx(20000 / RATE, abs=0.1)
+    with pytest.raises(AssertionError):
+        assert_begun(recorded(render([LEFT])[0][:20000]), low)
+    with pytest.raises(AssertionError):
+        assert_begun(recorded(low[:20000], low[-20000:]), low)
+    with pytest.raises(AssertionError, match="nothing was heard"):
+        assert_begun(SILENCE, low)
+
+
+def test_a_sentence_that_was_held_is_recognised_by_its_parts(low: Samples) -> None:
+    found = extent(low)
+    assert found
+    pause = np.zeros(2 * RATE, np.int16)
+    for at in (9000, 15000, 27000):
+        assert assert_resumed(recorded(low[:at], pause, low[at:]), low, 2.0) == pytest.approx(2, abs=0.3)
+        assert_resumed(recorded(low[:at], pause, low[at - 800 :]), low, 2.0, twice=0.05)
+    for wrong in [
+        recorded(low),
+        recorded(low[:9000], pause[:RATE], low[9000:]),
+        recorded(low[:9000], pause, low[10000:]),
+        recorded(low[:9000], pause, low[8000:]),
+        recorded(low[:9000], pause),
+        recorded(low[:9000], pause, without_end(low, 0.1)[9000:]),
+    ]:
+        with pytest.raises(AssertionError):
+            assert_resumed(wrong, low, 1.9)

@@ -1,0 +1,148 @@
+"""`Talk`, which starts, watches and ends a server for a test, shown with a small program in the server's place."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support import processes
+from tests.support.surroundings import MARK, marked
+
+if TYPE_CHECKING:
+    import pathlib
+
+    from tests.conftest import MakeTalk
+
+#: Greets, answers each request, sends one goal's events to a watcher; ends as its arguments say.
+PROGRAM = """
+import json, os, signal, socketserver, subprocess, sys
+
+class Handler(socketserver.StreamRequestHandler):
+    def say(self, **message):
+        self.wfile.write(json.dumps(message).encode() + b"\\n")
+
+    def handle(self):
+        self.say(talk=1, version="0", pid=os.getpid(), boot="test", features=[])
+        for line in self.rfile:
+            request = json.loads(line)
+            self.say(seq=request["seq"], ok=True, socket=os.environ.get("XDG_RUNTIME_DIR"))
+            if request["request"] == "watch":
+                for n, state in enumerate(sys.argv[2].split(",")):
+                    self.say(event="state", id="a", state=state, n=n, at=0)
+
+class Server(socketserver.ThreadingUnixStreamServer):
+    daemon_threads = True
+
+def end(*_):
+    if "keeps-socket" not in sys.argv:
+        os.unlink(os.environ["TALK_SOCKET"])
+    os._exit(int(sys.argv[1]))
+
+print("serving", sys.argv[3:], file=sys.stderr, flush=True)
+if "fails" in sys.argv:
+    sys.exit("no voice")
+if "leaves" in sys.argv:
+    subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+if "traceback" in sys.argv:
+    print("Traceback (most recent call last):", file=sys.stderr, flush=True)
+signal.signal(signal.SIGTERM, end)
+Server(os.environ["TALK_SOCKET"], Handler).serve_forever()
+"""
+WELL = "PENDING,ACTIVE,SUCCEEDED"
+
+
+@pytest.fixture
+def program(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "program.py"
+    path.write_text(PROGRAM)
+    monkeypatch.setattr(processes, "_SCRIPTED", str(path))
+
+
+@pytest.mark.usefixtures("program")
+def test_a_good_server_is_started_watched_and_ended(make_talk: MakeTalk) -> None:
+    talk = make_talk("0", WELL, scripted=True)
+    assert talk.running
+    assert talk.log == "serving []\n"
+    assert talk.watcher.wait_for("a", "SUCCEEDED")["n"] == 2
+    with talk.connect() as wire:
+        assert wire.greeting["pid"] == talk.pid
+    assert talk.request("status", timeout=1) == {"seq": 1, "ok": True, "socket": None}
+    talk.freeze()
+    talk.stop()
+    assert not talk.running
+    talk.start_server()
+    assert talk.running
+
+
+@pytest.mark.usefixtures("program")
+def test_a_server_that_was_killed_owes_no_end(make_talk: MakeTalk) -> None:
+    talk = make_talk("0", "ACTIVE", scripted=True)
+    talk.watcher.wait_for("a", "ACTIVE")
+    talk.kill()
+    assert not talk.running
+
+
+@pytest.mark.usefixtures("program")
+@pytest.mark.parametrize(
+    ("arguments", "fault"),
+    [
+        (("1", WELL), "ended with 1"),
+        (("0", "ACTIVE"), "no terminal state"),
+        (("0", WELL + ",SUCCEEDED"), "more than one terminal state"),
+        (("0", WELL, "keeps-socket"), "left its socket"),
+        (("0", WELL, "leaves"), "left running"),
+        (("0", WELL, "traceback"), "Traceback"),
+    ],
+)
+def test_a_bad_end_is_noticed(arguments: tuple[str, ...], fault: str) -> None:
+    talk = processes.Talk(arguments, scripted=True)
+    directory = talk.directory
+    try:
+        talk.watcher.wait_for("a", arguments[1].rpartition(",")[2])
+        with pytest.raises(AssertionError, match=fault):
+            talk.stop(gone_within=0.2)
+    finally:
+        talk.close()
+    assert not os.path.exists(directory)
+
+
+@pytest.mark.usefixtures("program")
+def test_a_server_that_does_not_start_is_told_with_its_log() -> None:
+    with pytest.raises(AssertionError, match="no voice"):
+        processes.Talk(("0", WELL, "fails"), scripted=True)
+
+
+@pytest.mark.usefixtures("program")
+def test_closing_ends_everything_without_a_word() -> None:
+    talk = processes.Talk(("0", WELL, "leaves"), scripted=True, env={"EXTRA": "1"})
+    mark = talk.env[MARK].removesuffix("-client")
+    client = talk.start("status")
+    assert talk.env["EXTRA"] == "1"
+    assert len(marked(mark)) == 2
+    talk.close()
+    assert marked(mark) == []
+    assert client.returncode is not None
+
+
+@pytest.mark.usefixtures("program")
+def test_clients_are_timed_and_end(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
+    talk = make_talk("0", WELL, scripted=True)
+    script = "import sys; print(sys.stdin.read()); print('late', file=sys.stderr); sys.exit(4)"
+    started = subprocess.Popen
+
+    def popen(command: list[str], **options: object) -> subprocess.Popen[str]:
+        assert command[:3] == [sys.executable, "-m", "talkcli"]
+        return started([sys.executable, "-c", *command[3:]], **options)  # type: ignore[call-overload, no-any-return]
+
+    monkeypatch.setattr(subprocess, "Popen", popen)
+    done = talk.run(script, stdin="battery low")
+    assert (done.code, done.id, done.err) == (4, "battery low", "late\n")
+    assert 0 < done.seconds < 5
+    with pytest.raises(AssertionError, match="did not end within"):
+        talk.run("import time; time.sleep(60)", timeout=0.2)
+    with pytest.raises(AssertionError, match="ValueError"):
+        talk.run("raise ValueError")

@@ -1,0 +1,15 @@
+"""Settings of the unit tests: no deadline for one example, and in CI the same examples each time.
+
+`HYPOTHESIS_PROFILE=deep pytest tests/unit` looks longer than every run can afford.
+"""
+
+from __future__ import annotations
+
+import os
+
+from hypothesis import settings
+
+settings.register_profile("here", deadline=None)
+settings.register_profile("repeatable", deadline=None, derandomize=True, database=None)
+settings.register_profile("deep", deadline=None, max_examples=5_000)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable" if os.environ.get("CI") else "here"))

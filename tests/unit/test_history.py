@@ -1,0 +1,126 @@
+"""What is remembered of goals that ended: the last ones, by count and by the size of their texts."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from talkcli import history as module
+from talkcli.history import History
+from talkcli.messages import Sender
+from talkcli.record import Record
+from talkcli.states import State
+
+
+def ended(number: int, state: State = State.SUCCEEDED, text: str = "door open") -> Record:
+    record = Record(f"k3fz-{number}", number, text, Sender(), 1.0)
+    record.state = state
+    record.reason = "canceled"
+    return record
+
+
+def test_the_last_thousand_results_are_kept() -> None:
+    history = History()
+    records = [ended(number) for number in range(1_001)]
+    for record in records:
+        history.add(record)
+    assert history.find("k3fz-0") is None
+    assert all(history.find(each.id) is each for each in records[1:])
+
+
+def test_rejected_goals_drive_out_nobodys_result() -> None:
+    history = History()
+    result = ended(0)
+    history.add(result)
+    rejected = [ended(number, State.REJECTED) for number in range(1, 2_000)]
+    for record in rejected:
+        history.add(record)
+    assert history.find(result.id) is result
+    assert all(history.find(each.id) is each for each in rejected[-200:])
+    assert history.find(rejected[-201].id) is None
+
+
+def test_results_drive_out_no_rejected_goal() -> None:
+    history = History()
+    rejected = ended(0, State.REJECTED)
+    history.add(rejected)
+    for number in range(1, 1_500):
+        history.add(ended(number))
+    assert history.find(rejected.id) is rejected
+
+
+def test_latest_are_the_newest_first_without_rejected_ones() -> None:
+    history = History()
+    for number in range(6):
+        history.add(ended(number, State.REJECTED if number % 2 else State.ABORTED))
+    assert [each.number for each in history.latest(2)] == [4, 2]
+    assert [each.number for each in history.latest(10)] == [4, 2, 0]
+    assert list(history.latest(0)) == []
+
+
+def test_an_unknown_id_is_not_found() -> None:
+    assert History().find("k3fz-1") is None
+
+
+def test_texts_take_eight_mebibytes_and_the_oldest_goes_first_but_its_result_stays() -> None:
+    history = History()
+    half = "a" * (4 * 1024 * 1024)
+    first, second, third = (ended(number, text=half) for number in range(3))
+    history.add(first)
+    history.add(second)
+    assert (first.text, second.text) == (half, half)
+    history.add(third)
+    assert (first.text, second.text, third.text) == (None, half, half)
+    kept = history.find(first.id)
+    assert kept is first
+    assert (kept.state, kept.reason, kept.snapshot().text) == (State.SUCCEEDED, "canceled", None)
+
+
+def test_bytes_count_not_characters() -> None:
+    history = History()
+    first = ended(1, text="🤖" * (1024 * 1024))
+    second = ended(2, text="a" * (4 * 1024 * 1024 + 1))
+    history.add(first)
+    history.add(second)
+    assert first.text is None
+    assert second.text is not None
+
+
+def test_a_text_that_is_no_utf8_is_counted_too() -> None:
+    history = History()
+    record = ended(1, State.REJECTED, "\ud800")
+    history.add(record)
+    assert history.find(record.id) is record
+
+
+def test_a_text_without_words_spoken_is_forgotten_with_them() -> None:
+    record = ended(1)
+    record.started_at, record.spoken_end = 2.0, 4
+    assert record.snapshot().spoken == "door"
+    record.drop_text()
+    assert (record.snapshot().text, record.snapshot().spoken) == (None, None)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 12)), max_size=60))
+def test_limits_hold_after_any_goals_and_only_the_oldest_texts_are_gone(goals: list[tuple[bool, int]]) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "MAX_ENDED", 7)
+        patch.setattr(module, "MAX_REJECTED", 3)
+        patch.setattr(module, "MAX_TEXT_BYTES", 40)
+        history = History()
+        records = []
+        for number, (rejected, size) in enumerate(goals):
+            records.append(ended(number, State.REJECTED if rejected else State.RECALLED, "é" * size))
+            history.add(records[-1])
+    kept = [each for each in records if history.find(each.id) is not None]
+    assert [each for each in kept if each.state is State.REJECTED] == [
+        each for each in records if each.state is State.REJECTED
+    ][-3:]
+    assert [each for each in kept if each.state is State.RECALLED] == [
+        each for each in records if each.state is State.RECALLED
+    ][-7:]
+    assert sum(len(each.text.encode()) for each in kept if each.text is not None) <= 40
+    with_text = [each.text is not None for each in kept]
+    assert with_text == sorted(with_text), "a newer text went before an older one"
+    assert not kept or kept[-1].text is not None

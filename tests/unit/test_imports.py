@@ -1,0 +1,200 @@
+"""Imports point one way, and what is heavy is imported only where it is needed: read from the source, with ast."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import talkcli
+
+PACKAGE = Path(talkcli.__file__).parent
+
+#: Each of these may import those after it, never one before it.
+CHAIN = ["cli", "client", "wire", "requests", "messages", "states", "errors"]
+PURE = ["states", "scheduler", "record", "history", "text", "messages", "requests", "wire", "errors"]
+IMPURE = {"asyncio", "threading", "socket", "time", "click", "pyttsx3", "os", "subprocess"}
+#: Who may name these, by the first part of a module's name.
+ONLY = {
+    "pyttsx3": {"engine"},
+    "espeakng_loader": {"engine"},
+    "click": {"cli", "completion"},
+    "asyncio": {"server"},
+    "platformdirs": {"paths"},
+}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One module that one import names, and where: the innermost function, or only for the type checker."""
+
+    name: str
+    function: str | None
+    typing: bool
+    line: int
+
+
+def module_name(path: Path) -> str:
+    """Return a file's name within the package: `wire`, `engine.thread`, and "" for the package itself."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@cache
+def sources() -> dict[str, ast.Module]:
+    return {module_name(path): ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def part(module: str) -> str:
+    """Return which part of the design a module is of; `python -m talkcli` is the cli's, `server_x` the server's."""
+    first = module.partition(".")[0]
+    if first.startswith("server"):
+        return "server"
+    return "cli" if first == "__main__" else first
+
+
+def absolute(module: str, node: ast.ImportFrom) -> str:
+    """Return the full name of what an import is from."""
+    if not node.level:
+        return node.module or ""
+    is_package = (PACKAGE / module.replace(".", "/") / "__init__.py").exists()
+    parents = ["talkcli", *module.split(".")] if module else ["talkcli"]
+    base = parents[: len(parents) - node.level + is_package]
+    return ".".join([*base, node.module] if node.module else base)
+
+
+def named(module: str, node: ast.AST) -> list[str]:
+    """Return the full names of the modules that this node names."""
+    if isinstance(node, ast.Import):
+        return [each.name for each in node.names]
+    if isinstance(node, ast.ImportFrom):
+        base = absolute(module, node)
+        inner = [f"{base}.{each.name}" for each in node.names]
+        modules = [each for each in inner if each.removeprefix("talkcli.") in sources()]
+        return modules if len(modules) == len(inner) else [base, *modules]
+    if isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+        called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", None)
+        if called in {"import_module", "__import__", "find_spec", "run_module"}:
+            return [str(node.args[0].value)]
+    return []
+
+
+def imports(module: str) -> list[Import]:
+    found: list[Import] = []
+
+    def walk(node: ast.AST, function: str | None, *, typing: bool) -> None:
+        found.extend(Import(name, function, typing, getattr(node, "lineno", 0)) for name in named(module, node))
+        inner = node.name if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) else function
+        typing = typing or (isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"))
+        for child in ast.iter_child_nodes(node):
+            walk(child, inner, typing=typing)
+
+    walk(sources()[module], None, typing=False)
+    return found
+
+
+def outside(module: str) -> set[str]:
+    return {each.name.partition(".")[0] for each in imports(module)} - {"talkcli"}
+
+
+def inside(module: str) -> list[tuple[str, Import]]:
+    """Return the modules of the package that this one imports, with their names within it."""
+    return [
+        (each.name.removeprefix("talkcli").removeprefix("."), each)
+        for each in imports(module)
+        if each.name.partition(".")[0] == "talkcli"
+    ]
+
+
+def test_the_modules_that_these_rules_are_about_are_there() -> None:
+    assert set(PURE) <= sources().keys()
+    assert {"asyncio", "json"} & set().union(*map(outside, sources()))
+
+
+@pytest.mark.parametrize("name", CHAIN)
+def test_imports_point_one_way(name: str) -> None:
+    before = set(CHAIN[: CHAIN.index(name)]) | {"server", "engine", "completion"}
+    if name == "cli":
+        before = set()
+    for module in sources():
+        if part(module) == name:
+            wrong = {each for each, _ in inside(module) if part(each) in before}
+            assert not wrong, f"talkcli.{module} imports {wrong}"
+
+
+def test_no_module_imports_itself_by_a_detour() -> None:
+    graph = {
+        module: {name for name, each in inside(module) if not each.typing} - {"", module}
+        for module in sources()
+        if module
+    }
+    try:
+        list(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        pytest.fail(f"imports go round: {error.args[1]}")
+
+
+@pytest.mark.parametrize("module", PURE)
+def test_what_decides_is_pure(module: str) -> None:
+    assert not outside(module) & IMPURE
+    assert not {each for each, _ in inside(module) if part(each) not in PURE}
+
+
+@pytest.mark.parametrize("library", ONLY)
+def test_only_its_own_part_names_a_library(library: str) -> None:
+    naming = {module for module in sources() if library in outside(module)}
+    assert {part(each) for each in naming} <= ONLY[library]
+
+
+def test_platformdirs_is_imported_only_when_a_path_is_asked_for() -> None:
+    for module in sources():
+        for each in imports(module):
+            assert each.name.partition(".")[0] != "platformdirs" or each.function, f"talkcli.{module}:{each.line}"
+
+
+def test_the_server_is_imported_by_the_serve_command_alone() -> None:
+    for module in sources():
+        if part(module) == "server":
+            continue
+        for name, each in inside(module):
+            if part(name) == "server" and not each.typing:
+                assert part(module) == "cli", f"talkcli.{module} imports the server"
+                serves = module.endswith("serve") or "serve" in (each.function or "")
+                assert serves, f"talkcli.{module}:{each.line} imports the server, not in the serve command"
+
+
+def test_only_the_cli_prints_and_exits() -> None:
+    for module, tree in sources().items():
+        if part(module) == "cli":
+            continue
+        for node in ast.walk(tree):
+            ends = isinstance(node, ast.Attribute) and ast.unparse(node) == "sys.exit"
+            if isinstance(node, ast.Name):
+                ends = node.id in {"print", "SystemExit", "exit", "quit"}
+            assert not ends, f"talkcli.{module}:{getattr(node, 'lineno', 0)} prints or exits"
+
+
+HEAVY = ["asyncio", "pyttsx3", "click", "platformdirs", "espeakng_loader", "talkcli.server", "talkcli.scheduler"]
+
+
+@pytest.mark.parametrize(
+    ("statement", "without"),
+    [
+        ("import talkcli", [*HEAVY, "talkcli.client", "socket"]),
+        ("import talkcli.client", HEAVY),
+        ("from talkcli import Client", HEAVY),
+        ("import talkcli.cli", [each for each in HEAVY if each != "click"]),
+    ],
+)
+def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> None:
+    code = f"{statement}\nimport sys\nprint(*[each for each in {without!r} if each in sys.modules])"
+    done = subprocess.run(  # as a program of its own: this one has loaded everything already
+        [sys.executable, "-c", code], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout.split(), done.stderr) == (0, [], "")

@@ -1,0 +1,210 @@
+"""Requests: written and read back, and refused with a code where a field or a type is not known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from talkcli.errors import BadRequest
+from talkcli.requests import (
+    KINDS,
+    MAX_DATA,
+    MAX_ID,
+    MAX_IDS,
+    MAX_NAME,
+    Cancel,
+    Hello,
+    Request,
+    Say,
+    Status,
+    Voices,
+    Wait,
+    Watch,
+    read_request,
+    write_request,
+)
+from talkcli.wire import decode, encode, failure
+
+if TYPE_CHECKING:
+    from talkcli.messages import JsonObject
+
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(10**18), 10**18)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=8,
+)
+goal_ids = st.text(min_size=1, max_size=MAX_ID)
+id_lists = st.lists(goal_ids, max_size=4).map(tuple)
+data = st.none() | st.dictionaries(st.text(max_size=5), st.none() | st.booleans() | st.text(max_size=5), max_size=3)
+requests: st.SearchStrategy[Request] = st.one_of(
+    st.builds(Hello, name=st.none() | st.text(min_size=1, max_size=MAX_NAME), urgent=st.booleans()),
+    st.builds(
+        Say,
+        text=st.text(),
+        wait=st.booleans(),
+        preempt=st.none() | st.booleans(),
+        data=data,
+        format=st.text(max_size=8),
+    ),
+    st.builds(Wait, ids=id_lists),
+    st.builds(Cancel, ids=id_lists, current=st.booleans(), before=st.none() | goal_ids),
+    st.builds(Status, id=st.none() | goal_ids),
+    st.just(Voices()),
+    st.just(Watch()),
+)
+FIELDS = {
+    "hello": {"name", "urgent"},
+    "say": {"text", "wait", "preempt", "data", "format"},
+    "wait": {"ids"},
+    "cancel": {"ids", "current", "before"},
+    "status": {"id"},
+    "voices": set(),
+    "watch": set(),
+}
+ALL_FIELDS = sorted(set().union(*FIELDS.values()))
+
+
+def refusal(message: JsonObject) -> BadRequest:
+    with pytest.raises(BadRequest) as refused:
+        read_request(message)
+    encode(failure(1, refused.value.code, refused.value.message))
+    return refused.value
+
+
+@given(requests)
+def test_a_request_goes_over_the_wire_and_is_the_same(request: Request) -> None:
+    assert read_request(decode(encode(write_request(request)))) == request
+
+
+@pytest.mark.parametrize("request_", [Hello(), Say("hi"), Wait(), Cancel(), Status(), Voices(), Watch()])
+def test_fields_at_their_defaults_are_not_written(request_: Request) -> None:
+    written = write_request(request_)
+    assert written == {"request": request_.kind} | ({"text": "hi"} if isinstance(request_, Say) else {})
+
+
+def test_cancel_and_status_without_fields_are_what_they_are_in_every_protocol() -> None:
+    assert write_request(Cancel()) == {"request": "cancel"}
+    assert write_request(Status()) == {"request": "status"}
+    cancel = read_request({"request": "cancel"})
+    assert isinstance(cancel, Cancel)
+    assert cancel.everything
+    assert read_request({"request": "status"}) == Status()
+
+
+@pytest.mark.parametrize("selection", [Cancel(("k3fz-1",)), Cancel(current=True), Cancel(before="k3fz-1")])
+def test_a_cancel_that_selects_is_not_of_everything(selection: Cancel) -> None:
+    assert not selection.everything
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_field_that_is_not_known_is_refused_and_named(kind: str) -> None:
+    for name in ("", "loudness", "Text", "seq", "request2", "a" * 5_000, "\x1b[31m", "\ud800"):
+        refused = refusal({"request": kind, "text": "hi", name: None} if kind == "say" else {"request": kind, name: 1})
+        assert refused.code == "unknown_field"
+        assert repr(name[:60])[1:-1] in refused.message
+        assert len(refused.message) < 500
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_request_knows_its_own_fields_and_no_others(kind: str) -> None:
+    assert KINDS.keys() == FIELDS.keys()
+    for name in set(ALL_FIELDS) - FIELDS[kind]:
+        message: JsonObject = {"request": kind, name: None}
+        assert refusal({**message, "text": "hi"} if kind == "say" else message).code == "unknown_field"
+
+
+@pytest.mark.parametrize("kind", ["", "SAY", "sing", "say ", "a" * 60_000, "\x1b]0;", "\ud800"])
+def test_a_request_that_is_not_known_is_refused_with_those_that_are(kind: str) -> None:
+    refused = refusal({"request": kind})
+    assert refused.code == "unknown_request"
+    assert all(each in refused.message for each in KINDS)
+    assert len(refused.message) < 500
+
+
+@pytest.mark.parametrize("message", [{}, {"text": "hi"}, {"request": None}, {"request": 1}, {"request": ["say"]}])
+def test_an_object_without_a_request_is_refused(message: JsonObject) -> None:
+    assert refusal(message).code == "bad_request"
+
+
+WRONG: list[tuple[str, str, list[object]]] = [
+    ("hello", "name", ["", "a" * 65, 1, True, [], {}]),
+    ("hello", "urgent", [None, 0, 1, "yes"]),
+    ("say", "text", [None, 1, True, ["hi"], {}]),
+    ("say", "wait", [None, 0, 1, "true", []]),
+    ("say", "preempt", [0, 1, "no", {}]),
+    ("say", "data", [1, "a", [], True, {"a": "b" * MAX_DATA}]),
+    ("say", "format", [None, 1, True, []]),
+    ("wait", "ids", [None, "k3fz-1", {"k3fz-1": 1}, [1], [None], [""], ["a" * 65], [["k3fz-1"]], ["a"] * 4_097]),
+    ("cancel", "ids", [None, "k3fz-1", 7, [7], [True], [""], ["a" * 65], ["a"] * 4_097]),
+    ("cancel", "current", [None, 0, 1, "yes"]),
+    ("cancel", "before", ["", 7, True, ["k3fz-1"], "a" * 65]),
+    ("status", "id", ["", 7, False, [], "a" * 65]),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"), [(kind, name, each) for kind, name, wrong in WRONG for each in wrong]
+)
+def test_a_value_of_the_wrong_type_or_length_is_refused_and_its_field_named(
+    kind: str, name: str, value: object
+) -> None:
+    refused = refusal({"request": kind, "text": "hi", name: value} if kind == "say" else {"request": kind, name: value})
+    assert refused.code == "bad_field"
+    assert repr(name) in refused.message
+    assert len(refused.message) < 500
+
+
+def test_say_without_a_text_is_refused() -> None:
+    assert refusal({"request": "say"}).code == "bad_field"
+
+
+def test_values_at_their_limits_are_taken() -> None:
+    exact: JsonObject = {"a": "b" * (MAX_DATA - len('{"a": ""}'))}
+    assert MAX_DATA == 1024
+    assert read_request({"request": "say", "text": "", "data": exact}) == Say("", data=exact)
+    longest = "a" * MAX_ID
+    assert read_request({"request": "status", "id": longest}) == Status(longest)
+    assert read_request({"request": "wait", "ids": [longest] * MAX_IDS}) == Wait((longest,) * MAX_IDS)
+
+
+def test_null_is_the_default_where_there_may_be_nothing() -> None:
+    assert read_request({"request": "say", "text": "hi", "preempt": None, "data": None}) == Say("hi")
+    assert read_request({"request": "cancel", "before": None}) == Cancel()
+    assert read_request({"request": "status", "id": None}) == Status()
+    assert read_request({"request": "hello", "name": None}) == Hello()
+
+
+@pytest.mark.parametrize("depth", range(900, 1_050))
+def test_data_at_any_depth_of_nesting_is_taken_or_refused(depth: int) -> None:
+    line = b'{"request": "say", "text": "hi", "data": {"a": ' + b"[" * depth + b"]" * depth + b"}}"
+    with pytest.raises(BadRequest):
+        read_request(decode(line))
+
+
+@given(
+    st.fixed_dictionaries({"request": st.sampled_from(sorted(KINDS)) | values})
+    | st.dictionaries(st.sampled_from(["request", *ALL_FIELDS]) | st.text(max_size=3), values),
+    st.dictionaries(st.sampled_from(ALL_FIELDS), values, max_size=3),
+)
+def test_any_object_is_a_request_or_a_bad_request(head: dict[str, object], fields: dict[str, object]) -> None:
+    message = {**head, **fields}
+    before = dict(message)
+    assert outcome(message) in {"request", "bad_request", "unknown_request", "unknown_field", "bad_field"}
+    assert message == before
+
+
+def outcome(message: JsonObject) -> str:
+    """Return "request" or the code of the refusal."""
+    try:
+        request = read_request(message)
+    except BadRequest as refused:
+        return refused.code
+    assert read_request(write_request(request)) == request
+    return "request"

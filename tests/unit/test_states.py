@@ -1,0 +1,83 @@
+"""The table of states: every pair, the allowed ones written out here, all others refused."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from talkcli.messages import Sender
+from talkcli.record import Record
+from talkcli.states import EXIT_CODES, TRANSITIONS, IllegalTransition, State, follow
+
+#: actionlib's names and numbers.
+NUMBERS = {
+    "PENDING": 0,
+    "ACTIVE": 1,
+    "PREEMPTED": 2,
+    "SUCCEEDED": 3,
+    "ABORTED": 4,
+    "REJECTED": 5,
+    "PREEMPTING": 6,
+    "RECALLING": 7,
+    "RECALLED": 8,
+    "LOST": 9,
+}
+ALLOWED = {
+    ("PENDING", "ACTIVE"),
+    ("PENDING", "RECALLING"),
+    ("RECALLING", "RECALLED"),
+    ("ACTIVE", "PREEMPTING"),
+    ("ACTIVE", "SUCCEEDED"),
+    ("ACTIVE", "ABORTED"),
+    ("PREEMPTING", "PREEMPTED"),
+    ("PREEMPTING", "SUCCEEDED"),
+    ("PREEMPTING", "ABORTED"),
+    # What a client concludes for a goal that had not ended when the connection did.
+    ("PENDING", "LOST"),
+    ("RECALLING", "LOST"),
+    ("ACTIVE", "LOST"),
+    ("PREEMPTING", "LOST"),
+}
+PAIRS = list(itertools.product(NUMBERS, repeat=2))
+
+
+def record_in(state: State) -> Record:
+    record = Record("k3fz-1", 1, "door open", Sender(), 1.0)
+    record.state = state
+    return record
+
+
+def test_names_and_numbers_are_actionlibs() -> None:
+    assert {each.name: each.value for each in State} == NUMBERS
+
+
+@pytest.mark.parametrize(("state", "target"), [each for each in PAIRS if each in ALLOWED])
+def test_transition_of_the_table_is_made(state: str, target: str) -> None:
+    assert follow(State[state], State[target]) is State[target]
+    record = record_in(State[state])
+    record.become(State[target])
+    assert record.state is State[target]
+
+
+@pytest.mark.parametrize(("state", "target"), [each for each in PAIRS if each not in ALLOWED])
+def test_any_other_transition_is_refused_and_changes_nothing(state: str, target: str) -> None:
+    with pytest.raises(IllegalTransition, match=rf"{state}.*{target}") as refused:
+        follow(State[state], State[target])
+    assert refused.value.code == "illegal_transition"
+    record = record_in(State[state])
+    before = record.snapshot()
+    with pytest.raises(IllegalTransition):
+        record.become(State[target])
+    assert record.snapshot() == before
+
+
+def test_a_goal_has_ended_where_nothing_may_follow() -> None:
+    ended = {"PREEMPTED", "SUCCEEDED", "ABORTED", "REJECTED", "RECALLED", "LOST"}
+    assert {each.name for each in State if each.terminal} == ended
+    assert {each.name for each, following in TRANSITIONS.items() if not following} == ended
+
+
+def test_each_end_has_its_exit_code() -> None:
+    codes = {"SUCCEEDED": 0, "ABORTED": 4, "REJECTED": 5, "RECALLED": 6, "PREEMPTED": 7, "LOST": 12}
+    assert {each.name: code for each, code in EXIT_CODES.items()} == codes

@@ -1,0 +1,323 @@
+"""The wire: lines from any segmentation, limits, JSON that is bad in every way, and greetings."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from talkcli.errors import BadRequest, Busy, ProtocolMismatch
+from talkcli.wire import (
+    MAX_LINE,
+    PROTOCOL,
+    LineSplitter,
+    busy_greeting,
+    check_greeting,
+    decode,
+    encode,
+    failure,
+    greeting,
+    item,
+    ok,
+    take_seq,
+)
+
+if TYPE_CHECKING:
+    from talkcli.messages import JsonObject
+
+KIB = 1024
+
+#: Any character but halves of surrogate pairs, of which JSON cannot tell two in a row from a whole pair.
+whole_texts = st.text(st.characters(exclude_categories=["Cs"]))
+texts = whole_texts | st.builds(
+    lambda a, b, half: a + half + b, whole_texts, whole_texts, st.sampled_from("\ud800\udfff")
+)
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(10**18), 10**18)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | texts,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(texts, inner, max_size=4),
+    max_leaves=12,
+)
+objects: st.SearchStrategy[JsonObject] = st.dictionaries(texts, values, max_size=5)
+
+BAD_LINES = {
+    "not JSON": (b"say hello", "bad_json"),
+    "nothing": (b"", "bad_json"),
+    "blanks": (b" \t\r", "bad_json"),
+    "an array": (b"[]", "bad_json"),
+    "an array of requests": (b'[{"request": "status"}]', "bad_json"),
+    "a number": (b"5", "bad_json"),
+    "a string": (b'"status"', "bad_json"),
+    "null": (b"null", "bad_json"),
+    "true": (b"true", "bad_json"),
+    "half an object": (b'{"request": "say", "te', "bad_json"),
+    "two objects": (b'{"request": "status"} {"request": "status"}', "bad_json"),
+    "arrays 60,000 deep": (b"[" * 60_000, "bad_json"),
+    "closed arrays 30,000 deep": (b"[" * 30_000 + b"]" * 30_000, "bad_json"),
+    "objects 10,000 deep": (b'{"a":' * 10_000 + b"1" + b"}" * 10_000, "bad_json"),
+    "an integer of 5,000 digits": (b'{"seq": ' + b"9" * 5_000 + b"}", "bad_json"),
+    "a negative integer of 5,000 digits": (b'{"seq": -' + b"9" * 5_000 + b"}", "bad_json"),
+    "a number past every float": (b'{"ttl": 1e999}', "bad_json"),
+    "a negative number past every float": (b'{"ttl": -1e999}', "bad_json"),
+    "a float of 5,000 digits": (b'{"ttl": ' + b"9" * 5_000 + b".0}", "bad_json"),
+    "NaN": (b'{"ttl": NaN}', "bad_json"),
+    "Infinity": (b'{"ttl": Infinity}', "bad_json"),
+    "-Infinity": (b'{"ttl": -Infinity}', "bad_json"),
+    "the same key twice": (b'{"request": "say", "text": "a", "text": "b"}', "bad_json"),
+    "the same key twice, within": (b'{"data": {"a": 1, "a": 1}}', "bad_json"),
+    "invalid UTF-8": (b'{"request": "say", "text": "\xff"}', "bad_encoding"),
+    "UTF-8 cut short": (b'{"request": "say", "text": "\xe6\x97"}', "bad_encoding"),
+    "a surrogate in UTF-8": (b'{"request": "say", "text": "\xed\xa0\x80"}', "bad_encoding"),
+    "UTF-16": ('{"request": "status"}'.encode("utf-16"), "bad_encoding"),
+    "NUL": (b"\0", "bad_json"),
+    "NUL in a string": (b'{"request": "st\0tus"}', "bad_json"),
+    "NUL after the object": (b'{"request": "status"}\0', "bad_json"),
+    "an escape character in a string": (b'{"request": "\x1b"}', "bad_json"),
+    "a byte order mark": (b'\xef\xbb\xbf{"request": "status"}', "bad_json"),
+    "a TLS hello": (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\x9a\xb4", "bad_encoding"),
+    "an HTTP request": (b"GET / HTTP/1.1\r", "bad_json"),
+}
+
+
+@pytest.mark.parametrize(("line", "code"), BAD_LINES.values(), ids=BAD_LINES.keys())
+def test_bad_line_is_refused_with_a_code(line: bytes, code: str) -> None:
+    with pytest.raises(BadRequest) as refused:
+        decode(line)
+    assert refused.value.code == code
+    encode(failure(None, refused.value.code, refused.value.message))
+
+
+@pytest.mark.parametrize("depth", [*range(1, 40), *range(900, 1_100)])
+def test_object_at_any_depth_of_nesting_is_read_or_refused(depth: int) -> None:
+    with contextlib.suppress(BadRequest):
+        assert isinstance(decode(b'{"a": ' + b"[" * depth + b"]" * depth + b"}"), dict)
+
+
+json_pieces = st.sampled_from(
+    [b"{", b"}", b"[", b"]", b'"', b":", b",", b"1", b"e999", b"-", b".", b"null", b"\\u", b"d8"]
+)
+
+
+@given(st.binary(max_size=40) | st.lists(json_pieces | st.binary(max_size=2), max_size=20).map(b"".join))
+@example(b'{"a": 1e999}')
+def test_any_bytes_are_an_object_that_can_be_written_again_or_a_bad_request(line: bytes) -> None:
+    assert decode(encode(read(line))) == read(line)
+
+
+def read(line: bytes) -> JsonObject:
+    """Return what a server makes of a line: the object, or the reply to what is none."""
+    try:
+        return decode(line)
+    except BadRequest as refused:
+        return failure(None, refused.code, refused.message)
+
+
+@given(objects, st.integers(0), st.binary(min_size=1, max_size=3))
+def test_mutated_line_is_an_object_or_a_bad_request(message: JsonObject, place: int, noise: bytes) -> None:
+    line = encode(message).rstrip(b"\n")
+    place %= len(line)
+    for mutated in (
+        line[:place] + noise + line[place:],
+        line[:place] + noise + line[place + len(noise) :],
+        line[:place],
+    ):
+        with contextlib.suppress(BadRequest):
+            assert isinstance(decode(mutated), dict)
+
+
+@given(objects)
+def test_what_is_written_is_one_line_and_is_read_back(message: JsonObject) -> None:
+    line = encode(message)
+    assert line.endswith(b"\n")
+    assert line.count(b"\n") == 1
+    assert decode(line) == message
+    assert decode(line.rstrip(b"\n")) == message
+
+
+def test_text_is_written_as_utf8_and_not_escaped() -> None:
+    assert encode({"text": "é日🤖"}) == '{"text": "é日🤖"}\n'.encode()
+
+
+@pytest.mark.parametrize("half", ["\ud800", "a\ud83d b", "\ude00\ud83d"])
+def test_half_of_a_surrogate_pair_goes_there_and_back(half: str) -> None:
+    line = encode({"text": half, "key": "é"})
+    line.decode()
+    assert decode(line) == {"text": half, "key": "é"}
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), float("-inf")])
+def test_a_number_that_is_no_json_is_never_written(number: float) -> None:
+    with pytest.raises(ValueError, match="float"):
+        encode({"ttl": number})
+
+
+def test_integers_of_twenty_digits_are_read() -> None:
+    assert decode(b'{"seq": 18446744073709551615}') == {"seq": 2**64 - 1}
+
+
+# Lines
+
+
+def cut(stream: bytes, places: list[int]) -> list[bytes]:
+    edges = [0, *sorted(place % (len(stream) + 1) for place in places), len(stream)]
+    return [stream[start:end] for start, end in itertools.pairwise(edges)]
+
+
+@given(
+    st.lists(st.binary(max_size=20).map(lambda line: line.replace(b"\n", b"")), max_size=8), st.lists(st.integers(0))
+)
+def test_any_segmentation_gives_the_same_lines(lines: list[bytes], places: list[int]) -> None:
+    splitter = LineSplitter(21)
+    received: list[bytes] = []
+    for segment in cut(b"".join(line + b"\n" for line in lines), places):
+        received += splitter.feed(segment)
+    assert received == lines
+    assert not splitter.unfinished
+
+
+@given(st.binary(max_size=60).filter(lambda stream: b"\n" not in stream), st.lists(st.integers(0)))
+def test_half_a_line_is_kept_until_it_ends(stream: bytes, places: list[int]) -> None:
+    splitter = LineSplitter()
+    for segment in cut(stream, places):
+        assert splitter.feed(segment) == []
+    assert splitter.unfinished == bool(stream)
+    assert splitter.feed(b"\n") == [stream]
+    assert not splitter.unfinished
+
+
+def test_requests_in_one_segment_and_in_segments_of_one_byte_are_the_same() -> None:
+    stream = encode({"request": "status"}) + encode({"request": "say", "text": "日"})
+    at_once, byte_by_byte = LineSplitter(), LineSplitter()
+    lines = [line for byte in stream for line in byte_by_byte.feed(bytes([byte]))]
+    assert at_once.feed(stream) == lines
+    assert [decode(line).get("request") for line in lines] == ["status", "say"]
+
+
+def test_ten_thousand_blank_lines_are_ten_thousand_lines() -> None:
+    assert LineSplitter().feed(b"\n" * 10_000) == [b""] * 10_000
+
+
+def feed(stream: bytes, segment: int) -> list[bytes]:
+    splitter = LineSplitter()
+    return [each for at in range(0, len(stream), segment) for each in splitter.feed(stream[at : at + segment])]
+
+
+@pytest.mark.parametrize("segment", [1, 7, 4 * KIB, 64 * KIB, 10 * KIB * KIB])
+def test_a_line_of_64_kib_with_its_newline_is_the_longest(segment: int) -> None:
+    assert MAX_LINE == 64 * KIB
+    line = b"a" * (64 * KIB - 1)
+    assert feed(line + b"\n", segment) == [line]
+    with pytest.raises(BadRequest) as refused:
+        feed(line + b"a\n", segment)
+    assert refused.value.code == "line_too_long"
+
+
+@pytest.mark.parametrize("segment", [4 * KIB, 64 * KIB, 10 * KIB * KIB])
+def test_ten_megabytes_without_a_newline_are_refused(segment: int) -> None:
+    with pytest.raises(BadRequest) as refused:
+        feed(b"[" * (10 * KIB * KIB), segment)
+    assert refused.value.code == "line_too_long"
+
+
+def test_a_line_without_an_end_is_refused_as_soon_as_it_is_too_long() -> None:
+    splitter = LineSplitter()
+    assert splitter.feed(b"[" * (MAX_LINE - 1)) == []
+    with pytest.raises(BadRequest):
+        splitter.feed(b"[")
+
+
+def test_a_longest_text_fits_in_a_line() -> None:
+    for text in ("🤖" * 10_000, "日" * 10_000, "\x01" * 10_000, '"' * 10_000):
+        assert len(encode({"seq": 1, "request": "say", "text": text, "wait": True})) <= MAX_LINE
+
+
+def test_a_trusted_servers_line_has_no_limit() -> None:
+    line = b"a" * (MAX_LINE * 3)
+    assert LineSplitter(None).feed(line + b"\n") == [line]
+
+
+# Greetings and replies
+
+
+def test_greeting_says_protocol_version_process_and_boot() -> None:
+    message = greeting("1.2.3", 4711, "k3fz")
+    assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "k3fz", "features": []}
+    assert PROTOCOL == 1
+    check_greeting(decode(encode(message)), "0.9")
+
+
+def test_greeting_with_features_and_fields_of_the_future_is_accepted() -> None:
+    check_greeting({**greeting("9.9", 1, "abcd"), "features": ["pause"], "new": {"a": 1}}, "0.1")
+
+
+@pytest.mark.parametrize(
+    ("theirs", "side"),
+    [(2, "upgrade this command"), (99, "upgrade this command"), (0, "restart the server"), (-1, "restart the server")],
+)
+def test_another_protocol_is_a_mismatch_that_says_which_side_to_upgrade(theirs: int, side: str) -> None:
+    with pytest.raises(ProtocolMismatch, match=side) as mismatch:
+        check_greeting({**greeting("3.0", 1, "k3fz"), "talk": theirs}, "0.1")
+    assert mismatch.value.exit_code == 9
+    assert "0.1" in mismatch.value.message
+    assert "3.0" in mismatch.value.message
+
+
+@pytest.mark.parametrize("message", [{}, {"talk": None}, {"talk": "1"}, {"talk": True}, {"talk": [1]}, {"ok": True}])
+def test_what_is_no_greeting_is_a_mismatch(message: JsonObject) -> None:
+    with pytest.raises(ProtocolMismatch):
+        check_greeting(message, "0.1")
+
+
+@given(objects)
+def test_any_object_for_a_greeting_is_accepted_or_a_mismatch(message: JsonObject) -> None:
+    with contextlib.suppress(ProtocolMismatch):
+        check_greeting(message, "0.1")
+        assert message.get("talk") == 1
+
+
+def test_a_server_that_is_full_is_busy() -> None:
+    assert busy_greeting() == {"talk": 1, "error": "busy"}
+    with pytest.raises(Busy) as busy:
+        check_greeting(busy_greeting(), "0.1")
+    assert (busy.value.code, busy.value.exit_code) == ("busy", 5)
+
+
+def test_replies_carry_the_number_of_their_request() -> None:
+    assert ok(3, goal={}) == {"seq": 3, "ok": True, "goal": {}}
+    assert ok(None) == {"ok": True}
+    assert item(3, voice={}) == {"seq": 3, "voice": {}}
+    assert item(None, voice={}) == {"voice": {}}
+    assert failure(3, "unknown_goal", "no") == {
+        "seq": 3,
+        "ok": False,
+        "error": {"code": "unknown_goal", "message": "no"},
+    }
+    assert failure(0, "busy", "no")["seq"] == 0
+
+
+def test_number_of_a_request_is_taken_out_of_it() -> None:
+    message: JsonObject = {"seq": 7, "request": "status"}
+    assert take_seq(message) == 7
+    assert message == {"request": "status"}
+    assert take_seq(message) is None
+    assert take_seq({"seq": None}) is None
+
+
+@pytest.mark.parametrize("seq", ["1", 1.0, True, [], {}])
+def test_number_of_a_request_that_is_no_integer_is_refused(seq: object) -> None:
+    with pytest.raises(BadRequest) as refused:
+        take_seq({"seq": seq})
+    assert refused.value.code == "bad_field"
+
+
+def test_a_line_is_what_any_json_writer_makes() -> None:
+    for compact in (json.dumps({"text": "é"}), json.dumps({"text": "é"}, separators=(",", ":"), ensure_ascii=False)):
+        assert decode(compact.encode() + b"\r") == {"text": "é"}
