@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from talkcli import wire
 from talkcli.dial import ANSWER_LIMIT, dial, ready
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
+from talkcli.printable import printable
 from talkcli.requests import Say, write_request
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class Interrupted(Exception):
 def _refusal(reply: JsonObject, items: list[JsonObject]) -> RequestRefused:
     error = reply.get("error")
     code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
-    refused = refusal(str(code), str(message))
+    refused = refusal(str(code), printable(str(message)))
     refused.items = items
     return refused
 

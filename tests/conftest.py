@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 from typing import TYPE_CHECKING, Protocol
 
 import pytest
@@ -28,6 +29,12 @@ class MakeTalk(Protocol):
     ) -> Talk:
         """Return the server, greeted and watched."""
         ...
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _interruptible() -> None:
+    """Start clients with SIGINT as a terminal would: what runs the tests in its background may have it ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkEr
 from talkcli.requests import Hello
 
 #: Connections that may wait to be accepted; the system's own limit applies too (net.core.somaxconn).
-_BACKLOG = 1024
+BACKLOG = 1024
 #: Seconds in which the holder of the lock has written its process id.
 _LOCK_NAMES_HOLDER = 1.0
 
@@ -28,6 +28,8 @@ class Listener:
 
     def __init__(self, path: str, mode: int) -> None:
         self.path = path
+        #: who may connect, as the mode of the socket's file
+        self.mode = mode
         self._lock = _lock(path)
         try:
             self.socket = _bind(path, mode)
@@ -56,6 +58,7 @@ class InheritedListener:
         self.socket.setblocking(False)
         name = self.socket.getsockname()
         self.path = name if isinstance(name, str) else os.fsdecode(name)
+        self.mode = stat.S_IMODE(os.stat(self.path).st_mode)
 
     def close(self) -> None:
         """Stop listening; the file stays."""
@@ -154,7 +157,7 @@ def _bind(path: str, mode: int) -> socket.socket:
             listening.bind(path)
         finally:
             os.umask(umask)
-        listening.listen(_BACKLOG)
+        listening.listen(BACKLOG)
     except OSError as error:
         listening.close()
         raise AddressInUse(f"cannot listen at {path}: {error.strerror or error}") from error

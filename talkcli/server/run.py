@@ -17,7 +17,7 @@ from talkcli.messages import Sender
 from talkcli.requests import Say
 from talkcli.server import log
 from talkcli.server.connection import Connection
-from talkcli.server.listener import InheritedListener, Listener, listen
+from talkcli.server.listener import BACKLOG, InheritedListener, Listener, listen
 from talkcli.server.service import Service
 
 if TYPE_CHECKING:
@@ -57,10 +57,12 @@ class _Server:
     async def run(self) -> None:
         loop = asyncio.get_running_loop()
         settings = self._settings
-        service = self._service = Service(_boot(), settings, self._listener.path)
+        service = self._service = Service(_boot(), settings, self._listener.path, self._listener.mode)
         loop.set_exception_handler(self._on_bug)
         for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self._on_signal, number)
+            # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
+            if signal.getsignal(number) != signal.SIG_IGN:
+                loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the voice along
         service.engine = EngineThread(
             protocol.Configure(os.getpid(), settings.driver, settings.player, settings.device, settings.voice),
@@ -69,7 +71,9 @@ class _Server:
         service.engine.start()
         try:
             # Not create_unix_server: that would remove a socket's file, with whoever serves it now.
-            server = await loop.create_server(lambda: Connection(service, loop), sock=self._listener.socket)
+            server = await loop.create_server(
+                lambda: Connection(service, loop), sock=self._listener.socket, backlog=BACKLOG
+            )
             log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
                 service.apply(service.scheduler.submit(Say(settings.greeting), _self(), service.now())[1])

@@ -37,10 +37,12 @@ DOOR = 16
 class Service:
     """One server's state, for as long as it runs. It is the handler of its connections."""
 
-    def __init__(self, boot: str, settings: Settings, path: str) -> None:
+    def __init__(self, boot: str, settings: Settings, path: str, mode: int) -> None:
         self.boot = boot
         self.settings = settings
         self.path = path
+        #: whether the socket's mode lets others in than its owner
+        self._open_to_others = bool(mode & 0o066)
         self.engine: EngineThread
         self.scheduler = Scheduler(
             boot, preempt=settings.preempt, max_queue=settings.max_queue, max_text=settings.max_text
@@ -70,8 +72,7 @@ class Service:
     def joined(self, connection: Connection, transport: asyncio.Transport) -> None:
         """Admit a client, let it wait at the door of a full server, or turn it away."""
         pid, uid = peers.credentials(transport.get_extra_info("socket"))
-        open_to_others = self.settings.socket_mode & 0o066
-        if uid not in {os.getuid(), 0} and not open_to_others:
+        if uid not in {os.getuid(), 0} and not self._open_to_others:
             words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
             transport.write(wire.encode({"talk": wire.PROTOCOL, "error": "permission_denied", "message": words}))
             transport.close()
