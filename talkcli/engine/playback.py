@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.engine.sink import SAMPLE, AudioFailed, Stopped
+from talkcli.engine.sink import PIECE, SAMPLE, AudioFailed, Stopped
 from talkcli.engine.wordclock import WordClock
 
 if TYPE_CHECKING:
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from talkcli.engine.outlet import Outlet
     from talkcli.engine.sink import Sink, Wait
     from talkcli.engine.wordclock import TimedWord
-
-#: Seconds of sound that are offered at once: small, so that little is on its way when it has to be silent.
-CHUNK = 0.02
 
 #: Seconds within which a player must take the first sound: a Bluetooth or USB device that sleeps needs one or two, a
 #: null sink that nobody records up to two.
@@ -110,7 +107,7 @@ class Playback:
             return
         self._sink.kill()
         while not self._sink.gone():  # hangs in the kernel: the server has a limit of its own
-            self._wait((), time.monotonic() + CHUNK)
+            self._wait((), time.monotonic() + PIECE)
 
     def _audible(self, samples: bytes) -> bool:
         return self._any_word or samples.count(0) != len(samples)
@@ -176,8 +173,8 @@ class Playback:
 
     def _offer(self, sink: Sink) -> int:
         begin = self._sent - self._dropped
-        chunk = int(CHUNK * self._rate) * SAMPLE
-        with memoryview(self._samples) as view, view[begin : begin + chunk] as part:
+        piece = int(PIECE * self._rate) * SAMPLE
+        with memoryview(self._samples) as view, view[begin : begin + piece] as part:
             taken = sink.offer(part)
         if not taken:
             return 0

@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from talkcli.engine.sink import AudioFailed
+from talkcli.engine.sink import PIECE, SAMPLE, AudioFailed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,8 +23,8 @@ PACKAGES = {"aplay": "alsa-utils", "pacat": "pulseaudio-utils", "pw-cat": "pipew
 #: three periods of 20 ms a busy machine makes gaps.
 BUFFER_MS = 60
 
-#: Bytes that a player may take before it has opened its device: pacat reads one block of this size while it connects,
-#: and of other programs no more is known. Only what is taken beyond proves that the sound goes somewhere.
+#: Bytes that a player may take before it has opened its device: a block as programs read it. Only what is taken beyond
+#: proves that the sound goes somewhere. Where more is known about a player, it is said there.
 READ_AHEAD = 4096
 
 
@@ -75,12 +75,13 @@ def _known(name: str, device: str | None, rate: int) -> Command:
         argv = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "1", "-r", str(rate)]
         argv += [f"--buffer-time={BUFFER_MS * 1000}"]
         argv += ["-D", device] if device else []
-        return Command(name, tuple(argv), read_ahead=0)
+        return Command(name, tuple(argv), read_ahead=0)  # it opens the device before it reads
     if name == "pacat":
         argv = ["pacat", "--playback", "--raw", "--format=s16le", "--channels=1", f"--rate={rate}"]
         argv += [f"--latency-msec={BUFFER_MS}", "--process-time-msec=20", "--client-name=talk", "--stream-name=talk"]
         argv += ["-d", device] if device else []
-        return Command(name, tuple(argv))
+        # It reads once while it still connects, and there is never more than one piece to read.
+        return Command(name, tuple(argv), read_ahead=int(PIECE * rate) * SAMPLE)
     argv = ["pw-cat", "--playback", f"--latency={BUFFER_MS}ms", "--media-role=Accessibility"]
     argv += [f"--target={device}"] if device else []
     return Command(name, (*argv, "-"), preamble=_au_header(rate))

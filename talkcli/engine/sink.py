@@ -12,6 +12,9 @@ from typing import Protocol
 #: bytes of one sample: 16 bit, one channel.
 SAMPLE = 2
 
+#: Seconds of sound that are offered at once: small, so that little is on its way when it has to be silent.
+PIECE = 0.02
+
 #: A file descriptor and the poll events that are waited for on it.
 Interest = tuple[int, int]
 

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
 
 
+#: What `talk`'s own driver is called by users: it stands in for pyttsx3's driver of that name.
+_OWN_NAME = "espeak"
+
+
 class CannotStart(Exception):
     """The engine cannot start: `reason` is for programs, the text names what to install or to change."""
 
@@ -59,13 +63,12 @@ def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait) -> 
         settings.set_voice(voice)
     except SettingFailed as error:
         raise CannotStart(str(error), error.reason) from error
-    return OpenEngine(engine, settings, name, version, None if own else _pump(name))
+    shown = _OWN_NAME if own else name
+    return OpenEngine(engine, settings, shown, version, None if own else _pump(name))
 
 
 def _is_own(driver: str | None) -> bool:
-    from talkcli.engine.espeak import DRIVER
-
-    return driver == DRIVER or (sys.platform.startswith("linux") and driver in (None, "espeak"))
+    return sys.platform.startswith("linux") and driver in (None, _OWN_NAME)
 
 
 def _register_own(outlet: Outlet, wait: Wait) -> str:

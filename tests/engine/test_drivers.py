@@ -163,10 +163,10 @@ def test_a_driver_that_cannot_be_stepped_is_refused_at_once() -> None:
     assert "leave --driver out" in failed.message
 
 
-@pytest.mark.parametrize("driver", ["espeak", "talk_espeak"])
+@pytest.mark.parametrize("driver", ["espeak", None])
 def test_espeak_means_talks_own_driver(driver: str) -> None:
     with Spawned(driver=driver) as engine:
-        assert engine.until(protocol.Ready).driver == "talk_espeak"
+        assert engine.until(protocol.Ready).driver == "espeak"
         assert engine.spoken("yes").outcome == protocol.COMPLETED
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def test_a_process_gets_ready_and_lists_its_voices_when_it_is_idle() -> None:
     with Spawned() as engine:
         ready = engine.until(protocol.Ready)
-        assert ready.driver == "talk_espeak"
+        assert ready.driver == "espeak"
         assert ready.version is not None
         assert ready.version.startswith("eSpeak NG ")
         assert ready.player == "null"
