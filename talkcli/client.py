@@ -166,12 +166,12 @@ class Client:
         self._connection.request(request, accepted)
         return handle
 
-    def follow(self, ids: Iterable[str] = ()) -> list[GoalHandle]:
-        """Return handles for these goals, whoever sent them, to wait for; without ids, for all that have not ended.
+    def follow(self, ids: Iterable[str] | None = None) -> list[GoalHandle]:
+        """Return handles for these goals, whoever sent them, to wait for; None: for all that have not ended.
 
         UnknownGoal if the server doesn't know one of them.
         """
-        wanted = tuple(self.full_id(each) for each in ids)
+        wanted = None if ids is None else tuple(self.full_id(each) for each in ids)
         handles: dict[str, GoalHandle] = {}
 
         def accepted(_: JsonObject, items: list[JsonObject]) -> None:
@@ -180,15 +180,16 @@ class Client:
                 self._attach(handles[goal.id])
 
         self._connection.request(Wait(wanted), accepted)
-        return [handles[each] for each in wanted] if wanted else list(handles.values())
+        return list(handles.values()) if wanted is None else [handles[each] for each in wanted]
 
-    def cancel(self, ids: Iterable[str] = (), *, current: bool = False, before: str | None = None) -> Canceled:
-        """Cancel the goals that are selected, or everything where nothing is; return once it is silent.
+    def cancel(self, ids: Iterable[str] | None = None, *, current: bool = False, before: str | None = None) -> Canceled:
+        """Cancel the goals that are selected, or everything where no selector is given; return once it is silent.
 
+        `ids`: these goals; an empty list selects none;
         `current`: the goal being spoken; `before`: this goal and all accepted before it. UnknownGoal if an id is not
         known: the others are cancelled all the same, and are in the error's `items`.
         """
-        selected = tuple(self.full_id(each) for each in ids)
+        selected = None if ids is None else tuple(self.full_id(each) for each in ids)
         _, items = self._connection.request(Cancel(selected, current, before and self.full_id(before)))
         return Canceled.from_items(items)
 

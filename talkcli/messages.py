@@ -140,7 +140,7 @@ class Goal:
             key=_maybe(value, "key", str),
             ttl=_seconds(value, "ttl"),
             data=data if isinstance(data, dict) else None,
-            client=Sender.from_json(value.get("client")),
+            client=None if value.get("client") is None else Sender.from_json(value["client"]),
             paused=_maybe(value, "paused", bool) or False,
             queued_at=_seconds(value, "queued_at"),
             started_at=_seconds(value, "started_at"),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, cast
 
 from talkcli.errors import BadRequest
 
@@ -62,9 +62,13 @@ def _name(value: object) -> str:
 
 
 def _data(value: object) -> JsonObject:
-    if not isinstance(value, dict) or len(json.dumps(value).encode()) > MAX_DATA:
+    try:
+        fits = isinstance(value, dict) and len(json.dumps(value)) <= MAX_DATA
+    except RecursionError:
+        fits = False
+    if not fits:
         raise ValueError(f"must be an object of at most {MAX_DATA} bytes")
-    return value
+    return cast("JsonObject", value)
 
 
 def _optional(check: Check) -> Check:
@@ -105,20 +109,24 @@ class Say:
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Send the results of these goals; without ids, of all that are active or pending now."""
+    """Send the results of these goals; where `ids` is not given, of all that are active or pending now."""
 
     kind: ClassVar[str] = "wait"
-    fields: ClassVar[Mapping[str, Check]] = {"ids": _goal_ids}
-    ids: tuple[str, ...] = ()
+    fields: ClassVar[Mapping[str, Check]] = {"ids": _optional(_goal_ids)}
+    ids: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """End what these select; without any selector, everything."""
+    """End what these select; where no selector is given, everything. An empty list of ids selects nothing."""
 
     kind: ClassVar[str] = "cancel"
-    fields: ClassVar[Mapping[str, Check]] = {"ids": _goal_ids, "current": _flag, "before": _optional(_goal_id)}
-    ids: tuple[str, ...] = ()
+    fields: ClassVar[Mapping[str, Check]] = {
+        "ids": _optional(_goal_ids),
+        "current": _flag,
+        "before": _optional(_goal_id),
+    }
+    ids: tuple[str, ...] | None = None
     #: the goal being spoken
     current: bool = False
     #: this goal and all accepted before it
@@ -126,7 +134,7 @@ class Cancel:
 
     @property
     def everything(self) -> bool:
-        return not (self.ids or self.current or self.before)
+        return self.ids is None and not self.current and self.before is None
 
 
 @dataclass(frozen=True, slots=True)

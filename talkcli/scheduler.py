@@ -190,7 +190,7 @@ class Scheduler:
         record.duration = duration
         if record.state is State.PREEMPTING and reason != "not_silent":
             return self.stopped(goal_id, now)
-        return self._end(record, State.ABORTED, reason, f"Talk aborted: {words}", None, now)
+        return self._end(record, State.ABORTED, reason, f"Talk aborted: {words}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
         """End the active goal, which was told to stop: it is silent."""
@@ -267,7 +267,7 @@ class Scheduler:
         if selection.everything:
             chosen = {each.number: each for each in self.unfinished()}
         else:
-            chosen = dict(self._named(selection.ids, done))
+            chosen = dict(self._named(selection.ids or (), done))
             if selection.current and self.active:
                 chosen[self.active.number] = self.active
             if selection.before is not None:

@@ -8,6 +8,7 @@ PROTOCOL number; `{"request": "cancel"}` and `{"request": "status"}` stay the sa
 from __future__ import annotations
 
 import json
+import math
 from typing import TYPE_CHECKING
 
 from talkcli.errors import BadRequest, Busy, ProtocolMismatch
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 
 PROTOCOL = 1
 
-#: Bytes of one request line, its newline included: a text of 10,000 characters fits with all of them escaped.
+#: Bytes of one request line, its newline included: the longest text (40,000 bytes of UTF-8) fits with room for quotes,
+#: and so do 10,000 characters that are all escaped as \uXXXX.
 MAX_LINE = 64 * 1024
 
 #: A JSON integer of more digits is no count or time of ours, and converting thousands of digits takes quadratic time.
@@ -40,6 +42,7 @@ def decode(line: bytes) -> JsonObject:
             object_pairs_hook=_no_duplicates,
             parse_constant=_no_constant,
             parse_int=_short_integer,
+            parse_float=_finite,
         )
     except UnicodeDecodeError as error:
         raise BadRequest(f"a line is UTF-8, but byte {error.start} of this one is not", "bad_encoding") from None
@@ -67,6 +70,13 @@ def _short_integer(digits: str) -> int:
     if len(digits) > MAX_DIGITS:
         raise ValueError(f"an integer of {len(digits)} digits")
     return int(digits)
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise ValueError("a number past every float")
+    return number
 
 
 class LineSplitter:

@@ -29,7 +29,7 @@ def command(context: click.Context, ids: tuple[str, ...], current: bool, before:
     options = common(context)
     with options.connect(urgent=True) as client:
         try:
-            _show(client.cancel(ids, current=current, before=before), options)
+            _show(client.cancel(ids or None, current=current, before=before), options)
         except UnknownGoal as error:
             _show(Canceled.from_items(error.items), options)
             raise

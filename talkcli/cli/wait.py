@@ -48,7 +48,7 @@ def command(context: click.Context, ids: tuple[str, ...], timeout: float | None)
         options.connect(interrupt=interrupts.descriptor, patience=patience) as client,
     ):
         try:
-            for goal in client.follow(ids):
+            for goal in client.follow(ids or None):
                 ended = goal.wait(None if end is None else max(0.0, end - time.monotonic()))
                 code = report(ended, options) if ids or ended.state is State.LOST or options.json else EXIT_OK
                 if ids or ended.state is State.LOST:

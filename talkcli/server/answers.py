@@ -80,8 +80,10 @@ class Answers:
         self._service.apply(effects)
 
     def _wait(self, connection: Connection, seq: int | None, request: Wait) -> None:
-        ids = list(dict.fromkeys(request.ids))
-        records = [self._find(each) for each in ids] if ids else self._scheduler.unfinished()
+        if request.ids is None:
+            records = self._scheduler.unfinished()
+        else:
+            records = [self._find(each) for each in dict.fromkeys(request.ids)]
         for record in records:
             if not record.state.terminal:
                 self._service.audience.await_result(record.id, connection)

@@ -119,17 +119,23 @@ class Service:
     def apply(self, effects: list[Effect]) -> None:
         """Carry out what the scheduler decided, in its order."""
         for effect in effects:
-            if isinstance(effect, Changed):
-                self._changed(effect)
-            elif isinstance(effect, Start):
-                self._start(effect.record)
-            elif isinstance(effect, GiveUp):
-                self.engine.give_up(effect.record.id)
-            else:
-                self.engine.stop(effect.record.id)
+            try:
+                self._carry_out(effect)
+            except Exception as error:  # noqa: BLE001 - the effects after it must not be lost: the engine would wait
+                self.failed(type(effect).__name__, error)
         self._set_timer()
         if self._closing and self.scheduler.active is None:
             self.finished.set()
+
+    def _carry_out(self, effect: Effect) -> None:
+        if isinstance(effect, Changed):
+            self._changed(effect)
+        elif isinstance(effect, Start):
+            self._start(effect.record)
+        elif isinstance(effect, GiveUp):
+            self.engine.give_up(effect.record.id)
+        else:
+            self.engine.stop(effect.record.id)
 
     def _changed(self, change: Changed) -> None:
         record = change.record

@@ -45,7 +45,7 @@ class Robot:
         return record
 
     def cancels(self, *ids: str, current: bool = False, before: str | None = None) -> Cancelled:
-        done = self.scheduler.cancel(Cancel(ids, current, before), DOOR, self.now)
+        done = self.scheduler.cancel(Cancel(ids or None, current, before), DOOR, self.now)
         self.see(done.effects)
         return done
 

@@ -46,9 +46,9 @@ class SlowGoal:
 
 @dataclass
 class Selection:
-    """What a cancel names; nothing named is everything."""
+    """What a cancel names; nothing named is everything, but a list of no ids names none."""
 
-    ids: list[str] = field(default_factory=list)
+    ids: list[str] | None = None
     current: bool = False
     before: str | None = None
 
@@ -136,12 +136,13 @@ class SlowModel:
     def selected(self, selection: Selection, outcome: Outcome) -> list[SlowGoal]:
         """Return the goals that have not ended among those selected; note in `outcome` what else was named."""
         living = self.voice + self.queue
-        if not (selection.ids or selection.current or selection.before is not None):
+        if selection.ids is None and not selection.current and selection.before is None:
             return living
-        named = list(selection.ids) if selection.before is None else [*selection.ids, selection.before]
+        ids = selection.ids or []
+        named = list(ids) if selection.before is None else [*ids, selection.before]
         known = {each.id: each for each in self.all}
         outcome.unknown = [each for each in named if each not in known]
-        outcome.ended = [each for each in selection.ids if each in known and known[each].state in ENDS]
+        outcome.ended = [each for each in ids if each in known and known[each].state in ENDS]
         chosen = [known[each] for each in named if each in known]
         if selection.current:
             chosen += self.voice

@@ -164,6 +164,8 @@ def test_room_is_counted_after_those_that_give_way() -> None:
     older = robot.says(preempt=True)
     newer = robot.says(preempt=True)
     assert (older.state, newer.state) == (State.RECALLED, State.PENDING)
+    assert robot.says(preempt=False).reason == "queue_full"
+    assert newer.state is State.PENDING
 
 
 def test_no_id_is_used_twice_and_each_is_the_boots() -> None:
