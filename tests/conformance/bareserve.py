@@ -1,0 +1,121 @@
+"""`talk serve` where `tests.support.processes.Talk` cannot be used: no socket is named, or it must not start."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tests.support.surroundings import clean_environment, dying_with_parent
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+TALK = [sys.executable, "-m", "talkcli"]
+SERVE = [*TALK, "serve", "--player", "null"]
+#: Seconds in which anything here starts or ends.
+LIMIT = 20.0
+
+
+@dataclass(slots=True)
+class Ended:
+    """A process that has ended by itself."""
+
+    code: int
+    out: str
+    err: str
+
+
+class BareServe:
+    """A server in an environment that is given whole."""
+
+    def __init__(self, command: Sequence[str], env: Mapping[str, str], pass_fds: Sequence[int] = ()) -> None:
+        self.process = subprocess.Popen(
+            dying_with_parent(list(command)),
+            env=dict(env),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            pass_fds=tuple(pass_fds),
+            start_new_session=True,
+        )
+        self._lines: list[str] = []
+        self._settled = threading.Event()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def log(self) -> str:
+        return "".join(self._lines)
+
+    def serves(self) -> bool:
+        """Wait until it says that it serves, or has closed its standard error, and return which."""
+        assert self._settled.wait(LIMIT), f"neither ready nor ended: {self.log}"
+        return "ready on " in self.log
+
+    def end(self, *signals: signal.Signals) -> int:
+        """Send it signals, one after the other, and return its exit code."""
+        for each in signals:
+            self.process.send_signal(each)
+        code = self.process.wait(LIMIT)
+        self._reader.join(LIMIT)
+        return code
+
+    def close(self) -> None:
+        """End it, however it is."""
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self._reader.join(LIMIT)
+        if self.process.stderr:
+            self.process.stderr.close()
+
+    def _read(self) -> None:
+        assert self.process.stderr
+        for line in self.process.stderr:
+            self._lines.append(line)
+            if "ready on " in line:
+                self._settled.set()
+        self._settled.set()
+
+
+@contextlib.contextmanager
+def serving(
+    env: Mapping[str, str], *options: str, command: Sequence[str] = SERVE, pass_fds: Sequence[int] = ()
+) -> Iterator[BareServe]:
+    """Run a server that is ready, and assert at the end that SIGTERM ends it well, if nothing has ended it before."""
+    server = BareServe([*command, *options], env, pass_fds)
+    try:
+        assert server.serves(), server.log
+        yield server
+        if server.process.poll() is None:
+            assert server.end(signal.SIGTERM) == 0, server.log
+        assert "Traceback" not in server.log
+    finally:
+        server.close()
+
+
+def run(command: Sequence[str], env: Mapping[str, str], **options: object) -> Ended:
+    """Run a program to its end."""
+    done = subprocess.run(  # type: ignore[call-overload]
+        list(command),
+        env=dict(env),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        timeout=LIMIT,
+        check=False,
+        **options,
+    )
+    return Ended(done.returncode, os.fsdecode(done.stdout), os.fsdecode(done.stderr))
+
+
+def environment(home: str, **extra: str) -> dict[str, str]:
+    """Return a clean environment whose temporary and home directories are this one."""
+    return clean_environment(home, {"TMPDIR": home, **extra})

@@ -1,0 +1,108 @@
+"""What the tests of what is heard share: sentences, goals that have begun, the processes behind a server."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import TYPE_CHECKING, Any
+
+from tests.support.compare import compare
+
+if TYPE_CHECKING:
+    import subprocess
+
+    import numpy as np
+    import numpy.typing as npt
+
+    from tests.support.compare import Comparison
+    from tests.support.connection import Message
+    from tests.support.processes import Talk
+
+    Samples = npt.NDArray[np.int16]
+
+#: Short sentences, and one that goes on while something is done to it. Each begins with a moment of silence, before its
+#: "b" or "c": what the monitor drops where a stream starts, up to 10 ms, is none of the sound then.
+LOW = "battery low"
+HOME = "coming home"
+HELP = "please help, I am stuck"
+LONG = "two three four five six seven eight nine ten eleven twelve"
+
+#: Seconds by which the time of a sample is known: blocks of the monitor, and of the sink before it.
+PRECISION = 0.03
+#: Seconds in which a process that was started must be there.
+_PATIENCE = 5.0
+
+
+def send(talk: Talk, text: str, **fields: Any) -> str:
+    """Send a goal that nobody waits for, and return its id."""
+    reply = talk.request("say", text=text, **fields)
+    assert reply["ok"], reply
+    goal: Message = reply["goal"]
+    assert goal["state"] in ("PENDING", "ACTIVE"), goal
+    return str(goal["id"])
+
+
+def await_word(talk: Talk, goal_id: str, number: int = 3) -> None:
+    """Wait until a goal is in mid-sentence: until its third word is heard, or the one asked for."""
+    wanted = {"event": "word", "id": goal_id, "number": number}
+    talk.watcher.wait_until(lambda each: wanted.items() <= each.items(), what=f"word {number} of {goal_id}")
+
+
+def begin(talk: Talk, text: str, **fields: Any) -> str:
+    """Send a goal and wait until it is in mid-sentence; return its id."""
+    goal_id = send(talk, text, **fields)
+    await_word(talk, goal_id)
+    return goal_id
+
+
+def begin_with_client(talk: Talk, text: str, *options: str) -> tuple[str, subprocess.Popen[str]]:
+    """Send a goal by a client that waits for it, and wait until it is in mid-sentence; return its id and the client."""
+    known = {None, *talk.watcher.goals()}
+    client = talk.start("say", "--wait", *options, "--", text)
+    goal_id = str(talk.watcher.wait_until(lambda each: each.get("id") not in known)["id"])
+    await_word(talk, goal_id)
+    return goal_id, client
+
+
+def heard(talk: Talk, quiet: float = 0.2) -> Samples:
+    """Return all that was heard, once it is quiet."""
+    talk.recording.wait_until_quiet(quiet)
+    return talk.recording.samples
+
+
+def assert_same(samples: Samples, reference: Samples) -> Comparison:
+    """Assert that one sentence was heard, whole, and nothing else; it may begin with sound at once."""
+    compared = compare(samples, reference)
+    assert compared.same, compared
+    return compared
+
+
+def assert_aborted(goal: Message, reason: str, *words: str) -> None:
+    """Assert that a goal was ABORTED for that reason, with these words in its message."""
+    assert (goal["state"], goal["reason"]) == ("ABORTED", reason), goal
+    assert goal["message"].startswith("Talk aborted: "), goal
+    for each in words:
+        assert each in goal["message"], goal
+
+
+def engine_process(talk: Talk) -> int:
+    """Return the process id of the server's engine."""
+    (engine,) = _children(talk.pid)
+    return engine
+
+
+def player_process(talk: Talk) -> int:
+    """Return the process id of the player of the goal that is being spoken."""
+    end = time.monotonic() + _PATIENCE
+    while len(found := _children(engine_process(talk))) != 1:
+        assert time.monotonic() < end, f"not one player: {found}"
+        time.sleep(0.005)  # a child of a child is no event here
+    return found[0]
+
+
+def _children(pid: int) -> list[int]:
+    found: list[int] = []
+    for thread in os.listdir(f"/proc/{pid}/task"):
+        with open(f"/proc/{pid}/task/{thread}/children", encoding="ascii") as file:
+            found += map(int, file.read().split())
+    return found

@@ -1,0 +1,275 @@
+"""Clients that wait, give up, are interrupted or lose their server: they end in time, with the code that is true."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.bareserve import environment
+from tests.conformance.rawsocket import GREETING, FakeServer, Raw
+from tests.conformance.witness import states
+from tests.support.surroundings import short_directory
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tests.support.processes import Talk
+
+#: Seconds that a client's start and end may take besides what is measured.
+START = 0.5
+
+
+def speaking(talk: Talk, *words: str) -> tuple[subprocess.Popen[str], str]:
+    """Start a client whose goal never ends, and return it with the goal's id once it is heard."""
+    client = talk.start("say", *words, "--", "never-ends words=1")
+    goal_id = str(talk.watcher.wait_for(None, "ACTIVE")["id"])
+    talk.watcher.wait_for_word(goal_id)
+    return client, goal_id
+
+
+def test_row_07_server_that_is_killed_loses_the_goal(scripted: Talk) -> None:
+    sayer, goal_id = speaking(scripted, "--wait")
+    behind = scripted.start("--json", "say", "--wait", "behind it")
+    pending_id = scripted.watcher.wait_until(lambda each: bool(each["id"] != goal_id))["id"]
+    scripted.kill()
+    for client in (sayer, behind):
+        done = scripted.finish(client)
+        assert done.code == 12
+        assert done.seconds < 1
+        assert "it may still be spoken" in done.err
+    goal = json.loads(done.out)
+    assert (goal["id"], goal["state"], goal["status"], goal["reason"]) == (pending_id, "LOST", 9, "lost")
+    assert goal["message"].startswith("Talk lost: ")
+
+
+def _until_watched(talk: Talk, clients: int) -> None:
+    """Wait until so many clients are connected: this one's question, the watcher and those that wait."""
+    end = time.monotonic() + 5
+    while talk.request("status")["server"]["clients"] != clients:
+        assert time.monotonic() < end, "the clients have not connected"
+
+
+def test_row_08_timeout_holds_while_the_server_is_frozen(scripted: Talk) -> None:
+    def attempt() -> None:
+        began = time.monotonic()
+        client = scripted.start("say", "--wait", "--timeout", "2", "--", "never-ends words=1")
+        goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
+        scripted.freeze()
+        try:
+            done = scripted.finish(client)
+            seconds = time.monotonic() - began
+        finally:
+            scripted.thaw()
+        assert done.code == 124
+        assert seconds >= 2
+        assert "did not confirm" in done.err
+        assert scripted.watcher.wait_for_terminal(goal_id) == "PREEMPTED"  # the cancel was on its way
+        assert scripted.goal(goal_id)["state"] == "PREEMPTED"
+        assert_within(seconds, 2 + 1 + START, "a timeout of 2 s, and 1 s for silence")
+
+    attempt()
+
+
+def test_row_10_timeout_cancels_the_goal(scripted: Talk) -> None:
+    def attempt() -> None:
+        began = time.time()
+        done = scripted.run("--json", "say", "--wait", "--timeout", "2", "length=10 words=1")
+        goal = json.loads(done.out)
+        assert (done.code, goal["state"], goal["reason"]) == (124, "PREEMPTED", "canceled")
+        assert goal["ended_at"] - began >= 2
+        assert_within(goal["ended_at"] - began, 2 + 0.3, "a timeout of 2 s")
+        assert_within(done.seconds, 2 + START, "a client with a timeout of 2 s")
+
+    retry_if_late(attempt)
+
+
+def test_row_10_timeout_counts_the_time_in_the_queue(scripted: Talk) -> None:
+    scripted.run("say", "never-ends")
+    done = scripted.run("--json", "say", "--wait", "--timeout", "0.5", "behind it")
+    goal = json.loads(done.out)
+    assert (done.code, goal["state"]) == (124, "RECALLED")
+    watched = scripted.run("wait", "--timeout", "0.3")
+    assert watched.code == 124
+    assert scripted.request("status")["active"]["state"] == "ACTIVE"  # `wait` cancels nothing
+
+
+@pytest.mark.parametrize("says", [GREETING, b""], ids=["after the greeting", "before it"])
+def test_timeout_holds_whatever_the_server_does_not_say(says: bytes) -> None:
+    with short_directory() as home, FakeServer(f"{home}/s", [says]):
+        began = time.monotonic()
+        done = _talk(home, "say", "--wait", "--timeout", "0.5", "--", "hello")
+        seconds = time.monotonic() - began
+    # Nothing was sent to a server that did not greet: that is no server.
+    assert done.returncode == (124 if says else 3), done
+    assert seconds < 0.5 + 1 + START
+
+
+def _talk(home: str, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "talkcli", *words],
+        env=environment(home, TALK_SOCKET=f"{home}/s"),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("reads", [True, False], ids=["reads the greeting", "reads nothing"])
+def test_row_15_client_that_is_gone_at_once_is_spoken_for(scripted: Talk, reads: bool) -> None:
+    count = 20
+    for _ in range(count):
+        with Raw(scripted.socket) as raw:
+            if reads:
+                raw.receive_lines(1)
+            raw.send(b'{"request": "say", "text": "length=0", "wait": true}\n')
+    last = scripted.run("say", "--wait", "length=0 the last").id
+    scripted.watcher.wait_for_terminal(last)  # then all the events before it have come
+    goals = scripted.watcher.goals()
+    assert len(goals) == count + 1
+    assert {scripted.watcher.wait_for_terminal(each) for each in goals} == {"SUCCEEDED"}
+    for line in scripted.log.splitlines():
+        assert " SUCCEEDED after " in line or " ready" in line, line  # no word about clients that are gone
+
+
+def test_row_15_client_that_is_killed_leaves_its_goal(scripted: Talk) -> None:
+    client = scripted.start("say", "--wait", "--", "length=0.5")
+    goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
+    client.kill()
+    client.wait()
+    assert scripted.watcher.wait_for_terminal(goal_id) == "SUCCEEDED"
+
+
+def test_row_31_goal_that_ended_is_known_to_any_process(scripted: Talk) -> None:
+    texts = {"length=0 fine": 0, "fail=audio_lost": 4, "length=0 too": 0, "crash": 4}
+    ids = [scripted.run("say", "--", text).id for text in texts]
+    for goal_id in ids:
+        scripted.watcher.wait_for_terminal(goal_id)
+    for goal_id, code in zip(ids, texts.values(), strict=True):
+        done = scripted.run("wait", goal_id)
+        assert (done.code, done.out) == (code, "")
+    number = ids[1].rpartition("-")[2]
+    done = scripted.run("--json", "wait", number)
+    goal = json.loads(done.out)
+    assert (done.code, goal["id"], goal["state"], goal["reason"]) == (4, ids[1], "ABORTED", "audio_lost")
+    assert scripted.run("wait", ids[0], ids[2], ids[3], ids[0]).code == 4  # of the first that did not succeed
+
+
+def test_wait_returns_the_code_of_the_first_in_order_that_did_not_succeed(scripted: Talk) -> None:
+    active, *pending = (scripted.run("say", "never-ends", str(each)).id for each in range(3))
+    scripted.watcher.wait_for_word(active)
+    waiters = [scripted.start("wait", *ids) for ids in ((*pending, active), (active, *pending), ())]
+    _until_watched(scripted, 5)
+    scripted.run("cancel")
+    assert [scripted.finish(each).code for each in waiters] == [6, 7, 0]  # without an id, it only waits
+
+
+@pytest.mark.parametrize(
+    ("command", "number", "code"),
+    [("say", signal.SIGINT, 130), ("say", signal.SIGTERM, 143), ("wait", signal.SIGINT, 130)],
+)
+def test_row_33_signal_ends_what_the_client_owns(
+    scripted: Talk, command: str, number: signal.Signals, code: int
+) -> None:
+    client, goal_id = speaking(scripted, "--wait") if command == "say" else speaking(scripted)
+    if command == "wait":
+        assert scripted.finish(client).id == goal_id
+        client = scripted.start("wait", goal_id)
+    _until_watched(scripted, 3)
+    client.send_signal(number)
+    done = scripted.finish(client)
+    assert done.code == code
+    assert done.seconds < 1 + START
+    if command == "wait":
+        assert scripted.goal(goal_id)["state"] == "ACTIVE"
+        return
+    assert states(scripted, goal_id)[-2:] == ["PREEMPTING", "PREEMPTED"]
+    assert (done.id, "Talk preempted" in done.err) == (goal_id, True)
+
+
+def test_row_33_signal_ends_a_client_whose_server_does_not_greet() -> None:
+    with short_directory() as home, FakeServer(f"{home}/s", []) as server:
+        for words in (["status"], ["wait"], ["cancel"], ["say", "hello"], ["say", "--wait", "hello"]):
+            client = subprocess.Popen(
+                [sys.executable, "-m", "talkcli", *words],
+                env=environment(home, TALK_SOCKET=f"{home}/s"),
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            server.wait_for_client()
+            client.send_signal(signal.SIGINT)
+            began = time.monotonic()
+            _, err = client.communicate(timeout=20)
+            assert client.returncode == 130, (words, err)
+            assert time.monotonic() - began < 1 + START, words
+            assert "Traceback" not in err
+
+
+def test_row_34_sigterm_to_a_background_job_of_a_script(scripted: Talk) -> None:
+    script = """"$0" -m talkcli say --wait -- "never-ends words=1" & pid=$!
+    read line; kill -TERM $pid; wait $pid; echo "code $?" """
+    shell = subprocess.Popen(
+        ["sh", "-c", script, sys.executable],
+        env=scripted.env,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
+    scripted.watcher.wait_for_word(goal_id)
+    out, err = shell.communicate("go on\n", timeout=20)
+    assert out == f"{goal_id}\ncode 143\n"
+    assert "Talk preempted" in err
+    assert scripted.goal(goal_id)["state"] == "PREEMPTED"
+
+
+@pytest.mark.parametrize("words", [["status"], ["cancel"], ["say", "hello"], ["say", "-w", "hello"], ["wait"]])
+def test_row_35_no_server_is_told_at_once(words: Sequence[str]) -> None:
+    with short_directory() as home:
+
+        def attempt() -> None:
+            began = time.monotonic()
+            done = _talk(home, *words)
+            seconds = time.monotonic() - began
+            assert (done.returncode, done.stdout) == (3, "")
+            assert f"{home}/s: not there" in done.stderr
+            assert "talk serve" in done.stderr
+            assert_within(seconds, 0.3, "the end of a client without a server")
+
+        retry_if_late(attempt)
+
+
+def test_row_46_server_that_is_frozen_for_good(scripted: Talk) -> None:
+    """Takes 16 s, the limit of silence: the clients wait together."""
+    waiter, goal_id = speaking(scripted, "--wait")
+    scripted.freeze()
+    began = time.monotonic()
+    try:
+        second = scripted.start("serve")
+        others = [scripted.start(*words) for words in (["status"], ["cancel"], ["say", "hello"], ["--json", "wait"])]
+        ended = [scripted.finish(each) for each in others]
+        assert time.monotonic() - began < 6
+        for done in ended:
+            assert (done.code, done.out) == (3, ""), done
+            assert "does not answer" in done.err
+            assert str(scripted.pid) in done.err  # whom to look at
+        refused = scripted.finish(second)
+        assert refused.code == 11  # who holds the lock keeps the socket
+        assert f"pid {scripted.pid}" in refused.err
+        lost = scripted.finish(waiter, timeout=25)
+        assert time.monotonic() - began < 20
+        assert (lost.code, lost.id) == (12, goal_id)
+        assert "it may still be spoken" in lost.err
+    finally:
+        scripted.thaw()
+    assert scripted.watcher.wait_for_terminal(scripted.request("say", text="length=0", preempt=True)["goal"]["id"])
+    assert [each for each in scripted.watcher.goals() if "hello" in str(scripted.goal(each)["text"])] == []

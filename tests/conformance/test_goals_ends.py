@@ -1,0 +1,226 @@
+"""How goals end when the engine fails, crashes or ignores a stop, and when clients cancel: a scripted engine."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.witness import ends, states
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.support.connection import Message, Wire
+    from tests.support.processes import Talk
+
+#: Seconds within which `status` and `cancel` answer, whatever the engine does.
+ANSWER = 0.1
+
+
+def submit(wire: Wire, text: str, *, wait: bool = False) -> str:
+    """Send a goal and return its id."""
+    reply = wire.request("say", text=text, wait=wait)
+    assert reply["ok"], reply
+    return str(reply["goal"]["id"])
+
+
+def heard(talk: Talk, goal_id: str) -> int:
+    """Return the offset after the last word that was heard of a goal."""
+    return max((int(each["end"]) for each in talk.watcher.words(goal_id)), default=0)
+
+
+def test_row_02_engine_that_fails_in_the_middle_aborts_its_goal_alone(scripted: Talk) -> None:
+    text = "length=0.6 fail=audio_lost message=the_cable_is_out one two three four"
+    done = scripted.run("--json", "say", "--wait", "--", text)
+    goal = json.loads(done.out)
+    assert (done.code, goal["state"], goal["reason"]) == (4, "ABORTED", "audio_lost")
+    assert goal["message"] == "Talk aborted: the cable is out"
+    assert "the cable is out" in done.err
+    assert states(scripted, goal["id"]) == ["PENDING", "ACTIVE", "ABORTED"]
+    assert 0 < len(goal["spoken"]) < len(text)
+    assert goal["spoken"] == text[: heard(scripted, goal["id"])]
+    assert scripted.run("say", "--wait", "battery low").code == 0
+
+
+@pytest.mark.parametrize("end", ["crash", "exit", "exit=3"])
+def test_row_04_engine_process_that_ends_without_a_result_is_replaced(scripted: Talk, end: str) -> None:
+    def attempt() -> None:
+        with scripted.connect() as wire:
+            first = submit(wire, f"length=0.2 {end} and more", wait=True)
+            second = submit(wire, "the next one", wait=True)
+            goal = wire.receive_event("result")["goal"]
+            assert (goal["id"], goal["state"], goal["reason"]) == (first, "ABORTED", "engine_crashed")
+            assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+        watcher = scripted.watcher
+        assert states(scripted, first) == ["PENDING", "ACTIVE", "ABORTED"]
+        word, aborted = watcher.wait_for_word(second), watcher.wait_for(first, "ABORTED")
+        assert_within(watcher.arrived(word) - watcher.arrived(aborted), 0.5, "speaking again after a crash")
+
+    retry_if_late(attempt)
+    assert scripted.running
+
+
+def test_row_05_sentence_that_ends_before_the_stop_has_succeeded(scripted: Talk) -> None:
+    waiter = scripted.start("say", "--wait", "--", "length=20 on-stop=complete words=1")
+    goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
+    scripted.watcher.wait_for_word(goal_id)
+    canceled = scripted.run("cancel", goal_id)
+    assert (canceled.code, canceled.out) == (0, "")  # it ended, but not because of this
+    assert states(scripted, goal_id) == ["PENDING", "ACTIVE", "PREEMPTING", "SUCCEEDED"]
+    assert scripted.finish(waiter).code == 0
+    goal = scripted.goal(goal_id)
+    assert (goal["reason"], goal["by"], goal["message"]) == (None, None, "Talk completed successfully")
+
+
+@pytest.mark.parametrize("how", ["ignore-stop never-ends", "length=20 on-stop=hang"])
+def test_row_06_engine_that_ignores_stop_is_killed(scripted: Talk, how: str) -> None:
+    def attempt() -> None:
+        with scripted.connect() as asker, scripted.connect() as canceler, scripted.connect() as speaker:
+            ended = submit(speaker, "length=0", wait=True)
+            speaker.receive_event("result", timeout=10)
+            goal_id = submit(speaker, f"{how} words=1")
+            following = submit(speaker, "length=0 the next one", wait=True)
+            scripted.watcher.wait_for_word(goal_id)
+            times: dict[str, float] = {"status": 0.0, "cancel": 0.0}
+            began = time.monotonic()
+            canceler.send({"seq": 0, "request": "cancel", "ids": [goal_id]})
+            while scripted.watcher.states(goal_id)[-1] != "PREEMPTED":
+                assert time.monotonic() - began < 2, scripted.watcher.states(goal_id)
+                for request in ("status", "cancel"):
+                    asked = time.monotonic()
+                    reply = asker.request("status") if request == "status" else asker.request("cancel", ids=[ended])
+                    assert reply["ok"]
+                    times[request] = max(times[request], time.monotonic() - asked)
+            silent = scripted.watcher.arrived(scripted.watcher.wait_for(goal_id, "PREEMPTED")) - began
+            reply = canceler.receive()
+            assert reply["canceled"]["id"] == goal_id
+            assert (reply["canceled"]["state"], reply["canceled"]["reason"]) == ("PREEMPTED", "canceled")
+            assert canceler.receive() == {"seq": 0, "ok": True, "count": 1}
+            result = speaker.receive_event("result", timeout=10)["goal"]
+            assert (result["id"], result["state"]) == (following, "SUCCEEDED")
+            assert states(scripted, goal_id) == ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
+            assert silent >= 0.14, "it was killed before the limit"
+            for request, seconds in times.items():
+                assert_within(seconds, ANSWER, request)
+            assert_within(silent, 0.15 + 0.35, "the end of a process that ignores stop")
+
+    retry_if_late(attempt)
+
+
+def test_row_09_each_message_belongs_to_its_own_goal(scripted: Talk) -> None:
+    with scripted.connect() as wire:
+        good = submit(wire, "length=0.2 all is well", wait=True)
+        bad = submit(wire, "fail=audio_device message=no_such_card", wait=True)
+        results = {(each := wire.receive_event("result")["goal"])["id"]: each for _ in range(2)}
+    assert list(results) == [good, bad]
+    assert (results[good]["state"], results[good]["message"]) == ("SUCCEEDED", "Talk completed successfully")
+    assert (results[bad]["state"], results[bad]["message"]) == ("ABORTED", "Talk aborted: no such card")
+    assert results[good]["text"] == "length=0.2 all is well"
+
+
+def test_row_11_cancel_without_an_id_ends_everything(scripted: Talk) -> None:
+    ids = [scripted.run("say", "never-ends", f"number {number}").id for number in range(4)]
+    scripted.watcher.wait_for_word(ids[0])
+    done = scripted.run("cancel")
+    assert (done.code, sorted(done.out.split()), done.err) == (0, sorted(ids), "")
+    assert [scripted.goal(each)["state"] for each in ids] == ["PREEMPTED", "RECALLED", "RECALLED", "RECALLED"]
+    assert {scripted.goal(each)["reason"] for each in ids} == {"canceled"}
+    assert ends(scripted, *ids) == [1, 1, 1, 1]
+    assert states(scripted, ids[1]) == ["PENDING", "RECALLED"]  # never ACTIVE in between
+
+
+def test_row_12_feedback_belongs_to_its_goal_and_comes_before_the_result(make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True)
+    texts = [f"length=0.15 this is goal number {number}" for number in range(4)]
+    with talk.connect() as watching, talk.connect() as one, talk.connect() as two:
+        assert watching.request("watch")["ok"]
+        ids = [submit(wire, text) for wire, text in zip((one, two, one, two), texts, strict=True)]
+        talk.watcher.wait_for(ids[-1], "SUCCEEDED")
+        events: list[Message] = [*watching.events]
+        while not events or events[-1].get("id") != ids[-1] or events[-1].get("state") != "SUCCEEDED":
+            events.append(watching.receive())
+    assert [each["n"] for each in events if "n" in each] == list(range(1, 1 + len(events)))  # nothing was dropped
+    for goal_id, text in zip(ids, texts, strict=True):
+        own = [each for each in events if each.get("id") == goal_id]
+        assert [each.get("state") for each in own] == ["PENDING", "ACTIVE", *[None] * 6, "SUCCEEDED"]
+        words = [each for each in own if each["event"] == "word"]
+        assert [each["word"] for each in words] == text.split()
+        assert all(text[each["start"] : each["end"]] == each["word"] for each in words)
+        assert [each["number"] for each in words] == [1, 2, 3, 4, 5, 6]
+
+
+def test_row_14_nothing_to_cancel_is_success(scripted: Talk) -> None:
+    for words in ([], ["--current"]):
+        done = scripted.run("cancel", *words)
+        assert (done.code, done.out, done.err) == (0, "", "")
+
+
+def test_row_19_ids_that_are_unknown_or_have_ended(scripted: Talk) -> None:
+    ended = scripted.run("say", "--wait", "length=0").id
+    before = scripted.goal(ended)
+    active, pending = (scripted.run("say", f"never-ends {each}").id for each in ("active", "pending"))
+    for words in (["cancel", "none-7"], ["wait", "none-7"], ["status", "none-7"], ["cancel", "--before", "none-7"]):
+        done = scripted.run(*words)
+        assert (done.code, done.out) == (8, ""), done
+        assert "none-7" in done.err
+    unknown_too = scripted.run("wait", active, "none-7")
+    assert unknown_too.code == 8
+    assert unknown_too.seconds < 2, "an unknown id is an error at once"
+    note = scripted.run("cancel", ended)
+    assert (note.code, note.out) == (0, "")
+    assert ended in note.err
+    assert "SUCCEEDED" in note.err
+    assert scripted.goal(ended) == before
+    both = scripted.run("cancel", pending, "none-7")
+    assert (both.code, both.id) == (8, pending)  # the known one is cancelled all the same
+    assert scripted.goal(active)["state"] == "ACTIVE"
+    assert scripted.run("cancel", "--current").id == active
+
+
+def test_row_20_cancel_before_a_goal_ends_exactly_those_up_to_it(scripted: Talk) -> None:
+    with scripted.connect() as wire:
+        ids = [submit(wire, f"never-ends number {number}") for number in range(10)]
+    scripted.watcher.wait_for_word(ids[0])
+    number = ids[6].rpartition("-")[2]
+    done = scripted.run("cancel", "--before", number)  # a number alone means this server's
+    assert (done.code, sorted(done.out.split())) == (0, sorted(ids[:7]))
+    assert [scripted.goal(each)["state"] for each in ids[7:]] == ["ACTIVE", "PENDING", "PENDING"]
+    more = scripted.run("cancel", ids[9].rpartition("-")[2], "--current")  # selectors add up
+    assert sorted(more.out.split()) == sorted([ids[7], ids[9]])
+    assert scripted.goal(ids[8])["state"] == "ACTIVE"
+    assert scripted.run("cancel").id == ids[8]
+
+
+def test_row_32_goals_shorter_than_any_poll_are_seen_in_all_their_states(scripted: Talk) -> None:
+    with scripted.connect() as wire:
+        ids = [submit(wire, "length=0") for _ in range(50)]
+        assert wire.request("wait", ids=ids[-1:])["ok"]
+        wire.receive_event("result", timeout=20)
+    for goal_id in ids:
+        assert states(scripted, goal_id) == ["PENDING", "ACTIVE", "SUCCEEDED"]
+
+
+def test_cancel_that_races_with_the_natural_end_leaves_one_terminal_state_each(scripted: Talk) -> None:
+    with scripted.connect() as speaker, scripted.connect() as canceler:
+        going = threading.Event()
+        ids: list[str] = []
+
+        def cancel() -> None:
+            while not going.is_set():
+                assert canceler.request("cancel", current=True)["ok"]
+
+        thread = threading.Thread(target=cancel)
+        thread.start()
+        try:
+            for _ in range(200):
+                ids.append(submit(speaker, "length=0", wait=True))
+                goal = speaker.receive_event("result")["goal"]
+                assert goal["state"] in {"SUCCEEDED", "PREEMPTED"}
+        finally:
+            going.set()
+            thread.join()
+    assert ends(scripted, *ids) == [1] * 200

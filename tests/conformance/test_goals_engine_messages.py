@@ -1,0 +1,145 @@
+"""Row 44: what an engine says of goals that it was not given, or out of order, is refused and changes nothing."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.witness import ends, states
+from tests.support import processes
+
+if TYPE_CHECKING:
+    import pathlib
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+
+#: An engine process that says what the text of a goal lists: "word=1", "ended=failed:2", "raw=…", each for the goal in
+#: hand or, after a colon, for the one with that number. "stop?" waits for a command.
+ENGINE = """
+import os, sys
+sys.path.insert(0, {root!r})
+from talkcli.engine import protocol
+
+buffer = b""
+
+def commands():
+    global buffer
+    while True:
+        while b"\\n" not in buffer:
+            data = os.read(0, 65536)
+            if not data:
+                sys.exit()
+            buffer += data
+        line, _, buffer = buffer.partition(b"\\n")
+        yield protocol.decode_command(line)
+
+def send(event):
+    os.write(0, protocol.encode(event))
+
+def does(word, said):
+    what, _, goal_id = word.partition(":")
+    name, _, value = what.partition("=")
+    goal_id = said.id.rpartition("-")[0] + "-" + goal_id if goal_id else said.id
+    if name == "started":
+        send(protocol.Started(goal_id))
+    elif name == "alive":
+        send(protocol.Alive(goal_id))
+    elif name == "ready":
+        send(protocol.Ready("scripted", "again", "none"))
+    elif name == "word":
+        send(protocol.Word(goal_id, 0, int(value), 1, 0.0))
+    elif name == "ended":
+        send(protocol.Ended(goal_id, value, "engine_failed", "out of order", 1.0))
+    elif name == "raw":
+        os.write(0, value.encode() + b"\\n")
+    elif name == "stop?":
+        assert isinstance(next(arriving), protocol.Stop)
+
+arriving = commands()
+for command in arriving:
+    if isinstance(command, protocol.Configure):
+        send(protocol.Ready("scripted", None, None))
+        send(protocol.Voices(()))
+    elif isinstance(command, protocol.Say):
+        for word in command.text.split():
+            does(word, command)
+    elif isinstance(command, protocol.Quit):
+        sys.exit()
+"""
+SERVE = """
+import sys
+sys.path.insert(0, {root!r})
+from talkcli.cli import main
+from talkcli.engine import spawn
+
+spawn.engine_command = lambda: [sys.executable, {engine!r}]
+sys.argv = ["talk", "serve", *sys.argv[1:]]
+main()
+"""
+
+
+@pytest.fixture
+def talk(make_talk: MakeTalk, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Talk:
+    engine, serve = tmp_path / "engine.py", tmp_path / "serve.py"
+    engine.write_text(ENGINE.format(root=ROOT))
+    serve.write_text(SERVE.format(root=ROOT, engine=str(engine)))
+    monkeypatch.setattr(processes, "_SCRIPTED", str(serve))
+    return make_talk(scripted=True)
+
+
+def test_row_44_messages_for_goals_that_are_not_active_change_nothing(talk: Talk) -> None:
+    others = ("1", "3", "99")  # one that has ended, one that is pending, one that nobody knows
+    strange = " ".join(
+        f"started:{other} alive:{other} word=7:{other} ended={outcome}:{other}"
+        for other, outcome in itertools.product(others, ("completed", "failed", "stopped"))
+    )
+    with talk.connect() as wire:
+        texts = ["ended=completed", f"{strange} started word=3 stop?", "started ended=completed"]
+        first, active, pending = (wire.request("say", text=text)["goal"]["id"] for text in texts)
+        talk.watcher.wait_for_word(active)
+        assert talk.goal(first)["state"] == "SUCCEEDED"
+        assert [talk.goal(each)["state"] for each in (active, pending)] == ["ACTIVE", "PENDING"]
+        assert talk.goal(active)["spoken"] == "sta"
+        assert wire.request("cancel", ids=[pending])["ok"]
+    assert states(talk, first) == ["PENDING", "ACTIVE", "SUCCEEDED"]
+    assert states(talk, pending) == ["PENDING", "RECALLED"]
+    assert talk.watcher.words(first) == talk.watcher.words(pending) == []
+
+
+@pytest.mark.parametrize("outcome", ["completed", "failed", "stopped"])
+def test_row_44_what_comes_after_the_end_changes_nothing(talk: Talk, outcome: str) -> None:
+    with talk.connect() as wire:
+        text = f"started word=5 ended=completed ended={outcome} word=7 started alive ended=failed ready"
+        goal_id = wire.request("say", text=text, wait=True)["goal"]["id"]
+        goal = wire.receive_event("result")["goal"]
+        following = wire.request("say", text="started ended=completed", wait=True)["goal"]["id"]
+        assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+    assert goal["state"] == "SUCCEEDED"
+    assert talk.goal(goal_id) == goal
+    assert len(talk.watcher.words(goal_id)) == 1
+    assert ends(talk, goal_id, following) == [1, 1]
+
+
+def test_row_44_a_goal_that_nobody_stopped_cannot_have_been_stopped(talk: Talk) -> None:
+    with talk.connect() as wire:
+        goal_id = wire.request("say", text="started ended=stopped", wait=True)["goal"]["id"]
+        goal = wire.receive_event("result")["goal"]
+    assert (goal["state"], goal["reason"]) == ("ABORTED", "engine_failed")
+    assert states(talk, goal_id) == ["PENDING", "ACTIVE", "ABORTED"]
+
+
+def test_row_44_an_engine_that_says_what_is_no_message_takes_nothing_along(talk: Talk) -> None:
+    lines = ("no-json", "[]", "{}", '{"kind":"sing"}', '{"kind":"word","id":7}', "\x01", '{"kind":"ended"}')
+    with talk.connect() as wire:
+        for line in lines:
+            goal_id = wire.request("say", text=f"started raw={line} ended=completed", wait=True)["goal"]["id"]
+            assert wire.receive_event("result", timeout=10)["goal"]["state"] in {"SUCCEEDED", "ABORTED"}
+            following = wire.request("say", text="started ended=completed", wait=True)["goal"]["id"]
+            assert wire.receive_event("result", timeout=10)["goal"]["state"] == "SUCCEEDED"
+            assert ends(talk, goal_id, following) == [1, 1]

@@ -1,0 +1,132 @@
+"""Row 13: texts that cannot be spoken, by every way in; and texts that are spoken as they are."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.rawsocket import Raw
+
+if TYPE_CHECKING:
+    from tests.support.processes import Finished, Talk
+
+INVALID = {
+    "empty": "",
+    "blanks": " \t\n\u3000 ",
+    "only a zero-width space": "\u200b",
+    "only controls": "\x07\x1b",
+    "NUL": "battery\0low",
+    "half of a surrogate pair": "battery \ud83d low",
+}
+TOO_LONG = {"10,001 characters": "a" * 10_001, "10,001 wide characters": "é" * 10_001}
+WHOLE = ["a" * 10_000, "😀" * 10_000, "😀 low", 'it\'s "$(touch hacked)"; `id`\n& done']
+
+
+class Bystanders:
+    """A goal that is spoken and one that would be preempted by the next: none may notice a goal that is REJECTED."""
+
+    def __init__(self, talk: Talk) -> None:
+        self._talk = talk
+        with talk.connect() as wire:
+            texts = {"active": "never-ends", "pending": "never-ends pending"}
+            self.ids = {name: str(wire.request("say", text=text)["goal"]["id"]) for name, text in texts.items()}
+        talk.watcher.wait_for_word(self.ids["active"])
+
+    def assert_untouched(self) -> None:
+        active, pending = (self._talk.goal(self.ids[each]) for each in ("active", "pending"))
+        assert (active["state"], pending["state"]) == ("ACTIVE", "PENDING")
+
+    def assert_only_these_were_active(self) -> None:
+        active = {each["id"] for each in self._talk.watcher.events() if each.get("state") == "ACTIVE"}
+        assert active == {self.ids["active"]}
+
+
+def assert_rejected(done: Finished, reason: str) -> None:
+    """Assert what a client says whose goal was REJECTED."""
+    goal = json.loads(done.out)
+    assert (done.code, goal["state"], goal["reason"]) == (5, "REJECTED", reason), done
+    assert "Talk rejected: " in done.err
+
+
+@pytest.mark.parametrize("preempt", [False, True])
+def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_wire(scripted: Talk, preempt: bool) -> None:
+    bystanders = Bystanders(scripted)
+    cases = [(name, text, "invalid_text") for name, text in INVALID.items()]
+    cases += [(name, text, "text_too_long") for name, text in TOO_LONG.items()]
+    with Raw(scripted.socket) as raw:
+        raw.receive_lines(1)
+        for number, (name, text, reason) in enumerate(cases):
+            request = {"seq": number, "request": "say", "text": text, "wait": True, "preempt": preempt}
+            raw.send(json.dumps(request).encode() + b"\n")
+            reply, state, result = raw.receive_lines(1 + 3 * (number + 1))[-3:]
+            assert reply["seq"] == number
+            assert reply["ok"], name
+            for goal in (reply["goal"], result["goal"]):
+                assert (goal["state"], goal["reason"]) == ("REJECTED", reason), name
+                assert goal["message"].startswith("Talk rejected: "), name
+                assert goal["started_at"] is None
+                assert goal["text"] == text
+            assert (state["event"], state["state"]) == ("state", "REJECTED")
+            bystanders.assert_untouched()
+    bystanders.assert_only_these_were_active()
+
+
+def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_command_line(scripted: Talk) -> None:
+    bystanders = Bystanders(scripted)
+    for text in ("", "  ", "\u200b", "battery \udcff low"):  # the last is a byte that is no UTF-8, as Python shows it
+        assert_rejected(scripted.run("--json", "say", "--preempt", "--wait", "--", text), "invalid_text")
+    for text in ("", "\n", "\u200b\r\n", "battery\0low"):
+        assert_rejected(scripted.run("--json", "say", "--preempt", "-", stdin=text), "invalid_text")
+    for text in ("a " * 50_000, "é" * 50_000, "a" * 10_001):
+        assert_rejected(scripted.run("--json", "say", "--preempt", "-", stdin=text), "text_too_long")
+        assert_rejected(scripted.run("--json", "say", "--preempt", text), "text_too_long")
+    plain = scripted.run("say", "--preempt", "--wait", "--", "")
+    assert (plain.code, plain.out) == (5, "")  # no id: there is nothing to wait for
+    assert plain.err.endswith("Talk rejected: the text is empty\n")
+    bystanders.assert_untouched()
+    bystanders.assert_only_these_were_active()
+
+
+def test_row_13_bytes_on_standard_input_that_are_no_utf8_are_rejected(scripted: Talk) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "talkcli", "--json", "say", "-"],
+        input=b"battery \xff low",
+        env=scripted.env,
+        capture_output=True,
+        timeout=20,
+        check=False,
+    )
+    goal = json.loads(done.stdout)
+    assert (done.returncode, goal["state"], goal["reason"]) == (5, "REJECTED", "invalid_text")
+    assert b"not valid UTF-8" in done.stderr
+    assert "ACTIVE" not in {each.get("state") for each in scripted.watcher.events()}
+
+
+def test_row_13_100_kilobytes_on_the_wire_are_refused_and_do_nothing(scripted: Talk) -> None:
+    bystanders = Bystanders(scripted)
+    with Raw(scripted.socket) as raw:
+        raw.send(json.dumps({"request": "say", "text": "a" * 100_000, "preempt": True}).encode() + b"\n")
+        _, reply = raw.receive_all()
+    assert (reply["ok"], reply["error"]["code"]) == (False, "line_too_long")
+    bystanders.assert_untouched()
+    bystanders.assert_only_these_were_active()
+
+
+def test_row_13_a_format_that_is_not_known_is_rejected(scripted: Talk) -> None:
+    goal = scripted.request("say", text="<speak>hello</speak>", format="ssml")["goal"]
+    assert (goal["state"], goal["reason"]) == ("REJECTED", "bad_option")
+
+
+def test_whole_texts_are_spoken_as_they_are(scripted: Talk) -> None:
+    for text in WHOLE:
+        by_wire = scripted.request("say", text=text)["goal"]
+        by_input = json.loads(scripted.run("--json", "say", "--wait", "-", stdin=f"{text}\n").out)
+        by_words = json.loads(scripted.run("--json", "say", "--wait", "--", text).out)
+        for goal in (scripted.goal(by_wire["id"]), by_input, by_words):
+            assert (goal["state"], goal["text"], goal["spoken"]) == ("SUCCEEDED", text, text)
+    assert not os.path.exists("hacked")

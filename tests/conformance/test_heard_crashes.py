@@ -1,0 +1,183 @@
+"""Processes that die or freeze in mid-sentence: it is silent, the goal's end is true, and the next one is heard."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.hearing import (
+    HOME,
+    LONG,
+    LOW,
+    assert_aborted,
+    assert_same,
+    begin,
+    begin_with_client,
+    engine_process,
+    heard,
+    player_process,
+    send,
+)
+from tests.conformance.stopped import DROPPED, assert_heard_after_stop
+from tests.support.compare import assert_begun, assert_heard, compare, time_heard
+from tests.support.reference import render
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from tests.conformance.hearing import Samples
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+    from tests.support.recording import Recording
+    from tests.support.sink import Sink
+
+#: Seconds, at 400 words per minute, that a text takes which a library spells out instead of crashing.
+SPELLED = 90
+CRASHING = {"initials": "a." * 85, "abbreviations": "e.g. " * 60, "address": "http://" + "x." * 100}
+
+
+@pytest.mark.parametrize("text", CRASHING.values(), ids=CRASHING.keys())
+def test_a_text_that_crashes_the_library_leaves_the_others_their_voice(
+    make_talk: MakeTalk, sink: Sink, text: str
+) -> None:
+    talk = make_talk("--rate", "400", sink=sink)
+    assert talk.run("say", "--wait", "--", LOW).code == 0
+    assert_same(heard(talk), render([LOW], rate=400)[0])
+    bad = talk.run("say", "--wait", "--", text, timeout=SPELLED)
+    ended = talk.goal(bad.id)
+    aborted = ended["state"] == "ABORTED"
+    if aborted:
+        assert_aborted(ended, "engine_crashed", "SIG")
+        assert (bad.code, ended["message"] in bad.err) == (4, True)
+    else:
+        assert (ended["state"], bad.code) == ("SUCCEEDED", 0)
+    with sink.record() as recording:
+        assert talk.run("say", "--wait", "--", HOME).code == 0
+    assert_same(recording.samples, render([HOME] if aborted else [LOW, text, HOME], rate=400)[-1])
+    assert talk.watcher.states(bad.id)[-1] == ended["state"]
+    with talk.connect() as wire:
+        assert wire.greeting["pid"] == talk.pid
+
+
+def test_a_killed_server_is_silent_and_the_next_one_speaks(talk: Talk, sink: Sink) -> None:
+    reference, following = render([LONG])[0], render([LOW])[0]
+
+    def attempt() -> None:
+        with sink.record() as recording:
+            goal, client = begin_with_client(talk, LONG)
+            killed = time.monotonic()
+            talk.kill(gone_within=0.3)
+            lost = talk.finish(client)
+            last = recording.wait_until_quiet()
+        assert (lost.code, lost.id) == (12, goal)
+        assert_begun(recording, reference, shortest=0.2)
+        assert os.path.lexists(talk.socket), "no stale socket is left, which the next server has to cope with"
+        began = time.monotonic()
+        talk.start_server()
+        served = time.monotonic() - began
+        with sink.record() as recording:
+            assert talk.run("say", "--wait", "--", LOW).code == 0
+        assert_same(recording.samples, following)
+        assert last is not None
+        assert_within(last - killed, 0.3, "the silence after the server was killed")
+        assert_within(served, 1, "the start after the server was killed")
+
+    retry_if_late(attempt)
+
+
+def test_a_killed_engine_is_replaced_within_half_a_second(talk: Talk, sink: Sink) -> None:
+    reference, following = render([LONG])[0], render([LOW])[0]
+
+    def attempt() -> None:
+        with sink.record() as recording:
+            goal, client = begin_with_client(talk, LONG)
+            next_goal = send(talk, LOW)
+            killed = time.monotonic()
+            os.kill(engine_process(talk), signal.SIGKILL)
+            assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
+            assert talk.watcher.wait_for_terminal(next_goal) == "SUCCEEDED"
+            done = talk.finish(client)
+        ended = talk.goal(goal)
+        assert_aborted(ended, "engine_crashed", "the engine crashed: it was killed by SIGKILL")
+        assert (done.code, ended["message"] in done.err) == (4, True)
+        assert ended["spoken"].startswith("two three")
+        assert ended["spoken"] != LONG
+        start, began = _began(recording, following)
+        assert_begun(recording.samples[:start], reference, shortest=0.2)
+        assert_within(began - killed, 0.5, "the next goal after a crash")
+
+    retry_if_late(attempt)
+
+
+def test_a_killed_engine_that_was_idle_is_replaced_within_half_a_second(talk: Talk, sink: Sink) -> None:
+    (reference,) = render([LOW])
+
+    def attempt() -> None:
+        assert talk.run("voices").code == 0  # they are known when it is ready, and has nothing to do
+        killed = time.monotonic()
+        os.kill(engine_process(talk), signal.SIGKILL)
+        with sink.record() as recording:
+            assert talk.run("say", "--wait", "--", LOW).code == 0
+        compared = assert_same(recording.samples, reference)
+        assert_within(time_heard(recording, compared, reference, 0) - killed, 0.5, "the next goal after a crash")
+
+    retry_if_late(attempt)
+
+
+def test_a_killed_player_aborts_its_goal_and_no_other(talk: Talk) -> None:
+    engine = engine_process(talk)
+    goal, client = begin_with_client(talk, LONG)
+    os.kill(player_process(talk), signal.SIGKILL)
+    done = talk.finish(client)
+    ended = talk.goal(goal)
+    assert_aborted(ended, "audio_lost", "killed by SIGKILL")
+    assert (done.code, ended["message"] in done.err) == (4, True)
+    assert ended["spoken"].startswith("two three")
+    assert ended["spoken"] != LONG
+    assert talk.run("say", "--wait", "--", LOW).code == 0
+    assert engine_process(talk) == engine
+    assert_heard_after_stop(heard(talk), LONG, [LOW])
+
+
+def test_a_frozen_engine_is_replaced_within_six_seconds(talk: Talk, sink: Sink) -> None:
+    (following,) = render([LOW])
+
+    def attempt() -> None:
+        with sink.record() as recording:
+            goal = begin(talk, LONG)
+            next_goal = send(talk, LOW)
+            frozen = time.monotonic()
+            os.kill(engine_process(talk), signal.SIGSTOP)
+            assert talk.watcher.wait_for_terminal(goal, 10) == "ABORTED"
+            assert talk.watcher.wait_for_terminal(next_goal, 10) == "SUCCEEDED"
+        ended = talk.goal(goal)
+        assert_aborted(ended, "engine_hung", "the engine gave no sign of life for 3 s")
+        assert ended["spoken"].startswith("two three")
+        assert ended["spoken"] != LONG
+        _, began = _began(recording, following)
+        assert_within(began - frozen, 6, "the next goal after a hang")
+
+    retry_if_late(attempt)
+
+
+def test_a_frozen_engine_is_killed_by_a_cancel(talk: Talk, sink: Sink) -> None:
+    goal = begin(talk, LONG)
+    os.kill(engine_process(talk), signal.SIGSTOP)
+    canceled = talk.run("cancel", goal)
+    assert (canceled.code, canceled.id) == (0, goal)
+    assert talk.goal(goal)["state"] == "PREEMPTED"
+    assert talk.goal(goal)["reason"] == "canceled"
+    with sink.record() as recording:
+        assert talk.run("say", "--wait", "--", LOW).code == 0
+    assert_same(recording.samples, render([LOW])[0])
+
+
+def _began(recording: Recording, whole: Samples) -> tuple[int, float]:
+    """Assert that a sentence was heard whole, and last; return the sample and the time at which its sound begins."""
+    samples = recording.samples
+    start = max(0, compare(samples, whole).offset - DROPPED)
+    assert_heard(samples[start:], [whole])
+    return start, recording.time_of(start)

@@ -1,0 +1,163 @@
+"""No player, no device, a device that is lost or frozen: never SUCCEEDED, always the error, heard when it is back."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.hearing import (
+    HOME,
+    LONG,
+    LOW,
+    assert_aborted,
+    begin_with_client,
+    heard,
+)
+from tests.conformance.stopped import assert_heard_after_stop
+from tests.support.compare import assert_begun, assert_silent
+from tests.support.reference import render
+from tests.support.sink import Sink
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    import pathlib
+    import subprocess
+    from collections.abc import Callable
+
+    from tests.conftest import MakeTalk
+    from tests.support.connection import Message
+    from tests.support.processes import Finished, Talk
+
+ABORTED = ["PENDING", "ACTIVE", "ABORTED"]
+#: Where ALSA finds no card.
+NO_CARD = "pcm.!default { type hw card 31 }\nctl.!default { type hw card 31 }\n"
+
+
+def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
+    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path
+) -> None:
+    talk = make_talk(sink=sink, env={"PATH": str(tmp_path)})
+    goal = _aborted(talk, talk.run("say", "--wait", "--", LOW))
+    assert_aborted(goal, "no_player", "no player found: install alsa-utils (aplay)", "pulseaudio-utils (pacat)")
+    assert goal["spoken"] == ""
+    aplay = shutil.which("aplay")
+    assert aplay
+    (tmp_path / "aplay").symlink_to(aplay)
+    assert talk.run("say", "--wait", "--", HOME).code == 0
+    assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False)
+
+
+def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
+    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path
+) -> None:
+    configuration = tmp_path / ".asoundrc"
+
+    def attempt() -> None:
+        configuration.write_text(NO_CARD)
+        talk = make_talk(sink=sink, env={"HOME": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"})
+        done = talk.run("say", "--wait", "--", LOW)
+        goal = _aborted(talk, done)
+        assert_aborted(goal, "audio_device", "aplay: audio open error: No such file or directory")
+        assert goal["spoken"] == ""
+        shutil.copy(os.path.join(sink.directory, ".asoundrc"), configuration)
+        assert talk.run("say", "--wait", "--", HOME).code == 0
+        assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False)
+        assert_within(done.seconds, 1, "`say --wait` without a device")
+
+    retry_if_late(attempt)
+
+
+@pytest.mark.parametrize(
+    ("player", "line"),
+    [("aplay", "aplay: audio open error: No such file or directory"), ("pacat", "No such entity")],
+)
+def test_row_41_a_device_of_another_name_is_told(make_talk: MakeTalk, sink: Sink, player: str, line: str) -> None:
+    talk = make_talk("--player", player, "--device", "nonesuch", sink=sink)
+    assert_aborted(_aborted(talk, talk.run("say", "--wait", "--", LOW)), "audio_device", line)
+    assert_silent(heard(talk))
+
+
+def test_row_41_a_device_that_is_lost_in_mid_sentence(make_talk: MakeTalk, private_sink: Callable[[], Sink]) -> None:
+    sink = private_sink()
+    talk = make_talk(sink=sink)
+    _, client = begin_with_client(talk, LONG)
+    sink.unload()
+    _lost(talk, client)
+    sink.reload()
+    _heard_again(talk, sink, LONG)
+
+
+def test_row_41_a_sound_server_that_is_killed_in_mid_sentence(
+    make_talk: MakeTalk, private_sink: Callable[[], Sink]
+) -> None:
+    sink = private_sink()
+    talk = make_talk(sink=sink)
+    _, client = begin_with_client(talk, LONG)
+    sink.kill_server()
+    _lost(talk, client)
+    without = make_talk(sink=sink)
+    goal = _aborted(without, without.run("say", "--wait", "--", LOW))
+    assert_aborted(goal, "audio_device", "aplay: audio open error: Connection refused")
+    sink.start_server()
+    _heard_again(talk, sink, LONG)
+    _heard_again(without, sink, LOW)
+
+
+@pytest.mark.parametrize(
+    ("hold", "let_go"), [(Sink.suspend, Sink.resume), (Sink.freeze, Sink.thaw)], ids=["suspended", "frozen"]
+)
+def test_row_41_a_sink_that_takes_no_sound_in_mid_sentence(
+    make_talk: MakeTalk,
+    private_sink: Callable[[], Sink],
+    hold: Callable[[Sink], None],
+    let_go: Callable[[Sink], None],
+) -> None:
+    sink = private_sink()
+
+    def attempt() -> None:
+        talk = make_talk(sink=sink)
+        _, client = begin_with_client(talk, LONG)
+        hold(sink)
+        held = time.monotonic()
+        done = talk.finish(client)
+        ended = time.monotonic()
+        let_go(sink)
+        goal = _aborted(talk, done)
+        assert_aborted(goal, "audio_stalled", "aplay took no sound for 3 s")
+        assert goal["spoken"].startswith("two three")
+        assert goal["spoken"] != LONG
+        assert talk.run("say", "--wait", "--", HOME).code == 0
+        # What the sound server had when it was frozen is heard when it goes on, so all of it is looked at here.
+        assert_heard_after_stop(heard(talk), LONG, [HOME])
+        # 3 s after it took something the last time, which the engine may have seen half a second later.
+        assert_within(ended - held, 4, "the end of a goal whose sink takes no sound")
+
+    retry_if_late(attempt)
+
+
+def _aborted(talk: Talk, done: Finished) -> Message:
+    """Assert that a client's goal was ABORTED and that the client told so; return the goal."""
+    goal = talk.goal(done.id)
+    assert (done.code, talk.watcher.states(done.id)) == (4, ABORTED), done
+    assert goal["message"] in done.err, done
+    return goal
+
+
+def _lost(talk: Talk, client: subprocess.Popen[str]) -> None:
+    """Assert of a client whose goal, the server's first, was LONG: it ended in mid-sentence, as the sound did."""
+    goal = _aborted(talk, talk.finish(client))
+    assert_aborted(goal, "audio_lost", "aplay: ", "error: Input/output error")
+    assert goal["spoken"].startswith("two three")
+    assert goal["spoken"] != LONG
+    assert_begun(talk.recording, render([LONG])[0], shortest=0.2)
+
+
+def _heard_again(talk: Talk, sink: Sink, failed: str) -> None:
+    """Assert that the next goal is heard whole, after the first one of a server failed."""
+    with sink.record() as recording:
+        assert talk.run("say", "--wait", "--", HOME).code == 0
+    assert_heard_after_stop(recording, failed, [HOME], begun=False)

@@ -1,0 +1,148 @@
+"""Sentences that are spoken: what is heard is what libespeak-ng makes of them, in the order in which they were sent."""
+
+from __future__ import annotations
+
+import os
+import time
+import wave
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_same, heard, send
+from tests.support.compare import EXTENT, assert_heard, assert_silent
+from tests.support.reference import RATE, render
+
+if TYPE_CHECKING:
+    import pathlib
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
+
+
+def test_row_01_a_goal_is_spoken_and_its_end_is_told(talk: Talk) -> None:
+    done = talk.run("say", "--wait", "--", LOW)
+    assert (done.code, done.err) == (0, "")
+    goal = talk.goal(done.id)
+    assert (goal["state"], goal["message"]) == ("SUCCEEDED", "Talk completed successfully")
+    assert (goal["reason"], goal["spoken"]) == (None, LOW)
+    assert talk.watcher.states(done.id) == SPOKEN
+    (reference,) = render([LOW])
+    assert goal["duration"] == pytest.approx(len(reference) / RATE, abs=0.001)
+    assert_heard(heard(talk), [reference])
+
+
+def test_done_when_the_first_sentence_of_a_server_is_espeak_ngs_own(talk: Talk) -> None:
+    """A correlation above 0.95, and a length within 20 ms."""
+    assert talk.run("say", LOW, "--wait").code == 0
+    (compared,) = assert_heard(heard(talk), render([LOW]))
+    assert compared.correlation > 0.95
+    assert abs(compared.heard - compared.expected) <= EXTENT
+
+
+def test_row_23_goals_are_spoken_in_the_order_in_which_they_came(talk: Talk) -> None:
+    texts = [HELP, LOW, HOME]
+    sent = [talk.run("say", "--", text).id for text in texts]
+    done = talk.run("wait", *sent)
+    assert (done.code, done.err) == (0, "")
+    for each in sent:
+        assert talk.watcher.states(each) == SPOKEN
+    assert_heard(heard(talk), render(texts))
+
+
+def test_row_18_a_pending_goal_that_is_cancelled_is_never_spoken(talk: Talk) -> None:
+    texts = [HELP, LOW, "never to be heard", HOME]
+    active, first, second, third = [send(talk, text) for text in texts]
+    talk.watcher.wait_for_word(active)
+    canceled = talk.run("cancel", second)
+    assert (canceled.code, canceled.id, canceled.err) == (0, second, "")
+    assert talk.goal(active)["state"] == "ACTIVE"
+    assert talk.watcher.states(second) == ["PENDING", "RECALLED"]
+    goal = talk.goal(second)
+    assert (goal["state"], goal["reason"]) == ("RECALLED", "canceled")
+    assert talk.watcher.wait_for_terminal(third, 10) == "SUCCEEDED"
+    assert talk.watcher.states(active) == talk.watcher.states(first) == SPOKEN
+    del texts[2]
+    assert_heard(heard(talk), render(texts))
+
+
+@pytest.fixture
+def empty(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathlib.Path:
+    """An empty directory, the one in which server and clients run."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_row_30_a_text_is_spoken_and_never_executed(make_talk: MakeTalk, sink: Sink, empty: pathlib.Path) -> None:
+    texts = [
+        "$(touch x)",
+        "`touch x`",
+        "low; touch x",
+        "low | touch x & touch y",
+        "it's \"touch x\" '; touch x; '",
+        "one\ntouch x\ntwo",
+        "hello \U0001f600 %s %n \\n",
+        "-5",
+    ]
+    talk = make_talk("--rate", "400", sink=sink)
+    for text, reference in zip(texts, render(texts, rate=400), strict=True):
+        with sink.record() as recording:
+            done = talk.run("say", "--wait", "--", text)
+            recording.wait_until_quiet(0.1)
+        assert (done.code, done.err) == (0, ""), text
+        assert talk.goal(done.id)["text"] == text
+        assert_same(recording.samples, reference)
+    assert os.listdir(empty) == []
+
+
+def test_row_30_words_are_joined_and_a_misspelt_option_is_not_spoken(talk: Talk) -> None:
+    refused = talk.run("say", "--wiat", LOW)
+    assert (refused.code, refused.out) == (2, "")
+    assert "talk say -- " in refused.err
+    assert talk.run("say", "--wait", *LOW.split()).code == 0
+    assert_heard(heard(talk), render([LOW]))
+
+
+def test_the_wheels_library_speaks_where_the_system_has_none(
+    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("espeakng_loader")
+    # The loader finds this first and can't load it; the reference rendering comes from the wheel then, too.
+    (tmp_path / "libespeak-ng.so.1").touch()
+    monkeypatch.setenv("LD_LIBRARY_PATH", str(tmp_path))
+    talk = make_talk(sink=sink)
+    assert talk.run("say", "--wait", "--", LOW).code == 0
+    assert "(espeakng-loader)" in talk.log
+    assert_same(heard(talk), render([LOW])[0])
+
+
+def test_pacat_plays_a_sentence(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = make_talk("--player", "pacat", sink=sink)
+    assert talk.run("say", "--wait", "--", LOW).code == 0
+    assert talk.run("say", "--wait", "--", HOME).code == 0
+    assert_heard(heard(talk), render([LOW, HOME]))
+
+
+def test_a_file_gets_every_sample_and_nothing_is_heard(make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "speech.wav"
+    talk = make_talk("--player", f"file:{path}", sink=sink)
+    for text in (LONG, LOW):
+        assert talk.run("say", "--wait", "--", text).code == 0
+    with wave.open(str(path)) as file:
+        assert (file.getframerate(), file.getnchannels(), file.getsampwidth()) == (RATE, 1, 2)
+        written = np.frombuffer(file.readframes(file.getnframes()), "<i2")
+    assert np.array_equal(written, np.concatenate(render([LONG, LOW])))
+    assert_silent(heard(talk))
+
+
+def test_the_null_player_takes_as_long_as_the_sentence_and_nothing_is_heard(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = make_talk("--player", "null", sink=sink)
+    began = time.monotonic()
+    assert talk.run("say", "--wait", "--", HELP).code == 0
+    took = time.monotonic() - began
+    assert took >= len(render([HELP])[0]) / RATE
+    assert_silent(heard(talk))

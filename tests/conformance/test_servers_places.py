@@ -1,0 +1,110 @@
+"""Server and client meet in one place, whatever the environment of each has; and what a server says at its start."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.bareserve import TALK, environment, run, serving
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.conftest import MakeTalk
+
+#: Says where platformdirs would put the socket, and where a client looks.
+PLACES = """
+import json, os, warnings
+warnings.simplefilter("ignore")
+import platformdirs
+from talkcli import paths
+place = platformdirs.PlatformDirs("talk", appauthor=False).user_runtime_dir
+print(json.dumps([os.path.join(place, paths.SOCKET), paths.client_sockets(None)]))
+"""
+ENVIRONMENTS = {
+    "a runtime directory": {"XDG_RUNTIME_DIR": "{home}/run"},
+    "none": {},
+    "none, another temporary directory": {"TMPDIR": "{home}/tmp"},
+    "none, no temporary directory named": {"TMPDIR": ""},
+    "one that is not there": {"XDG_RUNTIME_DIR": "{home}/gone"},
+    "an empty name": {"XDG_RUNTIME_DIR": ""},
+}
+
+
+@pytest.fixture
+def home() -> Iterator[str]:
+    with short_directory() as path:
+        for name in ("run", "tmp"):
+            os.mkdir(f"{path}/{name}", 0o700)
+        yield path
+
+
+def filled(home: str, name: str) -> dict[str, str]:
+    return environment(home, **{key: value.format(home=home) for key, value in ENVIRONMENTS[name].items()})
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_client_looks_where_platformdirs_puts_the_socket(home: str, name: str) -> None:
+    done = run([sys.executable, "-c", PLACES], filled(home, name))
+    place, looked = json.loads(done.out)
+    assert place in looked, done.err
+    assert looked[-1] == "/run/talk/talk.sock"
+    if os.environ.get("XDG_RUNTIME_DIR"):
+        assert looked[0].startswith(home)
+
+
+@pytest.mark.parametrize("name", ["a runtime directory", "none", "none, another temporary directory"])
+def test_server_and_client_meet_without_naming_a_socket(home: str, name: str) -> None:
+    env = filled(home, name)
+    if "XDG_RUNTIME_DIR" not in env and os.path.isdir(f"/run/user/{os.getuid()}"):
+        pytest.skip("this user has a runtime directory, which is the place then, and not the test's")
+    with serving(env) as server:
+        assert f"ready on {home}/" in server.log
+        assert run([*TALK, "say", "--wait", "hello"], env).code == 0
+        second = run([*TALK, "serve", "--player", "null"], env)
+        assert second.code == 11
+        assert f"pid {server.process.pid}" in second.err
+        if name == "a runtime directory":
+            # As cron and ssh start a client, and as a second server would be started from there: not found there.
+            assert run([*TALK, "status"], environment(home)).code == 3
+    assert run([*TALK, "status"], env).code == 3
+
+
+def test_error_names_every_place_in_its_order(home: str) -> None:
+    os.makedirs(f"{home}/run/talk", 0o700)
+    done = run([*TALK, "status"], environment(home, XDG_RUNTIME_DIR=f"{home}/run"))
+    places = [line.strip().partition(": ")[0] for line in done.err.splitlines() if line.startswith("  ")]
+    uid = os.getuid()
+    assert places[:2] == [f"{home}/run/talk/talk.sock", f"/run/user/{uid}/talk/talk.sock"]
+    assert places[-1] == "/run/talk/talk.sock"
+    assert f"{home}/runtime-{uid}/talk/talk.sock" in places
+    assert done.code == 3
+
+
+def test_system_service_serves_in_the_directory_that_systemd_made(home: str) -> None:
+    with serving(environment(home, RUNTIME_DIRECTORY=f"{home}/run")) as server:
+        assert f"ready on {home}/run/talk.sock" in server.log
+
+
+@pytest.mark.parametrize(("wanted", "near"), [("en-uss", "'en-us'"), ("English", "'English ("), ("germn", "'German'")])
+def test_voice_that_is_not_known_ends_the_server_with_2(home: str, wanted: str, near: str) -> None:
+    done = run([*TALK, "serve", "--player", "null", "--socket", f"{home}/s", "--voice", wanted], environment(home))
+    assert (done.code, done.out) == (2, "")
+    assert f'"{wanted}"' in done.err
+    assert near in done.err
+    assert not os.path.exists(f"{home}/s")
+
+
+def test_greeting_is_spoken_at_the_start(make_talk: MakeTalk) -> None:
+    talk = make_talk("--greeting", "length=0 at your service", scripted=True, watched=False)
+    with talk.connect() as wire:
+        goal_id = f"{wire.greeting['boot']}-1"
+        assert wire.request("wait", ids=[goal_id])["ok"]
+        goal = wire.receive_event("result")["goal"]
+    assert (goal["state"], goal["text"]) == ("SUCCEEDED", "length=0 at your service")
+    assert goal["client"]["pid"] == talk.pid

@@ -1,0 +1,80 @@
+"""Servers that are started twice, or again: one serves a socket, and ids from before mean nothing to the next."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from typing import TYPE_CHECKING
+
+from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run
+from tests.support import processes
+from tests.support.connection import Wire
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from tests.support.processes import Talk
+
+
+def test_row_45_of_two_servers_started_at_once_exactly_one_serves() -> None:
+    scripted = [SERVE[0], processes._SCRIPTED]  # the start of an engine is not what is tested
+    with short_directory() as home:
+        env = environment(home, TALK_SOCKET=f"{home}/s")
+        for attempt in range(20):
+            servers = [BareServe(scripted, env) for _ in range(2)]
+            try:
+                assert sorted(each.serves() for each in servers) == [False, True], f"attempt {attempt}"
+                loser, winner = sorted(servers, key=BareServe.serves)
+                assert loser.end() == 11, loser.log
+                assert f"(pid {winner.process.pid}) serves {home}/s already" in loser.log
+                with Wire(f"{home}/s") as wire:
+                    assert wire.greeting["pid"] == winner.process.pid
+                assert winner.end(signal.SIGTERM) == 0, f"attempt {attempt}: {winner.log}"
+                assert not os.path.exists(f"{home}/s")
+            finally:
+                for each in servers:
+                    each.close()
+
+
+def test_second_server_says_who_serves_and_takes_nothing_away(scripted: Talk) -> None:
+    for options in ([], ["--socket", scripted.socket], ["--player", "null"]):
+        done = run([*TALK, "serve", *options], scripted.env)
+        assert (done.code, done.out) == (11, "")
+        assert f"pid {scripted.pid}" in done.err
+    assert scripted.run("say", "--wait", "battery low").code == 0
+
+
+def test_row_48_ids_from_before_a_restart_are_unknown(scripted: Talk) -> None:
+    before = [scripted.run("say", "--wait", "length=0").id for _ in range(3)]
+    scripted.stop()
+    scripted.start_server()
+    active, pending = (scripted.run("say", f"never-ends {each}").id for each in ("active", "pending"))
+    scripted.watcher.wait_for_word(active)
+    assert {each.rpartition("-")[0] for each in before} != {active.rpartition("-")[0]}
+    for goal_id in before:
+        for words in (["wait", goal_id], ["cancel", goal_id], ["cancel", "--before", goal_id], ["status", goal_id]):
+            done = scripted.run(*words)
+            assert (done.code, done.out) == (8, ""), done
+    assert [scripted.goal(each)["state"] for each in (active, pending)] == ["ACTIVE", "PENDING"]
+    assert scripted.run("say", "third").code == 0  # "later": no id that comes is one of those from before
+    assert scripted.request("status")["server"]["pending"] == 2
+    assert not set(before) & set(scripted.watcher.goals())
+    assert len(scripted.run("cancel").out.split()) == 3
+
+
+def test_server_that_was_killed_is_followed_by_the_next(scripted: Talk) -> None:
+    scripted.run("say", "never-ends words=1")
+    scripted.watcher.wait_for(None, "ACTIVE")
+    scripted.kill()
+    assert os.path.exists(scripted.socket)
+    lost = scripted.run("status")
+    assert lost.code == 3
+    assert "nobody answers" in lost.err
+    scripted.start_server()
+    assert scripted.run("say", "--wait", "battery low").code == 0
+
+
+def test_ids_are_of_a_form_that_no_number_and_no_option_has(scripted: Talk) -> None:
+    goal_id = scripted.run("say", "length=0").id
+    assert re.fullmatch(r"[a-z0-9]{4}-1", goal_id)
+    assert scripted.run("status", "1").out.split()[1] == goal_id

@@ -1,0 +1,170 @@
+"""The wire as section 9 of the design has it: greeting, replies, events in their order, and clients of few lines."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from talkcli import __version__
+from tests.conformance.rawsocket import Raw
+from tests.support.surroundings import needs
+
+if TYPE_CHECKING:
+    from tests.support.connection import Message
+    from tests.support.processes import Talk
+
+KEYS = {
+    "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "priority", "key", "ttl", "data",
+    "client", "paused", "queued_at", "started_at", "ended_at", "duration",
+}  # fmt: skip
+
+
+def line(**fields: object) -> bytes:
+    return json.dumps(fields).encode() + b"\n"
+
+
+def shape(message: Message) -> str:
+    """Return a message in a word: its event's state, or what it is."""
+    if "event" in message:
+        return str(message.get("state", message["event"]))
+    return "reply" if "ok" in message else "item"
+
+
+def test_greeting_and_first_requests(scripted: Talk) -> None:
+    with scripted.connect() as wire:
+        assert wire.greeting.keys() == {"talk", "version", "pid", "boot", "features"}
+        assert (wire.greeting["talk"], wire.greeting["version"]) == (1, __version__)
+        assert (wire.greeting["pid"], wire.greeting["features"]) == (scripted.pid, [])
+        wire.send({"request": "hello", "name": "patrol"})
+        assert wire.receive() == {"ok": True}  # without a number, the reply has none
+        goal = wire.request("say", text="length=0", data={"label": ["é", 1, None]})["goal"]
+    assert goal["id"].startswith(f"{wire.greeting['boot']}-")
+    assert goal.keys() == KEYS
+    assert goal["client"].keys() == {"pid", "uid", "command", "parent", "name"}
+    assert goal["client"]["name"] == "patrol"
+    assert goal["data"] == {"label": ["é", 1, None]}
+
+
+@pytest.mark.parametrize("text", ["length=0.1 one two", "length=0.1 crash"])
+def test_row_50_reply_comes_first_and_the_result_last(scripted: Talk, text: str) -> None:
+    with Raw(scripted.socket) as raw:
+        raw.send(line(seq=1, request="say", text=text, wait=True))
+        _, reply, *events = raw.receive_lines(6)
+    state = "ABORTED" if "crash" in text else "SUCCEEDED"
+    assert [shape(each) for each in (reply, *events)] == ["reply", "PENDING", "ACTIVE", state, "result"]
+    assert reply["goal"].keys() == events[-1]["goal"].keys() == KEYS
+    assert reply["goal"]["state"] == "PENDING"  # as accepted: states that a client is told never go backwards
+    numbers = [each["n"] for each in events[:-1]]
+    assert numbers == sorted(set(numbers))
+    moments = [each["at"] for each in events[:-1]]
+    assert moments == sorted(moments)
+    assert abs(moments[0] - time.time()) < 10
+    result = events[-1]["goal"]
+    assert result["queued_at"] <= result["started_at"] <= result["ended_at"]
+
+
+def test_row_50_a_watcher_learns_with_its_first_event_what_a_goal_is(scripted: Talk) -> None:
+    for text in ("length=0.2 first, at once", "length=0 behind it", ""):
+        goal_id = scripted.request("say", text=text)["goal"]["id"]
+        first = scripted.watcher.wait_until(lambda each, goal_id=goal_id: each.get("id") == goal_id)  # type: ignore[misc]
+        assert first["state"] == ("PENDING" if text else "REJECTED")
+        assert (first["goal"]["text"], first["goal"]["state"]) == (text, first["state"])
+
+
+def test_row_50_end_of_a_displaced_goal_comes_before_the_newcomer_is_active(scripted: Talk) -> None:
+    with scripted.connect() as wire:
+        first = wire.request("say", text="length=20 slow-stop=0.05")["goal"]["id"]
+        scripted.watcher.wait_for_word(first)
+        second = wire.request("say", text="length=0", preempt=True)["goal"]["id"]
+    scripted.watcher.wait_for(second, "SUCCEEDED")
+    told = [(each["id"], each["state"]) for each in scripted.watcher.events() if each["event"] == "state"]
+    assert told[2:] == [
+        (second, "PENDING"),
+        (first, "PREEMPTING"),
+        (first, "PREEMPTED"),
+        (second, "ACTIVE"),
+        (second, "SUCCEEDED"),
+    ]
+    goal = scripted.goal(first)
+    assert (goal["reason"], goal["by"]) == ("preempted", {"goal": second})
+
+
+def test_row_50_events_come_before_the_reply_that_depends_on_them(scripted: Talk) -> None:
+    with scripted.connect() as wire:
+        active = wire.request("say", text="length=20 slow-stop=0.1", wait=True)["goal"]["id"]
+        pending = wire.request("say", text="length=20", wait=True)["goal"]["id"]
+        scripted.watcher.wait_for_word(active)
+        wire.events.clear()
+        reply = wire.request("cancel")
+        assert reply["count"] == 2
+        told = [(each.get("id") or each["goal"]["id"], shape(each)) for each in wire.events]
+        assert sorted(each["canceled"]["id"] for each in wire.items) == sorted([active, pending])
+    assert told[-4:] == [
+        (pending, "RECALLED"), (pending, "result"), (active, "PREEMPTING"), (active, "PREEMPTED"), (active, "result")
+    ][-4:]  # fmt: skip
+
+
+def test_two_requests_in_one_segment_are_two_requests(scripted: Talk) -> None:
+    with Raw(scripted.socket) as raw:
+        requests = [line(seq=1, request="say", text="length=0"), line(seq=2, request="say", text="length=0 two")]
+        raw.send(b"".join([*requests, line(seq=3, request="status")[:10]]))
+        _, one, two = raw.receive_lines(3)
+        assert [each["seq"] for each in (one, two)] == [1, 2]
+        raw.send(line(seq=3, request="wait", ids=[two["goal"]["id"]])[0:0] + line(seq=3, request="status")[10:])
+        assert raw.receive_lines(4)[3]["seq"] == 3
+    for reply in (one, two):
+        assert scripted.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
+
+
+def test_request_in_segments_of_one_byte_is_a_request(scripted: Talk) -> None:
+    with Raw(scripted.socket) as raw:
+        for byte in line(seq=1, request="say", text="length=0 é", wait=True):
+            raw.send(bytes([byte]))
+        *_, result = raw.receive_lines(6)
+    assert (result["goal"]["state"], result["goal"]["text"]) == ("SUCCEEDED", "length=0 é")
+
+
+def test_result_is_delivered_to_a_client_that_has_closed_its_half(scripted: Talk) -> None:
+    with Raw(scripted.socket) as raw:
+        raw.send(line(request="say", text="length=0.5", wait=True))
+        raw.half_close()
+        *_, result = raw.receive_all(timeout=5)
+    assert (shape(result), result["goal"]["state"]) == ("result", "SUCCEEDED")
+
+
+def test_replies_that_are_owed_reach_a_client_that_has_closed_its_half(scripted: Talk) -> None:
+    scripted.request("say", text="length=20 slow-stop=0.1")
+    scripted.watcher.wait_for(None, "ACTIVE")
+    with Raw(scripted.socket) as raw:
+        raw.send(line(seq=1, request="cancel") + line(seq=2, request="voices") + line(seq=3, request="status"))
+        raw.half_close()
+        replies = [each["seq"] for each in raw.receive_all() if "ok" in each]
+    assert sorted(replies) == [1, 2, 3]
+
+
+def test_one_line_of_socat_says_a_sentence(scripted: Talk) -> None:
+    needs("socat")
+    command = """echo '{"request": "say", "text": "battery low"}' | socat -t 2 - UNIX-CONNECT:"$TALK_SOCKET" """
+    done = subprocess.run(command, shell=True, env=scripted.env, capture_output=True, text=True, timeout=20, check=True)
+    greeting, reply = (json.loads(each) for each in done.stdout.splitlines())
+    assert (greeting["talk"], reply["goal"]["text"]) == (1, "battery low")
+    assert scripted.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
+
+
+def test_lists_come_one_item_a_line(scripted: Talk) -> None:
+    with scripted.connect() as wire:
+        said = wire.request("say", text="length=0", wait=True)["goal"]["id"]
+        wire.receive_event("result")
+        active, *pending = (wire.request("say", text="never-ends")["goal"]["id"] for _ in range(3))
+        scripted.watcher.wait_for(active, "ACTIVE")
+        reply = wire.request("status")
+        assert reply["active"]["id"] == active
+        kinds: list[tuple[str, Any]] = [
+            (name, each[name]["id"]) for each in wire.items for name in each.keys() - {"seq"}
+        ]
+        assert kinds == [*(("pending", each) for each in pending), ("recent", said)]
+        assert wire.request("cancel")["count"] == 3

@@ -1,0 +1,199 @@
+"""Clients that don't read, or write too slowly: they are held to the limits, and nobody else notices."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.conformance.rawsocket import Raw
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+#: Limits of the design's section 11, and what a loaded machine may be late.
+FIRST_REQUEST = 5.0
+LINE = 10.0
+LATE = 1.0
+HELLO = b'{"request": "hello"}\n'
+
+
+@contextlib.contextmanager
+def others_served(talk: Talk, speak: str | None = None) -> Iterator[list[float]]:
+    """Ask for the status all the time, on a connection of its own, and say something at the end; gives the times."""
+    times: list[float] = []
+    done = threading.Event()
+
+    def ask() -> None:
+        with talk.connect() as wire:
+            while not done.is_set():
+                began = time.monotonic()
+                assert wire.request("status", timeout=20)["ok"]
+                times.append(time.monotonic() - began)
+                done.wait(0.005)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        yield times
+        if speak is not None:
+            with talk.connect() as wire:
+                assert wire.request("say", text=speak, wait=True)["ok"]
+                assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+    finally:
+        done.set()
+        thread.join()
+    assert times
+
+
+def test_10000_requests_without_reading_the_replies(scripted: Talk) -> None:
+    count = 10_000
+
+    def attempt() -> None:
+        with Raw(scripted.socket) as raw:
+            requests = b"".join(
+                b'{"seq": %d, "request": "status"}'.ljust(200) % number + b"\n" for number in range(count)
+            )
+            sender = threading.Thread(target=raw.send, args=(requests,))
+            with others_served(scripted, "length=0") as times:
+                raw.socket.settimeout(30)
+                sender.start()
+                sender.join(0.5)
+                numbers: list[int] = []
+                while len(numbers) < count:
+                    raw.receive()
+                    done, _, rest = bytes(raw.received).rpartition(b"\n")
+                    numbers += [each["seq"] for each in map(json.loads, done.split(b"\n")) if each.get("ok")]
+                    raw.received = bytearray(rest)
+                sender.join()
+            assert numbers == list(range(count))
+            assert_within(max(times), 0.1, "status for another client")
+
+    retry_if_late(attempt)
+
+
+def test_replies_to_requests_that_were_sent_ahead_all_come(make_talk: MakeTalk) -> None:
+    """A cancel is answered when it is silent; a long list that is being read slowly must not be lost to that."""
+    talk = make_talk(scripted=True)
+    with talk.connect() as wire:
+        active = wire.request("say", text="never-ends slow-stop=0.1")["goal"]["id"]
+        for _ in range(100):
+            assert wire.request("say", text="w" * 9_900)["goal"]["state"] == "PENDING"
+        talk.watcher.wait_for_word(active)
+        wire.send({"seq": "cancel"})  # no number: an error, and the rest goes on
+        assert wire.receive()["error"]["code"] == "bad_field"
+        wire.send({"seq": 1001, "request": "cancel", "ids": [active]})
+        wire.send({"seq": 1002, "request": "status"})
+        talk.watcher.wait_for(active, "PREEMPTED")
+        replies: dict[int, dict[str, Any]] = {}
+        items: dict[int, int] = {1001: 0, 1002: 0}
+        while len(replies) < 2:
+            message = wire.receive()
+            if "ok" in message:
+                replies[message["seq"]] = message
+            else:
+                items[message["seq"]] += 1
+        assert all(each["ok"] for each in replies.values())
+        assert items == {1001: 1, 1002: 100}
+        assert wire.request("cancel", timeout=20)["ok"]
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the memory of a process is not told here")
+def test_requests_that_come_faster_than_they_are_answered_do_not_pile_up(scripted: Talk) -> None:
+    with Raw(scripted.socket) as raw:
+        before = peak_memory(scripted.pid)
+        sender = threading.Thread(target=raw.send, args=(HELLO * 1_500_000,))
+        with others_served(scripted, "length=0"):
+            raw.socket.settimeout(20)
+            sender.start()
+            sender.join(2)
+            grown = peak_memory(scripted.pid) - before
+        with contextlib.suppress(OSError):
+            raw.socket.shutdown(socket.SHUT_RDWR)
+        sender.join()
+    assert grown < 16 * 1024, f"31 MB of requests took {grown} kB of the server's memory"
+
+
+def peak_memory(pid: int) -> int:
+    """Return the most memory that a process has had, in kB."""
+    with open(f"/proc/{pid}/status", encoding="utf-8") as file:
+        return next(int(each.split()[1]) for each in file if each.startswith("VmHWM:"))
+
+
+def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None:
+    text = "length=2 " + "a " * 4_900
+    with scripted.connect() as stuck:
+        assert stuck.request("watch")["ok"]
+        with others_served(scripted) as times:
+            ids = [scripted.request("say", text=text)["goal"]["id"] for _ in range(2)]
+            scripted.watcher.wait_for(ids[-1], "SUCCEEDED", timeout=30)
+        assert stuck.request("hello")["ok"]  # answered when all that waited for this client has been sent
+        events = stuck.events
+    everything = scripted.watcher.events()
+    seen = [each for each in events if "n" in each]
+    assert len(seen) < everything[-1]["n"], "this watcher was not behind: the test must send more"
+    assert len(everything) > len(seen), "who reads must not miss what another does not take"
+    assert max(times) < 1
+    unordered = [each for last, each in itertools.pairwise(seen) if each["n"] < last["n"]]
+    assert not unordered, f"{len(unordered)} events came late, as {unordered[0]}"
+    for goal_id in ids:
+        states = [each["state"] for each in seen if each["id"] == goal_id and each["event"] == "state"]
+        assert states == ["PENDING", "ACTIVE", "SUCCEEDED"]
+
+
+def test_slow_clients_are_closed_by_the_limits(scripted: Talk) -> None:
+    """Takes 12 s, the longest limit: all kinds of slow clients at once, so that it is paid once."""
+    with contextlib.ExitStack() as stack:
+        began = time.monotonic()
+        raws = [stack.enter_context(Raw(scripted.socket)) for _ in range(100)]
+        silent, begun, idle, waiting, tls, *dripping = raws
+        dripping_later = dripping[:45]
+        for each in (begun, idle, waiting, *dripping_later):
+            each.send(HELLO)
+        begun.send(b'{"request": "sa')
+        waiting.send(b'{"request": "say", "text": "never-ends", "wait": true}\n')
+        tls.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(11, 255)))
+        closed: dict[int, float] = {}
+        times = stack.enter_context(others_served(scripted))
+        for second in range(12):
+            for each in dripping:
+                each.send(b"x")
+            while time.monotonic() < began + second + 1:
+                _collect(raws, closed, began)
+        assert max(times) < 1, "others were kept waiting"
+        for each in (silent, tls, *dripping[45:]):
+            assert FIRST_REQUEST - 0.1 <= closed[id(each)] <= FIRST_REQUEST + LATE
+        for each in (begun, *dripping_later):
+            assert LINE - 0.1 <= closed[id(each)] <= LINE + LATE
+        for each in (silent, begun, tls, *dripping):
+            assert each.lines[-1]["error"]["code"] == "too_slow"
+        assert not {id(idle), id(waiting)} & closed.keys()
+        assert len([each for each in waiting.lines if each.get("event") == "alive"]) == 2  # every 5 s
+        assert len(idle.lines) == 2  # nobody waits here
+        idle.send(b'{"seq": 3, "request": "cancel"}\n')  # a connection may idle for ever
+        assert idle.receive_lines(4)[-1] == {"seq": 3, "ok": True, "count": 1}
+        while waiting.lines[-1].get("event") != "result":
+            waiting.receive()
+        assert waiting.lines[-1]["goal"]["state"] == "PREEMPTED"
+
+
+def _collect(raws: list[Raw], closed: dict[int, float], began: float) -> None:
+    """Take what has come on any connection, waiting a moment for it, and note which were closed when."""
+    for each in raws:
+        if id(each) in closed:
+            continue
+        with contextlib.suppress(TimeoutError, BlockingIOError):
+            if not each.receive(0.0):
+                closed[id(each)] = time.monotonic() - began
+    time.sleep(0.02)

@@ -1,0 +1,269 @@
+"""The command line: options, output, exit codes and errors of every command, as a script or a person meets them."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from talkcli import __version__
+from talkcli.cli import COMMANDS
+from tests.conformance.bareserve import TALK, environment, run
+from tests.conformance.rawsocket import GREETING, FakeServer
+from tests.support.surroundings import clean_environment, short_directory
+
+if TYPE_CHECKING:
+    from tests.support.processes import Talk
+
+GOAL = {
+    "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "priority", "key", "ttl", "data",
+    "client", "paused", "queued_at", "started_at", "ended_at", "duration",
+}  # fmt: skip
+#: ESC, a bidi override, a line of its own, a bell, a NEL: none of these may reach a terminal.
+HOSTILE = "a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end"
+RAW = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+
+
+def alone(*words: str, **extra: str) -> Any:
+    """Run `talk` where there is no server."""
+    with short_directory() as home:
+        return run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", **extra))
+
+
+def error_of(err: str) -> dict[str, Any]:
+    """Return the error in a standard error that is one line of JSON."""
+    lines = err.splitlines()
+    assert len(lines) == 1, err
+    error: dict[str, Any] = json.loads(lines[0])["error"]
+    assert error.keys() == {"code", "exit", "message"}
+    return error
+
+
+# Help, versions, usage
+
+
+def test_version_and_help() -> None:
+    assert (done := alone("--version")).out == f"talk {__version__}\n"
+    assert done.code == 0
+    helps = [alone(*words) for words in (["-h"], ["--help"], [])]
+    assert len({each.out for each in helps}) == 1
+    assert [each.code for each in helps] == [0, 0, 0]
+    for command, words in COMMANDS.items():
+        assert re.search(rf"(?m)^  {command} +{re.escape(words)}$", helps[0].out)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_a_terminal_and_tells_the_exit_codes(command: str) -> None:
+    done = alone(command, "--help", COLUMNS="80")
+    assert done.code == 0
+    assert [each for each in done.out.splitlines() if len(each) > 80] == []
+    assert "Exit codes: 0 " in done.out
+    assert done.out == alone(command, "-h", COLUMNS="80").out
+    for option in ("--socket PATH", "--json", "--quiet"):
+        assert option in done.out
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["sya", "hello"], "Did you mean 'say'?"),
+        (["stauts"], "Did you mean 'status'?"),
+        (["battery", "low"], 'talk say "battery low"'),
+        (["say", "--wiat", "hello"], "--wait"),
+        (["say", "-5", "degrees"], "talk say -- TEXT"),
+        (["say", "--loud", "hello"], "talk say -- TEXT"),
+        (["say"], "TEXT"),
+        (["say", "--timeout", "3", "hello"], "--wait"),
+        (["say", "-t", "0", "-w", "hello"], "--timeout"),
+        (["say", "-t", "nan", "-w", "hello"], "--timeout"),
+        (["say", "-t", "soon", "-w", "hello"], "--timeout"),
+        (["wait", "-t", "-1"], "--timeout"),
+        (["wait", "-t", "nan"], "--timeout"),
+        (["serve", "--volume", "1.5"], "--volume"),
+        (["serve", "--volume", "nan"], "--volume"),
+        (["serve", "--rate", "79"], "--rate"),
+        (["serve", "--pitch", "101"], "--pitch"),
+        (["serve", "--socket-mode", "0400"], "--socket-mode"),
+        (["serve", "--socket-mode", "777"], "--socket-mode"),
+        (["serve", "--player", "null", "--device", "x"], "--device"),
+        (["serve", "extra"], "extra"),
+        (["status", "a-1", "a-2"], "a-2"),
+    ],
+)
+def test_usage_errors_are_told_and_nothing_is_done(words: list[str], hint: str) -> None:
+    done = alone(*words)
+    assert (done.code, done.out) == (2, "")
+    assert hint in done.err
+    as_json = alone("--json", *words)
+    error = error_of(as_json.err)
+    assert (as_json.code, as_json.out, error["code"], error["exit"]) == (2, "", "usage", 2)
+
+
+def test_json_after_the_command_holds_for_usage_errors_too() -> None:
+    assert error_of(alone("wait", "-t", "soon", "--json").err)["exit"] == 2
+    assert error_of(alone("say", "--loud", "hello", "--json").err)["exit"] == 2
+
+
+def test_name_that_is_too_long_is_refused_and_not_dropped(scripted: Talk) -> None:
+    done = scripted.run("say", "--as", "n" * 65, "hello")
+    assert (done.code, done.out) == (2, "")
+    assert "64" in done.err
+    assert scripted.run("say", "--as", "n" * 64, "hello").code == 0
+
+
+# What is printed
+
+
+def test_json_shapes(scripted: Talk) -> None:
+    accepted = scripted.run("--json", "say", "never-ends")
+    goal = json.loads(accepted.out)
+    assert goal.keys() == GOAL
+    assert accepted.out.count("\n") == 1
+    scripted.watcher.wait_for_word(goal["id"])
+    pending = json.loads(scripted.run("say", "behind", "it", "--json").out)  # the option may stand after the command
+    assert (pending["state"], pending["text"], pending["spoken"]) == ("PENDING", "behind it", None)
+    status = json.loads(scripted.run("status", "--json").out)
+    assert status.keys() == {"server", "active", "pending", "recent"}
+    assert (status["active"]["id"], [each["id"] for each in status["pending"]]) == (goal["id"], [pending["id"]])
+    assert json.loads(scripted.run("status", "--json", goal["id"]).out).keys() == GOAL
+    canceled = [json.loads(each) for each in scripted.run("cancel", "--json").out.splitlines()]
+    assert {each["id"]: each["state"] for each in canceled} == {goal["id"]: "PREEMPTED", pending["id"]: "RECALLED"}
+    assert all(each.keys() == GOAL for each in canceled)
+    ended = json.loads(scripted.run("--json", "say", "--wait", "length=0").out)
+    assert (ended.keys(), ended["state"], ended["status"]) == (GOAL, "SUCCEEDED", 3)
+    assert json.loads(scripted.run("--json", "wait", ended["id"]).out) == ended
+    rejected = json.loads(scripted.run("--json", "say", "").out)
+    assert (rejected.keys(), rejected["state"]) == (GOAL, "REJECTED")
+    voice = json.loads(scripted.run("--json", "voices").out)
+    assert voice == {"id": "en", "language": "en", "name": "scripted"}
+    unknown = scripted.run("--json", "wait", "none-1")
+    assert error_of(unknown.err) == {"code": "unknown_goal", "exit": 8, "message": error_of(unknown.err)["message"]}
+    assert unknown.out == ""
+
+
+def test_standard_output_carries_data_only(scripted: Talk) -> None:
+    failed = scripted.run("say", "--wait", "fail=audio_lost message=no_cable")
+    assert re.fullmatch(r"\w{4}-\d+\n", failed.out)
+    assert failed.err == f"talk: {failed.id}: Talk aborted: no cable\n"
+    quiet = scripted.run("-q", "say", "--wait", "fail=audio_lost")
+    assert (quiet.code, quiet.out, quiet.err) == (4, "", "")
+    assert scripted.run("say", "-q", "length=0").out == ""
+    assert alone("--json", "status").out == ""
+    assert error_of(alone("--json", "status").err)["code"] == "no_server"
+
+
+def test_options_before_and_after_the_command(scripted: Talk) -> None:
+    for words in (["--socket", scripted.socket, "status"], ["status", "--socket", scripted.socket]):
+        done = run([*TALK, *words], {**scripted.env, "TALK_SOCKET": "/nowhere"})
+        assert done.code == 0, done.err
+        assert f"pid {scripted.pid}" in done.out
+    assert run([*TALK, "status"], {**scripted.env, "TALK_SOCKET": "/nowhere"}).code == 3
+
+
+def test_standard_output_that_is_closed_is_141(scripted: Talk) -> None:
+    for words in (["status"], ["--json", "status"], ["say", "hello"], ["say", "--json", "hello"], ["--help"]):
+        reader, writer = os.pipe()
+        os.close(reader)
+        with os.fdopen(writer, "wb") as closed:
+            done = subprocess.run(
+                [*TALK, *words], env=scripted.env, stdout=closed, stderr=subprocess.PIPE, timeout=20, check=False
+            )
+        assert (done.returncode, done.stderr) == (141, b""), words
+
+
+def test_text_of_others_never_reaches_a_terminal_raw(scripted: Talk) -> None:
+    goal_id = scripted.run("say", "--as", HOSTILE[:60], "--", f"never-ends {HOSTILE}").id
+    scripted.watcher.wait_for_word(goal_id)
+    scripted.run("say", "--wait", "--as", "b\x1b]0;title\x07", "-t", "0.1", "--", f"{HOSTILE} pending")
+    shown = [scripted.run("status").out, scripted.run("status", goal_id).out]
+    # Text that a script forgot to quote is a command, an option or an id to talk.
+    shown += [scripted.run(*words, HOSTILE).err for words in (["wait"], ["cancel"], ["status"], ["cancel", "--before"])]
+    shown += [scripted.run(HOSTILE).err, scripted.run("say", f"--{HOSTILE}").err, scripted.run("voices", HOSTILE).err]
+    shown += [scripted.run("voices", "--language", HOSTILE).err, scripted.log]
+    for text in shown:
+        assert text
+        assert not RAW.search(text), repr(text)
+        assert not re.search("(?m)^fake line", text), repr(text)
+    assert r"a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end" in shown[0]
+
+
+def test_no_colour_but_on_a_terminal(scripted: Talk) -> None:
+    scripted.run("say", "--wait", "length=0")
+    for extra in ({}, {"NO_COLOR": "1"}, {"TERM": "dumb"}):
+        env = {"TERM": "xterm", **scripted.env, **extra}
+        done = run([*TALK, "status"], env)
+        assert (done.code, "\x1b" in done.out + done.err) == (0, False)
+        terminal, theirs = pty.openpty()
+        with os.fdopen(theirs, "wb") as stdout, os.fdopen(terminal, "rb", buffering=0) as reader:
+            subprocess.run([*TALK, "status"], env=env, stdin=stdout, stdout=stdout, timeout=20, check=True)
+            shown = reader.read(65536)
+        assert b"SUCCEEDED" in shown
+        assert (b"\x1b[" in shown) == (not extra), shown
+
+
+# Standard input
+
+
+def test_standard_input_is_read_where_it_is_asked_for_alone(scripted: Talk) -> None:
+    assert json.loads(scripted.run("--json", "say", "-", stdin="one\ntwo\n").out)["text"] == "one\ntwo"
+    assert json.loads(scripted.run("--json", "say", "-", "and", stdin="unread").out)["text"] == "- and"
+    for words in (["say", "hello"], ["status"], ["cancel"], ["wait"]):
+        client = scripted.start(*words, stdin=subprocess.PIPE)  # which is never closed
+        assert client.wait(10) == 0
+
+
+def test_python_m_talkcli_is_talk_whatever_the_locale_is(scripted: Talk) -> None:
+    few: dict[str, str] = {each: scripted.env[each] for each in ("PYTHONPATH", "TALK_SOCKET") if each in scripted.env}
+    for env in ({**scripted.env, "LANG": "C", "LC_ALL": "C"}, {**scripted.env, "LC_ALL": "POSIX"}, few):
+        done = run([*TALK, "--json", "say", "--wait", "--", "d'été 日本"], env)
+        assert (done.code, json.loads(done.out)["text"]) == (0, "d'été 日本")
+        assert "日本" in run([*TALK, "status"], env).out
+
+
+def test_timeout_may_be_as_long_as_one_likes(scripted: Talk) -> None:
+    for seconds in ("inf", "1e300", "9999999"):
+        done = scripted.run("say", "--wait", "--timeout", seconds, "length=0")
+        assert done.code == 0, done.err
+        assert scripted.run("wait", "--timeout", seconds, done.id).code == 0
+
+
+# What a client costs, and whom it talks to
+
+
+def test_client_imports_nothing_heavy(scripted: Talk) -> None:
+    heavy = ["asyncio", "pyttsx3", "platformdirs", "talkcli.server", "talkcli.scheduler", "talkcli.engine", "ssl"]
+    code = "import sys; from talkcli.cli import run; assert run({}) == 0; print([m for m in {} if m in sys.modules])"
+    for words in (["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"]):
+        done = run([sys.executable, "-c", code.format(words, heavy)], scripted.env)
+        assert done.out.splitlines()[-1] == "[]", done
+
+
+@pytest.mark.parametrize(
+    ("says", "code", "error", "words"),
+    [
+        (b'{"talk": 2, "version": "9.1"}\n', 9, "protocol_mismatch", "upgrade this command"),
+        (b'{"talk": 0, "version": "0.0"}\n', 9, "protocol_mismatch", "restart the server"),
+        (b'{"talk": "1"}\n', 9, "protocol_mismatch", "protocol 1"),
+        (b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n', 10, "permission_denied", "not you"),
+        (b"220 mail.example.org ESMTP\r\n", 3, "no_server", "no talk server"),
+        (b"[]\n", 3, "no_server", "no talk server"),
+        (b"", 3, "no_server", "closed the connection"),
+        (GREETING, 3, "no_server", "went away"),
+    ],
+)
+def test_what_else_may_answer(says: bytes, code: int, error: str, words: str) -> None:
+    with short_directory() as home, FakeServer(f"{home}/s", [says], closes=True):
+        env = clean_environment(home, {"TALK_SOCKET": f"{home}/s"})
+        began = time.monotonic()
+        done = run([*TALK, "--json", "status"], env)
+        assert time.monotonic() - began < 2
+    told = error_of(done.err)
+    assert (done.code, told["code"], told["exit"]) == (code, error, code)
+    assert words in told["message"]
