@@ -27,6 +27,9 @@ FIRST_WITHIN = 5.0
 #: up to 2 on a null sink that nobody records.
 STALLED_AFTER = 3.0
 
+#: Seconds between two looks at how much a player has taken: the start of a stall is known as exactly as this.
+LOOK_EVERY = 0.1
+
 #: Seconds that a player may take longer than the rest of the audio to drain and end, for the same reason.
 DRAIN_WITHIN = 3.0
 
@@ -206,6 +209,8 @@ class Playback:
 
     def _wait_for(self, sink: Sink, until: float) -> None:
         moments = [until, sink.wake_at(), self._clock.next_due() if sink.proven else None]
+        if self._taken < self._sent:  # a player that takes a part of what waits wakes nobody
+            moments.append(time.monotonic() + LOOK_EVERY)
         self._wait(sink.interests(), min(moment for moment in moments if moment is not None))
         self._check_stopped()
 

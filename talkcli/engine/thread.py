@@ -259,16 +259,21 @@ class EngineThread(threading.Thread):
         if not (self._closing or process.explained):
             self._post(EngineDied(words))
         if not process.ready:
-            self._start_failed(self._start_error if process.explained and self._start_error else words)
+            self._start_failed(self._start_error if process.explained and self._start_error else words, process)
         elif had_goal or now - self._started_at > SHORT_LIFE:
             self._failures = 0
             self._start_at = now
         else:
             self._wait_longer(now)
 
-    def _start_failed(self, words: str) -> None:
-        self._start_error = words
+    def _start_failed(self, words: str, process: spawn.EngineProcess | None = None) -> None:
+        """Plan another start; no goal waits for it, unless only one start has failed and nobody knows why."""
+        explained = process is None or process.explained
+        first = self._failures == 0
         self._wait_longer(time.monotonic())
+        if first and not explained:
+            return
+        self._start_error = words
         if self._goal and not self._verdict:
             self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "engine_failed", words))
 

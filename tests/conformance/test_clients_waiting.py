@@ -198,16 +198,16 @@ def test_row_33_signal_ends_what_the_client_owns(
 def test_row_33_signal_ends_a_client_whose_server_does_not_greet() -> None:
     with short_directory() as home, FakeServer(f"{home}/s", []) as server:
         for words in (["status"], ["wait"], ["cancel"], ["say", "hello"], ["say", "--wait", "hello"]):
-            client = subprocess.Popen(
+            with subprocess.Popen(
                 [sys.executable, "-m", "talkcli", *words],
                 env=environment(home, TALK_SOCKET=f"{home}/s"),
                 stderr=subprocess.PIPE,
                 text=True,
-            )
-            server.wait_for_client()
-            client.send_signal(signal.SIGINT)
-            began = time.monotonic()
-            _, err = client.communicate(timeout=20)
+            ) as client:
+                server.wait_for_client()
+                client.send_signal(signal.SIGINT)
+                began = time.monotonic()
+                _, err = client.communicate(timeout=20)
             assert client.returncode == 130, (words, err)
             assert time.monotonic() - began < 1 + START, words
             assert "Traceback" not in err
@@ -216,17 +216,17 @@ def test_row_33_signal_ends_a_client_whose_server_does_not_greet() -> None:
 def test_row_34_sigterm_to_a_background_job_of_a_script(scripted: Talk) -> None:
     script = """"$0" -m talkcli say --wait -- "never-ends words=1" & pid=$!
     read line; kill -TERM $pid; wait $pid; echo "code $?" """
-    shell = subprocess.Popen(
+    with subprocess.Popen(
         ["sh", "-c", script, sys.executable],
         env=scripted.env,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-    )
-    goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
-    scripted.watcher.wait_for_word(goal_id)
-    out, err = shell.communicate("go on\n", timeout=20)
+    ) as shell:
+        goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
+        scripted.watcher.wait_for_word(goal_id)
+        out, err = shell.communicate("go on\n", timeout=20)
     assert out == f"{goal_id}\ncode 143\n"
     assert "Talk preempted" in err
     assert scripted.goal(goal_id)["state"] == "PREEMPTED"

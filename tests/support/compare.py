@@ -32,6 +32,8 @@ EXTENT = 0.02
 _PART = RATE // 10
 #: Samples by which a part may sit beside its place.
 _SLACK = 48
+#: Samples that the monitor may lose where a stream starts: up to 211 were seen to be.
+_LOST = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +83,8 @@ def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> l
         assert found is not None, f"sentence {number} of {len(references)} was not heard: {_told(samples, result)}"
         start = cursor + found[0]
         # What is between two sentences is silence, so this one's sound begins where the next sound does.
-        nearby = samples[max(0, start - _SLACK) : start + len(wanted) + _SLACK].astype(np.float64)
-        offset = max(0, start - _SLACK) + _align(nearby, wanted, 2 * _SLACK)
+        nearby = samples[max(0, start - _LOST) : start + len(wanted) + _SLACK].astype(np.float64)
+        offset = max(0, start - _LOST) + _align(nearby, wanted, _LOST + _SLACK)
         cursor = min(len(samples), offset + len(wanted) + _SLACK)
         inside = extent(samples[max(0, offset - _SLACK) : cursor])
         length = (inside[1] - inside[0]) / RATE if inside else 0.0
