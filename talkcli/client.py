@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING
 from talkcli import __version__, wire
 from talkcli.connection import SILENCE_LIMIT, Connection
 from talkcli.dial import ANSWER_LIMIT
+from talkcli.errors import UnknownGoal, UsageError
 from talkcli.messages import Goal
-from talkcli.requests import Cancel, Hello, Say, Status, Voices, Wait, write_request
+from talkcli.requests import MAX_DATA, MAX_ID, MAX_NAME, Cancel, Hello, Say, Status, Voices, Wait, write_request
 from talkcli.states import State
 
 if TYPE_CHECKING:
@@ -69,6 +70,8 @@ class GoalHandle:
         self._client = client
         #: the goal as it was last heard of
         self.goal = goal
+        #: whether the server tells this connection how it ends
+        self._followed = False
 
     @property
     def id(self) -> str:
@@ -111,15 +114,19 @@ class Client:
 
         `socket`: path of the server's socket, default TALK_SOCKET, then the usual places; `name`: what this sender
         calls itself in `talk status` and the log, default TALK_NAME; `interrupt`: a descriptor that ends any waiting
-        with talkcli.connection.Interrupted as soon as it is readable; `patience`: seconds in which the server must
+        with talkcli.dial.Interrupted as soon as it is readable; `patience`: seconds in which the server must
         greet; `urgent`: for status and cancel alone, for which a full server keeps some places.
 
-        ServerUnavailable, AccessDenied, Busy or ProtocolMismatch where that fails: nothing was sent then.
+        UsageError for a name that is too long; ServerUnavailable, AccessDenied, Busy or ProtocolMismatch where there is
+        no server to be had: nothing was sent then.
         """
         from talkcli import paths
 
         self._handles: dict[str, list[GoalHandle]] = {}
-        hello = Hello(name or os.environ.get("TALK_NAME") or None, urgent)
+        name = name or os.environ.get("TALK_NAME") or None
+        if name and len(name) > MAX_NAME:
+            raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
+        hello = Hello(name, urgent)
         self._connection = Connection(
             paths.named_socket(socket), hello, __version__, self._on_event, interrupt, patience
         )
@@ -153,6 +160,8 @@ class Client:
         `preempt`: stop what is being spoken and go first, None leaves that to the server; `data`: an object of at most
         1 KiB that travels with the goal; `follow`: have this connection told how it ends, so that `wait` works.
         """
+        if data is not None and len(wire.encode(data)) > MAX_DATA:
+            raise UsageError(f"data is an object of at most {MAX_DATA} bytes of JSON")
         request = Say(text, wait=follow, preempt=preempt, data=data)
         if len(wire.encode({"seq": 0, **write_request(request)})) > wire.MAX_LINE - 32:
             return GoalHandle(self, _too_long(text))
@@ -215,8 +224,17 @@ class Client:
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
 
     def full_id(self, goal_id: str) -> str:
-        """Return the whole id for a number alone, which means a goal of this server's."""
-        return f"{self._connection.line.boot}-{goal_id}" if goal_id.isdecimal() else goal_id
+        """Return the whole id for a number alone, which means a goal of this server's.
+
+        UsageError for an empty id, UnknownGoal for one that no goal can have.
+        """
+        if not goal_id:
+            raise UsageError("an id is empty: is the variable set that it comes from?")
+        if goal_id.isascii() and goal_id.isdecimal():
+            goal_id = f"{self._connection.line.boot}-{goal_id}"
+        if len(goal_id) > MAX_ID:
+            raise UnknownGoal(f"no goal {goal_id[:MAX_ID]!a}… is known: an id has at most {MAX_ID} characters")
+        return goal_id
 
     # -- inside
 
@@ -224,6 +242,7 @@ class Client:
         self._connection.post(request)
 
     def _attach(self, handle: GoalHandle) -> None:
+        handle._followed = True
         if not handle.state.terminal:
             self._handles.setdefault(handle.id, []).append(handle)
 
@@ -241,6 +260,8 @@ class Client:
 
     def _wait_for(self, handle: GoalHandle, timeout: float | None) -> Goal:
         end = None if timeout is None else time.monotonic() + timeout
+        if not (handle._followed or handle.state.terminal):
+            self._follow_late(handle)
         ended = self._connection.wait_until(lambda: handle.state.terminal, lambda: end, SILENCE_LIMIT)
         if not ended and self._connection.ended is not None:
             words = f"Talk lost: {self._connection.ended}; it may still be spoken"
@@ -248,6 +269,13 @@ class Client:
         elif not ended:
             raise TimeoutError(f"{handle.id} has not ended after {timeout:g} s")
         return handle.goal
+
+    def _follow_late(self, handle: GoalHandle) -> None:
+        def accepted(_: JsonObject, items: list[JsonObject]) -> None:
+            handle.goal = next(_goals(items, "goal"))
+            self._attach(handle)
+
+        self._connection.request(Wait((handle.id,)), accepted)
 
     def _cancel_one(self, handle: GoalHandle) -> Goal:
         if not handle.state.terminal:

@@ -6,16 +6,18 @@ lock while it waits for the server.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import select
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from socket import SHUT_RDWR
 from typing import TYPE_CHECKING
 
 from talkcli import wire
-from talkcli.dial import ANSWER_LIMIT, dial, ready
+from talkcli.dial import ANSWER_LIMIT, Interrupted, dial, ready
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
 from talkcli.printable import printable
 from talkcli.requests import Say, write_request
@@ -29,10 +31,6 @@ SILENCE_LIMIT = 15.0
 
 
 OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
-
-
-class Interrupted(Exception):
-    """The caller's own interrupt descriptor became readable while a reply or an event was awaited."""
 
 
 def _refusal(reply: JsonObject, items: list[JsonObject]) -> RequestRefused:
@@ -67,7 +65,8 @@ class Connection:
         interrupt: int | None = None,
         patience: float = ANSWER_LIMIT,
     ) -> None:
-        self.line = dial(socket, hello, version, patience)
+        self.line = dial(socket, hello, version, patience, interrupt)
+        self._patience = patience
         self._on_event = on_event
         self._interrupt = interrupt
         self._interruptible = True
@@ -78,6 +77,8 @@ class Connection:
         self._sending = threading.Lock()
         self._reading = False
         self._heard = time.monotonic()
+        #: what the server said last that was no answer to anything
+        self._told: str | None = None
         #: why there is nothing more to come, once that is so
         self.ended: str | None = None
 
@@ -85,6 +86,8 @@ class Connection:
         """Close the connection; goals that were sent are spoken all the same."""
         with self._changed:
             self.ended = self.ended or "the connection was closed"
+            with contextlib.suppress(OSError):
+                self.line.socket.shutdown(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
             self.line.socket.close()
             self._changed.notify_all()
 
@@ -101,7 +104,7 @@ class Connection:
         self._interruptible = not isinstance(request, Say)
         try:
             self._send(wire.encode({"seq": number, **write_request(request)}))
-            self.wait_until(lambda: exchange.reply is not None, lambda: exchange.touched + ANSWER_LIMIT)
+            self.wait_until(lambda: exchange.reply is not None, lambda: exchange.touched + self._patience)
         finally:
             self._interruptible = True
             del self._exchanges[number]
@@ -116,7 +119,7 @@ class Connection:
         self._send(wire.encode({"seq": next(self._numbers), **write_request(request)}))
 
     def _no_reply(self, request: Request) -> TalkError:
-        why = self.ended or f"it did not reply within {ANSWER_LIMIT:g} s"
+        why = self.ended or f"it did not reply within {self._patience:g} s"
         words = f"{request.kind} was sent to the server at {self.line.path}, but {why}"
         # Only a goal can still have an effect that the sender does not know of.
         return Lost(f"{words}; it may still be spoken") if isinstance(request, Say) else ServerUnavailable(words)
@@ -129,6 +132,7 @@ class Connection:
         `silence`: seconds without a line from the server after which the connection counts as ended.
         """
         began = time.monotonic()
+        last = False
         while True:
             with self._changed:
                 if done():
@@ -137,17 +141,17 @@ class Connection:
                     return False
                 now = time.monotonic()
                 limit = deadline()
-                if limit is not None and now >= limit:
+                quiet = None if silence is None else max(began, self._heard) + silence
+                if last and limit is not None and now >= limit:
                     return False
-                if silence is not None:
-                    quiet = max(began, self._heard) + silence
-                    if now >= quiet:
-                        self.ended = f"it has said nothing for {silence:g} s"
-                        continue
-                    limit = quiet if limit is None else min(limit, quiet)
-                rest = None if limit is None else limit - now
+                if last and quiet is not None and now >= quiet:
+                    self.ended = f"it has said nothing for {silence:g} s"
+                    return False
+                rest = min((each - now for each in (limit, quiet) if each is not None), default=None)
+                # What has arrived by the deadline counts: one more look, that doesn't wait.
+                last = rest is not None and rest <= 0
                 if self._reading:
-                    self._changed.wait(rest)
+                    self._changed.wait(None if rest is None else min(max(0.0, rest), threading.TIMEOUT_MAX))
                     continue
                 self._reading = True
             try:
@@ -187,7 +191,7 @@ class Connection:
             data = b""
             self.ended = self.ended or f"the connection broke: {error}"
         if not data:
-            self.ended = self.ended or "the server went away"
+            self.ended = self.ended or self._told or "the server went away"
             return False
         self._heard = time.monotonic()
         self._lines.extend(self.line.splitter.feed(data))
@@ -198,6 +202,8 @@ class Connection:
             self._on_event(message)
             return
         number = message.get("seq")
+        if number is None and message.get("ok") is False:
+            self._told = f"the server closed it: {_refusal(message, [])}"
         exchange = self._exchanges.get(number) if isinstance(number, int) else None
         if exchange is None:
             return

@@ -5,6 +5,7 @@ It sends nothing but `hello`, so whatever fails here is safe to try again.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 
 from talkcli import paths, peers, wire
 from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
+from talkcli.printable import printable
 from talkcli.requests import Hello, write_request
 
 #: Seconds in which a server greets, and answers each request.
@@ -42,26 +44,32 @@ class Line:
     lines: list[bytes]
 
 
+class Interrupted(Exception):
+    """The caller's own interrupt descriptor became readable while the server was awaited."""
+
+
 class _BacklogFull(ServerUnavailable):
     """More clients connect than the server takes at this moment."""
 
 
-def dial(named: str | None, hello: Hello, version: str, patience: float = ANSWER_LIMIT) -> Line:
+def dial(
+    named: str | None, hello: Hello, version: str, patience: float = ANSWER_LIMIT, interrupt: int | None = None
+) -> Line:
     """Return a connection to the first server that answers.
 
     `named`: the only socket to try, or None for the list; `hello`: what is said to it; `version`: the client's own;
-    `patience`: seconds in which the server must greet.
+    `patience`: seconds in which the server must greet; `interrupt`: a descriptor that ends it with Interrupted.
 
     ServerUnavailable, AccessDenied, ProtocolMismatch or Busy where there is none.
     """
     end = time.monotonic() + min(BUSY_LIMIT, patience)
     while True:
         try:
-            return _try_all(named, hello, version, patience)
+            return _try_all(named, hello, version, patience, interrupt)
         except (Busy, _BacklogFull):
             if time.monotonic() >= end:
                 raise
-            time.sleep(random.uniform(*_BUSY_PAUSE))
+            _await(None, random.uniform(*_BUSY_PAUSE), interrupt)
 
 
 def ready(watched: dict[int, int], timeout: float | None) -> set[int]:
@@ -69,10 +77,21 @@ def ready(watched: dict[int, int], timeout: float | None) -> set[int]:
     poll = select.poll()  # not select(), which fails in a program that has more than 1,024 descriptors
     for fd, events in watched.items():
         poll.register(fd, events)
-    return {fd for fd, _ in poll.poll(None if timeout is None else max(0, math.ceil(timeout * 1000)))}
+    # poll takes a C int of milliseconds, 24 days at most: whoever waits that long is woken, and looks again
+    milliseconds = None if timeout is None else math.ceil(min(max(0.0, timeout * 1000), 2**31 - 1))
+    return {fd for fd, _ in poll.poll(milliseconds)}
 
 
-def _try_all(named: str | None, hello: Hello, version: str, patience: float) -> Line:
+def _await(connected: socket.socket | None, timeout: float, interrupt: int | None) -> bool:
+    """Wait until the server has said something; False after `timeout` seconds."""
+    watched = {fd: select.POLLIN for fd in (connected.fileno() if connected else None, interrupt) if fd is not None}
+    found = ready(watched, timeout)
+    if interrupt in found:
+        raise Interrupted
+    return bool(found)
+
+
+def _try_all(named: str | None, hello: Hello, version: str, patience: float, interrupt: int | None) -> Line:
     failures = []
     denied = False
     for path in paths.client_sockets(named):
@@ -84,7 +103,7 @@ def _try_all(named: str | None, hello: Hello, version: str, patience: float) -> 
             continue
         try:
             _check_owner(connected, path, named is not None)
-            return _greet(connected, path, hello, version, patience)
+            return _greet(connected, path, hello, version, patience, interrupt)
         except AccessDenied as error:
             connected.close()
             denied = True
@@ -127,14 +146,17 @@ def _check_owner(connected: socket.socket, path: str, named: bool) -> None:
         raise AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
 
 
-def _greet(connected: socket.socket, path: str, hello: Hello, version: str, patience: float) -> Line:
+def _greet(
+    connected: socket.socket, path: str, hello: Hello, version: str, patience: float, interrupt: int | None
+) -> Line:
     splitter = wire.LineSplitter(limit=None)
     lines: list[bytes] = []
     try:
-        connected.send(wire.encode(write_request(hello)))
+        with contextlib.suppress(BrokenPipeError):  # it has hung up already, but it may have said why
+            connected.send(wire.encode(write_request(hello)))
         end = time.monotonic() + patience
         while not lines:
-            if not ready({connected.fileno(): select.POLLIN}, end - time.monotonic()):
+            if not _await(connected, end - time.monotonic(), interrupt):
                 raise ServerUnavailable(f"the server at {path} does not answer; {_next_step(connected)}")
             data = connected.recv(65536)
             if not data:
@@ -146,9 +168,11 @@ def _greet(connected: socket.socket, path: str, hello: Hello, version: str, pati
         greeting = wire.decode(lines.pop(0))
     except BadRequest:
         raise ServerUnavailable(f"what answers at {path} is no talk server") from None
+    if "talk" not in greeting:
+        raise ServerUnavailable(f"what answers at {path} is no talk server")
     wire.check_greeting(greeting, version)
     if "error" in greeting:
-        raise AccessDenied(f"the server refuses: {greeting.get('message') or greeting['error']}")
+        raise AccessDenied(f"the server refuses: {printable(str(greeting.get('message') or greeting['error']))}")
     boot, pid, server_version = greeting.get("boot"), greeting.get("pid"), greeting.get("version")
     return Line(
         connected,

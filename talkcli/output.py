@@ -39,7 +39,7 @@ def ending(goal: Goal) -> str:
     words = printable(goal.message or goal.state.name)
     if goal.by:
         words += f" ({by_whom(goal.by)})"
-    return f"{goal.id}: {words}" if goal.id else words
+    return f"{printable(goal.id)}: {words}" if goal.id else words
 
 
 def by_whom(by: By) -> str:
@@ -66,7 +66,7 @@ def who(sender: Sender | None) -> str:
 def goal_lines(goal: Goal, *, colour: bool) -> list[str]:
     """Return all that is known of one goal, a line each."""
     rows = [
-        ("id", goal.id),
+        ("id", printable(goal.id)),
         ("state", _state(goal.state, colour)),
         ("reason", goal.reason),
         ("message", goal.message and printable(goal.message)),
@@ -87,8 +87,8 @@ def status_lines(status: ServerStatus, *, colour: bool, now: float | None = None
     now = time.time() if now is None else now
     server = status.server
     lines = [
-        f"server   pid {server.get('pid')} on {printable(str(server.get('socket')))}, "
-        f"up {span(_number(server, 'uptime'))}, {server.get('clients')} of {server.get('max_clients')} clients",
+        f"server   pid {_field(server, 'pid')} on {_field(server, 'socket')}, up {span(_number(server, 'uptime'))}, "
+        f"{_field(server, 'clients')} of {_field(server, 'max_clients')} clients",
         f"engine   {_engine(server)}",
         f"now      {_now(status.active, now, colour)}",
     ]
@@ -114,13 +114,12 @@ def span(seconds: float) -> str:
 
 
 def _engine(server: JsonObject) -> str:
-    parts = [printable(str(server.get("engine")))]
-    parts.append(f"driver {printable(str(server.get('driver') or 'default'))}")
+    parts = [_field(server, "engine"), f"driver {_field(server, 'driver')}"]
     if server.get("synthesizer"):
-        parts.append(printable(str(server["synthesizer"])))
-    parts.append(f"player {printable(str(server.get('player') or 'default'))}")
-    parts.append(f"voice {printable(str(server.get('voice') or 'default'))}")
-    parts.append(f"{server.get('rate')} words a minute, volume {server.get('volume')}, pitch {server.get('pitch')}")
+        parts.append(_field(server, "synthesizer"))
+    parts += [f"player {_field(server, 'player')}", f"voice {_field(server, 'voice')}"]
+    parts.append(f"{_field(server, 'rate')} words a minute")
+    parts.append(f"volume {_field(server, 'volume')}, pitch {_field(server, 'pitch')}")
     if server.get("preempt"):
         parts.append("preempts")
     return ", ".join(parts)
@@ -130,7 +129,7 @@ def _now(active: Goal | None, now: float, colour: bool) -> str:
     if active is None:
         return "silent"
     since = "" if active.started_at is None else f" for {max(0.0, now - active.started_at):.1f} s"
-    return f"{active.id}  {_state(active.state, colour)}{since}  {_who_and_text(active, with_id=False)}"
+    return f"{printable(active.id)}  {_state(active.state, colour)}{since}  {_who_and_text(active, with_id=False)}"
 
 
 def _list(name: str, goals: tuple[Goal, ...], show: Callable[[Goal], str]) -> list[str]:
@@ -141,13 +140,13 @@ def _list(name: str, goals: tuple[Goal, ...], show: Callable[[Goal], str]) -> li
 
 def _who_and_text(goal: Goal, *, with_id: bool = True) -> str:
     text = "(text no longer kept)" if goal.text is None else f'"{printable(goal.text, MAX_TEXT)}"'
-    return f"{goal.id + '  ' if with_id else ''}{text}  from {who(goal.client)}"
+    return f"{printable(goal.id) + '  ' if with_id else ''}{text}  from {who(goal.client)}"
 
 
 def _outcome(goal: Goal, colour: bool) -> str:
     text = "(text no longer kept)" if goal.text is None else f'"{printable(goal.text, MAX_TEXT)}"'
     why = "" if goal.state is State.SUCCEEDED else f"  {printable(goal.message or '')}"
-    return f"{goal.id}  {_state(goal.state, colour)}  {text}{why}"
+    return f"{printable(goal.id)}  {_state(goal.state, colour)}  {text}{why}"
 
 
 def _state(state: State, colour: bool) -> str:
@@ -160,6 +159,11 @@ def _clock(seconds: float | None) -> str:
 
 def _moment(seconds: float | None) -> str | None:
     return None if seconds is None else time.strftime("%Y-%m-%d %H:%M:%S %z", time.localtime(seconds))
+
+
+def _field(server: JsonObject, name: str) -> str:
+    value = server.get(name)
+    return "default" if value is None else printable(str(value), MAX_TEXT)
 
 
 def _number(fields: JsonObject, name: str) -> float:

@@ -73,14 +73,16 @@ class Record:
         """Forget the text, to make room; the result stays."""
         self.text = None
 
-    def snapshot(self) -> Goal:
-        """Return the goal as it is now."""
+    def snapshot(self, state: State | None = None) -> Goal:
+        """Return the goal as it is now; with PENDING, as it was when it was accepted."""
+        state = self.state if state is None else state
+        started_at = None if state is State.PENDING else self.started_at
         spoken = None
-        if self.started_at is not None and self.text is not None:
+        if started_at is not None and self.text is not None:
             spoken = self.text[: self.spoken_end]
         return Goal(
             id=self.id,
-            state=self.state,
+            state=state,
             text=self.text,
             reason=self.reason,
             by=self.by,
@@ -90,7 +92,7 @@ class Record:
             data=self.data,
             client=self.sender,
             queued_at=self.queued_at,
-            started_at=self.started_at,
+            started_at=started_at,
             ended_at=self.ended_at,
             duration=self.duration,
         )

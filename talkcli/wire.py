@@ -129,12 +129,12 @@ def check_greeting(message: JsonObject, version: str) -> None:
     """Raise ProtocolMismatch or Busy where a client of `version` can't go on after this greeting."""
     theirs = message.get("talk")
     if theirs != PROTOCOL or isinstance(theirs, bool):
-        server = message.get("version", "unknown")
+        server = ascii(message.get("version", "unknown"))
         older = isinstance(theirs, int) and theirs < PROTOCOL
         side = "restart the server with the newer version" if older else "upgrade this command"
         raise ProtocolMismatch(
             f"this command (version {version}) speaks protocol {PROTOCOL}, the server (version {server}) speaks "
-            f"{theirs!r}: {side}"
+            f"{theirs!a}: {side}"
         )
     if message.get("error") == "busy":
         raise Busy("the server has as many clients as it takes (`talk serve --max-clients`)", "busy")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import Client
-from talkcli.errors import Busy, Lost, ServerUnavailable, UnknownGoal, UsageError
+from talkcli.errors import AccessDenied, Busy, Lost, ServerUnavailable, UnknownGoal, UsageError
 from talkcli.states import State
 from tests.conformance.rawsocket import GREETING, FakeServer
 from tests.support.surroundings import short_directory
@@ -150,6 +150,14 @@ def test_say_that_is_not_answered_may_have_been_heard() -> None:
         client.say("hello")
     with short_directory() as home, pytest.raises(ServerUnavailable, match="talk serve"):
         Client(f"{home}/s")
+
+
+def test_refusal_is_heard_though_the_server_hangs_up_at_once() -> None:
+    says = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
+    with short_directory() as home, FakeServer(f"{home}/s", [says], closes=True, listens=False):
+        for _ in range(300):  # it may have hung up before the client's own first words
+            with pytest.raises(AccessDenied, match="not you"), Client(f"{home}/s"):
+                pass
 
 
 def test_closed_client_says_so(client: Client) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,6 +10,7 @@ import pytest
 from talkcli import completion
 from talkcli.cli import COMMANDS
 from tests.conformance.bareserve import TALK, environment, run
+from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
     import pathlib
@@ -28,8 +28,7 @@ def test_scripts_that_are_checked_in_are_those_of_this_version(tmp_path: pathlib
 
 @pytest.mark.parametrize(("shell", "name"), [("bash", "talk.bash"), ("zsh", "_talk"), ("fish", "talk.fish")])
 def test_scripts_have_no_syntax_error(shell: str, name: str) -> None:
-    if shutil.which(shell) is None:
-        pytest.skip(f"needs {shell}")
+    needs(shell)
     done = run([shell, "-n", os.path.join(CHECKED_IN, name)], dict(os.environ))
     assert (done.code, done.err) == (0, "")
 

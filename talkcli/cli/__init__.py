@@ -9,13 +9,14 @@ import importlib
 import os
 import signal
 import sys
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
 from talkcli import __version__
 from talkcli.cli.common import Common, common_options, note, show_error
-from talkcli.errors import EXIT_ERROR, EXIT_SIGNAL, EXIT_USAGE, TalkError, UsageError
+from talkcli.errors import EXIT_ERROR, EXIT_SIGNAL, TalkError, UsageError
+from talkcli.printable import printable
 
 #: The commands, in the order in which help lists them: what a newcomer needs first comes first.
 COMMANDS = {
@@ -28,8 +29,24 @@ COMMANDS = {
 }
 
 
+class _OutputClosed(Exception):
+    """Standard output is closed. Under its own name, because click ends the process with 1 for a broken pipe."""
+
+
 class _Commands(click.Group):
     """Loads the module of a command when it is needed; lists them all without."""
+
+    def make_context(self, *arguments: Any, **extra: Any) -> click.Context:
+        try:
+            return super().make_context(*arguments, **extra)
+        except BrokenPipeError as error:
+            raise _OutputClosed from error
+
+    def invoke(self, ctx: click.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:
+            raise _OutputClosed from error
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         return list(COMMANDS)
@@ -49,7 +66,7 @@ class _Commands(click.Group):
 
             near = difflib.get_close_matches(name, COMMANDS, n=1)
             hint = f"Did you mean {near[0]!r}?" if near else f'To speak it, write: talk say "{" ".join(args)}"'
-            raise click.UsageError(f"No such command {name!r}. {hint}", ctx)
+            raise click.UsageError(f"No such command '{name}'. {hint}", ctx)
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
@@ -89,21 +106,24 @@ def main() -> NoReturn:
 def run(arguments: list[str]) -> int:
     """Run a command line, and return its exit code."""
     options = Common()
+    _fill_closed_descriptors()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     try:
         code = talk.main(arguments, prog_name="talk", standalone_mode=False, obj=options)
-        sys.stdout.flush()
+        if sys.stdout:
+            sys.stdout.flush()
     except click.ClickException as error:
-        _show_click_error(error, options)
+        # The options may not have been read as far as --json when the error was found.
+        _show_click_error(error, json=options.json or "--json" in arguments)
         return error.exit_code
     except TalkError as error:
         show_error(error, json=options.json)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         return EXIT_SIGNAL + signal.SIGINT
-    except BrokenPipeError:
+    except (_OutputClosed, BrokenPipeError):
         # Whoever read standard output has gone; nothing more may be written to it, not even at the interpreter's end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return EXIT_SIGNAL + signal.SIGPIPE
@@ -115,9 +135,22 @@ def run(arguments: list[str]) -> int:
     return code if isinstance(code, int) else 0
 
 
-def _show_click_error(error: click.ClickException, options: Common) -> None:
-    if options.json:
-        show_error(UsageError(error.format_message()), json=True)
+def _fill_closed_descriptors() -> None:
+    """Open /dev/null where 0, 1 or 2 is closed: a socket or a lock must not end up as standard error."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest that is free: this one
+
+
+def _show_click_error(error: click.ClickException, *, json: bool) -> None:
+    """Show a usage error. What was typed may be text of somebody else's, so its controls are escaped."""
+    words = printable(error.format_message())
+    if json:
+        show_error(UsageError(words), json=True)
     else:
-        error.show()
-    assert error.exit_code in {EXIT_ERROR, EXIT_USAGE}
+        context = getattr(error, "ctx", None)
+        if context is not None:
+            click.echo(f"{context.get_usage()}\nTry '{context.command_path} --help' for help.\n", err=True)
+        click.echo(f"Error: {words}", err=True)

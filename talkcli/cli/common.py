@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from dataclasses import dataclass
@@ -53,7 +54,6 @@ def common_options(command: _F) -> _F:
             click.option(
                 "--socket",
                 metavar="PATH",
-                type=click.Path(),
                 expose_value=False,
                 callback=_store,
                 help="Socket of the server. [env: TALK_SOCKET; default: the usual places, see the README]",
@@ -73,14 +73,25 @@ def common_options(command: _F) -> _F:
     return command
 
 
+def number(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    """Refuse NaN, which compares with nothing and so is in any range."""
+    if value is not None and math.isnan(value):
+        raise click.BadParameter(f"{value!r} is not a number.", context, parameter)
+    return value
+
+
 def show(line: str) -> None:
-    """Write a line of data to standard output, at once."""
+    """Write a line of data to standard output, at once; BrokenPipeError where that is closed."""
+    if sys.stdout is None:
+        raise BrokenPipeError("standard output is closed")
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
 
 def show_json(message: JsonObject) -> None:
-    """Write an object as a line of JSON, in UTF-8 whatever the locale is."""
+    """Write an object as a line of JSON, in UTF-8 whatever the locale is; BrokenPipeError as `show`."""
+    if sys.stdout is None:
+        raise BrokenPipeError("standard output is closed")
     sys.stdout.flush()
     sys.stdout.buffer.write(wire.encode(message))
     sys.stdout.buffer.flush()

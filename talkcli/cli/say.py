@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import sys
+import os
+import select
 import time
 from typing import TYPE_CHECKING
 
 import click
 
 from talkcli import output
-from talkcli.cli.common import Common, common, common_options, note, show, show_json
+from talkcli.cli.common import Common, common, common_options, note, number, show, show_error, show_json
 from talkcli.cli.interrupts import Interrupts
-from talkcli.connection import Interrupted
-from talkcli.dial import ANSWER_LIMIT
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
+from talkcli.dial import ANSWER_LIMIT, Interrupted, ready
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost, ServerUnavailable, TalkError
 from talkcli.states import EXIT_CODES, State
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ class _SayCommand(click.Command):
     "-t",
     "--timeout",
     type=click.FloatRange(0, min_open=True),
+    callback=number,
     metavar="SEC",
     help="With --wait: cancel it after SEC seconds, time in the queue included; exit code 124.",
 )
@@ -81,27 +82,43 @@ def command(
     began = time.monotonic()
     if timeout is not None and not wait:
         raise click.UsageError("--timeout needs --wait: without it, nothing is waited for", context)
-    sentence = _read_input() if text == ("-",) else " ".join(text)
+    end = None if timeout is None else began + timeout
+    sentence = _read_input(end) if text == ("-",) else " ".join(text)
     options = common(context)
-    patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
-    with (
-        Interrupts() as interrupts,
-        options.connect(name=name, interrupt=interrupts.descriptor, patience=patience) as client,
-    ):
-        goal = client.say(sentence, preempt=preempt, follow=wait)
-        if goal.state is State.REJECTED:
-            return report(goal.goal, options)
-        if not options.json and not options.quiet:
-            show(goal.id)
-        if not wait:
-            if options.json:
-                show_json(goal.goal.to_json())
-            return EXIT_OK
-        return _own(goal, interrupts, None if timeout is None else began + timeout, options)
+    with Interrupts() as interrupts:
+        try:
+            patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
+            with options.connect(name=name, interrupt=interrupts.descriptor, patience=patience) as client:
+                if interrupts.number is not None:
+                    raise Interrupted
+                goal = client.say(sentence, preempt=preempt, follow=wait)
+                return _tell(goal, options) if not wait else _own(goal, interrupts, end, options)
+        except Interrupted:
+            return interrupts.exit_code
+        except Lost as error:
+            if interrupts.number is None and (end is None or time.monotonic() < end):
+                raise
+            show_error(error, json=options.json)
+            return EXIT_TIMEOUT if interrupts.number is None else interrupts.exit_code
+
+
+def _tell(goal: GoalHandle, options: Common) -> int:
+    """Print the id of a goal that was accepted."""
+    if goal.state is State.REJECTED:
+        return report(goal.goal, options)
+    if options.json:
+        show_json(goal.goal.to_json())
+    elif not options.quiet:
+        show(goal.id)
+    return EXIT_OK
 
 
 def _own(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common) -> int:
     """Wait for a goal that this command owns: where it can't wait any longer, the goal ends too."""
+    if goal.state is State.REJECTED:
+        return report(goal.goal, options)
+    if not options.json and not options.quiet:
+        show(goal.id)
     try:
         goal.wait(None if end is None else max(0.0, end - time.monotonic()))
     except (Interrupted, TimeoutError):
@@ -137,6 +154,21 @@ def report(goal: Goal, options: Common) -> int:
     return EXIT_CODES.get(goal.state, EXIT_TIMEOUT)
 
 
-def _read_input() -> str:
+def _read_input(end: float | None) -> str:
     """Return standard input as one sentence: no more of it than the longest text, so that it can be refused."""
-    return sys.stdin.buffer.read(_MAX_INPUT).decode(errors="surrogateescape").rstrip("\r\n")
+    data = b""
+    while len(data) < _MAX_INPUT:
+        if not ready({0: select.POLLIN}, None if end is None else max(0.0, end - time.monotonic())):
+            raise InputLate("standard input has not ended within the time: nothing was sent")
+        more = os.read(0, _MAX_INPUT - len(data))
+        if not more:
+            break
+        data += more
+    return data.decode(errors="surrogateescape").rstrip("\r\n")
+
+
+class InputLate(TalkError):
+    """What should be spoken was not there in time."""
+
+    code = "timeout"
+    exit_code = EXIT_TIMEOUT

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import re
 
 import click
 
-from talkcli.cli.common import common, common_options
+from talkcli.cli.common import common, common_options, number
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE, Settings
-
-
-def _volume(context: click.Context, parameter: click.Parameter, value: float) -> float:
-    """Refuse NaN, which compares with nothing and so is in any range."""
-    if math.isnan(value):
-        raise click.BadParameter(f"{value!r} is not a number from 0 to 1.", context, parameter)
-    return value
 
 
 def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int:
@@ -40,7 +32,7 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
 @click.option(
     "--volume",
     type=click.FloatRange(0, 1),
-    callback=_volume,
+    callback=number,
     default=1.0,
     show_default=True,
     envvar="TALK_VOLUME",

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import time
+from typing import TYPE_CHECKING
 
 import click
 
-from talkcli.cli.common import common, common_options, note
+from talkcli.cli.common import Common, common, common_options, note, number
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.say import report
-from talkcli.connection import Interrupted
-from talkcli.dial import ANSWER_LIMIT
+from talkcli.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
 from talkcli.states import State
+
+if TYPE_CHECKING:
+    from talkcli.client import GoalHandle
 
 
 @click.command("wait")
@@ -21,6 +24,7 @@ from talkcli.states import State
     "-t",
     "--timeout",
     type=click.FloatRange(0, min_open=True),
+    callback=number,
     metavar="SEC",
     help="Wait no longer than SEC seconds; the goals go on; exit code 124.",
 )
@@ -42,20 +46,24 @@ def command(context: click.Context, ids: tuple[str, ...], timeout: float | None)
     end = None if timeout is None else time.monotonic() + timeout
     patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
     options = common(context)
-    first_failure = EXIT_OK
-    with (
-        Interrupts() as interrupts,
-        options.connect(interrupt=interrupts.descriptor, patience=patience) as client,
-    ):
+    with Interrupts() as interrupts:
         try:
-            for goal in client.follow(ids or None):
-                ended = goal.wait(None if end is None else max(0.0, end - time.monotonic()))
-                code = report(ended, options) if ids or ended.state is State.LOST or options.json else EXIT_OK
-                if ids or ended.state is State.LOST:
-                    first_failure = first_failure or code
+            with options.connect(interrupt=interrupts.descriptor, patience=patience) as client:
+                return _wait(client.follow(ids or None), end, options, named=bool(ids))
         except Interrupted:
             return interrupts.exit_code
         except TimeoutError as error:
             note(str(error))
             return EXIT_TIMEOUT
+
+
+def _wait(goals: list[GoalHandle], end: float | None, options: Common, *, named: bool) -> int:
+    """Wait for the goals in their order; how those ended that were not named is nobody's failure."""
+    first_failure = EXIT_OK
+    for goal in goals:
+        ended = goal.wait(None if end is None else max(0.0, end - time.monotonic()))
+        counts = named or ended.state is State.LOST
+        code = report(ended, options) if counts or options.json else EXIT_OK
+        if counts:
+            first_failure = first_failure or code
     return first_failure

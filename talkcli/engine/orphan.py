@@ -25,6 +25,8 @@ def die_with_parent() -> None:
 def prepare_child() -> Callable[[], None]:
     """Return what a child calls between fork and exec, so that it dies with this process.
 
+    It leads a process group of its own, so that whatever it starts itself can be killed with it.
+
     All that it needs is looked up here: the child of a fork must not import or allocate more than it has to. The parent
     may have died between the fork and the request, so the child looks afterwards who its parent is.
     """
@@ -32,6 +34,7 @@ def prepare_child() -> Callable[[], None]:
     parent = os.getpid()
 
     def in_child() -> None:
+        os.setpgid(0, 0)
         request()
         if os.getppid() != parent:
             os._exit(1)

@@ -1,8 +1,8 @@
 """A player program at the end of a pipe: the sink that is heard.
 
-It is started for one sentence and is gone after it. It stays in the engine process's session, so that the server can
-kill both, and dies with the engine process. Nothing in here blocks, except that a killed player is given a moment to
-be reaped.
+It is started for one sentence and is gone after it. It leads a process group, so that a command line of the user's is
+silent with all that it has started; and it dies with the engine process. Nothing in here blocks, except that a killed
+player is given a moment to be reaped.
 """
 
 from __future__ import annotations
@@ -123,9 +123,10 @@ class PlayerPipe:
         return None if self._broken_at is None else self._broken_at + LAST_WORDS
 
     def kill(self) -> None:
-        """Kill the player, and reap it if that takes no time."""
-        with contextlib.suppress(ProcessLookupError):
-            self._process.kill()
+        """Kill the player and what it has started, and reap it if that takes no time."""
+        if self._process.returncode is None:  # not reaped yet, so its group can't be another's
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
         self._close_stdin()
         if self._exit is not None and self._process.returncode is None:
             wait = select.poll()

@@ -71,16 +71,18 @@ class Session:
 
     def run(self) -> None:
         """Carry out commands until the server leaves or says so."""
-        voices_told = False
+        voices_told = spoken = False
         while not (self._leaving or self._channel.closed):
-            if self._backlog:
-                self._carry_out(self._backlog.popleft())
-                continue
-            if not voices_told and not self._readable(QUIET):
+            # With a goal after the other there never is a quiet moment: then between the first two.
+            if not voices_told and (spoken or not (self._backlog or self._readable(QUIET))):
                 voices_told = True
                 self._channel.send(protocol.Voices(self._voices()))
-                continue
-            self._backlog.extend(self._channel.receive())
+            elif self._backlog:
+                command = self._backlog.popleft()
+                self._carry_out(command)
+                spoken = spoken or isinstance(command, protocol.Say)
+            else:
+                self._backlog.extend(self._channel.receive())
 
     def wait(self, interests: Sequence[Interest], until: float | None) -> None:
         """Wait for one of the interests, a command or a monotonic time, and carry out what the server wants now."""

@@ -12,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
@@ -50,33 +51,31 @@ class EngineProcess:
         self.explained = False
         self._lines = LineSplitter(limit=None)
         self._stderr_tail = b""
-        with contextlib.ExitStack() as opened:
+        environment = {name: value for name, value in os.environ.items() if name not in _NOT_INHERITED}
+        with contextlib.ExitStack() as kept, contextlib.ExitStack() as handed_over:
             self.socket, theirs = socket.socketpair()
-            opened.callback(self.socket.close)
-            with theirs:
-                self.socket.setblocking(False)
-                self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-                self.liveness, inherited = os.pipe()
-                opened.callback(os.close, self.liveness)
-                self.stderr, stderr = os.pipe()
-                opened.callback(os.close, self.stderr)
-                os.set_blocking(self.stderr, False)
-                try:
-                    environment = {name: value for name, value in os.environ.items() if name not in _NOT_INHERITED}
-                    self._process: subprocess.Popen[bytes] = subprocess.Popen(
-                        command,
-                        stdin=theirs.fileno(),
-                        stdout=subprocess.DEVNULL,
-                        stderr=stderr,
-                        env={**environment, LIVENESS_VARIABLE: str(inherited)},
-                        pass_fds=[inherited],
-                        # Ctrl-C in the server's terminal must not reach it; and one kill reaches all of a session.
-                        start_new_session=True,
-                    )
-                finally:
-                    os.close(inherited)
-                    os.close(stderr)
-            opened.pop_all()
+            kept.callback(self.socket.close)
+            handed_over.callback(theirs.close)
+            self.liveness, liveness = os.pipe()
+            kept.callback(os.close, self.liveness)
+            handed_over.callback(os.close, liveness)
+            self.stderr, stderr = os.pipe()
+            kept.callback(os.close, self.stderr)
+            handed_over.callback(os.close, stderr)
+            os.set_blocking(self.stderr, False)
+            self.socket.setblocking(False)
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+            self._process: subprocess.Popen[bytes] = subprocess.Popen(
+                command,
+                stdin=theirs.fileno(),
+                stdout=subprocess.DEVNULL,
+                stderr=stderr,
+                env={**environment, LIVENESS_VARIABLE: str(liveness)},
+                pass_fds=[liveness],
+                # Ctrl-C in the server's terminal must not reach it, and one kill reaches all of its group.
+                start_new_session=True,
+            )
+            kept.pop_all()
         self.send(configure)
 
     @property
@@ -124,7 +123,12 @@ class EngineProcess:
                 os.killpg(self._process.pid, signal.SIGKILL)
 
     def last_words(self) -> str:
-        """Return how a process that closed its connection ended, for people. Waits a moment for it to be gone."""
+        """Return how a process that closed its connection ended, for people; what it started is killed.
+
+        Waits a moment for it to be gone.
+        """
+        self._await_exit()
+        self.kill()  # before it is reaped: from then on its group could be another's
         try:
             status = self._process.wait(_LAST_BREATH)
         except subprocess.TimeoutExpired:
@@ -133,6 +137,15 @@ class EngineProcess:
         lines = [line.strip() for line in self._stderr_tail.decode(errors="replace").splitlines() if line.strip()]
         how = f"it was killed by {_signal_name(-status)}" if status < 0 else f"it exited with status {status}"
         return f"{how} ({lines[-1]})" if lines else how
+
+    def _await_exit(self) -> None:
+        """Let the process end by itself, so that its own exit status is seen; it stays to be reaped."""
+        if not hasattr(os, "waitid"):
+            return  # macOS before Python 3.13: the status seen may be that of the kill
+        end = time.monotonic() + _LAST_BREATH
+        pid = self._process.pid
+        while os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None and time.monotonic() < end:
+            time.sleep(0.001)
 
     def silent(self) -> bool:
         """Whether process and player are gone. Call where `liveness` is readable: nothing is ever written there."""

@@ -41,7 +41,14 @@ class EngineDied:
     words: str
 
 
-Report = protocol.Event | EngineDied
+@dataclass(frozen=True, slots=True)
+class ThreadDied:
+    """A bug ended the engine thread: nothing will be spoken any more."""
+
+    words: str
+
+
+Report = protocol.Event | EngineDied | ThreadDied
 
 
 class EngineThread(threading.Thread):
@@ -67,10 +74,12 @@ class EngineThread(threading.Thread):
         #: when the process last gave a sign of life for the goal; None while the goal waits for a process
         self._heard_at: float | None = None
         self._stop_at: float | None = None
+        #: how the goal ended, once the process that spoke it is known to be gone
         self._verdict: protocol.Ended | None = None
+        self._verdict_on: spawn.EngineProcess | None = None
         #: killed, not yet known to be gone, with the time by which they must be
         self._dying: dict[spawn.EngineProcess, float] = {}
-        self._closing = False
+        self._closing = self._ended = False
 
     # -- called from other threads
 
@@ -91,6 +100,8 @@ class EngineThread(threading.Thread):
         self._call(self._begin_close)
 
     def _call(self, action: Callable[[], None]) -> None:
+        if self._ended:
+            return  # nobody is left to do it: `ThreadDied` says so, or the server ends
         self._inbox.append(action)
         # Where the pipe is full, a wake-up that was not seen yet does for this one, too.
         with contextlib.suppress(BlockingIOError):
@@ -99,12 +110,18 @@ class EngineThread(threading.Thread):
     # -- the loop
 
     def run(self) -> None:
-        """Serve until `close`."""
-        while not self._closing:
-            self._keep_limits(time.monotonic())
-            for key, _ in self._selector.select(self._timeout()):
-                self._handle(key)
-        self._shut_down()
+        """Serve until `close`; a bug is reported, so that no goal waits for an engine that is not there."""
+        try:
+            while not self._closing:
+                self._keep_limits(time.monotonic())
+                for key, _ in self._selector.select(self._timeout()):
+                    self._handle(key)
+        except Exception as error:
+            self._closing = True
+            self._post(ThreadDied(f"a bug in the engine thread: {type(error).__name__}: {error}"))
+            raise
+        finally:
+            self._shut_down()
 
     def _timeout(self) -> float | None:
         due = [each for each in self._deadlines() if each is not None]
@@ -131,7 +148,7 @@ class EngineThread(threading.Thread):
         for process, limit in list(self._dying.items()):
             if now >= limit:
                 self._dying[process] = float("inf")  # kept, to be reaped when it goes after all
-                if self._verdict:
+                if self._verdict and self._verdict_on is process:
                     words = f"the player could not be ended within {SILENCE_LIMIT:g} s"
                     self._finish(protocol.Ended(self._verdict.id, protocol.FAILED, "not_silent", words))
 
@@ -188,8 +205,9 @@ class EngineThread(threading.Thread):
 
     def _abandon(self, goal_id: str) -> None:
         if self._goal and self._goal.id == goal_id:
+            in_hand = self._heard_at is not None
             self._goal = self._heard_at = self._stop_at = self._verdict = None
-            if self._process and self._process.ready:
+            if in_hand:
                 self._lose_process("the engine could not be silenced", "not_silent")
 
     def _finish(self, ended: protocol.Ended) -> None:
@@ -250,6 +268,7 @@ class EngineThread(threading.Thread):
         had_goal = self._goal is not None and self._heard_at is not None
         if self._goal and had_goal:
             stopped = self._stop_at is not None
+            self._verdict_on = process
             self._verdict = (
                 protocol.Ended(self._goal.id, protocol.STOPPED)
                 if stopped
@@ -288,7 +307,7 @@ class EngineThread(threading.Thread):
             self._selector.unregister(process.stderr)
         process.close()
         limit = self._dying.pop(process)
-        if self._verdict and limit != float("inf"):
+        if self._verdict and self._verdict_on is process and limit != float("inf"):
             self._finish(self._verdict)
 
     # -- the end
@@ -303,6 +322,7 @@ class EngineThread(threading.Thread):
         while self._dying and time.monotonic() < limit:
             for key, _ in self._selector.select(max(0.0, limit - time.monotonic())):
                 self._handle(key)
+        self._ended = True
         for process in list(self._dying):
             process.close()
         self._selector.close()

@@ -30,7 +30,8 @@ def unknown_voice(wanted: str, voices: tuple[Voice, ...]) -> str:
     import difflib
 
     known = {word.casefold(): word for voice in voices for word in (voice.language, voice.name, voice.id) if word}
-    near = [known[word] for word in difflib.get_close_matches(wanted.casefold(), known, n=3, cutoff=0.5)]
+    within = [known[word] for word in known if len(wanted) > 2 and wanted.casefold() in word][:3]
+    near = within or [known[word] for word in difflib.get_close_matches(wanted.casefold(), known, n=3, cutoff=0.5)]
     hint = f"did you mean {' or '.join(repr(word) for word in near)}? " if near else ""
     return f'unknown voice "{wanted}": {hint}"talk voices" lists them'
 

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 #: Ended goals that `status` lists.
 RECENT = 10
+#: Seconds in which a request for the voices is answered; a client gives up after five.
+VOICES_LIMIT = 4.0
 
 
 class Answers:
@@ -64,7 +66,7 @@ class Answers:
             connection.settle()
 
     def voices_known(self) -> None:
-        """Answer those who asked for the voices; also where it is known now that there are none."""
+        """Answer those who asked for the voices, also where there are none yet and it would take too long."""
         asked, self._voices_asked = self._voices_asked, []
         for connection, seq in asked:
             self._send_voices(connection, seq)
@@ -76,7 +78,9 @@ class Answers:
         record, effects = self._scheduler.submit(request, connection.sender, self._service.now())
         if request.wait:
             self._service.audience.await_result(record.id, connection)
-        connection.reply(wire.ok(seq, goal=record.snapshot().to_json()))
+        # As it was accepted: it may have started in the same step, but that is told by its events.
+        accepted = record.state if record.state is State.REJECTED else State.PENDING
+        connection.reply(wire.ok(seq, goal=record.snapshot(accepted).to_json()))
         self._service.apply(effects)
 
     def _wait(self, connection: Connection, seq: int | None, request: Wait) -> None:
@@ -116,6 +120,7 @@ class Answers:
         if self._service.voices is None and self._service.engine_words in {"starting", "ready"}:
             connection.owed += 1
             self._voices_asked.append((connection, seq))
+            self._service.call_later(VOICES_LIMIT, self.voices_known)
         else:
             self._send_voices(connection, seq)
 
@@ -171,7 +176,9 @@ class Answers:
     def _send_voices(self, connection: Connection, seq: int | None) -> None:
         voices = self._service.voices
         if voices is None:
-            words = f"the engine can't list its voices: {self._service.engine_words}"
+            words = f"the engine can't list its voices now: it is {self._service.engine_words}"
+            if self._scheduler.active:
+                words += ", and busy with its first sentence: ask again after that"
             connection.reply(wire.failure(seq, "engine_failed", words))
             return
         items = (wire.item(seq, voice={"id": each.id, "language": each.language, "name": each.name}) for each in voices)

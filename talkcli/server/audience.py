@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from talkcli.states import State
+
 if TYPE_CHECKING:
     import asyncio
 
     from talkcli.messages import JsonObject
     from talkcli.record import Record
     from talkcli.server.connection import Connection
-    from talkcli.states import State
 
 #: Seconds between signs of life to those who wait; a client gives a server up after three of them.
 ALIVE_EVERY = 5.0
@@ -64,7 +65,7 @@ class Audience:
             event: JsonObject = {"event": "state", "id": record.id, "state": state.name, "n": self._count, "at": at}
             for connection in waiting:
                 connection.publish(event)
-            self._tell_watchers(record, event)
+            self._tell_watchers(record, state, event)
         if state.terminal and waiting:
             self._send_result(record, waiting)
 
@@ -76,11 +77,11 @@ class Audience:
             for connection in list(self._watchers):
                 connection.publish(event, feedback=True)
 
-    def _tell_watchers(self, record: Record, event: JsonObject) -> None:
+    def _tell_watchers(self, record: Record, state: State, event: JsonObject) -> None:
         if not self._watchers:
             return
-        if record.started_at is None or record.state.terminal:
-            event = {**event, "goal": record.snapshot().to_json()}  # its first state, and its last
+        if state is State.PENDING or state.terminal:
+            event = {**event, "goal": record.snapshot(state).to_json()}  # its first state, and its last
         for connection in list(self._watchers):
             connection.publish(event)
 

@@ -7,6 +7,8 @@ not read from either; feedback for it is dropped, and at last the client itself.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import os
 from collections import deque
 from dataclasses import replace
 from itertools import chain
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 SOFT_OUTPUT = 256 * 1024
 #: Bytes that may wait for a client that doesn't read its results, before it is let go.
 HARD_OUTPUT = 4 * 1024 * 1024
-#: Events held back while a list is sent to a client that reads it slowly, before it is let go.
+#: Messages held back while a list is sent to a client that reads it slowly, before it is let go.
 MAX_HELD = 10_000
 #: Seconds from connecting to the first complete request: clients send `hello` at once.
 FIRST_REQUEST = 5.0
@@ -70,10 +72,10 @@ class Connection(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._splitter = wire.LineSplitter()
         self._lines: deque[bytes] = deque()
-        self._list: Iterator[JsonObject] | None = None
-        self._held: deque[JsonObject] = deque()
+        #: what has to be sent in its order while a list is on its way: lists, and what came after them
+        self._outbox: deque[Iterator[JsonObject]] = deque()
         self._newest: JsonObject | None = None
-        self._congested = self._half_closed = self._turn_is_due = self._working = False
+        self._congested = self._half_closed = self._turn_is_due = False
         self._bad_lines = 0
         self._first_limit: asyncio.TimerHandle | None = None
         self._line_limit: asyncio.TimerHandle | None = None
@@ -92,13 +94,15 @@ class Connection(asyncio.Protocol):
         if self.admitted:
             self._write(self._handler.greeting())
 
-    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
+    def connection_lost(self, exc: Exception | None) -> None:
         for limit in (self._first_limit, self._line_limit):
             if limit:
                 limit.cancel()
-        self._transport = self._list = None
+        if isinstance(exc, OSError) and self.admitted:
+            self._hear_last_requests()
+        self._transport = None
         self._lines.clear()
-        self._held.clear()
+        self._outbox.clear()
         self._handler.left(self)
 
     def data_received(self, data: bytes) -> None:
@@ -107,14 +111,10 @@ class Connection(asyncio.Protocol):
         except BadRequest as error:
             self.refuse(error.code, str(error))
             return
-        if self._line_limit and (b"\n" in data or not self._splitter.unfinished):
-            self._line_limit.cancel()
-            self._line_limit = None
-        if self._splitter.unfinished and not self._line_limit:
-            self._line_limit = self._loop.call_later(
-                LINE_LIMIT, self.refuse, "too_slow", f"a line took more than {LINE_LIMIT:g} s"
-            )
+        if b"\n" in data:
+            self._stop_line_limit()  # what follows the newline is another line
         self._work()
+        self._set_reading()
 
     def eof_received(self) -> bool:
         self._half_closed = True
@@ -123,41 +123,39 @@ class Connection(asyncio.Protocol):
 
     def pause_writing(self) -> None:
         self._congested = True
-        if self._transport:
-            self._transport.pause_reading()
+        self._set_reading()
 
     def resume_writing(self) -> None:
         self._congested = False
-        if self._transport and self._open:
-            self._transport.resume_reading()
         self._work()
+        self._set_reading()
 
     # -- what the handler calls
 
     def reply(self, message: JsonObject) -> None:
         """Answer a request."""
-        self._write(message)
+        self._send(message)
 
     def stream(self, items: Iterable[JsonObject], reply: JsonObject) -> None:
         """Send a list, as fast as the client reads, and its reply; what comes after it waits."""
-        self._list = chain(items, [reply])
-        self._work()
+        self._outbox.append(chain(items, [reply]))
+        self._ask_for_a_turn()
 
     def publish(self, event: JsonObject, *, feedback: bool = False) -> None:
         """Send an event. Feedback is dropped, all but the newest, while the client doesn't read."""
-        if self._list is not None or self._held:
-            self._held.append(event)
-            if len(self._held) > MAX_HELD:
-                self.drop()
-        elif feedback and self._congested:
+        if feedback and self._congested:
             self._newest = event
-        else:
-            self._write(event)
+            return
+        if self._newest:  # what was the newest is older than this
+            newest, self._newest = self._newest, None
+            self._send(newest)
+        self._send(event)
 
     def settle(self) -> None:
         """Note that an answer that was owed has been given."""
         self.owed -= 1
-        self._work()
+        # Not at once: whoever gives the answer may be in the middle of other things, and another request must wait.
+        self._ask_for_a_turn()
 
     def refuse(self, code: str, words: str) -> None:
         """Say why, and close."""
@@ -181,6 +179,36 @@ class Connection(asyncio.Protocol):
         """Whether more can be sent."""
         return self._transport is not None and not self._transport.is_closing()
 
+    def _send(self, message: JsonObject) -> None:
+        """Send a message after the lists that are on their way."""
+        if not self._outbox:
+            self._write(message)
+        elif len(self._outbox) < MAX_HELD:
+            self._outbox.append(iter((message,)))
+        else:
+            self.drop()
+
+    def _set_reading(self) -> None:
+        """Read from the client only while it takes its answers and its requests are kept up with."""
+        if self._transport is None or self._transport.is_closing():
+            return
+        reading = not self._congested and len(self._lines) <= TURN
+        if reading:
+            self._transport.resume_reading()
+        else:
+            self._transport.pause_reading()
+        if not reading or not self._splitter.unfinished:
+            self._stop_line_limit()
+        elif self._line_limit is None:
+            self._line_limit = self._loop.call_later(
+                LINE_LIMIT, self.refuse, "too_slow", f"a line took more than {LINE_LIMIT:g} s"
+            )
+
+    def _stop_line_limit(self) -> None:
+        if self._line_limit:
+            self._line_limit.cancel()
+            self._line_limit = None
+
     def _write(self, message: JsonObject) -> None:
         if self._transport is None or self._transport.is_closing():
             return
@@ -188,21 +216,25 @@ class Connection(asyncio.Protocol):
         if self._transport.get_write_buffer_size() > HARD_OUTPUT:
             self.drop()
 
+    def _hear_last_requests(self) -> None:
+        """Take what a client sent that closed without reading: the error hid it, but it is still in the socket."""
+        assert self._transport is not None
+        descriptor = self._transport.get_extra_info("socket").fileno()
+        with contextlib.suppress(OSError, BadRequest):
+            while data := os.read(descriptor, SOFT_OUTPUT):
+                self._lines.extend(self._splitter.feed(data))
+        while self._lines:
+            self._take(self._lines.popleft())
+
     def _work(self) -> None:
-        """Do what can be done now: send the list, then what was held back, then take requests."""
-        if self._working:
-            return  # a request is being carried out, in a call further up
-        self._working = True
-        try:
-            steps = 0
-            while self._open and not self._congested and self._step():
-                steps += 1
-                if steps == TURN:
-                    self._ask_for_a_turn()
-                    return
-        finally:
-            self._working = False
-        idle = not (self._list or self._held or self._lines or self.owed or self._congested)
+        """Do what can be done now: send the lists and what was held back for them, then take requests."""
+        for _ in range(TURN):
+            if not self._open or self._congested or not self._step():
+                break
+        else:
+            self._ask_for_a_turn()
+            return
+        idle = not (self._outbox or self._lines or self.owed or self._congested)
         if self._half_closed and idle:
             self.close()
 
@@ -214,16 +246,15 @@ class Connection(asyncio.Protocol):
     def _next_turn(self) -> None:
         self._turn_is_due = False
         self._work()
+        self._set_reading()
 
     def _step(self) -> bool:
-        if self._list is not None:
-            message = next(self._list, None)
+        if self._outbox:
+            message = next(self._outbox[0], None)
             if message is None:
-                self._list = None
+                self._outbox.popleft()
             else:
                 self._write(message)
-        elif self._held:
-            self._write(self._held.popleft())
         elif self._newest:
             newest, self._newest = self._newest, None
             self._write(newest)

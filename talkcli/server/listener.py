@@ -11,6 +11,7 @@ import fcntl
 import os
 import socket
 import stat
+import sys
 import time
 
 from talkcli import __version__, dial, paths
@@ -143,15 +144,20 @@ def _holder(fd: int) -> str:
 
 
 def _bind(path: str, mode: int) -> socket.socket:
-    with contextlib.suppress(FileNotFoundError):
+    try:
         if not stat.S_ISSOCK(os.lstat(path).st_mode):
             raise AddressInUse(f"{path} exists and is no socket: remove it, or name another one")
         os.unlink(path)  # the lock is ours, so whoever bound it is gone
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise AddressInUse(f"the socket {path} of an earlier server can't be removed: {error.strerror}") from error
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listening.setblocking(False)
         # Before bind, so that the file never has any other mode; bind takes the umask away from it.
-        os.fchmod(listening.fileno(), mode)
+        if sys.platform.startswith("linux"):  # elsewhere a socket has no mode of its own, and the umask has to do
+            os.fchmod(listening.fileno(), mode)
         umask = os.umask(0o777 & ~mode)
         try:
             listening.bind(path)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.thread import EngineThread
-from talkcli.errors import EXIT_OK, EXIT_SIGNAL, UsageError
+from talkcli.errors import EXIT_OK, EXIT_SIGNAL
 from talkcli.messages import Sender
 from talkcli.requests import Say
 from talkcli.server import log
@@ -84,7 +84,7 @@ class _Server:
             service.engine.close()
             await asyncio.to_thread(service.engine.join, _ENGINE_GOODBYE)
         if service.fatal:
-            raise UsageError(service.fatal)
+            raise service.fatal
 
     async def _say_goodbye(self) -> None:
         """Let every client take what was written for it, but wait for none that doesn't read."""

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 from talkcli import __version__, peers, wire
 from talkcli.engine import protocol
-from talkcli.engine.thread import EngineDied, Report
+from talkcli.engine.thread import EngineDied, Report, ThreadDied
+from talkcli.errors import TalkError, UsageError
 from talkcli.messages import Sender
 from talkcli.scheduler import Changed, Effect, GiveUp, Now, Scheduler, Start
 from talkcli.server import log
@@ -23,6 +24,8 @@ from talkcli.server.answers import Answers
 from talkcli.server.audience import Audience
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from talkcli.engine.thread import EngineThread
     from talkcli.messages import JsonObject
     from talkcli.record import Record
@@ -54,7 +57,7 @@ class Service:
         self.deserted = asyncio.Event()
         self.deserted.set()
         #: why the server must end at once: what it was told to do can't be done
-        self.fatal: str | None = None
+        self.fatal: TalkError | None = None
         self.ready: protocol.Ready | None = None
         self.voices: tuple[protocol.Voice, ...] | None = None
         #: how the engine is, in a few words
@@ -159,6 +162,10 @@ class Service:
             )
         )
 
+    def call_later(self, seconds: float, action: Callable[[], None]) -> None:
+        """Do something after a while, whatever happens meanwhile."""
+        self._loop.call_later(seconds, action)
+
     def _set_timer(self) -> None:
         if self._timer:
             self._timer.cancel()
@@ -191,16 +198,26 @@ class Service:
         elif isinstance(report, protocol.StartFailed):
             self._engine_fails(report.message)
             if report.reason == "unknown_voice" and self.ready is None:
-                self.fatal = report.message
+                self.fatal = UsageError(report.message)
                 self.shut_down()
         elif isinstance(report, EngineDied):
             self._engine_fails(report.words)
+        elif isinstance(report, ThreadDied):
+            self._thread_died(report.words)
 
     def _engine_fails(self, words: str) -> None:
         if words != self.engine_words:
             log.line(log.shown(words))
         self.engine_words = words
         self._answers.voices_known()
+
+    def _thread_died(self, words: str) -> None:
+        """End: there is nothing left that could speak, and a supervisor will start another server."""
+        self._engine_fails(words)
+        self.fatal = TalkError(words)
+        self.shut_down()
+        if self.scheduler.active:
+            self.apply(self.scheduler.failed(self.scheduler.active.id, "engine_failed", words, None, self._now()))
 
     def _ended(self, ended: protocol.Ended) -> None:
         active = self.scheduler.active

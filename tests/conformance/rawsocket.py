@@ -75,11 +75,15 @@ class Raw(contextlib.AbstractContextManager["Raw"]):
 
 
 class FakeServer(contextlib.AbstractContextManager["FakeServer"]):
-    """Says the same bytes to every client, and nothing else; `closes`: hangs up after that."""
+    """Says the same bytes to every client, and nothing else.
 
-    def __init__(self, path: str, says: Iterable[bytes], *, closes: bool = False) -> None:
+    `closes`: hangs up after that and the client's first words; `listens`: waits for these.
+    """
+
+    def __init__(self, path: str, says: Iterable[bytes], *, closes: bool = False, listens: bool = True) -> None:
         self._says = b"".join(says)
         self._closes = closes
+        self._listens = listens
         self._clients: list[socket.socket] = []
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.bind(path)
@@ -107,7 +111,8 @@ class FakeServer(contextlib.AbstractContextManager["FakeServer"]):
             with contextlib.suppress(OSError):
                 client.sendall(self._says)
                 client.settimeout(PATIENCE)
-                client.recv(65536)
+                if self._listens:
+                    client.recv(65536)
             self._served.release()
             if self._closes:
                 client.close()

@@ -14,7 +14,7 @@ from tests.conformance.rawsocket import Raw
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from tests.support.processes import Talk
+    from tests.conftest import MakeTalk
 
 LINES = [
     '{"request": "hello", "name": "patrol", "urgent": false}',
@@ -55,11 +55,12 @@ def mutated(source: random.Random) -> Iterator[bytes]:
 
 
 @pytest.mark.timeout(180)
-def test_mutated_lines_get_one_reply_each(scripted: Talk) -> None:
+def test_mutated_lines_get_one_reply_each(make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True, watched=False)
     lines = mutated(random.Random(20))
     for _ in range(COUNT // ON_ONE):
         batch = [next(lines) for _ in range(ON_ONE)]
-        with Raw(scripted.socket) as raw:
+        with Raw(talk.socket) as raw:
             data = b"".join(each + b'{"request": "hello"}\n' for each in batch)
             raw.socket.settimeout(60)
             sender = threading.Thread(target=_send, args=(raw, data))
@@ -67,11 +68,11 @@ def test_mutated_lines_get_one_reply_each(scripted: Talk) -> None:
             replies = _count_replies(raw)
             sender.join()
         assert replies == 2 * ON_ONE
-    with scripted.connect() as wire:
+    with talk.connect() as wire:
         assert wire.request("cancel")["ok"]
         assert wire.request("say", text="still here", wait=True)["ok"]
         assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
-    assert "a bug" not in scripted.log
+    assert "a bug" not in talk.log
 
 
 def _send(raw: Raw, data: bytes) -> None:
