@@ -15,7 +15,7 @@ import click
 import pytest
 
 import talkcli
-from tests.conformance.bareserve import SERVE, environment, run, serving
+from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support import processes
 from tests.support.connection import Wire
 from tests.support.surroundings import needs, short_directory

@@ -73,7 +73,8 @@ def test_the_dummy_driver_speaks_and_reports_words() -> None:
         for goal in ("g1", "g2"):
             assert engine.spoken("battery low", goal).outcome == protocol.COMPLETED
             assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
-        assert engine.until(protocol.Voices).voices[0].id == "dummy.voice1"
+            if goal == "g1":  # between the first two, as there was no quiet moment before
+                assert engine.until(protocol.Voices).voices[0].id == "dummy.voice1"
 
 
 def test_a_driver_without_pitch_fails_only_who_asks_for_it() -> None:
