@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -53,6 +54,23 @@ def test_states_that_a_handle_shows_only_go_forward(scripted: Talk, client: Clie
         client.status()  # any request reads on
     assert seen in ([State.PENDING, State.ACTIVE], [State.ACTIVE]), seen
     assert scripted.watcher.wait_for_terminal(handle.id) == "SUCCEEDED"
+
+
+def test_wait_without_patience_sees_what_has_arrived(scripted: Talk, client: Client) -> None:
+    handle = client.say("length=0")
+    scripted.watcher.wait_for_terminal(handle.id)
+    end = time.monotonic() + 5
+    while not handle.state.terminal and time.monotonic() < end:
+        with contextlib.suppress(TimeoutError):
+            handle.wait(0)  # nothing else reads on this connection
+    assert handle.state is State.SUCCEEDED
+
+
+def test_goal_that_was_not_followed_can_be_waited_for(client: Client) -> None:
+    assert client.say("length=0.1", follow=False).wait(5).state is State.SUCCEEDED
+    late = client.say("length=0", follow=False)
+    client.say("length=0").wait(5)
+    assert late.wait(5).state is State.SUCCEEDED
 
 
 def test_wait_gives_up_and_the_goal_goes_on(scripted: Talk, client: Client) -> None:

@@ -1,4 +1,4 @@
-"""The wire as section 9 of the design has it: greeting, replies, events in their order, and clients of few lines."""
+"""The wire: greeting, replies, events in their order, and clients of few lines."""
 
 from __future__ import annotations
 
@@ -168,3 +168,22 @@ def test_lists_come_one_item_a_line(scripted: Talk) -> None:
         ]
         assert kinds == [*(("pending", each) for each in pending), ("recent", said)]
         assert wire.request("cancel")["count"] == 3
+
+
+def test_request_is_not_taken_in_the_middle_of_what_an_end_brings_about(scripted: Talk) -> None:
+    count = 60
+    with scripted.connect() as wire:
+        for number in range(count):
+            wire.send({"seq": number, "request": "say", "text": "length=0.005", "wait": True})
+        # Requests that wait to be taken are there when the goals end, one after the other.
+        wire.send_raw(b"".join(line(request="cancel", current=True) for _ in range(4 * count)))
+        last = scripted.run("say", "--wait", "length=0 the last")
+    assert last.code == 0
+    for goal in scripted.watcher.goals():
+        states = scripted.watcher.states(goal)
+        assert states[0] == "PENDING"
+        assert states[1:] in (
+            ["ACTIVE", "SUCCEEDED"],
+            ["ACTIVE", "PREEMPTING", "PREEMPTED"],
+            ["ACTIVE", "PREEMPTING", "SUCCEEDED"],
+        ), states

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
-#: Limits of the design's section 11, and what a loaded machine may be late.
+#: The server's own limits, and what a loaded machine may be late.
 FIRST_REQUEST = 5.0
 LINE = 10.0
 LATE = 1.0

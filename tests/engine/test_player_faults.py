@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import sys
 import time
@@ -290,3 +291,20 @@ def test_no_descriptor_is_left_over(player: Player) -> None:
         for number in range(1, 6):
             engine.spoken(TEXT, f"g{number}")
         assert os.listdir(f"/proc/{engine.process.pid}/fd") == before
+
+
+def test_what_a_player_has_started_is_silent_with_it(tmp_path: Path) -> None:
+    script = tmp_path / "pipeline.sh"
+    script.write_text(f"sleep 60 & echo $! > {tmp_path}/child; cat > /dev/null; wait\n", "utf-8")
+    with Spawned(f"sh {script}") as engine:
+        engine.until(protocol.Ready)
+        engine.say(TEXT, "g1")
+        engine.until(protocol.Word)
+        child = int((tmp_path / "child").read_text("utf-8"))
+        descriptor = os.pidfd_open(child)
+        try:
+            engine.send(protocol.Stop("g1"))
+            assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+            assert select.select([descriptor], [], [], 0.1)[0], "what the player had started goes on"
+        finally:
+            os.close(descriptor)

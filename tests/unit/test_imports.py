@@ -52,7 +52,7 @@ def sources() -> dict[str, ast.Module]:
 
 
 def part(module: str) -> str:
-    """Return which part of the design a module is of; `python -m talkcli` is the cli's, `server_x` the server's."""
+    """Return which part of the package a module is of; `python -m talkcli` is the cli's, `server_x` the server's."""
     first = module.partition(".")[0]
     if first.startswith("server"):
         return "server"
