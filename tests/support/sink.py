@@ -16,6 +16,7 @@ import time
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from tests.support.espeak import RATE
 from tests.support.monitor import Monitor
@@ -93,7 +94,7 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
             with self._changed:
                 self._taps.remove(recording)
 
-    def play(self, samples: np.ndarray[tuple[int], np.dtype[np.int16]], player: str = "aplay") -> None:
+    def play(self, samples: npt.NDArray[np.int16], player: str = "aplay") -> None:
         """Play samples to their end with `aplay` or `pacat`."""
         command = {
             "aplay": ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-r", str(RATE), "-c", "1", "-"],
