@@ -51,11 +51,12 @@ class ThreadDied:
 Report = protocol.Event | EngineDied | ThreadDied
 
 
-class EngineThread(threading.Thread):
+class EngineThread:
     """`post` is called in this thread, with what the engine process says and with an `Ended` for each goal."""
 
     def __init__(self, configure: protocol.Configure, post: Callable[[Report], None]) -> None:
-        super().__init__(name="engine", daemon=True)
+        # Held, not inherited from: a Thread has private names of its own, and others in each version of Python.
+        self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
         self._configure = configure
         self._post = post
         self._inbox: deque[Callable[[], None]] = deque()
@@ -83,6 +84,14 @@ class EngineThread(threading.Thread):
 
     # -- called from other threads
 
+    def start(self) -> None:
+        """Start the thread, and with it the first engine process."""
+        self._thread.start()
+
+    def join(self, timeout: float) -> None:
+        """Wait for the thread to end, at most `timeout` seconds."""
+        self._thread.join(timeout)
+
     def say(self, goal: protocol.Say) -> None:
         """Hand in a goal; the one before must have ended or been given up."""
         self._call(lambda: self._take(goal))
@@ -109,7 +118,7 @@ class EngineThread(threading.Thread):
 
     # -- the loop
 
-    def run(self) -> None:
+    def _run(self) -> None:
         """Serve until `close`; a bug is reported, so that no goal waits for an engine that is not there."""
         try:
             while not self._closing:
