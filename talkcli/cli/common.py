@@ -80,6 +80,12 @@ def number(context: click.Context, parameter: click.Parameter, value: float | No
     return value
 
 
+def timeout_option(words: str) -> Callable[[_F], _F]:
+    """Return the option --timeout; `words` is its help: what the command does when the time is over."""
+    seconds = click.FloatRange(0, min_open=True)
+    return click.option("-t", "--timeout", type=seconds, callback=number, metavar="SEC", help=words)
+
+
 def show(line: str) -> None:
     """Write a line of data to standard output, at once; BrokenPipeError where that is closed."""
     if sys.stdout is None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from talkcli import output
-from talkcli.cli.common import Common, common, common_options, note, number, show, show_error, show_json
+from talkcli.cli.common import Common, common, common_options, note, show, show_error, show_json, timeout_option
 from talkcli.cli.interrupts import Interrupts
 from talkcli.dial import ANSWER_LIMIT, Interrupted, ready
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost, ServerUnavailable, TalkError
@@ -40,14 +40,7 @@ class _SayCommand(click.Command):
 @click.command("say", cls=_SayCommand)
 @click.argument("text", nargs=-1, required=True)
 @click.option("-w", "--wait", is_flag=True, help="Wait until it has ended; the exit code tells how.")
-@click.option(
-    "-t",
-    "--timeout",
-    type=click.FloatRange(0, min_open=True),
-    callback=number,
-    metavar="SEC",
-    help="With --wait: cancel it after SEC seconds, time in the queue included; exit code 124.",
-)
+@timeout_option("With --wait: cancel it after SEC seconds, time in the queue included; exit code 124.")
 @click.option(
     "--preempt/--queue",
     default=None,

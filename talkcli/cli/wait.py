@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from talkcli.cli.common import Common, common, common_options, note, number
+from talkcli.cli.common import Common, common, common_options, note, timeout_option
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.say import report
 from talkcli.dial import ANSWER_LIMIT, Interrupted
@@ -20,14 +20,7 @@ if TYPE_CHECKING:
 
 @click.command("wait")
 @click.argument("ids", nargs=-1, metavar="[ID]...")
-@click.option(
-    "-t",
-    "--timeout",
-    type=click.FloatRange(0, min_open=True),
-    callback=number,
-    metavar="SEC",
-    help="Wait no longer than SEC seconds; the goals go on; exit code 124.",
-)
+@timeout_option("Wait no longer than SEC seconds; the goals go on; exit code 124.")
 @common_options
 @click.pass_context
 def command(context: click.Context, ids: tuple[str, ...], timeout: float | None) -> int:
