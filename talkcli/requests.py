@@ -25,6 +25,8 @@ MAX_DATA = 1024
 MAX_NAME = 64
 #: Ids in one request; more would not fit into a line anyway.
 MAX_IDS = 4096
+#: Goals that one request for the log asks for: as many as are kept.
+MAX_LOG = 1_200
 
 Check = Callable[[object], object]
 
@@ -39,6 +41,24 @@ def _flag(value: object) -> bool:
     if not isinstance(value, bool):
         raise ValueError("must be true or false")
     return value
+
+
+def _integer(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError("must be an integer")
+    return value
+
+
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError("must be a number")
+    return value
+
+
+def _count(value: object) -> int:
+    if not 0 < _integer(value) <= MAX_LOG:
+        raise ValueError(f"must be 1 to {MAX_LOG}")
+    return _integer(value)
 
 
 def _goal_id(value: object) -> str:
@@ -88,21 +108,53 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Say:
-    """A goal: speak this."""
+    """A goal: speak this. Values out of their range make it REJECTED, bad_option; see `admission`."""
 
     kind: ClassVar[str] = "say"
     fields: ClassVar[Mapping[str, Check]] = {
         "text": _text,
         "wait": _flag,
+        "feedback": _flag,
+        "patient": _flag,
         "preempt": _optional(_flag),
+        "flush": _flag,
+        "priority": _integer,
+        "ttl": _optional(_number),
+        "key": _optional(_text),
+        "throttle": _optional(_number),
+        "id": _optional(_text),
+        "rate": _optional(_integer),
+        "volume": _optional(_number),
+        "voice": _optional(_text),
+        "pitch": _optional(_integer),
         "data": _optional(_data),
         "format": _text,
     }
     text: str
-    #: send this connection the goal's events, and its result
+    #: send this connection the goal's states, and its result
     wait: bool = False
+    #: … and each word as it is heard; implies `wait`
+    feedback: bool = False
+    #: where the queue is full, answer when there is room, instead of REJECTED, queue_full
+    patient: bool = False
     #: stop what is being spoken and go first; None leaves it to the server's default
     preempt: bool | None = None
+    #: as `preempt`, and recall everything pending of the same or a lower priority
+    flush: bool = False
+    #: higher goes first
+    priority: int = 0
+    #: seconds from acceptance in which it must begin; 0 for no limit, None leaves it to the server's default
+    ttl: float | None = None
+    #: replaces the pending goal with the same key
+    key: str | None = None
+    #: seconds in which no other goal of this key, or else of this text, may have begun to be spoken
+    throttle: float | None = None
+    #: the sender's own id; the same id again attaches to the first goal
+    id: str | None = None
+    rate: int | None = None  # words per minute
+    volume: float | None = None  # 0 to 1
+    voice: str | None = None  # id, name or language
+    pitch: int | None = None  # 0 to 100
     data: JsonObject | None = None
     format: str = "text"
 
@@ -112,8 +164,10 @@ class Wait:
     """Send the results of these goals; where `ids` is not given, of all that are active or pending now."""
 
     kind: ClassVar[str] = "wait"
-    fields: ClassVar[Mapping[str, Check]] = {"ids": _optional(_goal_ids)}
+    fields: ClassVar[Mapping[str, Check]] = {"ids": _optional(_goal_ids), "feedback": _flag}
     ids: tuple[str, ...] | None = None
+    #: each word as it is heard, too
+    feedback: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,16 +179,19 @@ class Cancel:
         "ids": _optional(_goal_ids),
         "current": _flag,
         "before": _optional(_goal_id),
+        "key": _optional(_text),
     }
     ids: tuple[str, ...] | None = None
     #: the goal being spoken
     current: bool = False
     #: this goal and all accepted before it
     before: str | None = None
+    #: goals with this key, pending or active
+    key: str | None = None
 
     @property
     def everything(self) -> bool:
-        return self.ids is None and not self.current and self.before is None
+        return self.ids is None and not self.current and self.before is None and self.key is None
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,9 +219,57 @@ class Watch:
     fields: ClassVar[Mapping[str, Check]] = {}
 
 
-Request = Hello | Say | Wait | Cancel | Status | Voices | Watch
+@dataclass(frozen=True, slots=True)
+class Log:
+    """The last `count` goals that ended, REJECTED ones too, oldest first."""
 
-KINDS: dict[str, type[Request]] = {each.kind: each for each in (Hello, Say, Wait, Cancel, Status, Voices, Watch)}
+    kind: ClassVar[str] = "log"
+    fields: ClassVar[Mapping[str, Check]] = {"count": _count}
+    count: int = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Set:
+    """Change the running server's settings; those not given stay. Answered with all of them."""
+
+    kind: ClassVar[str] = "set"
+    fields: ClassVar[Mapping[str, Check]] = {
+        "rate": _optional(_integer),
+        "volume": _optional(_number),
+        "voice": _optional(_text),
+        "pitch": _optional(_integer),
+        "preempt": _optional(_flag),
+        "ttl": _optional(_number),
+    }
+    rate: int | None = None  # words per minute
+    volume: float | None = None  # 0 to 1
+    voice: str | None = None  # id, name or language; "default" for the driver's own
+    pitch: int | None = None  # 0 to 100
+    preempt: bool | None = None
+    ttl: float | None = None  # seconds, 0 for no limit
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Hold speech where it is; answered when it is silent."""
+
+    kind: ClassVar[str] = "pause"
+    fields: ClassVar[Mapping[str, Check]] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class Resume:
+    """Go on where speech was held."""
+
+    kind: ClassVar[str] = "resume"
+    fields: ClassVar[Mapping[str, Check]] = {}
+
+
+Request = Hello | Say | Wait | Cancel | Status | Voices | Watch | Log | Set | Pause | Resume
+
+KINDS: dict[str, type[Request]] = {
+    each.kind: each for each in (Hello, Say, Wait, Cancel, Status, Voices, Watch, Log, Set, Pause, Resume)
+}
 
 
 def read_request(message: JsonObject) -> Request:

@@ -5,7 +5,8 @@ directions). This module holds only the form of the messages: it opens, reads an
 engine process can be written against it.
 
 Order, as the process must keep it: `Configure` comes in once, first. Then `Ready` goes out, or `StartFailed` and the
-process ends. After that each `Say` gets one `Started`, any number of `Word` and `Alive`, and exactly one `Ended`.
+process ends. After that each `Say` gets one `Started`, any number of `Word`, `Alive` and `Paused`, and exactly one
+`Ended`.
 """
 
 from __future__ import annotations
@@ -39,6 +40,10 @@ class Configure:
     device: str | None
     #: voice to check at the start, by id, name or language; None for the driver's default.
     voice: str | None
+    #: milliseconds of silence before a sentence when the device has been idle.
+    lead_in: int = 0
+    #: whether the server doesn't know the voices yet: `Voices` then comes right after `Ready`, else never.
+    list_voices: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +64,22 @@ class Stop:
     """Be silent now. A stop for a goal that is not being spoken is ignored: it ended before the stop arrived."""
 
     kind: ClassVar[str] = "stop"
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Hold the sentence where it is; `Paused` comes when it is silent. Ignored where the goal isn't being spoken."""
+
+    kind: ClassVar[str] = "pause"
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Resume:
+    """Go on where the sentence was held. Ignored where it is not held."""
+
+    kind: ClassVar[str] = "resume"
     id: str
 
 
@@ -99,7 +120,7 @@ class StartFailed:
 
 @dataclass(frozen=True, slots=True)
 class Voices:
-    """All voices of the driver; sent once, after `Ready`, as soon as nothing else is to be done."""
+    """All voices of the driver; sent once, right after `Ready`, where `Configure` asks for it."""
 
     kind: ClassVar[str] = "voices"
     voices: tuple[Voice, ...]
@@ -134,6 +155,14 @@ class Word:
 
 
 @dataclass(frozen=True, slots=True)
+class Paused:
+    """The sentence is held and silent, until `Resume` or `Stop`."""
+
+    kind: ClassVar[str] = "paused"
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
 class Ended:
     """The `Say` is over, and it is silent: the player is reaped, or its stream is closed."""
 
@@ -145,11 +174,11 @@ class Ended:
     duration: float | None = None  # seconds of audio, where all of it was synthesised
 
 
-Command = Configure | Say | Stop | Quit
-Event = Ready | StartFailed | Voices | Started | Alive | Word | Ended
+Command = Configure | Say | Stop | Pause | Resume | Quit
+Event = Ready | StartFailed | Voices | Started | Alive | Word | Paused | Ended
 
-_COMMANDS = {each.kind: each for each in (Configure, Say, Stop, Quit)}
-_EVENTS = {each.kind: each for each in (Ready, StartFailed, Started, Alive, Word, Ended)}
+_COMMANDS = {each.kind: each for each in (Configure, Say, Stop, Pause, Resume, Quit)}
+_EVENTS = {each.kind: each for each in (Ready, StartFailed, Started, Alive, Word, Paused, Ended)}
 
 
 def encode(message: Command | Event) -> bytes:
