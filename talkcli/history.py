@@ -6,6 +6,7 @@ Pure: it keeps what it is given and drops the oldest by fixed limits.
 from __future__ import annotations
 
 from collections import OrderedDict
+from heapq import merge
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,9 @@ class History:
         self._rejected: OrderedDict[str, Record] = OrderedDict()
         self._with_text: OrderedDict[str, Record] = OrderedDict()
         self._text_bytes = 0
+        #: how many ended before each, so that both rings can be told in one order
+        self._order: dict[str, int] = {}
+        self._count = 0
 
     def add(self, record: Record) -> None:
         """Keep a goal that has ended; the oldest give way."""
@@ -39,8 +43,12 @@ class History:
         kept[record.id] = record
         self._with_text[record.id] = record
         self._text_bytes += record.text_bytes
+        self._count += 1
+        self._order[record.id] = self._count
         if len(kept) > limit:
-            self._forget_text(kept.popitem(last=False)[1])
+            oldest = kept.popitem(last=False)[1]
+            del self._order[oldest.id]
+            self._forget_text(oldest)
         while self._text_bytes > MAX_TEXT_BYTES:
             oldest = next(iter(self._with_text.values()))
             self._forget_text(oldest)
@@ -52,6 +60,11 @@ class History:
     def latest(self, count: int) -> Iterator[Record]:
         """Return the last goals that ended, REJECTED ones aside, the newest first."""
         return islice(reversed(self._ended.values()), count)
+
+    def log(self, count: int) -> Iterator[Record]:
+        """Return the last goals that ended, REJECTED ones too, the newest first."""
+        both = (reversed(self._ended.values()), reversed(self._rejected.values()))
+        return islice(merge(*both, key=lambda each: self._order[each.id], reverse=True), count)
 
     def _forget_text(self, record: Record) -> None:
         if self._with_text.pop(record.id, None) is not None:

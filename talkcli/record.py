@@ -12,23 +12,31 @@ from talkcli.states import State, follow
 
 if TYPE_CHECKING:
     from talkcli.messages import JsonObject, Sender
+    from talkcli.requests import Say
 
 
 class Record:
     """One goal, from its acceptance to its end."""
 
     __slots__ = (
+        "began",
         "by",
         "data",
         "duration",
         "ended_at",
+        "expires_at",
         "format",
         "id",
+        "key",
         "message",
         "number",
+        "paused",
+        "pitch",
         "place",
         "preempt",
+        "priority",
         "queued_at",
+        "rate",
         "reason",
         "sender",
         "spoken_end",
@@ -37,6 +45,10 @@ class Record:
         "stop_since",
         "text",
         "text_bytes",
+        "text_hash",
+        "ttl",
+        "voice",
+        "volume",
     )
 
     def __init__(self, goal_id: str, number: int, text: str, sender: Sender, queued_at: float) -> None:
@@ -44,13 +56,25 @@ class Record:
         #: order of acceptance
         self.number = number
         self.text: str | None = text
+        #: stands for the text once that is dropped
+        self.text_hash = 0
         #: what the text takes in the history
         self.text_bytes = len(text.encode(errors="surrogatepass"))
         self.sender = sender
         self.queued_at = queued_at
         self.state = State.PENDING
         self.preempt = False
-        #: where it stands in the queue: lower goes first
+        self.priority = 0
+        self.key: str | None = None
+        #: seconds from acceptance in which it must begin, and the monotonic time at which they are over
+        self.ttl: float | None = None
+        self.expires_at: float | None = None
+        #: its own settings, None where it has the server's
+        self.rate: int | None = None
+        self.volume: float | None = None
+        self.voice: str | None = None
+        self.pitch: int | None = None
+        #: where it stands among its priority in the queue
         self.place = 0
         self.format = "text"
         self.data: JsonObject | None = None
@@ -59,6 +83,10 @@ class Record:
         self.message: str | None = None
         #: offset after the last word that was heard
         self.spoken_end = 0
+        #: held in the middle of being spoken
+        self.paused = False
+        #: monotonic time at which it was handed to the engine
+        self.began = 0.0
         self.started_at: float | None = None
         self.ended_at: float | None = None
         self.duration: float | None = None
@@ -69,9 +97,20 @@ class Record:
         """Change the state as the table allows, or raise IllegalTransition and change nothing."""
         self.state = follow(self.state, state)
 
+    def take_options(self, say: Say) -> None:
+        """Take over what the goal's sender asked for, but for what the server decides: preempt and ttl."""
+        self.priority, self.key = say.priority, say.key
+        self.rate, self.volume, self.voice, self.pitch = say.rate, say.volume, say.voice, say.pitch
+        self.format, self.data = say.format, say.data
+
     def drop_text(self) -> None:
         """Forget the text, to make room; the result stays."""
+        self.text_hash = hash(self.text)
         self.text = None
+
+    def has_text(self, text: str) -> bool:
+        """Whether this was the goal's text, also where it is not kept any more."""
+        return hash(text) == self.text_hash if self.text is None else text == self.text
 
     def snapshot(self, state: State | None = None) -> Goal:
         """Return the goal as it is now; with PENDING, as it was when it was accepted."""
@@ -89,8 +128,12 @@ class Record:
             message=self.message,
             format=self.format,
             spoken=spoken,
+            priority=self.priority,
+            key=self.key,
+            ttl=self.ttl,
             data=self.data,
             client=self.sender,
+            paused=self.paused and state is self.state,
             queued_at=self.queued_at,
             started_at=started_at,
             ended_at=self.ended_at,

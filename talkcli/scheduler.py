@@ -3,25 +3,29 @@
 Pure: a request, an engine event or the time goes in, effects come out; no thread, socket or clock inside. A method
 either does all of its step or raises and has changed nothing. Effects are to be carried out in their order.
 
-What holds after every step: at most one goal is ACTIVE or PREEMPTING, and none starts before that one has ended; a goal
-ends once; the queue is first in first out but for what `--preempt` puts at its front.
+What holds after every step: at most one goal is ACTIVE or PREEMPTING, and none starts before that one has ended, or
+while speech is paused; a goal ends once; the order in which goals wait is `pending`'s.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from talkcli import text as texts
+from talkcli.admission import bad_option, is_clients_id
+from talkcli.effects import Cancelled, Changed, GiveUp, Hold, Resume, Start, Stop, Submitted
 from talkcli.history import History
 from talkcli.messages import By
+from talkcli.pending import Pending
+from talkcli.recent import EarlyCancels, Said, throttling
 from talkcli.record import Record
+from talkcli.selection import outdone, select
 from talkcli.states import IllegalTransition, State
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator
 
+    from talkcli.effects import Effect, Now
     from talkcli.messages import Sender
     from talkcli.requests import Cancel, Say
 
@@ -32,74 +36,35 @@ SUCCEEDED_MESSAGE = "Talk completed successfully"
 PREEMPTED_MESSAGE = "Talk preempted"
 
 
-@dataclass(frozen=True, slots=True)
-class Now:
-    """One moment on both clocks, in seconds: monotonic, for limits, and since 1970 UTC, to be shown."""
-
-    monotonic: float
-    wall: float
-
-
-@dataclass(frozen=True, slots=True)
-class Changed:
-    """A goal is in a new state; to be published."""
-
-    record: Record
-    state: State
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """The engine shall speak this goal."""
-
-    record: Record
-
-
-@dataclass(frozen=True, slots=True)
-class Stop:
-    """The engine shall stop this goal; the answer is `ended`."""
-
-    record: Record
-
-
-@dataclass(frozen=True, slots=True)
-class GiveUp:
-    """The engine didn't become silent in time: it must be replaced before it may be given another goal."""
-
-    record: Record
-
-
-Effect = Changed | Start | Stop | GiveUp
-
-
-@dataclass(slots=True)
-class Cancelled:
-    """What a cancel did: goals that ended at once, the one being stopped, those that had ended, ids nobody knows."""
-
-    recalled: list[Record] = field(default_factory=list)
-    stopping: Record | None = None
-    ended: list[Record] = field(default_factory=list)
-    unknown: list[str] = field(default_factory=list)
-    effects: list[Effect] = field(default_factory=list)
-
-
 class Scheduler:
     """Goals of one server. `boot` makes their ids: four random characters a server start."""
 
-    def __init__(self, boot: str, *, preempt: bool, max_queue: int, max_text: int = texts.MAX_CHARACTERS) -> None:
+    def __init__(
+        self,
+        boot: str,
+        *,
+        preempt: bool,
+        max_queue: int,
+        max_text: int = texts.MAX_CHARACTERS,
+        ttl: float = 0.0,
+    ) -> None:
         self.boot = boot
         #: whether goals that don't say preempt
         self.preempt = preempt
+        #: time to live of goals that don't say, in seconds; 0 for no limit
+        self.ttl = ttl
         self.max_queue = max_queue
         self.max_text = max_text
         self.history = History()
         #: the goal that is ACTIVE or PREEMPTING
         self.active: Record | None = None
-        self._pending: OrderedDict[int, Record] = OrderedDict()
+        #: whether nothing is to be spoken until `resume`
+        self.paused = False
+        self._pending = Pending()
         self._by_id: dict[str, Record] = {}
-        self._preempting: dict[int, Record] = {}
+        self._said = Said()
+        self._early = EarlyCancels()
         self._count = 0
-        self._front = self._back = 0
         self._closing = False
 
     # -- what there is
@@ -110,43 +75,63 @@ class Scheduler:
 
     def pending(self) -> Iterator[Record]:
         """Return the pending goals in the order in which they will be spoken."""
-        return iter(self._pending.values())
+        return iter(self._pending)
 
     def find(self, goal_id: str) -> Record | None:
         """Return a goal that is active, pending, or still remembered."""
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
+    def with_key(self, key: str | None) -> list[Record]:
+        """Return the goals with this key that have not ended."""
+        return [each for each in (self.active, self._pending.with_key(key)) if each and each.key == key is not None]
+
+    def lacks_room(self, say: Say) -> bool:
+        """Whether this goal would be REJECTED for no other reason than that the queue is full."""
+        attaches = say.id is not None and self.find(say.id) is not None
+        return not attaches and self._room_fault(say) is not None and self._refuse(say, None, None) is None
+
     def unfinished(self) -> list[Record]:
         """Return the active goal and the pending ones."""
-        return ([self.active] if self.active else []) + list(self._pending.values())
+        return ([self.active] if self.active else []) + list(self._pending)
 
     # -- what clients ask for
 
-    def submit(self, say: Say, sender: Sender, now: Now) -> tuple[Record, list[Effect]]:
-        """Accept or reject a goal. Admission is one step: a goal that is REJECTED has done nothing to the others."""
+    def submit(self, say: Say, sender: Sender, now: Now, fault: tuple[str, str] | None = None) -> Submitted:
+        """Accept or reject a goal. Admission is one step: a goal that is REJECTED has done nothing to the others.
+
+        `fault`: reason and words, where something was found wrong with it that can't be known here.
+        """
+        first = self.find(say.id) if say.id is not None and is_clients_id(say.id) else None
+        if first is not None and first.has_text(say.text):
+            return Submitted(first, [], attached=True)
         self._count += 1
-        record = Record(f"{self.boot}-{self._count}", self._count, say.text, sender, now.wall)
-        record.preempt = self.preempt if say.preempt is None else say.preempt
-        record.format, record.data = say.format, say.data
-        refused = self._refuse(say, record)
+        record = self._record(say, sender, now)
+        early = self._early.find(say.id, now.monotonic)
+        refused = self._refuse(say, fault, first) or self._throttle(say, record, now)
+        refused = refused or (None if early else self._room_fault(say))
         if refused:
-            record.state = State.REJECTED
             record.reason, words = refused
-            record.message = f"Talk rejected: {words}"
-            record.ended_at = now.wall
+            record.state, record.message, record.ended_at = State.REJECTED, f"Talk rejected: {words}", now.wall
             self.history.add(record)
-            return record, [Changed(record, State.REJECTED)]
+            return Submitted(record, [Changed(record, State.REJECTED)])
+        record.id = say.id or record.id
+        self._by_id[record.id] = record
         effects: list[Effect] = [Changed(record, State.PENDING)]
-        if record.preempt:
-            effects += self._give_way(record, now)
-        self._enqueue(record)
-        return record, effects + self._start_next(now)
+        if early:
+            record.become(State.RECALLING)
+            words = "Talk recalled: canceled before it arrived"
+            return Submitted(record, effects + self._close(record, State.RECALLED, "canceled", words, early, now))
+        effects += self._make_way(record, say, now)
+        return Submitted(record, effects + self._start_next(now))
 
     def cancel(self, selection: Cancel, sender: Sender | None, now: Now) -> Cancelled:
         """End what is selected: pending goals at once, the active one as soon as the engine is silent."""
         done = Cancelled()
         by = By(client=sender)
-        for record in self._select(selection, done):
+        chosen = select(selection, self, done)
+        for goal_id in filter(is_clients_id, done.unknown):
+            self._early.note(goal_id, by, now.monotonic)
+        for record in chosen:
             if record.state is State.PENDING:
                 done.effects += self._recall(record, "canceled", "canceled before it was spoken", by, now)
                 done.recalled.append(record)
@@ -159,11 +144,33 @@ class Scheduler:
         """End everything, and take no goal any more."""
         self._closing = True
         effects: list[Effect] = []
-        for record in list(self._pending.values()):
+        for record in list(self._pending):
             effects += self._recall(record, "shutdown", "the server was stopped", None, now)
         if self.active:
             effects += self._stop(self.active, "shutdown", None, now)
         return effects
+
+    def pause(self) -> list[Effect]:
+        """Hold the goal being spoken, and start none."""
+        if self.paused:
+            return []
+        self.paused = True
+        if self.active is None or self.active.state is not State.ACTIVE:
+            return []
+        self.active.paused = True
+        return [Hold(self.active)]
+
+    def resume(self, now: Now) -> list[Effect]:
+        """Go on with the goal that is held, or else with the next."""
+        if not self.paused:
+            return []
+        self.paused = False
+        if self.active is None:
+            return self._start_next(now)
+        if not self.active.paused:
+            return []  # it is being stopped
+        self.active.paused = False
+        return [Resume(self.active)]
 
     # -- what the engine says
 
@@ -201,100 +208,112 @@ class Scheduler:
 
     def deadline(self) -> float | None:
         """Return the monotonic time at which `tick` has something to do."""
+        due = [self._silence_deadline(), self._pending.next_expiry()]
+        return min((each for each in due if each is not None), default=None)
+
+    def tick(self, now: Now) -> list[Effect]:
+        """Do what is due: recall goals whose time is over; abort one that was stopped and isn't silent in time."""
+        effects: list[Effect] = []
+        deadline = self._silence_deadline()
+        if self.active is not None and deadline is not None and now.monotonic >= deadline:
+            record = self.active
+            words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
+            effects = [GiveUp(record), *self._end(record, State.ABORTED, "not_silent", words, record.by, now)]
+        return effects + self._expire(now)
+
+    # -- inside
+
+    def _record(self, say: Say, sender: Sender, now: Now) -> Record:
+        record = Record(f"{self.boot}-{self._count}", self._count, say.text, sender, now.wall)
+        record.preempt = self._preempts(say)
+        record.ttl = (self.ttl if say.ttl is None else say.ttl) or None
+        record.expires_at = None if record.ttl is None else now.monotonic + record.ttl
+        record.take_options(say)
+        return record
+
+    def _refuse(self, say: Say, fault: tuple[str, str] | None, first: Record | None) -> tuple[str, str] | None:
+        """Return reason and words why a goal can't be had, whatever else is being said."""
+        if self._closing:
+            return "shutdown", "the server is being stopped"
+        words = bad_option(say)
+        if words:
+            return "bad_option", words
+        if first is not None:
+            return "id_conflict", f"the id {say.id} is that of another text already"
+        return texts.fault(say.text, self.max_text) or fault
+
+    def _throttle(self, say: Say, record: Record, now: Now) -> tuple[str, str] | None:
+        found = throttling(say, self.active, self._pending, self._said, now.monotonic)
+        if found is None:
+            return None
+        record.by = By(goal=found[0])
+        return "throttled", f"the same {found[1]}"
+
+    def _room_fault(self, say: Say) -> tuple[str, str] | None:
+        # There never are more goals in the queue than may be: one that will be recalled makes room enough.
+        if len(self._pending) < self.max_queue or outdone(say, self._pending, preempts=self._preempts(say)):
+            return None
+        lowest = self._pending.newest_of_lowest()
+        if lowest is not None and lowest.priority < say.priority:
+            return None
+        return "queue_full", f"{len(self._pending)} goals are waiting already (`talk serve --max-queue`)"
+
+    def _preempts(self, say: Say) -> bool:
+        return say.flush or (self.preempt if say.preempt is None else say.preempt)
+
+    def _make_way(self, record: Record, say: Say, now: Now) -> list[Effect]:
+        """Queue a goal that was accepted, and end what it replaces, preempts or displaces."""
+        ended = outdone(say, self._pending, preempts=record.preempt)
+        lowest = self._pending.newest_of_lowest()
+        if not ended and lowest is not None and len(self._pending) >= self.max_queue:
+            ended = [(lowest, "displaced")]
+        by = By(goal=record.id)
+        effects: list[Effect] = []
+        queued = False
+        for each, reason in ended:
+            if reason == "replaced" and each.priority == record.priority and not record.preempt:
+                self._pending.replace(each, record)
+                queued = True
+            else:
+                self._pending.remove(each)
+            effects += self._recalled(each, reason, f"{reason} by {record.id}", by, now)
+        if record.preempt and self.active and self.active.priority <= record.priority:
+            effects += self._stop(self.active, "preempted", by, now)
+        if not queued:
+            self._pending.add(record)
+        return effects
+
+    def _expire(self, now: Now) -> list[Effect]:
+        effects: list[Effect] = []
+        for record in self._pending.expired(now.monotonic):
+            words = f"its time to live of {record.ttl:g} s was over before it was spoken"
+            effects += self._recall(record, "expired", words, None, now)
+        return effects
+
+    def _silence_deadline(self) -> float | None:
         if self.active is None or self.active.stop_since is None:
             return None
         return self.active.stop_since + SILENCE_LIMIT
 
-    def tick(self, now: Now) -> list[Effect]:
-        """Do what is due: a goal that was stopped and did not become silent in time is ABORTED."""
-        deadline = self.deadline()
-        if self.active is None or deadline is None or now.monotonic < deadline:
-            return []
-        record = self.active
-        words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
-        return [GiveUp(record), *self._end(record, State.ABORTED, "not_silent", words, record.by, now)]
-
-    # -- inside
-
-    def _refuse(self, say: Say, record: Record) -> tuple[str, str] | None:
-        if self._closing:
-            return "shutdown", "the server is being stopped"
-        if say.format != "text":
-            return "bad_option", f"the format {say.format[:64]!r} is not known, only 'text'"
-        fault = texts.fault(say.text, self.max_text)
-        if fault:
-            return fault
-        makes_room = len(self._preempting) if record.preempt else 0
-        if len(self._pending) - makes_room >= self.max_queue:
-            return "queue_full", f"{len(self._pending)} goals are waiting already (`talk serve --max-queue`)"
-        return None
-
-    def _give_way(self, record: Record, now: Now) -> list[Effect]:
-        """Make room at the front for a goal that preempts: the newest of those wins, the others are recalled."""
-        by = By(goal=record.id)
-        effects: list[Effect] = []
-        for earlier in list(self._preempting.values()):
-            effects += self._recall(earlier, "preempted", f"preempted by {record.id}", by, now)
-        if self.active:
-            effects += self._stop(self.active, "preempted", by, now)
-        return effects
-
-    def _enqueue(self, record: Record) -> None:
-        self._by_id[record.id] = record
-        if record.preempt:
-            self._front -= 1
-            record.place = self._front
-            self._preempting[record.place] = record
-        else:
-            self._back += 1
-            record.place = self._back
-        self._pending[record.place] = record
-        if record.preempt:
-            self._pending.move_to_end(record.place, last=False)
-
     def _start_next(self, now: Now) -> list[Effect]:
-        if self.active or not self._pending:
+        if self.active or self.paused:
             return []
-        record = next(iter(self._pending.values()))
+        effects = self._expire(now)
+        record = self._pending.first()
+        if record is None:
+            return effects
         record.become(State.ACTIVE)
-        self._leave_queue(record)
-        record.started_at = now.wall
+        self._pending.remove(record)
+        record.started_at, record.began = now.wall, now.monotonic
         self.active = record
-        return [Changed(record, State.ACTIVE), Start(record)]
-
-    def _select(self, selection: Cancel, done: Cancelled) -> Iterable[Record]:
-        """Return the selected goals that have not ended, pending ones first; note in `done` what else was named."""
-        if selection.everything:
-            chosen = {each.number: each for each in self.unfinished()}
-        else:
-            chosen = dict(self._named(selection.ids or (), done))
-            if selection.current and self.active:
-                chosen[self.active.number] = self.active
-            if selection.before is not None:
-                chosen.update(self._accepted_until(selection.before, done))
-        # The active one last: another must not start, even for the length of this step, and be stopped again.
-        return sorted(chosen.values(), key=lambda each: (each is self.active, each.number))
-
-    def _named(self, ids: Iterable[str], done: Cancelled) -> Iterator[tuple[int, Record]]:
-        for goal_id in dict.fromkeys(ids):
-            record = self.find(goal_id)
-            if record is None:
-                done.unknown.append(goal_id)
-            elif record.state.terminal:
-                done.ended.append(record)
-            else:
-                yield record.number, record
-
-    def _accepted_until(self, goal_id: str, done: Cancelled) -> dict[int, Record]:
-        last = self.find(goal_id)
-        if last is None:
-            done.unknown.append(goal_id)
-            return {}
-        return {each.number: each for each in self.unfinished() if each.number <= last.number}
+        return [*effects, Changed(record, State.ACTIVE), Start(record)]
 
     def _recall(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
+        self._pending.remove(record)
+        return self._recalled(record, reason, words, by, now)
+
+    def _recalled(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
         record.become(State.RECALLING)
-        self._leave_queue(record)
         return self._close(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
 
     def _stop(self, record: Record, reason: str, by: By | None, now: Now) -> list[Effect]:
@@ -302,6 +321,7 @@ class Scheduler:
             return []  # the first stop gives the reason, later ones join it
         record.become(State.PREEMPTING)
         record.reason, record.by, record.stop_since = reason, by, now.monotonic
+        record.paused = False
         return [Changed(record, State.PREEMPTING), Stop(record)]
 
     def _spoken(self, goal_id: str) -> Record:
@@ -322,10 +342,9 @@ class Scheduler:
         record.become(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at = now.wall
+        record.paused = False
+        if record.spoken_end and state is not State.ABORTED:
+            self._said.note(record)
         self._by_id.pop(record.id)
         self.history.add(record)
         return [Changed(record, state)]
-
-    def _leave_queue(self, record: Record) -> None:
-        del self._pending[record.place]
-        self._preempting.pop(record.place, None)

@@ -1,0 +1,63 @@
+"""Which goals a request ends: a cancel, or a goal that replaces or preempts others.
+
+Pure: it looks, and changes nothing but the answer that it fills in.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from talkcli.effects import Cancelled
+    from talkcli.pending import Pending
+    from talkcli.record import Record
+    from talkcli.requests import Cancel, Say
+    from talkcli.scheduler import Scheduler
+
+
+def select(selection: Cancel, goals: Scheduler, done: Cancelled) -> list[Record]:
+    """Return the selected goals that have not ended; note in `done` what else was named."""
+    if selection.everything:
+        chosen = goals.unfinished()
+    else:
+        chosen = [*_named(selection, goals, done), *goals.with_key(selection.key)]
+        if selection.current and goals.active:
+            chosen.append(goals.active)
+        if selection.before is not None:
+            chosen += _accepted_until(selection.before, goals, done)
+    once = {each.number: each for each in chosen}.values()
+    # The active one last: another must not start, even for the length of this step, and be stopped again.
+    return sorted(once, key=lambda each: (each is goals.active, each.number))
+
+
+def outdone(say: Say, pending: Pending, *, preempts: bool) -> list[tuple[Record, str]]:
+    """Return the pending goals that this one recalls, whether there is room or not, and the reason."""
+    replaced = pending.with_key(say.key)
+    others: Iterable[Record] = ()
+    if say.flush:
+        others = pending.up_to(say.priority)
+    elif preempts:
+        others = pending.preempting_up_to(say.priority)
+    preempted = [(each, "preempted") for each in others if each is not replaced]
+    return [(replaced, "replaced"), *preempted] if replaced else preempted
+
+
+def _named(selection: Cancel, goals: Scheduler, done: Cancelled) -> Iterator[Record]:
+    for goal_id in dict.fromkeys(selection.ids or ()):
+        record = goals.find(goal_id)
+        if record is None:
+            done.unknown.append(goal_id)
+        elif record.state.terminal:
+            done.ended.append(record)
+        else:
+            yield record
+
+
+def _accepted_until(goal_id: str, goals: Scheduler, done: Cancelled) -> list[Record]:
+    last = goals.find(goal_id)
+    if last is None:
+        done.unknown.append(goal_id)
+        return []
+    return [each for each in goals.unfinished() if each.number <= last.number]
