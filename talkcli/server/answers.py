@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from talkcli import __version__, wire
+from talkcli.admission import DEFAULT_VOICE, bad_setting
 from talkcli.errors import UnknownGoal
-from talkcli.requests import Cancel, Request, Say, Status, Voices, Wait, Watch
+from talkcli.messages import By
+from talkcli.requests import Cancel, Log, Pause, Request, Resume, Say, Set, Status, Voices, Wait, Watch
+from talkcli.server import log
 from talkcli.states import State
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from talkcli.effects import Cancelled
     from talkcli.messages import JsonObject
     from talkcli.record import Record
-    from talkcli.scheduler import Cancelled
     from talkcli.server.connection import Connection
     from talkcli.server.service import Service
 
 #: Ended goals that `status` lists.
 RECENT = 10
-#: Seconds in which a request for the voices is answered; a client gives up after five.
-VOICES_LIMIT = 4.0
+#: Seconds after which a pause is answered though nobody knows that it is silent.
+PAUSE_LIMIT = 2.0
 
 
 class Answers:
@@ -34,7 +38,10 @@ class Answers:
         self._scheduler = service.scheduler
         #: cancels that are answered when the goal they stopped is silent
         self._cancels: list[tuple[Connection, int | None, Cancelled]] = []
-        self._voices_asked: list[tuple[Connection, int | None]] = []
+        #: pauses that are answered when the goal that they hold is silent
+        self._pauses: list[tuple[Connection, int | None, Record]] = []
+        #: the goal that is known to be held and silent
+        self._held: str | None = None
         self._by_kind: dict[type[Request], Callable[..., None]] = {
             Say: self._say,
             Wait: self._wait,
@@ -42,6 +49,10 @@ class Answers:
             Status: self._status,
             Voices: self._voices,
             Watch: self._watch,
+            Log: self._log,
+            Set: self._set,
+            Pause: self._pause,
+            Resume: self._resume,
         }
 
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
@@ -54,7 +65,7 @@ class Answers:
     def left(self, connection: Connection) -> None:
         """Owe a connection that is gone nothing more."""
         self._cancels = [each for each in self._cancels if each[0] is not connection]
-        self._voices_asked = [each for each in self._voices_asked if each[0] is not connection]
+        self._pauses = [each for each in self._pauses if each[0] is not connection]
 
     def ended(self, record: Record) -> None:
         """Answer those who wait for this goal to be silent."""
@@ -64,24 +75,50 @@ class Answers:
         for connection, seq, done in due:
             self._report_cancel(connection, seq, done)
             connection.settle()
+        if record.id == self._held:
+            self._held = None
+        self._answer_pauses(record)
 
-    def voices_known(self) -> None:
-        """Answer those who asked for the voices, also where there are none yet and it would take too long."""
-        asked, self._voices_asked = self._voices_asked, []
-        for connection, seq in asked:
-            self._send_voices(connection, seq)
-            connection.settle()
+    def held(self, goal_id: str) -> None:
+        """Answer those who wait for the active goal to be held and silent."""
+        active = self._scheduler.active
+        if active is not None and active.id == goal_id and active.paused:
+            self._held = goal_id
+            self._answer_pauses(active)
 
     # -- one method a request
 
     def _say(self, connection: Connection, seq: int | None, request: Say) -> None:
-        record, effects = self._scheduler.submit(request, connection.sender, self._service.now())
-        if request.wait:
-            self._service.audience.await_result(record.id, connection)
-        # As it was accepted: it may have started in the same step, but that is told by its events.
-        accepted = record.state if record.state is State.REJECTED else State.PENDING
-        connection.reply(wire.ok(seq, goal=record.snapshot(accepted).to_json()))
-        self._service.apply(effects)
+        def submit() -> None:
+            self._submit(connection, seq, request)
+
+        later = self._service.later
+        if later.awaits_voices or (request.voice is not None and self._voices_awaited()):
+            later.until_voices(connection, submit)
+        elif request.patient and self._scheduler.lacks_room(request):
+            later.until_room(connection, submit, lambda: not self._scheduler.lacks_room(request))
+        else:
+            submit()
+
+    def _submit(self, connection: Connection, seq: int | None, request: Say) -> None:
+        now = self._service.now()
+        submitted = self._scheduler.submit(request, connection.sender, now, self._service.voice_fault(request.voice))
+        record = submitted.record
+        extra: JsonObject = {"paused": True} if self._scheduler.paused else {}
+        if submitted.attached:
+            state = record.state
+            extra["attached"] = True
+        else:
+            # As it was accepted: it may have started in the same step, but that is told by its events.
+            state = record.state if record.state is State.REJECTED else State.PENDING
+        goal = record.snapshot(state).to_json()
+        ended = submitted.attached and state.terminal
+        if (request.wait or request.feedback) and not ended:
+            self._service.audience.await_result(record.id, connection, feedback=request.feedback)
+        connection.reply(wire.ok(seq, goal=goal, **extra))
+        if ended and (request.wait or request.feedback):
+            connection.publish({"event": "result", "goal": goal})
+        self._service.apply(submitted.effects)
 
     def _wait(self, connection: Connection, seq: int | None, request: Wait) -> None:
         if request.ids is None:
@@ -90,7 +127,7 @@ class Answers:
             records = [self._find(each) for each in dict.fromkeys(request.ids)]
         for record in records:
             if not record.state.terminal:
-                self._service.audience.await_result(record.id, connection)
+                self._service.audience.await_result(record.id, connection, feedback=request.feedback)
         goals = [record.snapshot().to_json() for record in records]
         connection.stream((wire.item(seq, goal=each) for each in goals), wire.ok(seq, count=len(goals)))
         for record, goal in zip(records, goals, strict=True):
@@ -98,6 +135,7 @@ class Answers:
                 connection.publish({"event": "result", "goal": goal})
 
     def _cancel(self, connection: Connection, seq: int | None, request: Cancel) -> None:
+        self._service.later.voices_known()  # goals that wait for them came before it
         done = self._scheduler.cancel(request, connection.sender, self._service.now())
         self._service.apply(done.effects)
         if done.stopping is None or done.stopping.state.terminal:
@@ -117,12 +155,80 @@ class Answers:
         self._service.audience.watch(connection)
 
     def _voices(self, connection: Connection, seq: int | None, _: Voices) -> None:
-        if self._service.voices is None and self._service.engine_words in {"starting", "ready"}:
-            connection.owed += 1
-            self._voices_asked.append((connection, seq))
-            self._service.call_later(VOICES_LIMIT, self.voices_known)
+        if self._voices_awaited():
+            self._service.later.until_voices(connection, lambda: self._send_voices(connection, seq))
         else:
             self._send_voices(connection, seq)
+
+    def _voices_awaited(self) -> bool:
+        return self._service.voices is None and self._service.engine_words in {"starting", "ready"}
+
+    def _log(self, connection: Connection, seq: int | None, request: Log) -> None:
+        records = list(self._scheduler.history.log(request.count))
+        items = (wire.item(seq, goal=each.snapshot().to_json()) for each in reversed(records))
+        connection.stream(items, wire.ok(seq, count=len(records)))
+
+    def _set(self, connection: Connection, seq: int | None, request: Set) -> None:
+        words = bad_setting(request)
+        if words:
+            connection.reply(wire.failure(seq, "bad_option", words))
+        elif request.voice is not None and self._voices_awaited():
+            self._service.later.until_voices(connection, lambda: self._change_settings(connection, seq, request))
+        else:
+            self._change_settings(connection, seq, request)
+
+    def _change_settings(self, connection: Connection, seq: int | None, request: Set) -> None:
+        service, scheduler = self._service, self._scheduler
+        fault = service.voice_fault(request.voice)
+        if fault:
+            connection.reply(wire.failure(seq, *fault))
+            return
+        changed = {name: getattr(request, name) for name in request.fields if getattr(request, name) is not None}
+        scheduler.preempt = changed.get("preempt", scheduler.preempt)
+        scheduler.ttl = changed.get("ttl", scheduler.ttl)
+        service.settings = replace(service.settings, **changed)
+        if changed:
+            values = ", ".join(f"{name} {value}" for name, value in changed.items())
+            log.line(log.shown(f"set to {values} by {log.who(connection.sender)}"))
+        settings = service.settings
+        connection.reply(
+            wire.ok(
+                seq,
+                settings={
+                    "rate": settings.rate,
+                    "volume": settings.volume,
+                    "voice": None if settings.voice == DEFAULT_VOICE else settings.voice,
+                    "pitch": settings.pitch,
+                    "preempt": scheduler.preempt,
+                    "ttl": scheduler.ttl or None,
+                },
+            )
+        )
+
+    def _pause(self, connection: Connection, seq: int | None, _: Pause) -> None:
+        self._service.now()
+        newly = not self._scheduler.paused
+        effects = self._scheduler.pause()
+        if newly:
+            self._tell_paused(connection)
+        self._service.apply(effects)
+        active = self._scheduler.active
+        if active is None or active.id == self._held:
+            self._report_paused(connection, seq)
+            return
+        connection.owed += 1
+        self._pauses.append((connection, seq, active))
+        self._service.call_later(PAUSE_LIMIT, lambda: self._doubt_pauses(active))
+
+    def _resume(self, connection: Connection, seq: int | None, _: Resume) -> None:
+        now = self._service.now()
+        newly = self._scheduler.paused
+        self._held = None
+        effects = self._scheduler.resume(now)
+        if newly:
+            self._tell_paused(connection)
+        self._report_paused(connection, seq)
+        self._service.apply(effects)
 
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)
@@ -161,12 +267,14 @@ class Answers:
             "synthesizer": ready.version if ready else None,
             "player": ready.player if ready else settings.player,
             "device": settings.device,
+            "lead_in": settings.lead_in,
             "rate": settings.rate,
             "volume": settings.volume,
-            "voice": settings.voice,
+            "voice": None if settings.voice == DEFAULT_VOICE else settings.voice,
             "pitch": settings.pitch,
             "preempt": self._scheduler.preempt,
-            "paused": False,
+            "ttl": self._scheduler.ttl or None,
+            "paused": self._scheduler.paused,
             "pending": self._scheduler.pending_count,
             "max_queue": settings.max_queue,
             "clients": len(service.connections),
@@ -196,3 +304,32 @@ class Answers:
         else:
             reply = wire.ok(seq, count=len(ended))
         connection.stream(items, reply)
+
+    def _tell_paused(self, connection: Connection) -> None:
+        """Publish and log that speech is paused, or not any more."""
+        scheduler, by = self._scheduler, By(client=connection.sender)
+        held = scheduler.active
+        paused = scheduler.paused
+        self._service.audience.paused(held.id if held else None, paused=paused, by=by, at=time.time())
+        log.line(f"{'paused' if paused else 'resumed'} by {log.who(connection.sender)}")
+
+    def _answer_pauses(self, record: Record) -> None:
+        """Answer the pauses that waited for this goal to be silent: it is held, or it has ended."""
+        due = [each for each in self._pauses if each[2] is record]
+        self._pauses = [each for each in self._pauses if each[2] is not record]
+        for connection, seq, _ in due:
+            self._report_paused(connection, seq)
+            connection.settle()
+
+    def _doubt_pauses(self, record: Record) -> None:
+        due = [each for each in self._pauses if each[2] is record]
+        self._pauses = [each for each in self._pauses if each[2] is not record]
+        for connection, seq, _ in due:
+            words = f"speech is paused, but {record.id} was not known to be silent within {PAUSE_LIMIT:g} s"
+            connection.reply(wire.failure(seq, "not_silent", words))
+            connection.settle()
+
+    def _report_paused(self, connection: Connection, seq: int | None) -> None:
+        active = self._scheduler.active
+        goal = None if active is None else active.snapshot().to_json()
+        connection.reply(wire.ok(seq, paused=self._scheduler.paused, goal=goal))

@@ -12,7 +12,7 @@ from talkcli.states import State
 if TYPE_CHECKING:
     import asyncio
 
-    from talkcli.messages import JsonObject
+    from talkcli.messages import By, JsonObject
     from talkcli.record import Record
     from talkcli.server.connection import Connection
 
@@ -27,19 +27,33 @@ class Audience:
         self._loop = loop
         #: events published so far: a watcher sees by a gap that feedback was dropped
         self._count = 0
-        self._waiters: dict[str, dict[Connection, None]] = {}
+        #: by goal: those who wait for its end, and whether they want its feedback
+        self._waiters: dict[str, dict[Connection, bool]] = {}
         self._awaited: dict[Connection, set[str]] = {}
         self._watchers: dict[Connection, None] = {}
+        #: those whose request waits, and how many of them
+        self._kept: dict[Connection, int] = {}
         self._alive: asyncio.TimerHandle | None = None
 
-    def await_result(self, goal_id: str, connection: Connection) -> None:
-        """Tell this connection of the goal's states, and at last its result."""
+    def await_result(self, goal_id: str, connection: Connection, *, feedback: bool = False) -> None:
+        """Tell this connection of the goal's states, of each word where it wants `feedback`, and at last its result."""
         waiting = self._waiters.setdefault(goal_id, {})
         if connection not in waiting:
-            waiting[connection] = None
             self._awaited.setdefault(connection, set()).add(goal_id)
             connection.owed += 1
             self._keep_alive()
+        waiting[connection] = waiting.get(connection, False) or feedback
+
+    def keep_waiting(self, connection: Connection) -> None:
+        """Tell this connection that the server is alive while its request waits."""
+        self._kept[connection] = self._kept.get(connection, 0) + 1
+        self._keep_alive()
+
+    def answered(self, connection: Connection) -> None:
+        """Note that a request that waited is being answered."""
+        self._kept[connection] -= 1
+        if not self._kept[connection]:
+            del self._kept[connection]
 
     def watch(self, connection: Connection) -> None:
         """Tell this connection of everything."""
@@ -51,6 +65,7 @@ class Audience:
     def left(self, connection: Connection) -> None:
         """Forget a connection that is gone."""
         self._watchers.pop(connection, None)
+        self._kept.pop(connection, None)
         for goal_id in self._awaited.pop(connection, ()):
             waiting = self._waiters[goal_id]
             del waiting[connection]
@@ -72,10 +87,22 @@ class Audience:
     def heard(self, goal_id: str, word: JsonObject, at: float) -> None:
         """Publish that a word of a goal is being heard."""
         self._count += 1
-        if self._watchers:
+        listening = dict(self._watchers)
+        listening.update((each, None) for each, feedback in self._waiters.get(goal_id, {}).items() if feedback)
+        if listening:
             event = {"event": "word", "id": goal_id, **word, "n": self._count, "at": at}
-            for connection in list(self._watchers):
+            for connection in listening:
                 connection.publish(event, feedback=True)
+
+    def paused(self, held: str | None, *, paused: bool, by: By, at: float) -> None:
+        """Publish that speech is held, or goes on: `held` is the goal that was being spoken."""
+        self._count += 1
+        listening = dict(self._watchers)
+        for waiting in self._waiters.values():
+            listening.update((each, None) for each, feedback in waiting.items() if feedback)
+        event: JsonObject = {"event": "paused", "paused": paused, "id": held, "by": by.to_json()}
+        for connection in listening:
+            connection.publish({**event, "n": self._count, "at": at})
 
     def _tell_watchers(self, record: Record, state: State, event: JsonObject) -> None:
         if not self._watchers:
@@ -103,7 +130,7 @@ class Audience:
 
     def _say_alive(self) -> None:
         self._alive = None
-        listening = dict.fromkeys([*self._awaited, *self._watchers])
+        listening = dict.fromkeys([*self._awaited, *self._watchers, *self._kept])
         for connection in listening:
             connection.publish({"event": "alive"})
         if listening:

@@ -65,7 +65,9 @@ class _Server:
                 loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the voice along
         service.engine = EngineThread(
-            protocol.Configure(os.getpid(), settings.driver, settings.player, settings.device, settings.voice),
+            protocol.Configure(
+                os.getpid(), settings.driver, settings.player, settings.device, settings.voice, settings.lead_in
+            ),
             service.report,
         )
         service.engine.start()
@@ -76,7 +78,7 @@ class _Server:
             )
             log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
-                service.apply(service.scheduler.submit(Say(settings.greeting), _self(), service.now())[1])
+                service.apply(service.scheduler.submit(Say(settings.greeting), _self(), service.now()).effects)
             await service.finished.wait()
             server.close()
             await self._say_goodbye()

@@ -14,14 +14,19 @@ import traceback
 from typing import TYPE_CHECKING
 
 from talkcli import __version__, peers, wire
+from talkcli.admission import DEFAULT_VOICE
+from talkcli.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
 from talkcli.engine import protocol
 from talkcli.engine.thread import EngineDied, Report, ThreadDied
+from talkcli.engine.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.messages import Sender
-from talkcli.scheduler import Changed, Effect, GiveUp, Now, Scheduler, Start
+from talkcli.scheduler import Scheduler
 from talkcli.server import log
 from talkcli.server.answers import Answers
 from talkcli.server.audience import Audience
+from talkcli.server.clock import LOOK_EVERY, elapsed
+from talkcli.server.later import Later
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,7 +53,11 @@ class Service:
         self._open_to_others = bool(mode & 0o066)
         self.engine: EngineThread
         self.scheduler = Scheduler(
-            boot, preempt=settings.preempt, max_queue=settings.max_queue, max_text=settings.max_text
+            boot,
+            preempt=settings.preempt,
+            max_queue=settings.max_queue,
+            max_text=settings.max_text,
+            ttl=settings.ttl,
         )
         self.connections: set[Connection] = set()
         #: set once everything has ended after `shut_down`
@@ -63,9 +72,10 @@ class Service:
         #: how the engine is, in a few words
         self.engine_words = "starting"
         self.began = self._now()
-        self.audience = Audience(asyncio.get_running_loop())
-        self._answers = Answers(self)
         self._loop = asyncio.get_running_loop()
+        self.audience = Audience(self._loop)
+        self.later = Later(self._loop, self.audience)
+        self._answers = Answers(self)
         self._closing = False
         self._timer: asyncio.TimerHandle | None = None
         self._started: tuple[str, float] = ("", 0.0)
@@ -98,6 +108,7 @@ class Service:
         if not self.connections:
             self.deserted.set()
         self.audience.left(connection)
+        self.later.left(connection)
         self._answers.left(connection)
 
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
@@ -113,11 +124,16 @@ class Service:
     # -- the scheduler's effects
 
     def now(self) -> Now:
-        return self._now()
+        """Return the time, after whatever was due by then is done."""
+        now = self._now()
+        deadline = self.scheduler.deadline()
+        if deadline is not None and deadline <= now.monotonic:
+            self.apply(self.scheduler.tick(now))
+        return now
 
     @staticmethod
     def _now() -> Now:
-        return Now(time.monotonic(), time.time())
+        return Now(elapsed(), time.time())
 
     def apply(self, effects: list[Effect]) -> None:
         """Carry out what the scheduler decided, in its order."""
@@ -127,6 +143,7 @@ class Service:
             except Exception as error:  # noqa: BLE001 - the effects after it must not be lost: the engine would wait
                 self.failed(type(effect).__name__, error)
         self._set_timer()
+        self.later.look()
         if self._closing and self.scheduler.active is None:
             self.finished.set()
 
@@ -137,6 +154,10 @@ class Service:
             self._start(effect.record)
         elif isinstance(effect, GiveUp):
             self.engine.give_up(effect.record.id)
+        elif isinstance(effect, Hold):
+            self.engine.pause(effect.record.id)
+        elif isinstance(effect, Resume):
+            self.engine.resume(effect.record.id)
         else:
             self.engine.stop(effect.record.id)
 
@@ -150,15 +171,16 @@ class Service:
 
     def _start(self, record: Record) -> None:
         self._started = (record.id, time.monotonic())
-        settings = self.settings
+        own, general = record, self.settings
+        voice = general.voice if own.voice is None else own.voice
         self.engine.say(
             protocol.Say(
                 id=record.id,
                 text=record.text or "",
-                rate=settings.rate,
-                volume=settings.volume,
-                voice=settings.voice,
-                pitch=settings.pitch,
+                rate=general.rate if own.rate is None else own.rate,
+                volume=general.volume if own.volume is None else own.volume,
+                voice=None if voice == DEFAULT_VOICE else voice,
+                pitch=general.pitch if own.pitch is None else own.pitch,
             )
         )
 
@@ -166,11 +188,20 @@ class Service:
         """Do something after a while, whatever happens meanwhile."""
         self._loop.call_later(seconds, action)
 
+    def voice_fault(self, voice: str | None) -> tuple[str, str] | None:
+        """Return reason and words why a voice can't be had; None also where the voices aren't known."""
+        if voice is None or voice == DEFAULT_VOICE or not self.voices or find_voice(voice, self.voices):
+            return None
+        return "unknown_voice", unknown_voice(voice, self.voices)
+
     def _set_timer(self) -> None:
         if self._timer:
             self._timer.cancel()
         deadline = self.scheduler.deadline()
-        self._timer = None if deadline is None else self._loop.call_at(deadline, self._tick)
+        self._timer = None
+        if deadline is not None:
+            rest = max(0.0, deadline - elapsed())
+            self._timer = self._loop.call_later(min(rest, LOOK_EVERY), self._tick)
 
     def _tick(self) -> None:
         self.apply(self.scheduler.tick(self._now()))
@@ -187,29 +218,37 @@ class Service:
             self._ended(report)
         elif isinstance(report, protocol.Word):
             self._word(report)
-        elif isinstance(report, protocol.Ready):
-            if self.ready != report:
-                version = f", {log.shown(report.version)}" if report.version else ""
-                log.line(f"engine ready: driver {report.driver}{version}, player {report.player or 'its own'}")
-            self.ready, self.engine_words = report, "ready"
+        elif isinstance(report, protocol.Paused):
+            self._answers.held(report.id)
         elif isinstance(report, protocol.Voices):
             self.voices = report.voices
-            self._answers.voices_known()
+            self.later.voices_known()
+        elif isinstance(report, protocol.Ready):
+            self._ready(report)
         elif isinstance(report, protocol.StartFailed):
-            self._engine_fails(report.message)
-            if report.reason == "unknown_voice" and self.ready is None:
-                self.fatal = UsageError(report.message)
-                self.shut_down()
+            self._start_failed(report)
         elif isinstance(report, EngineDied):
             self._engine_fails(report.words)
         elif isinstance(report, ThreadDied):
             self._thread_died(report.words)
 
+    def _ready(self, ready: protocol.Ready) -> None:
+        if self.ready != ready:
+            version = f", {log.shown(ready.version)}" if ready.version else ""
+            log.line(f"engine ready: driver {ready.driver}{version}, player {ready.player or 'its own'}")
+        self.ready, self.engine_words = ready, "ready"
+
+    def _start_failed(self, failed: protocol.StartFailed) -> None:
+        self._engine_fails(failed.message)
+        if failed.reason == "unknown_voice" and self.ready is None:
+            self.fatal = UsageError(failed.message)
+            self.shut_down()
+
     def _engine_fails(self, words: str) -> None:
         if words != self.engine_words:
             log.line(log.shown(words))
         self.engine_words = words
-        self._answers.voices_known()
+        self.later.voices_known()
 
     def _thread_died(self, words: str) -> None:
         """End: there is nothing left that could speak, and a supervisor will start another server."""
@@ -223,7 +262,9 @@ class Service:
         active = self.scheduler.active
         if active is None or active.id != ended.id:
             return  # it was given up before the engine came to its end
-        now = self._now()
+        now = self.now()
+        if self.scheduler.active is not active:
+            return  # it was due just now
         if ended.outcome == protocol.COMPLETED:
             effects = self.scheduler.completed(ended.id, ended.duration, now)
         elif ended.outcome == protocol.STOPPED and active.stop_since is not None:
@@ -254,3 +295,4 @@ class Service:
         """End every goal; `finished` is set once it is silent."""
         self._closing = True
         self.apply(self.scheduler.shutdown(self._now()))
+        self.later.voices_known()

@@ -19,11 +19,13 @@ class Settings:
     voice: str | None = None  # id, name or language
     pitch: int = 50  # 0 to 100
     preempt: bool = False
+    ttl: float = 0.0  # seconds in which a goal must begin; 0 for no limit
     max_queue: int = MAX_QUEUE
     max_text: int = 10_000  # characters
     max_clients: int = MAX_CLIENTS
     player: str | None = None
     device: str | None = None
+    lead_in: int = 0  # milliseconds of silence before a sentence, where the device has been idle
     driver: str | None = None
     socket: str | None = None
     socket_mode: int = 0o600

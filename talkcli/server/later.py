@@ -1,0 +1,98 @@
+"""Requests that can't be carried out yet: they wait until the voices are known, or for room in the queue.
+
+It decides nothing about them: it keeps them in their order, counts them as owed to their clients, and lets them go.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
+
+    from talkcli.server.audience import Audience
+    from talkcli.server.connection import Connection
+
+#: Seconds for which the voices are awaited; a client gives up after five.
+VOICES_LIMIT = 4.0
+#: Requests that wait for one client; one more is carried out as things are.
+MAX_WAITING = 64
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    connection: Connection
+    carry_out: Callable[[], None]
+    may_go: Callable[[], bool]
+
+
+class Later:
+    """The requests that wait. Whatever waits keeps its connection open, and is forgotten with it."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, audience: Audience) -> None:
+        self._loop = loop
+        self._audience = audience
+        self._for_voices: deque[_Waiting] = deque()
+        self._for_room: deque[_Waiting] = deque()
+        self._turn: asyncio.Handle | None = None
+
+    @property
+    def awaits_voices(self) -> bool:
+        """Whether something waits for the voices: what comes after it must not overtake it."""
+        return bool(self._for_voices)
+
+    def until_voices(self, connection: Connection, carry_out: Callable[[], None]) -> None:
+        """Carry it out as soon as the voices are known, at the latest after VOICES_LIMIT seconds."""
+        if self._add(self._for_voices, _Waiting(connection, carry_out, lambda: True)):
+            self._loop.call_later(VOICES_LIMIT, self.voices_known)
+
+    def until_room(self, connection: Connection, carry_out: Callable[[], None], may_go: Callable[[], bool]) -> None:
+        """Carry it out as soon as it may go; the client is told meanwhile that the server is alive."""
+        if self._add(self._for_room, _Waiting(connection, carry_out, may_go)):
+            self._audience.keep_waiting(connection)
+
+    def voices_known(self) -> None:
+        """Carry out what waits for the voices, known or not."""
+        due, self._for_voices = self._for_voices, deque()
+        for each in due:
+            self._go(each)
+
+    def look(self) -> None:
+        """Let go, soon, what may go now that something has changed."""
+        if self._for_room and self._turn is None:
+            # Soon, not at once: whoever changed something may be in the middle of other changes.
+            self._turn = self._loop.call_soon(self._let_go)
+
+    def left(self, connection: Connection) -> None:
+        """Forget what waits for a client that is gone."""
+        self._for_voices = deque(each for each in self._for_voices if each.connection is not connection)
+        self._for_room = deque(each for each in self._for_room if each.connection is not connection)
+
+    def _add(self, line: deque[_Waiting], waiting: _Waiting) -> bool:
+        if sum(each.connection is waiting.connection for each in line) >= MAX_WAITING:
+            waiting.carry_out()
+            return False
+        waiting.connection.owed += 1
+        line.append(waiting)
+        return True
+
+    def _let_go(self) -> None:
+        self._turn = None
+        waiting, self._for_room = self._for_room, deque()
+        stay = []
+        for each in waiting:
+            if each.may_go():
+                self._audience.answered(each.connection)
+                self._go(each)
+            else:
+                stay.append(each)
+        self._for_room.extendleft(reversed(stay))
+        if len(stay) < len(waiting):
+            self.look()  # those that went may have made room for others
+
+    def _go(self, waiting: _Waiting) -> None:
+        waiting.carry_out()
+        waiting.connection.settle()
