@@ -189,7 +189,7 @@ class Answers:
         service.settings = replace(service.settings, **changed)
         if changed:
             values = ", ".join(f"{name} {value}" for name, value in changed.items())
-            log.line(log.shown(f"set to {values} by {log.who(connection.sender)}"))
+            log.line(f"set to {log.shown(values)} by {log.who(connection.sender)}")
         settings = service.settings
         connection.reply(
             wire.ok(

@@ -18,7 +18,22 @@ PACKAGE = Path(talkcli.__file__).parent
 
 #: Each of these may import those after it, never one before it.
 CHAIN = ["cli", "client", "wire", "requests", "messages", "states", "errors"]
-PURE = ["states", "scheduler", "record", "history", "text", "messages", "requests", "wire", "errors"]
+PURE = [
+    "states",
+    "scheduler",
+    "admission",
+    "effects",
+    "pending",
+    "recent",
+    "selection",
+    "record",
+    "history",
+    "text",
+    "messages",
+    "requests",
+    "wire",
+    "errors",
+]
 IMPURE = {"asyncio", "threading", "socket", "time", "click", "pyttsx3", "os", "subprocess"}
 #: Who may name these, by the first part of a module's name.
 ONLY = {

@@ -1,0 +1,105 @@
+"""The service's timers: what a suspend of the machine, or a change of its wall clock, does to goals that wait.
+
+Nothing here can put the machine to sleep, so the clock is the test's own: it jumps, as it does when a machine wakes up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.messages import Sender
+from talkcli.requests import Say
+from talkcli.server import clock, service
+from talkcli.server.service import Service
+from talkcli.server.settings import Settings
+from talkcli.states import State
+
+if TYPE_CHECKING:
+    from talkcli.engine import protocol
+
+
+class _BusyEngine:
+    """Takes every goal, and says nothing."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def say(self, goal: protocol.Say) -> None:
+        self.said.append(goal.text)
+
+
+class _Clock:
+    def __init__(self) -> None:
+        self.ahead = 0.0
+
+    def __call__(self) -> float:
+        return time.monotonic() + self.ahead
+
+
+async def _queued_behind_another(ttl: float) -> Service:
+    served = Service("k3fz", Settings(ttl=ttl), "unused", 0o600)
+    served.engine = _BusyEngine()  # type: ignore[assignment]
+    for text in ("a long sentence", "the door is open"):
+        served.apply(served.scheduler.submit(Say(text), Sender(), served.now()).effects)
+    return served
+
+
+async def _until(served: Service, goal_id: str, state: State, limit: float) -> float:
+    """Return the seconds until the goal is in this state."""
+    began = time.monotonic()
+    record = served.scheduler.find(goal_id)
+    assert record is not None
+    while record.state is not state:
+        assert time.monotonic() - began < limit, f"{goal_id} is {record.state.name} after {limit} s"
+        await asyncio.sleep(0.005)
+    return time.monotonic() - began
+
+
+def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine_wakes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slept = _Clock()
+    monkeypatch.setattr(service, "elapsed", slept)
+
+    async def scenario() -> None:
+        served = await _queued_behind_another(ttl=600)
+        await asyncio.sleep(0)  # the loop's own timer for the ten minutes is set
+        slept.ahead += 3_600
+        await _until(served, "k3fz-2", State.RECALLED, clock.LOOK_EVERY + 1)
+
+    asyncio.run(scenario())
+
+
+def test_no_request_after_a_suspend_finds_a_goal_whose_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept = _Clock()
+    monkeypatch.setattr(service, "elapsed", slept)
+
+    async def scenario() -> None:
+        served = await _queued_behind_another(ttl=600)
+        slept.ahead += 3_600
+        served.now()  # what every request begins with
+        assert served.scheduler.pending_count == 0
+
+    asyncio.run(scenario())
+
+
+def test_the_wall_clock_ends_no_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario() -> None:
+        served = await _queued_behind_another(ttl=600)
+        with monkeypatch.context() as patched:
+            now = time.time()
+            patched.setattr(service.time, "time", lambda: now + 86_400)
+            served.now()
+        assert served.scheduler.pending_count == 1
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that counts a suspend")
+def test_the_clock_is_the_one_that_counts_a_suspend() -> None:
+    before = time.clock_gettime(time.CLOCK_BOOTTIME)
+    assert before <= clock.elapsed() <= time.clock_gettime(time.CLOCK_BOOTTIME)
