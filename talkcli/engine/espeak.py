@@ -23,6 +23,7 @@ from talkcli.engine.wordclock import TimedWord
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from talkcli.engine.hold import Hold
     from talkcli.engine.library import Library
     from talkcli.engine.outlet import Outlet
     from talkcli.engine.sink import Wait
@@ -50,10 +51,10 @@ class UnknownVoice(Exception):
     """The library has no such voice."""
 
 
-def register(library: Library, outlet: Outlet, wait: Wait) -> None:
+def register(library: Library, outlet: Outlet, wait: Wait, hold: Hold) -> None:
     """Put the driver among pyttsx3's own, so that `pyttsx3.init(DRIVER)` finds it."""
     module: Any = types.ModuleType(f"pyttsx3.drivers.{DRIVER}")
-    module.buildDriver = lambda proxy: EspeakDriver(proxy, library, outlet, wait)
+    module.buildDriver = lambda proxy: EspeakDriver(proxy, library, outlet, wait, hold)
     sys.modules[module.__name__] = module
 
 
@@ -66,12 +67,14 @@ class EspeakDriver:
         library: Library,
         outlet: Outlet,
         wait: Wait,
+        hold: Hold,
     ) -> None:
         self._proxy = proxy
         self._espeak = library.espeak
         self._rate = library.rate
         self._outlet = outlet
         self._wait = wait
+        self._hold = hold
         self._text: str | None = None
         self._playback: Playback | None = None
         self._caught: BaseException | None = None
@@ -150,7 +153,7 @@ class EspeakDriver:
     def _speak(self, text: str) -> None:
         """Speak the text, with exactly one finished-utterance at its end."""
         self._proxy.notify("started-utterance")
-        self._playback = playback = Playback(self._outlet, self._wait, self._word_heard)
+        self._playback = playback = Playback(self._outlet, self._wait, self._hold, self._word_heard)
         playback.begin(self._rate)
         failure: Exception | None = None
         duration = None

@@ -1,10 +1,11 @@
 """Where the sound goes: opens a sink for each sentence, as `--player` and `--device` say.
 
-It remembers which player worked, and nothing else: no device is open between two sentences.
+It remembers which player worked and when the device was last in use: none is open between two sentences.
 """
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -21,16 +22,24 @@ if TYPE_CHECKING:
 
 _FILE = "file:"
 
+#: Seconds after which a device that was let go of counts as idle, and gets the lead-in again: the power saving of sound
+#: cards (snd_hda_intel) begins after 1 s where it is on, sound servers suspend a device after 5 s.
+IDLE_AFTER = 1.0
+
 
 class Outlet:
     """The player setting of one engine process."""
 
-    def __init__(self, player: str | None, device: str | None, inherited: Sequence[int] = ()) -> None:
-        """`inherited` are descriptors that every player program gets."""
+    def __init__(
+        self, player: str | None, device: str | None, inherited: Sequence[int] = (), lead_in: float = 0.0
+    ) -> None:
+        """`inherited` are descriptors that every player program gets, `lead_in` seconds for a device that slept."""
         self._player = player
         self._device = device
         self._inherited = inherited
+        self._lead_in = lead_in
         self._worked: str | None = None
+        self._used_at: float | None = None
 
     def candidates(self, rate: int) -> list[Callable[[], Sink]]:
         """Return what opens the sinks to try for a sentence, best first; AudioFailed if there is none."""
@@ -44,6 +53,15 @@ class Outlet:
     def worked(self, name: str) -> None:
         """Take note that a sentence was played whole by the player of this name."""
         self._worked = name
+
+    def let_go(self) -> None:
+        """Take note that a device that had been playing was closed."""
+        self._used_at = time.monotonic()
+
+    def lead_in(self) -> float:
+        """Return the seconds of silence that a player which is started now begins with."""
+        idle = self._used_at is None or time.monotonic() - self._used_at >= IDLE_AFTER
+        return self._lead_in if idle else 0.0
 
     def first(self) -> str | None:
         """Return the name of what is tried first, for people; None if nothing is found."""

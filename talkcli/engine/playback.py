@@ -1,7 +1,7 @@
-"""The playback of one sentence: feeds a sink, keeps the word clock, and judges whether all of it was heard.
+"""The playback of one sentence: feeds a player, holds it where it is asked to, and judges whether all of it was heard.
 
-It waits only through the function it is given, which lets a stop come in. It knows nothing of synthesis and nothing of
-processes: a sink says what it takes, this says what that means.
+It waits only through the function it is given, which lets a stop and a pause come in. It knows nothing of synthesis and
+nothing of processes: a sink says what it takes, this says what that means.
 """
 
 from __future__ import annotations
@@ -9,12 +9,14 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+from talkcli.engine.feed import Feed
 from talkcli.engine.sink import PIECE, SAMPLE, AudioFailed, Stopped
 from talkcli.engine.wordclock import WordClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from talkcli.engine.hold import Hold
     from talkcli.engine.outlet import Outlet
     from talkcli.engine.sink import Sink, Wait
     from talkcli.engine.wordclock import TimedWord
@@ -37,36 +39,41 @@ DRAIN_WITHIN = 3.0
 #: silence. The pause at a sentence's end is longer than this, so that nothing audible can be missing.
 EARLY_END = 0.25
 
-#: Seconds of sound that a player holds at least between taking and playing it: of the 60 ms it is asked for, aplay was
-#: seen to hold 42 to 78, pacat 25 to 60.
-PLAYER_HOLDS = 0.02
+#: Seconds within which a sentence that is to be held must be silent. A player has 42 to 98 ms of it to play; one that
+#: has more, or stands still, is ended instead and the sentence goes on with another.
+SILENT_WITHIN = 0.15
+
+#: Seconds by which the word clock may be ahead of what is heard: 4 to 8 ms were measured.
+CLOCK_AHEAD = 0.01
+
+#: Seconds that are said again where a player had to be ended before all it held was heard: the clock is no better than
+#: this, and nothing may be lost.
+SAID_AGAIN = 0.03
+
+#: Seconds of a pause after which the player is let go of: long enough for a question in between, after which the next
+#: sample is heard at once; a longer one must leave the device to other programs, and let it sleep.
+RELEASE_AFTER = 10.0
 
 
 class Playback:
-    """One sentence on its way to the player. Every method may raise Stopped or AudioFailed, except the last three."""
+    """One sentence on its way to the player. Every method may raise Stopped or AudioFailed, except the last two."""
 
-    def __init__(
-        self,
-        outlet: Outlet,
-        wait: Wait,
-        on_word: Callable[[TimedWord], None],
-    ) -> None:
+    def __init__(self, outlet: Outlet, wait: Wait, hold: Hold, on_word: Callable[[TimedWord], None]) -> None:
         self._outlet = outlet
         self._wait = wait
+        self._hold = hold
         self._on_word = on_word
         self._rate = 0
         self._candidates: list[Callable[[], Sink]] = []
-        self._sink: Sink | None = None
+        self._feed: Feed | None = None
         self._first_error: AudioFailed | None = None
         self._clock = WordClock()
         self._any_word = False
-        #: samples that may still be needed: all of them until the player is proven, then those it has not taken yet
+        #: samples that may still be needed: all of them until the player is proven, then those that were not heard yet
         self._samples = bytearray()
         self._dropped = 0  # bytes before those
-        self._sent = 0  # bytes the sink has taken
-        self._first_write = 0.0
-        self._taken = 0  # the sink's own count, when it last grew
-        self._progress_at = 0.0
+        self._begin = 0  # bytes before the first that this player got
+        self._sent = 0  # bytes that players have taken
         self._stopped = False
 
     def begin(self, rate: int) -> None:
@@ -83,150 +90,244 @@ class Playback:
         self._samples += samples
         self._wait((), 0.0)  # a file is never waited for, and it must be possible to stop that too
         self._check_stopped()
-        if self._sink is None and not self._audible(samples):
+        if self._sent == 0 and self._feed is None and not self._audible(samples):
             return
-        self._try(self._feed)
+        self._try(self._feed_all)
 
     def finish(self) -> float:
         """Play to the end and return the length in seconds. Returns only if all of it was heard."""
-        if self._sink is None and not self._any_word:
+        if self._sent == 0 and self._feed is None and not self._any_word:
             raise AudioFailed("nothing_to_say", "nothing in the text can be spoken")
         self._try(self._drain)
         for word in self._clock.rest():
             self._on_word(word)
-        if self._sink is not None:
-            self._outlet.worked(self._sink.name)
-        return self._length()
+        if self._feed is not None:
+            self._outlet.worked(self._feed.sink.name)
+        return self._seconds(self._end())
 
     def stop(self) -> None:
         """Be silent now; what waits ends with Stopped."""
         self._stopped = True
-        if self._sink is not None:
-            self._sink.kill()
+        if self._feed is not None:
+            self._feed.sink.kill()
 
     def silence(self) -> None:
         """Return when nothing can be heard any more, however it ended."""
-        if self._sink is None:
+        if self._feed is None:
             return
-        self._sink.kill()
-        while not self._sink.gone():  # hangs in the kernel: the server has a limit of its own
+        sink = self._feed.sink
+        sink.kill()
+        while not sink.gone():  # hangs in the kernel: the server has a limit of its own
             self._wait((), time.monotonic() + PIECE)
+        if sink.real_time and sink.proven:
+            self._outlet.let_go()
 
     def _audible(self, samples: bytes) -> bool:
         return self._any_word or samples.count(0) != len(samples)
 
-    def _try(self, step: Callable[[], None]) -> None:
-        """Do the step; where a player fails before any sound was taken, do it again with the next one."""
+    # -- players
+
+    def _try(self, step: Callable[[Feed], bool]) -> None:
+        """Do the step; where a player fails before any sound was taken, or is let go of, do it again with the next."""
         while True:
             self._check_stopped()
             try:
-                if self._sink is None:
-                    self._open()
-                step()
+                if self._feed is None:
+                    self._await_resume()
+                    if 0 < self._begin == self._end():  # held at its very end
+                        return
+                    self._feed = self._open()
+                if step(self._feed):
+                    return
             except AudioFailed as error:
                 self._next_player(error)
-            else:
-                return
 
-    def _open(self) -> None:
+    def _open(self) -> Feed:
         if not self._candidates:
             self._candidates = self._outlet.candidates(self._rate)
-        self._sink = self._candidates.pop(0)()
-        self._sent = self._taken = 0
-        self._progress_at = time.monotonic()
+        sink = self._candidates.pop(0)()
+        self._sent = self._begin
+        return Feed(sink, self._rate, self._clock, self._seconds(self._begin), self._outlet.lead_in())
 
     def _next_player(self, error: AudioFailed) -> None:
         """Give up on this player; raises the first player's error if there is no other, or if sound was taken."""
+        feed = self._feed
+        if feed is not None and feed.sink.real_time and self._hold.asked:
+            self._go_back(feed)  # what is held is spoken by another later, and fails then if there is none
+            return
         first = self._first_error or error
         self._first_error = first
-        lost = self._sink is not None and (self._sink.proven or error.reason == "audio_stalled")
+        lost = feed is not None and (feed.sink.proven or error.reason == "audio_stalled")
         if lost or not self._candidates:
             raise error if lost else first
-        self.silence()
-        self._sink = None
+        self._leave()
 
-    def _feed(self) -> None:
-        """Hand all samples there are to the sink."""
-        sink = self._running()
-        while self._sent < self._end():
-            taken = self._offer(sink)
-            self._tick(sink)
+    def _leave(self) -> None:
+        """End the player; the next one begins where `_begin` says."""
+        self.silence()
+        self._feed = None
+
+    def _let_go(self, begin: int) -> None:
+        """End the player of a sentence that is held; any of them may go on with it."""
+        feed, self._begin, self._sent = self._feed, begin, begin
+        if feed is not None and feed.sink.proven:
+            self._outlet.worked(feed.sink.name)  # tried first again
+        self._candidates = []
+        self._first_error = None
+        self._leave()
+
+    def _go_back(self, feed: Feed) -> None:
+        """End a player that holds sound that wasn't heard; the next one begins there."""
+        self._let_go(self._unheard() if feed.sink.proven else self._begin)
+
+    # -- samples
+
+    def _feed_all(self, feed: Feed) -> bool:
+        """Hand all samples there are to the player; False if it was let go of before."""
+        while True:
+            if self._hold.asked and not self._stay_silent(feed):
+                return False
+            if self._sent == self._end():
+                return True
+            taken = self._offer(feed)
+            self._tick(feed)
             if taken:
                 continue
-            limit = FIRST_WITHIN if self._taken == 0 else STALLED_AFTER
-            self._wait_for(sink, self._progress_at + limit)
-            if self._sent < self._end() and time.monotonic() >= self._progress_at + limit and not self._offer(sink):
-                raise AudioFailed("audio_stalled", f"{sink.name} took no sound for {limit:g} s")
+            limit = FIRST_WITHIN if feed.taken == 0 else STALLED_AFTER
+            self._wait_for(feed, feed.progress_at + limit)
+            if time.monotonic() >= feed.progress_at + limit and not self._hold.asked and not self._offer(feed):
+                raise AudioFailed("audio_stalled", f"{feed.sink.name} took no sound for {limit:g} s")
 
-    def _drain(self) -> None:
-        """Close the sink and wait for its end."""
-        self._feed()
-        sink = self._running()
+    def _drain(self, feed: Feed) -> bool:
+        """Close the player's input and wait for its end; False if it was let go of before."""
+        if not self._feed_all(feed):
+            return False
+        sink = feed.sink
         sink.close()
         now = time.monotonic()
-        limit = now + max(0.0, self._length() - self._clock.position(now)) + DRAIN_WITHIN
+        limit = now + feed.ahead(now) + DRAIN_WITHIN
         while not sink.ended():
-            self._tick(sink)
-            if time.monotonic() >= limit:
+            self._tick(feed)
+            now = time.monotonic()
+            if self._hold.asked and feed.ahead(now) > SILENT_WITHIN:
+                self._go_back(feed)
+                return False  # with less than that left it has ended as soon as it could be held
+            if now >= limit:
                 raise AudioFailed("audio_stalled", f"{sink.name} did not end {DRAIN_WITHIN:g} s after the sound")
-            self._wait_for(sink, limit)
-        missing = self._first_write + self._length() - time.monotonic()
+            self._wait_for(feed, limit)
+        missing = feed.missing(time.monotonic())
         if sink.real_time and missing > EARLY_END:
             raise AudioFailed("audio_lost", f"{sink.name} ended {missing:.1f} s before the sound did")
+        return True
 
-    def _offer(self, sink: Sink) -> int:
+    def _offer(self, feed: Feed) -> int:
+        if feed.leading_in:
+            return feed.lead_in()
         begin = self._sent - self._dropped
-        piece = int(PIECE * self._rate) * SAMPLE
-        with memoryview(self._samples) as view, view[begin : begin + piece] as part:
-            taken = sink.offer(part)
-        if not taken:
-            return 0
-        now = time.monotonic()
-        if self._sent == 0:
-            self._first_write = now
-            self._clock.start(now)
+        with memoryview(self._samples) as view, view[begin : begin + feed.piece] as part:
+            taken = feed.offer(part)
         self._sent += taken
-        self._progress_at = now
         return taken
 
-    def _tick(self, sink: Sink) -> None:
-        """Bring the clock up to date, report the words that are heard, forget the samples that were taken."""
+    def _tick(self, feed: Feed) -> None:
+        """Bring the clock up to date, report the words that are heard, forget the samples that were heard."""
         now = time.monotonic()
-        consumed = sink.consumed()
-        if consumed > self._taken:
-            if self._taken == 0:  # it has opened its device: the clock starts here, not with what waited in the pipe
-                self._clock.start(now)
-            self._taken = consumed
-            self._progress_at = now
-        if sink.real_time and consumed < self._end():
-            self._clock.hold(now, max(0.0, self._seconds(consumed) - PLAYER_HOLDS))
+        feed.tick(now, last=self._sent == self._end() and not self._hold.asked)
+        sink = feed.sink
         if not sink.proven:
             return
-        del self._samples[: self._sent - self._dropped]
-        self._dropped = self._sent
+        needed = self._unheard() if sink.real_time else self._sent
+        del self._samples[: needed - self._dropped]
+        self._dropped = needed
         for word in self._clock.due(now) if sink.real_time else self._clock.rest():
             self._on_word(word)
 
-    def _wait_for(self, sink: Sink, until: float) -> None:
+    # -- holding
+
+    def _stay_silent(self, feed: Feed) -> bool:
+        """Feed silence while the sentence is held; False if the player was let go of."""
+        if not feed.sink.real_time:
+            self._await_resume()
+            return True
+        if not self._fall_silent(feed):
+            return False
+        if self._hold.asked and not self._stay_open(feed):
+            self._let_go(self._sent)  # what it held was heard
+            return False
+        feed.progress_at = time.monotonic()
+        return True
+
+    def _fall_silent(self, feed: Feed) -> bool:
+        """Return when all that the player has of the sentence is heard, or it may go on; False if it was let go of."""
+        mark, now = feed.written, time.monotonic()
+        limit = now + SILENT_WITHIN
+        hopeless = feed.taken == 0 or feed.unheard(mark, now) > SILENT_WITHIN
+        while self._hold.asked and (left := feed.unheard(mark, now) + CLOCK_AHEAD) > 0:
+            if hopeless or now >= limit:
+                self._go_back(feed)
+                return False
+            if not self._feed_silence(feed):
+                self._wait_for(feed, min(limit, now + left))
+            now = time.monotonic()
+        return True
+
+    def _stay_open(self, feed: Feed) -> bool:
+        """Keep the player that holds nothing but silence; False if it failed, or must be let go of, before the end."""
+        release_at = time.monotonic() + RELEASE_AFTER
+        while self._hold.asked:
+            self._hold.confirm()
+            try:
+                fed = self._feed_silence(feed)
+            except AudioFailed:
+                return False  # a pause is no reason to end the sentence
+            due = min(release_at, feed.progress_at + STALLED_AFTER)
+            if time.monotonic() >= due:
+                return False
+            if not fed:
+                self._wait_for(feed, due)
+        return True
+
+    def _feed_silence(self, feed: Feed) -> int:
+        """Offer a piece of silence, unless the player has more than enough: one that takes all would keep us busy."""
+        feed.sink.ended()  # raises if it is gone
+        taken = 0 if self._full(feed) else feed.offer_silence(self._seconds(self._sent))
+        self._tick(feed)
+        return taken
+
+    def _full(self, feed: Feed) -> bool:
+        return self._hold.asked and feed.ahead(time.monotonic()) >= SILENT_WITHIN
+
+    def _await_resume(self) -> None:
+        """Wait, without a player, while the sentence is held."""
+        while self._hold.asked:
+            self._hold.confirm()
+            self._wait((), None)
+            self._check_stopped()
+
+    def _wait_for(self, feed: Feed, until: float) -> None:
+        sink, now = feed.sink, time.monotonic()
         moments = [until, sink.wake_at(), self._clock.next_due() if sink.proven else None]
-        if self._taken < self._sent:  # a player that takes a part of what waits wakes nobody
-            moments.append(time.monotonic() + LOOK_EVERY)
-        self._wait(sink.interests(), min(moment for moment in moments if moment is not None))
+        full = self._full(feed)
+        if full:
+            moments[1] = now + PIECE
+        if feed.taken < feed.written:  # a player that takes a part of what waits wakes nobody
+            moments.append(now + LOOK_EVERY)
+        self._wait(feed.interests(full), min(moment for moment in moments if moment is not None))
         self._check_stopped()
 
     def _check_stopped(self) -> None:
         if self._stopped:
             raise Stopped
 
-    def _running(self) -> Sink:
-        assert self._sink is not None
-        return self._sink
+    # -- lengths
+
+    def _unheard(self) -> int:
+        """Return the bytes before those that may not have been heard yet, of those that this player got."""
+        heard = int(max(0.0, self._clock.heard(time.monotonic()) - SAID_AGAIN) * self._rate) * SAMPLE
+        return min(self._sent, max(self._begin, self._dropped, heard))
 
     def _end(self) -> int:
         return self._dropped + len(self._samples)
 
     def _seconds(self, length: int) -> float:
         return length / (self._rate * SAMPLE)
-
-    def _length(self) -> float:
-        return self._seconds(self._end())

@@ -45,10 +45,10 @@ def _serve(channel: Channel, configure: protocol.Configure) -> None:
     from talkcli.engine.session import Session
     from talkcli.engine.start import CannotStart, start
 
-    outlet = Outlet(configure.player, configure.device, _inherited())
+    outlet = Outlet(configure.player, configure.device, _inherited(), configure.lead_in / 1000)
     session = Session(channel)
     try:
-        started = start(configure.driver, configure.voice, outlet, session.wait)
+        started = start(configure.driver, configure.voice, outlet, session.wait, session.hold)
     except CannotStart as error:
         channel.send(protocol.StartFailed(error.reason, str(error)))
         return
@@ -56,7 +56,7 @@ def _serve(channel: Channel, configure: protocol.Configure) -> None:
     own = started.pump is None
     channel.send(protocol.Ready(started.driver, started.version, outlet.first() if own else None))
     try:
-        session.run()
+        session.run(configure.list_voices)
     finally:
         started.engine.endLoop()
 

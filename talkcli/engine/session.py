@@ -1,8 +1,9 @@
 """The engine process's loop: one goal after the other through pyttsx3's engine, with commands in between and during.
 
 One thread. While a goal is spoken by `talk`'s own driver, the driver waits in `Session.wait`; a `Stop` that comes in
-there is carried out at once, by `engine.stop()`. Nothing may leave a goal without its `Ended`: pyttsx3 swallows what
-its callbacks raise, ignores blank text and turns errors into notifications.
+there is carried out at once, by `engine.stop()`, a `Pause` by its playback. Other drivers know no pause: there the
+sentence is stopped, and what is left of it is spoken as another. Nothing may leave a goal without its `Ended`: pyttsx3
+swallows what its callbacks raise, ignores blank text and turns errors into notifications.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from talkcli.engine import protocol
+from talkcli.engine.hold import Hold
 from talkcli.engine.settings import SettingFailed
 from talkcli.engine.sink import AudioFailed
 from talkcli.engine.voices import list_voices
@@ -32,18 +34,26 @@ if TYPE_CHECKING:
 #: Seconds between two steps of a driver that is not ours while it has a goal in hand: it has no way to wake us.
 STEP = 0.05
 
-#: Seconds without a command before the voices are listed: a goal that waited for this process comes at once, and
-#: listing takes up to 40 ms.
-QUIET = 0.2
-
 
 @dataclass(slots=True)
 class InHand:
     """The goal that is being spoken."""
 
     id: str
+    text: str
     words: Words
+    #: when it began, without the time for which it was held
     began: float
+    #: whether the driver has it; not while it is held, unless the driver is our own
+    spoken: bool = False
+    #: whether the driver was told to stop because it is to be held
+    interrupted: bool = False
+    #: when it became silent after that
+    silent_at: float | None = None
+    #: where in the text begins what the driver was given
+    offset: int = 0
+    #: where in the text the last word that was heard begins
+    last_word: int = 0
     stop_asked: bool = False
     error: Exception | None = None
 
@@ -59,6 +69,8 @@ class Session:
         self._engine: Any = None
         self._settings: Settings | None = None
         self._pump: Callable[[], None] | None = None
+        #: for our own driver to obey, and what the session itself goes by with another
+        self.hold = Hold(self._tell_paused)
 
     def open(self, engine: Any, settings: Settings, pump: Callable[[], None] | None) -> None:
         """Take the engine; `pump` is called about 20 times a second while a goal is spoken by a foreign driver."""
@@ -69,18 +81,13 @@ class Session:
         engine.connect("finished-utterance", _told(self._finished))
         engine.connect("error", _told(self._error))
 
-    def run(self) -> None:
-        """Carry out commands until the server leaves or says so."""
-        voices_told = spoken = False
+    def run(self, voices: bool) -> None:
+        """Carry out commands until the server leaves or says so; before that tell the voices, if they are wanted."""
+        if voices:
+            self._channel.send(protocol.Voices(self._voices()))
         while not (self._leaving or self._channel.closed):
-            # With a goal after the other there never is a quiet moment: then between the first two.
-            if not voices_told and (spoken or not (self._backlog or self._readable(QUIET))):
-                voices_told = True
-                self._channel.send(protocol.Voices(self._voices()))
-            elif self._backlog:
-                command = self._backlog.popleft()
-                self._carry_out(command)
-                spoken = spoken or isinstance(command, protocol.Say)
+            if self._backlog:
+                self._carry_out(self._backlog.popleft())
             else:
                 self._backlog.extend(self._channel.receive())
 
@@ -99,15 +106,35 @@ class Session:
         self._tell_alive()
 
     def _take_commands(self) -> None:
-        """Read what came during a goal; a stop is carried out, the rest has to wait."""
+        """Read what came during a goal; what concerns it is carried out, the rest has to wait."""
         for command in self._channel.receive():
-            if isinstance(command, protocol.Stop):
-                self._stop(command)
-            else:
-                self._leaving = self._leaving or isinstance(command, protocol.Quit)
-                self._backlog.append(command)
+            self._carry_out_now(command)
         if self._leaving or self._channel.closed:
             self._silence()
+
+    def _carry_out_now(self, command: Command) -> None:
+        goal = self._goal
+        if isinstance(command, protocol.Stop):
+            self._stop(command)
+        elif isinstance(command, protocol.Pause | protocol.Resume):
+            if goal is not None and goal.id == command.id and not goal.stop_asked:
+                self._hold_or_go_on(goal, isinstance(command, protocol.Pause))
+        else:
+            self._leaving = self._leaving or isinstance(command, protocol.Quit)
+            self._backlog.append(command)
+
+    def _hold_or_go_on(self, goal: InHand, held: bool) -> None:
+        if not held:
+            self.hold.release()
+            return
+        self.hold.ask()
+        if self._pump is not None and goal.spoken and not goal.interrupted:
+            goal.interrupted = True
+            self._engine.stop()
+
+    def _tell_paused(self) -> None:
+        if self._goal is not None and not self._goal.stop_asked:
+            self._channel.send(protocol.Paused(self._goal.id))
 
     def _stop(self, command: protocol.Stop) -> None:
         if self._goal is not None and self._goal.id == command.id:
@@ -123,31 +150,54 @@ class Session:
     def _silence(self) -> None:
         if self._goal is not None and not self._goal.stop_asked:
             self._goal.stop_asked = True
-            self._engine.stop()
+            if self._goal.spoken:
+                self._engine.stop()
+            else:  # held, or not begun: the driver has nothing that it could end
+                self._end(protocol.STOPPED)
 
     def _carry_out(self, command: Command) -> None:
         if isinstance(command, protocol.Say):
             self._say(command)
         elif isinstance(command, protocol.Quit):
             self._leaving = True
-        # A Stop out of a goal came too late, a second Configure has nothing to change.
+        # What else comes out of a goal came too late; a second Configure has nothing to change.
 
     def _say(self, say: protocol.Say) -> None:
         """Speak a goal to its end."""
         assert self._settings is not None
-        self._goal = InHand(say.id, Words(say.text), time.monotonic())
+        self._goal = goal = InHand(say.id, say.text, Words(say.text), time.monotonic())
+        self.hold.release()
         self._channel.send(protocol.Started(say.id))
+        # What came with it in one piece is no later than what comes in a moment.
+        waiting, self._backlog = self._backlog, deque()
+        for command in waiting:
+            self._carry_out_now(command)
+        if self._leaving:
+            self._silence()
         try:
             self._settings.apply(say)
         except SettingFailed as error:
-            self._end(protocol.FAILED, error.reason, str(error))
-            return
-        self._goal.error = None
-        if self._engine.say(say.text, say.id) is not None:
-            self._end(protocol.FAILED, "nothing_to_say", "nothing in the text can be spoken")
-            return
+            if self._goal is not None:
+                self._end(protocol.FAILED, error.reason, str(error))
+        goal.error = None
         while self._goal is not None and not self._leaving:
+            self._go_on(goal)
+
+    def _go_on(self, goal: InHand) -> None:
+        """Do the next thing for the goal in hand: begin it, let the driver speak, wait while it is held."""
+        if goal.spoken:
             self._step()
+            return
+        if self._pump is not None and self.hold.asked:
+            self.hold.confirm()
+            self.wait((), None)
+            return
+        if goal.silent_at is not None:
+            goal.began += _since(goal.silent_at)
+        goal.offset = goal.last_word
+        goal.spoken, goal.interrupted, goal.silent_at = True, False, None
+        if self._engine.say(goal.text[goal.offset :], goal.id) is not None:
+            self._end(protocol.FAILED, "nothing_to_say", "nothing in the text can be spoken")
 
     def _step(self) -> None:
         """Let the driver go on. Ours speaks to the end in one step, others are asked again and again."""
@@ -173,10 +223,11 @@ class Session:
     def _word(self, location: int, length: int, time: float | None = None, **_: object) -> None:
         """Report a word. Other drivers give the word as the notification's name, so that says nothing."""
         goal = self._goal
-        if goal is None or goal.stop_asked:
+        if goal is None or goal.stop_asked or goal.interrupted:
             return
-        found = goal.words.next(location, length)
+        found = goal.words.next(goal.offset + location if location >= 0 else location, length)
         if found is not None:
+            goal.last_word = found.start
             seconds = _since(goal.began) if time is None else time
             self._channel.send(protocol.Word(goal.id, found.start, found.end, found.number, round(seconds, 3)))
 
@@ -188,7 +239,9 @@ class Session:
         goal = self._goal
         if goal is None or name != goal.id:  # of a goal that ended before
             return
-        if completed:
+        if goal.interrupted and not (completed or goal.stop_asked or goal.error):
+            goal.spoken, goal.silent_at = False, time.monotonic()
+        elif completed:
             self._end(protocol.COMPLETED, duration=None if duration is None else round(duration, 6))
         elif goal.stop_asked and not isinstance(goal.error, AudioFailed):
             self._end(protocol.STOPPED)
@@ -213,11 +266,6 @@ class Session:
         due = self._alive_due()
         if due is not None and self._goal is not None and time.monotonic() >= due:
             self._channel.send(protocol.Alive(self._goal.id))
-
-    def _readable(self, seconds: float) -> bool:
-        poll = select.poll()
-        poll.register(self._channel.descriptor, select.POLLIN)
-        return bool(poll.poll(seconds * 1000))
 
     def _voices(self) -> tuple[protocol.Voice, ...]:
         try:

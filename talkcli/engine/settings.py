@@ -1,7 +1,8 @@
 """A goal's settings as properties of a pyttsx3 engine.
 
 A property is set only where it differs from what the driver has: the first sentence of a fresh process must be what
-the library alone would make, and a foreign driver may not know a property that nobody asked for.
+the library alone would make, and a foreign driver may not know a property that nobody asked for. A voice is always set
+by an id that the driver itself lists.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from talkcli.engine.espeak import UnknownVoice
 from talkcli.engine.voices import find_voice, list_voices, unknown_voice
 
 if TYPE_CHECKING:
-    from talkcli.engine.protocol import Say
+    from talkcli.engine.protocol import Say, Voice
 
 #: What libespeak-ng starts with, and what pyttsx3's drivers set themselves.
 LIBRARY_DEFAULTS: dict[str, object] = {"rate": 175, "volume": 1.0, "pitch": 50}
@@ -31,12 +32,13 @@ class Settings:
     """What the properties of one engine were last set to."""
 
     def __init__(self, engine: Any, driver: str, own: bool) -> None:
-        """`own` says that the driver finds voices itself, by any of their names."""
+        """`own` says that the driver is `talk`'s own, over libespeak-ng."""
         self._engine = engine
         self._driver = driver
         self._own = own
         self._set = dict(LIBRARY_DEFAULTS if own else PYTTSX3_DEFAULTS)
         self._default_voice: Any = None
+        self._voices: tuple[Voice, ...] | None = None
         self._voice: str | None = None
         self._error: Exception | None = None
         engine.connect("error", self._note)
@@ -45,7 +47,7 @@ class Settings:
         """Set what the goal wants; SettingFailed if that cannot be had."""
         self.set_voice(say.voice)
         for name, value in (("rate", say.rate), ("volume", say.volume), ("pitch", say.pitch)):
-            if self._set[name] == value:
+            if self._set.get(name) == value:
                 continue
             error = self._try(name, value)
             if error is not None:
@@ -60,21 +62,24 @@ class Settings:
         if self._voice is None:
             self._default_voice = self._engine.getProperty("voice")
         value = self._default_voice if wanted is None else self._driver_id(wanted)
+        if self._own:
+            # Some voices leave their own speed to the next one, up to a third slower, unless the rate is set after it.
+            self._set.clear()
         error = self._try("voice", value)
-        if isinstance(error, UnknownVoice) and wanted is not None:
-            raise SettingFailed("unknown_voice", unknown_voice(wanted, list_voices(self._engine))) from error
+        if isinstance(error, UnknownVoice):
+            text = f"the voice {value} is listed, but it cannot be loaded: part of it is missing"
+            raise SettingFailed("unknown_voice", text) from error
         if error is not None:
             text = f"the driver {self._driver} cannot set the voice {wanted}"
             raise SettingFailed("bad_option", f"{text}: {_text(error)}") from error
         self._voice = wanted
 
     def _driver_id(self, wanted: str) -> str:
-        if self._own:
-            return wanted
-        voices = list_voices(self._engine)
-        found = find_voice(wanted, voices)
+        if self._voices is None:  # once: it takes some milliseconds, and they don't change while a process lives
+            self._voices = list_voices(self._engine)
+        found = find_voice(wanted, self._voices)
         if found is None:
-            raise SettingFailed("unknown_voice", unknown_voice(wanted, voices))
+            raise SettingFailed("unknown_voice", unknown_voice(wanted, self._voices))
         return found.id
 
     def _try(self, name: str, value: Any) -> Exception | None:

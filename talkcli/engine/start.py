@@ -14,6 +14,7 @@ from talkcli.engine.settings import SettingFailed, Settings
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from talkcli.engine.hold import Hold
     from talkcli.engine.outlet import Outlet
     from talkcli.engine.sink import Wait
 
@@ -45,14 +46,14 @@ class OpenEngine:
     pump: Callable[[], None] | None
 
 
-def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait) -> OpenEngine:
+def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait, hold: Hold) -> OpenEngine:
     """Build the engine, with its loop started; CannotStart."""
     try:
         import pyttsx3
     except ImportError as error:
         raise CannotStart(f"pyttsx3 is missing: pip install pyttsx3 ({error})") from error
     own = _is_own(driver)
-    version = _register_own(outlet, wait) if own else None
+    version = _register_own(outlet, wait, hold) if own else None
     from talkcli.engine.espeak import DRIVER
 
     name = DRIVER if own else driver or pyttsx3.engine.default_engine_by_sys_platform()
@@ -71,7 +72,7 @@ def _is_own(driver: str | None) -> bool:
     return sys.platform.startswith("linux") and driver in (None, _OWN_NAME)
 
 
-def _register_own(outlet: Outlet, wait: Wait) -> str:
+def _register_own(outlet: Outlet, wait: Wait, hold: Hold) -> str:
     from talkcli.engine.espeak import register
     from talkcli.engine.library import LibraryMissing, load
 
@@ -79,7 +80,7 @@ def _register_own(outlet: Outlet, wait: Wait) -> str:
         library = load()
     except LibraryMissing as error:
         raise CannotStart(str(error)) from error
-    register(library, outlet, wait)
+    register(library, outlet, wait, hold)
     return library.version
 
 

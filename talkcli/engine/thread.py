@@ -6,16 +6,15 @@ holds no lock while it waits, and everything it learns goes out through `post`. 
 
 from __future__ import annotations
 
-import contextlib
-import os
 import selectors
 import threading
 import time
-from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol, spawn
+from talkcli.engine.handed import Handed
+from talkcli.engine.inbox import Inbox
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,6 +47,7 @@ class ThreadDied:
     words: str
 
 
+_OF_A_GOAL = protocol.Started | protocol.Alive | protocol.Word | protocol.Paused | protocol.Ended
 Report = protocol.Event | EngineDied | ThreadDied
 
 
@@ -59,28 +59,19 @@ class EngineThread:
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
         self._configure = configure
         self._post = post
-        self._inbox: deque[Callable[[], None]] = deque()
-        self._wake_read, self._wake_write = os.pipe()
-        os.set_blocking(self._wake_read, False)
-        os.set_blocking(self._wake_write, False)
+        self._inbox = Inbox()
         self._selector = selectors.DefaultSelector()
-        self._selector.register(self._wake_read, selectors.EVENT_READ)
+        self._selector.register(self._inbox.descriptor, selectors.EVENT_READ)
         self._process: spawn.EngineProcess | None = None
         self._started_at = 0.0
         self._start_at = 0.0
         self._failures = 0
         #: why no process becomes ready, while that is so
         self._start_error: str | None = None
-        self._goal: protocol.Say | None = None
-        #: when the process last gave a sign of life for the goal; None while the goal waits for a process
-        self._heard_at: float | None = None
-        self._stop_at: float | None = None
-        #: how the goal ended, once the process that spoke it is known to be gone
-        self._verdict: protocol.Ended | None = None
-        self._verdict_on: spawn.EngineProcess | None = None
+        self._goal: Handed | None = None
         #: killed, not yet known to be gone, with the time by which they must be
         self._dying: dict[spawn.EngineProcess, float] = {}
-        self._closing = self._ended = False
+        self._closing = False
 
     # -- called from other threads
 
@@ -94,27 +85,27 @@ class EngineThread:
 
     def say(self, goal: protocol.Say) -> None:
         """Hand in a goal; the one before must have ended or been given up."""
-        self._call(lambda: self._take(goal))
+        self._inbox.call(lambda: self._take(goal))
 
     def stop(self, goal_id: str) -> None:
         """Make the goal end, silent."""
-        self._call(lambda: self._begin_stop(goal_id))
+        self._inbox.call(lambda: self._begin_stop(goal_id))
+
+    def pause(self, goal_id: str) -> None:
+        """Hold the goal where it is; `Paused` is posted when it is silent, and nothing once it is being stopped."""
+        self._inbox.call(lambda: self._hold(goal_id, paused=True))
+
+    def resume(self, goal_id: str) -> None:
+        """Let the goal go on."""
+        self._inbox.call(lambda: self._hold(goal_id, paused=False))
 
     def give_up(self, goal_id: str) -> None:
         """Let go of a goal that didn't end in time: its process is left behind, there will be no `Ended`."""
-        self._call(lambda: self._abandon(goal_id))
+        self._inbox.call(lambda: self._abandon(goal_id))
 
     def close(self) -> None:
         """End the process and this thread."""
-        self._call(self._begin_close)
-
-    def _call(self, action: Callable[[], None]) -> None:
-        if self._ended:
-            return  # nobody is left to do it: `ThreadDied` says so, or the server ends
-        self._inbox.append(action)
-        # Where the pipe is full, a wake-up that was not seen yet does for this one, too.
-        with contextlib.suppress(BlockingIOError):
-            os.write(self._wake_write, b"\0")
+        self._inbox.call(self._begin_close)
 
     # -- the loop
 
@@ -141,29 +132,31 @@ class EngineThread:
             first: list[float | None] = [self._start_at]
         else:
             first = [None if self._process.ready else self._started_at + START_LIMIT]
-        first.append(None if self._heard_at is None else self._heard_at + HANG_AFTER)
-        first.append(None if self._stop_at is None else self._stop_at + STOP_LIMIT)
+        if goal := self._goal:
+            first.append(None if goal.heard_at is None else goal.heard_at + HANG_AFTER)
+            first.append(None if goal.stop_at is None else goal.stop_at + STOP_LIMIT)
         return first + [limit for limit in self._dying.values() if limit != float("inf")]
 
     def _keep_limits(self, now: float) -> None:
+        goal = self._goal
         if self._process is None and now >= self._start_at:
             self._start()
         elif self._process and not self._process.ready and now >= self._started_at + START_LIMIT:
             self._lose_process(f"the engine was not ready after {START_LIMIT:g} s", "engine_failed")
-        elif self._stop_at is not None and now >= self._stop_at + STOP_LIMIT:
+        elif goal and goal.stop_at is not None and now >= goal.stop_at + STOP_LIMIT:
             self._lose_process(f"the engine did not confirm a stop within {STOP_LIMIT * 1000:.0f} ms", "engine_hung")
-        elif self._heard_at is not None and now >= self._heard_at + HANG_AFTER:
+        elif goal and goal.heard_at is not None and now >= goal.heard_at + HANG_AFTER:
             self._lose_process(f"the engine gave no sign of life for {HANG_AFTER:g} s", "engine_hung")
         for process, limit in list(self._dying.items()):
             if now >= limit:
                 self._dying[process] = float("inf")  # kept, to be reaped when it goes after all
-                if self._verdict and self._verdict_on is process:
+                if self._goal and self._goal.verdict_on is process:
                     words = f"the player could not be ended within {SILENCE_LIMIT:g} s"
-                    self._finish(protocol.Ended(self._verdict.id, protocol.FAILED, "not_silent", words))
+                    self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "not_silent", words))
 
     def _handle(self, key: selectors.SelectorKey) -> None:
-        if key.fd == self._wake_read:
-            self._run_inbox()
+        if key.fd == self._inbox.descriptor:
+            self._inbox.run()
             return
         if key.fd not in self._selector.get_map():
             return  # closed by what was handled before it
@@ -181,46 +174,58 @@ class EngineThread:
         elif process is self._process:
             self._hear(process)
 
-    def _run_inbox(self) -> None:
-        os.read(self._wake_read, 4096)
-        while self._inbox:
-            self._inbox.popleft()()
-
     # -- goals
 
-    def _take(self, goal: protocol.Say) -> None:
-        self._goal, self._heard_at, self._stop_at, self._verdict = goal, None, None, None
+    def _take(self, say: protocol.Say) -> None:
+        self._goal = Handed(say)
         if self._start_error is not None:
-            self._finish(protocol.Ended(goal.id, protocol.FAILED, "engine_failed", self._start_error))
+            self._finish(protocol.Ended(say.id, protocol.FAILED, "engine_failed", self._start_error))
         else:
             self._hand_over()
 
     def _hand_over(self) -> None:
-        if self._goal and self._heard_at is None and self._process and self._process.ready:
-            self._heard_at = time.monotonic()
-            if not self._process.send(self._goal):
-                self._lose_process("the engine takes no commands", "engine_hung")
+        goal = self._goal
+        waits = goal and not (goal.spoken or goal.paused or goal.verdict)
+        if goal and waits and self._process and self._process.ready:
+            goal.heard_at = time.monotonic()
+            self._tell(goal.say)
+
+    def _tell(self, command: protocol.Command) -> None:
+        if self._process and not self._process.send(command):
+            self._lose_process("the engine takes no commands", "engine_hung")
+
+    def _hold(self, goal_id: str, paused: bool) -> None:
+        goal = self._goal
+        if goal is None or goal.id != goal_id or goal.ending or not (paused or goal.paused):
+            return  # it ended, or is about to, while this was on its way
+        goal.paused = paused
+        if goal.spoken:
+            self._tell(protocol.Pause(goal_id) if paused else protocol.Resume(goal_id))
+        elif paused:
+            self._post(protocol.Paused(goal_id))  # it waits for a process, and now for `resume` as well
+        else:
+            self._hand_over()
 
     def _begin_stop(self, goal_id: str) -> None:
-        if self._goal is None or self._goal.id != goal_id or self._stop_at is not None:
+        goal = self._goal
+        if goal is None or goal.id != goal_id or goal.stop_at is not None:
             return  # it ended while the stop was on its way
-        if self._verdict:
-            self._verdict = protocol.Ended(goal_id, protocol.STOPPED)
-        elif self._heard_at is None:
+        if goal.verdict:
+            goal.verdict = protocol.Ended(goal_id, protocol.STOPPED)
+        elif not goal.spoken:
             self._finish(protocol.Ended(goal_id, protocol.STOPPED))
         elif self._process:
-            self._stop_at = time.monotonic()
+            goal.stop_at = time.monotonic()
             self._process.send(protocol.Stop(goal_id))
 
     def _abandon(self, goal_id: str) -> None:
         if self._goal and self._goal.id == goal_id:
-            in_hand = self._heard_at is not None
-            self._goal = self._heard_at = self._stop_at = self._verdict = None
-            if in_hand:
+            spoken, self._goal = self._goal.spoken, None
+            if spoken:
                 self._lose_process("the engine could not be silenced", "not_silent")
 
     def _finish(self, ended: protocol.Ended) -> None:
-        self._goal = self._heard_at = self._stop_at = self._verdict = None
+        self._goal = None
         self._post(ended)
 
     # -- the process
@@ -247,13 +252,14 @@ class EngineThread:
         self._lose_process(f"the engine crashed: {process.last_words()}", "engine_crashed")
 
     def _note(self, process: spawn.EngineProcess, event: protocol.Event) -> None:
-        if isinstance(event, protocol.Started | protocol.Alive | protocol.Word | protocol.Ended):
-            if self._goal is None or self._heard_at is None or event.id != self._goal.id:
+        if isinstance(event, _OF_A_GOAL):
+            goal = self._goal
+            if goal is None or not goal.spoken or event.id != goal.id:
                 return  # of a goal that has ended already
-            self._heard_at = time.monotonic()
+            goal.heard_at = time.monotonic()
             if isinstance(event, protocol.Ended):
                 self._finish(event)
-            elif isinstance(event, protocol.Word):
+            elif isinstance(event, protocol.Word) or (isinstance(event, protocol.Paused) and goal.paused):
                 self._post(event)
             return
         if isinstance(event, protocol.Ready):
@@ -262,6 +268,8 @@ class EngineThread:
         elif isinstance(event, protocol.StartFailed):
             self._start_error = event.message
             process.explained = True
+        elif isinstance(event, protocol.Voices):
+            self._configure = replace(self._configure, list_voices=False)  # the next process need not
         self._post(event)
         self._hand_over()
 
@@ -274,16 +282,13 @@ class EngineThread:
         process.kill()
         self._selector.unregister(process.socket.fileno())
         self._dying[process] = now + SILENCE_LIMIT
-        had_goal = self._goal is not None and self._heard_at is not None
-        if self._goal and had_goal:
-            stopped = self._stop_at is not None
-            self._verdict_on = process
-            self._verdict = (
-                protocol.Ended(self._goal.id, protocol.STOPPED)
-                if stopped
-                else protocol.Ended(self._goal.id, protocol.FAILED, reason, words)
-            )
-            self._heard_at = self._stop_at = None
+        goal = self._goal
+        had_goal = goal is not None and goal.spoken
+        if goal and had_goal:
+            failed = protocol.Ended(goal.id, protocol.FAILED, reason, words)
+            goal.verdict = failed if goal.stop_at is None else protocol.Ended(goal.id, protocol.STOPPED)
+            goal.verdict_on = process
+            goal.heard_at = goal.stop_at = None
         if not (self._closing or process.explained):
             self._post(EngineDied(words))
         if not process.ready:
@@ -302,7 +307,7 @@ class EngineThread:
         if first and not explained:
             return
         self._start_error = words
-        if self._goal and not self._verdict:
+        if self._goal and not self._goal.verdict:
             self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "engine_failed", words))
 
     def _wait_longer(self, now: float) -> None:
@@ -316,8 +321,9 @@ class EngineThread:
             self._selector.unregister(process.stderr)
         process.close()
         limit = self._dying.pop(process)
-        if self._verdict and self._verdict_on is process and limit != float("inf"):
-            self._finish(self._verdict)
+        goal = self._goal
+        if goal and goal.verdict and goal.verdict_on is process and limit != float("inf"):
+            self._finish(goal.verdict)
 
     # -- the end
 
@@ -331,9 +337,8 @@ class EngineThread:
         while self._dying and time.monotonic() < limit:
             for key, _ in self._selector.select(max(0.0, limit - time.monotonic())):
                 self._handle(key)
-        self._ended = True
+        self._inbox.refuse()
         for process in list(self._dying):
             process.close()
         self._selector.close()
-        os.close(self._wake_read)
-        os.close(self._wake_write)
+        self._inbox.close()

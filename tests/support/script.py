@@ -18,7 +18,11 @@ sentences are spoken plainly:
 | `ignore-stop` | ignores stop and ends by its length; with `never-ends`, never, but shows that it is alive |
 | `slow-stop=SECONDS` | ends that long after it was told to stop |
 | `on-stop=crash`, `=exit`, `=hang`, `=fail`, `=complete` | does that when it is told to stop |
+| `slow-pause=SECONDS` | goes on that long after it was told to pause, before it is silent |
+| `ignore-pause` | ignores pause and resume, and says nothing about it |
 | `linger=SECONDS` | leaves a process that holds the pipe of `TALK_LIVENESS_FD` open so long, whatever happens |
+
+While it is paused all that it has planned waits, and it shows that it is alive.
 
 A start is `fail`, `fail=REASON`, `hang`, `slow`, `slow=SECONDS` (0.5), `crash` or `exit=CODE`, in the environment
 variable SCRIPTED_START or, read anew by each start, in the file that SCRIPTED_START_FILE names; else it is ready at
@@ -33,8 +37,10 @@ from dataclasses import dataclass
 
 #: No scripted process outlives this many seconds of hanging or lingering, whatever happens to the test.
 LONGEST = 30.0
-_FLAGS = frozenset({"silent-start", "crash", "exit", "hang", "never-ends", "ignore-stop"})
-_VALUED = frozenset({"length", "words", "at", "fail", "message", "exit", "slow-stop", "on-stop", "linger"})
+_FLAGS = frozenset({"silent-start", "crash", "exit", "hang", "never-ends", "ignore-stop", "ignore-pause"})
+_VALUED = frozenset(
+    {"length", "words", "at", "fail", "message", "exit", "slow-stop", "on-stop", "slow-pause", "linger"}
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +59,8 @@ class Script:
     ignore_stop: bool = False
     slow_stop: float = 0.0
     on_stop: str | None = None
+    slow_pause: float = 0.0
+    ignore_pause: bool = False
     linger: float = 0.0
     words: tuple[tuple[int, int], ...] = ()
 
@@ -85,6 +93,8 @@ def parse(text: str) -> Script:
         ignore_stop="ignore-stop" in asked,
         slow_stop=float(asked.get("slow-stop", "0")),
         on_stop=asked.get("on-stop"),
+        slow_pause=float(asked.get("slow-pause", "0")),
+        ignore_pause="ignore-pause" in asked,
         linger=min(LONGEST, float(asked.get("linger", "0"))),
         words=tuple(spans[:count]) if "silent-start" not in asked else (),
     )

@@ -38,11 +38,23 @@ class Goal:
         self.script = script.parse(say.text)
         self.plan: list[tuple[float, Callable[[], None]]] = []
         self.stopped = False
+        #: when it is silent because it was told to pause, or has been since; the plan stands still then
+        self.silent_at: float | None = None
 
     def then(self, due: float, action: Callable[[], None]) -> None:
         """Plan an action for a monotonic time, after those that are planned for the same one."""
         self.plan.append((due, action))
         self.plan.sort(key=lambda each: each[0])
+
+    def held(self, now: float) -> bool:
+        """Whether it is silent because of a pause."""
+        return self.silent_at is not None and now >= self.silent_at
+
+    def resume(self, now: float) -> None:
+        """Go on with the plan where it stood still."""
+        if self.silent_at is not None and now > self.silent_at:
+            self.plan = [(due + now - self.silent_at, action) for due, action in self.plan]
+        self.silent_at = None
 
 
 class Engine:
@@ -52,6 +64,8 @@ class Engine:
         self._goal: Goal | None = None
         self._last = time.monotonic()
         self._buffer = b""
+        #: whether `Paused` is still to be sent
+        self._pause_untold = False
 
     def run(self) -> None:
         """Serve until the other side closes, or tells it to quit."""
@@ -64,9 +78,11 @@ class Engine:
     def _patience(self) -> float | None:
         if self._goal is None:
             return None
-        due = self._last + protocol.ALIVE_EVERY
-        if self._goal.plan:
-            due = min(due, self._goal.plan[0][0])
+        goal, due = self._goal, self._last + protocol.ALIVE_EVERY
+        if self._pause_untold and goal.silent_at is not None:
+            due = min(due, goal.silent_at)
+        if goal.plan and not goal.held(time.monotonic()):
+            due = min(due, goal.plan[0][0])
         return max(0.0, due - time.monotonic())
 
     def _read(self) -> bool:
@@ -78,16 +94,20 @@ class Engine:
 
     def _take(self, command: protocol.Command) -> bool:
         if isinstance(command, protocol.Configure):
-            self._start()
+            self._start(command.list_voices)
         elif isinstance(command, protocol.Say):
             self._say(command)
         elif isinstance(command, protocol.Stop):
             self._stop(command)
+        elif isinstance(command, protocol.Pause):
+            self._pause(command)
+        elif isinstance(command, protocol.Resume):
+            self._resume(command)
         else:
             return not self._quit()
         return True
 
-    def _start(self) -> None:
+    def _start(self, voices: bool) -> None:
         what, value = script.start()
         if what == "fail":
             self._send(protocol.StartFailed(value or "engine_failed", "scripted start failure"))
@@ -97,7 +117,8 @@ class Engine:
         elif what:
             self._act(what, int(value or 0))
         self._send(protocol.Ready("scripted", "scripted engine", "none"))
-        self._send(protocol.Voices((protocol.Voice("en", "en", "scripted"),)))
+        if voices:
+            self._send(protocol.Voices((protocol.Voice("en", "en", "scripted"),)))
 
     def _say(self, say: protocol.Say) -> None:
         if self._goal:
@@ -124,11 +145,29 @@ class Engine:
         goal = self._goal
         if goal is None or goal.id != stop.id or goal.script.ignore_stop or goal.stopped:
             return
-        goal.stopped = True
+        goal.stopped, goal.silent_at, self._pause_untold = True, None, False
         goal.plan.clear()
         act = goal.script.on_stop
         action = (lambda: self._act(act, goal.script.code)) if act else (lambda: self._end(protocol.STOPPED))
         goal.then(time.monotonic() + goal.script.slow_stop, action)
+
+    def _pause(self, pause: protocol.Pause) -> None:
+        goal = self._goal
+        if (
+            goal is None
+            or goal.id != pause.id
+            or goal.script.ignore_pause
+            or goal.stopped
+            or goal.silent_at is not None
+        ):
+            return
+        goal.silent_at = time.monotonic() + goal.script.slow_pause
+        self._pause_untold = True
+
+    def _resume(self, resume: protocol.Resume) -> None:
+        if self._goal and self._goal.id == resume.id:
+            self._goal.resume(time.monotonic())
+            self._pause_untold = False
 
     def _quit(self) -> bool:
         if self._goal:
@@ -138,9 +177,14 @@ class Engine:
         return True
 
     def _work(self) -> None:
-        while self._goal and self._goal.plan and self._goal.plan[0][0] <= time.monotonic():
-            _, action = self._goal.plan.pop(0)
+        while (goal := self._goal) and goal.plan and goal.plan[0][0] <= time.monotonic():
+            if goal.silent_at is not None and goal.plan[0][0] >= goal.silent_at:
+                break
+            _, action = goal.plan.pop(0)
             action()
+        if goal and self._pause_untold and goal.held(time.monotonic()):
+            self._pause_untold = False
+            self._send(protocol.Paused(goal.id))
         if self._goal and time.monotonic() - self._last >= protocol.ALIVE_EVERY:
             self._send(protocol.Alive(self._goal.id))
 
@@ -161,7 +205,7 @@ class Engine:
             sys.exit(f"the script asks for {what!r}, which is not in its grammar")
 
     def _end(self, outcome: str) -> None:
-        goal, self._goal = self._goal, None
+        goal, self._goal, self._pause_untold = self._goal, None, False
         assert goal
         failed = outcome == protocol.FAILED
         self._send(
