@@ -10,15 +10,49 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.client import Client as Client
-    from talkcli.client import GoalHandle as GoalHandle
+    from talkcli.events import PausedChanged as PausedChanged
+    from talkcli.events import Result as Result
+    from talkcli.events import Snapshot as Snapshot
+    from talkcli.events import StateChanged as StateChanged
+    from talkcli.events import WordHeard as WordHeard
+    from talkcli.handle import GoalHandle as GoalHandle
+    from talkcli.messages import Goal as Goal
+    from talkcli.replies import Canceled as Canceled
+    from talkcli.replies import ServerStatus as ServerStatus
+    from talkcli.states import State as State
 
 __version__ = "0.1.0"
-__all__ = ["Client", "GoalHandle", "__version__"]
+__all__ = [
+    "Canceled",
+    "Client",
+    "Goal",
+    "GoalHandle",
+    "PausedChanged",
+    "Result",
+    "ServerStatus",
+    "Snapshot",
+    "State",
+    "StateChanged",
+    "WordHeard",
+    "__version__",
+]
 
 
 def __getattr__(name: str) -> object:
-    if name in {"Client", "GoalHandle"}:
+    if name in {"Canceled", "Client", "GoalHandle", "ServerStatus"}:
         from talkcli import client
 
         return getattr(client, name)
+    if name in {"PausedChanged", "Result", "Snapshot", "StateChanged", "WordHeard"}:
+        from talkcli import events
+
+        return getattr(events, name)
+    if name == "Goal":
+        from talkcli.messages import Goal
+
+        return Goal
+    if name == "State":
+        from talkcli.states import State
+
+        return State
     raise AttributeError(f"module 'talkcli' has no attribute {name!r}")

@@ -13,89 +13,43 @@ It imports neither click nor asyncio nor pyttsx3, starts no thread, and may be u
 from __future__ import annotations
 
 import os
-import time
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from talkcli import __version__, wire
+from talkcli import __version__
+from talkcli.backlog import MAX_STATES, Backlog
 from talkcli.connection import SILENCE_LIMIT, Connection
 from talkcli.dial import ANSWER_LIMIT
-from talkcli.errors import UnknownGoal, UsageError
+from talkcli.errors import Lost, UnknownGoal, UsageError
+from talkcli.events import Snapshot
+from talkcli.handle import Followed, GoalHandle
 from talkcli.messages import Goal
-from talkcli.requests import MAX_DATA, MAX_ID, MAX_NAME, Cancel, Hello, Say, Status, Voices, Wait, write_request
+from talkcli.outgoing import batches, check, check_key, full_id, too_long
+from talkcli.replies import Canceled, ServerStatus, goal_in, goals
+from talkcli.requests import (
+    MAX_LOG,
+    MAX_NAME,
+    Cancel,
+    Hello,
+    Log,
+    Pause,
+    Resume,
+    Say,
+    Set,
+    Status,
+    Voices,
+    Wait,
+    Watch,
+)
 from talkcli.states import State
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from types import TracebackType
 
+    from talkcli.events import Event
     from talkcli.messages import JsonObject
 
-
-@dataclass(frozen=True, slots=True)
-class ServerStatus:
-    """What a server says, will say and said. `server` is its own description, for people and programs."""
-
-    server: JsonObject
-    active: Goal | None
-    pending: tuple[Goal, ...]
-    recent: tuple[Goal, ...]
-
-    def to_json(self) -> JsonObject:
-        return {
-            "server": self.server,
-            "active": None if self.active is None else self.active.to_json(),
-            "pending": [each.to_json() for each in self.pending],
-            "recent": [each.to_json() for each in self.recent],
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class Canceled:
-    """What a cancel did: the goals that it ended, and those named that had ended before."""
-
-    canceled: tuple[Goal, ...]
-    ended: tuple[Goal, ...]
-
-    @classmethod
-    def from_items(cls, items: list[JsonObject]) -> Canceled:
-        """Return what the lines of a cancel's list say."""
-        return cls(tuple(_goals(items, "canceled")), tuple(_goals(items, "ended")))
-
-
-class GoalHandle:
-    """A goal that was sent, or is waited for."""
-
-    def __init__(self, client: Client, goal: Goal) -> None:
-        self._client = client
-        #: the goal as it was last heard of
-        self.goal = goal
-        #: whether the server tells this connection how it ends
-        self._followed = False
-
-    @property
-    def id(self) -> str:
-        return self.goal.id
-
-    @property
-    def state(self) -> State:
-        """The goal's state as far as it was read: `wait` reads on."""
-        return self.goal.state
-
-    def wait(self, timeout: float | None = None) -> Goal:
-        """Wait until the goal has ended, and return it; TimeoutError after `timeout` seconds.
-
-        Where the server goes away first, the goal's state is LOST: it may have been spoken or not.
-        """
-        return self._client._wait_for(self, timeout)
-
-    def request_cancel(self) -> None:
-        """Ask for the goal to be cancelled, without waiting for it: `wait` tells how it ended."""
-        self._client._post(Cancel((self.id,)))
-
-    def cancel(self) -> Goal:
-        """Cancel the goal, and return it once it has ended: silent, if it was being spoken."""
-        return self._client._cancel_one(self)
+__all__ = ["Canceled", "Client", "GoalHandle", "ServerStatus"]
 
 
 class Client:
@@ -122,13 +76,13 @@ class Client:
         """
         from talkcli import paths
 
-        self._handles: dict[str, list[GoalHandle]] = {}
+        self._followed = Followed()
         name = name or os.environ.get("TALK_NAME") or None
         if name and len(name) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
         hello = Hello(name, urgent)
         self._connection = Connection(
-            paths.named_socket(socket), hello, __version__, self._on_event, interrupt, patience
+            paths.named_socket(socket), hello, __version__, self._followed.hear, interrupt, patience
         )
 
     @property
@@ -153,142 +107,228 @@ class Client:
         self.close()
 
     def say(
-        self, text: str, *, preempt: bool | None = None, data: JsonObject | None = None, follow: bool = True
+        self,
+        text: str,
+        *,
+        preempt: bool | None = None,
+        flush: bool = False,
+        priority: int = 0,
+        ttl: float | None = None,
+        key: str | None = None,
+        throttle: float | None = None,
+        id: str | None = None,  # noqa: A002 - the name that it has everywhere
+        rate: int | None = None,
+        volume: float | None = None,
+        voice: str | None = None,
+        pitch: int | None = None,
+        data: JsonObject | None = None,
+        follow: bool = True,
+        feedback: bool = False,
+        patient: bool = False,
     ) -> GoalHandle:
         """Send a goal, and return it as it was accepted, or REJECTED with the reason.
 
-        `preempt`: stop what is being spoken and go first, None leaves that to the server; `data`: an object of at most
-        1 KiB that travels with the goal; `follow`: have this connection told how it ends, so that `wait` works.
+        `preempt`: stop what is being spoken and go first, None leaves that to the server; `flush`: that, and recall
+        all that is pending of the same or a lower priority; `priority`: higher goes first; `ttl`: seconds in which it
+        must have begun, else it is RECALLED, 0 for no limit, None leaves that to the server; `key`: 1 to 64 characters,
+        replaces the pending goal with the same key; `throttle`: REJECTED where a goal of that key, or else of that
+        text, began less than so many seconds ago; `id`: 1 to 64 of A-Z a-z 0-9 . _ : - of the sender's choice: said
+        again with the same id it is not spoken twice, the handle is `attached` to the first.
+
+        `rate`: 80 to 450 words per minute; `volume`: 0 to 1; `voice`: id, name or language; `pitch`: 0 to 100; None
+        is the server's setting when it starts. `data`: an object of at most 1 KiB that travels with the goal.
+
+        `follow`: have this connection told how it ends; `feedback`: and each word as it is heard, for
+        `GoalHandle.feedback` and `events`; `patient`: where the queue is full, wait until there is room, any time.
+
+        UsageError for a value out of its range, ServerUnavailable where the server is gone: nothing was sent then.
+        Lost where it was sent and not answered: it may be spoken. Interrupted only while a patient one waits for room:
+        close the client then, and it is not spoken.
         """
-        if data is not None and len(wire.encode(data)) > MAX_DATA:
-            raise UsageError(f"data is an object of at most {MAX_DATA} bytes of JSON")
-        request = Say(text, wait=follow, preempt=preempt, data=data)
-        if len(wire.encode({"seq": 0, **write_request(request)})) > wire.MAX_LINE - 32:
-            return GoalHandle(self, _too_long(text))
+        request = Say(
+            text,
+            wait=follow or feedback,
+            feedback=feedback,
+            patient=patient,
+            preempt=preempt,
+            flush=flush,
+            priority=priority,
+            ttl=ttl,
+            key=key,
+            throttle=throttle,
+            id=id,
+            rate=rate,
+            volume=volume,
+            voice=voice,
+            pitch=pitch,
+            data=data,
+        )
+        check(request)
+        rejected = too_long(request)
+        if rejected is not None:
+            return GoalHandle(self, rejected)
         handle = GoalHandle(self, Goal("", State.PENDING))
 
         def accepted(reply: JsonObject, _: list[JsonObject]) -> None:
             handle.goal = Goal.from_json(reply.get("goal"))
-            if follow:
-                self._attach(handle)
+            handle.attached = reply.get("attached") is True
+            handle.speech_paused = reply.get("paused") is True
+            if request.wait:
+                self._followed.add(handle, feedback=feedback)
 
-        self._connection.request(request, accepted)
+        self._connection.request(request, accepted, slow=patient)
         return handle
 
-    def follow(self, ids: Iterable[str] | None = None) -> list[GoalHandle]:
+    def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
         """Return handles for these goals, whoever sent them, to wait for; None: for all that have not ended.
 
-        UnknownGoal if the server doesn't know one of them.
+        `feedback`: have this connection told each of their words, too. UnknownGoal if the server doesn't know one.
         """
-        wanted = None if ids is None else tuple(self.full_id(each) for each in ids)
+        wanted = None if ids is None else [self._full_id(each) for each in ids]
         handles: dict[str, GoalHandle] = {}
 
         def accepted(_: JsonObject, items: list[JsonObject]) -> None:
-            for goal in _goals(items, "goal"):
+            for goal in goals(items, "goal"):
                 handles[goal.id] = GoalHandle(self, goal)
-                self._attach(handles[goal.id])
+                self._followed.add(handles[goal.id], feedback=feedback)
 
-        self._connection.request(Wait(wanted), accepted)
+        for some in [None] if wanted is None else batches(wanted):
+            self._connection.request(Wait(some, feedback), accepted)
         return list(handles.values()) if wanted is None else [handles[each] for each in wanted]
 
-    def cancel(self, ids: Iterable[str] | None = None, *, current: bool = False, before: str | None = None) -> Canceled:
+    def cancel(
+        self,
+        ids: Iterable[str] | None = None,
+        *,
+        current: bool = False,
+        before: str | None = None,
+        key: str | None = None,
+    ) -> Canceled:
         """Cancel the goals that are selected, or everything where no selector is given; return once it is silent.
 
-        `ids`: these goals; an empty list selects none;
-        `current`: the goal being spoken; `before`: this goal and all accepted before it. UnknownGoal if an id is not
-        known: the others are cancelled all the same, and are in the error's `items`.
+        `ids`: these goals; an empty list selects none; `current`: the goal being spoken; `before`: this goal and all
+        accepted before it; `key`: goals with this key, pending or active. UnknownGoal if an id is not known: the
+        others are cancelled all the same, and are in the error's `items`.
         """
-        selected = None if ids is None else tuple(self.full_id(each) for each in ids)
-        _, items = self._connection.request(Cancel(selected, current, before and self.full_id(before)))
+        wanted = None if ids is None else [self._full_id(each) for each in ids]
+        first, *others = [None] if wanted is None else batches(wanted) or [()]
+        requests = [Cancel(first, current, before and self._full_id(before), key), *map(Cancel, others)]
+        check_key(key)
+        items: list[JsonObject] = []
+        unknown: list[str] = []
+        for request in requests:
+            try:
+                items += self._connection.request(request)[1]
+            except UnknownGoal as error:
+                items += error.items
+                unknown.append(error.message)
+        if unknown:
+            refused = UnknownGoal("\n".join(unknown))
+            refused.items = items
+            raise refused
         return Canceled.from_items(items)
 
     def status(self) -> ServerStatus:
         """Return what the server is saying, will say and said."""
-        reply, items = self._connection.request(Status())
-        server, active = reply.get("server"), reply.get("active")
-        return ServerStatus(
-            server if isinstance(server, dict) else {},
-            None if active is None else Goal.from_json(active),
-            tuple(_goals(items, "pending")),
-            tuple(_goals(items, "recent")),
-        )
+        return ServerStatus.from_reply(*self._connection.request(Status()))
 
     def goal(self, goal_id: str) -> Goal:
         """Return one goal as it is now; UnknownGoal if the server doesn't know it."""
-        reply, _ = self._connection.request(Status(self.full_id(goal_id)))
+        reply, _ = self._connection.request(Status(self._full_id(goal_id)))
         return Goal.from_json(reply.get("goal"))
+
+    def log(self, count: int = 20) -> list[Goal]:
+        """Return the last `count` goals that ended, REJECTED ones too, oldest first; at most 1,200 are kept."""
+        if not 0 < count <= MAX_LOG:
+            raise UsageError(f"a log has 1 to {MAX_LOG} goals, not {count}")
+        _, items = self._connection.request(Log(count))
+        return list(goals(items, "goal"))
 
     def voices(self) -> list[JsonObject]:
         """Return the voices of the server's engine: objects with id, language and name."""
         _, items = self._connection.request(Voices())
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
 
-    def full_id(self, goal_id: str) -> str:
-        """Return the whole id for a number alone, which means a goal of this server's.
+    def settings(self) -> JsonObject:
+        """Return what goals are spoken with that say nothing else: rate, volume, voice, pitch, preempt, ttl.
 
-        UsageError for an empty id, UnknownGoal for one that no goal can have.
+        Units are those of `say`; a voice of None is the driver's own, a ttl of None is no limit.
         """
-        if not goal_id:
-            raise UsageError("an id is empty: is the variable set that it comes from?")
-        if goal_id.isascii() and goal_id.isdecimal():
-            goal_id = f"{self._connection.line.boot}-{goal_id}"
-        if len(goal_id) > MAX_ID:
-            raise UnknownGoal(f"no goal {goal_id[:MAX_ID]!a}… is known: an id has at most {MAX_ID} characters")
-        return goal_id
+        return self.set()
+
+    def set(
+        self,
+        rate: int | None = None,
+        volume: float | None = None,
+        voice: str | None = None,
+        pitch: int | None = None,
+        preempt: bool | None = None,
+        ttl: float | None = None,
+    ) -> JsonObject:
+        """Change the running server's settings, for goals that have not begun, and return all of them as they are now.
+
+        Those not given stay. `voice`: "default" for the driver's own; `ttl`: 0 for no limit; the others as in `say`.
+        UsageError for a value out of its range; BadOption for one that this server doesn't take, such as a voice that
+        its engine doesn't have.
+        """
+        request = Set(rate, volume, voice, pitch, preempt, ttl)
+        check(request)
+        reply, _ = self._connection.request(request)
+        settings = reply.get("settings")
+        return settings if isinstance(settings, dict) else {}
+
+    def pause(self) -> Goal | None:
+        """Hold speech where it is; return once it is silent. The goal that is held, if one was being spoken.
+
+        Nothing is spoken until `resume`, whoever sends it. Pausing twice is no error.
+        """
+        return goal_in(self._connection.request(Pause(), slow=True)[0])
+
+    def resume(self) -> Goal | None:
+        """Go on where speech was held. The goal that goes on, if one was held. Resuming twice is no error."""
+        return goal_in(self._connection.request(Resume())[0])
+
+    def events(self) -> Iterator[Event]:
+        """Iterate over everything that happens to any goal from now on: first a Snapshot, then StateChanged, with the
+        whole goal where it begins and ends, WordHeard and PausedChanged. It has no end but Lost, when the server goes
+        away; break off whenever you like.
+
+        Words that nobody takes in time are dropped, the oldest first (`n` has gaps then). States are not: where 10,000
+        wait, because other threads use this client and none takes these, it ends with Lost, too.
+        """
+        backlog = Backlog()
+
+        def accepted(reply: JsonObject, items: list[JsonObject]) -> None:
+            backlog.add(Snapshot(ServerStatus.from_reply(reply, items)))
+            self._followed.watch(backlog)
+
+        self._connection.request(Watch(), accepted)
+        return self._take_all(backlog)
 
     # -- inside
 
-    def _post(self, request: Cancel) -> None:
-        self._connection.post(request)
+    def _full_id(self, goal_id: str) -> str:
+        return full_id(goal_id, self._connection.line.boot)
 
-    def _attach(self, handle: GoalHandle) -> None:
-        handle._followed = True
-        if not handle.state.terminal:
-            self._handles.setdefault(handle.id, []).append(handle)
+    def _take_all(self, backlog: Backlog) -> Iterator[Event]:
+        event: Event | None = None
 
-    def _on_event(self, event: JsonObject) -> None:
-        if event.get("event") == "result":
-            goal = Goal.from_json(event.get("goal"))
-            for handle in self._handles.pop(goal.id, ()):
-                handle.goal = goal
-        elif event.get("event") == "state":
-            state = State.__members__.get(str(event.get("state")))
-            for handle in self._handles.get(str(event.get("id")), ()):
-                # Its end comes with the result, which says how and why.
-                if state is not None and not state.terminal:
-                    handle.goal = replace(handle.goal, state=state)
+        def arrived() -> bool:
+            nonlocal event
+            event = backlog.take()
+            return event is not None or backlog.overrun
 
-    def _wait_for(self, handle: GoalHandle, timeout: float | None) -> Goal:
-        end = None if timeout is None else time.monotonic() + timeout
-        if not (handle._followed or handle.state.terminal):
-            self._follow_late(handle)
-        ended = self._connection.wait_until(lambda: handle.state.terminal, lambda: end, SILENCE_LIMIT)
-        if not ended and self._connection.ended is not None:
-            words = f"Talk lost: {self._connection.ended}; it may still be spoken"
-            handle.goal = replace(handle.goal, state=State.LOST, reason="lost", message=words)
-        elif not ended:
-            raise TimeoutError(f"{handle.id} has not ended after {timeout:g} s")
-        return handle.goal
+        while self._connection.wait_until(arrived, lambda: None, SILENCE_LIMIT):
+            if event is None:
+                raise Lost(
+                    f"more than {MAX_STATES} events waited and none was taken: watch again, and take them faster"
+                )
+            yield event
+        raise Lost(f"nothing more is heard of the server at {self.path}: {self._connection.ended}")
 
-    def _follow_late(self, handle: GoalHandle) -> None:
+    def _follow_late(self, handle: GoalHandle, *, feedback: bool) -> None:
         def accepted(_: JsonObject, items: list[JsonObject]) -> None:
-            handle.goal = next(_goals(items, "goal"))
-            self._attach(handle)
+            handle._settle(next(goals(items, "goal")))
+            self._followed.add(handle, feedback=feedback)
 
-        self._connection.request(Wait((handle.id,)), accepted)
-
-    def _cancel_one(self, handle: GoalHandle) -> Goal:
-        if not handle.state.terminal:
-            for goal in self.cancel([handle.id]).canceled:
-                handle.goal = goal
-        return handle.goal if handle.state.terminal else self.goal(handle.id)
-
-
-def _goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    return (Goal.from_json(each[name]) for each in items if name in each)
-
-
-def _too_long(text: str) -> Goal:
-    """Return the goal that the server would have made of a text that doesn't fit into a request."""
-    message = f"Talk rejected: the text has {len(text):,} characters, more than a request can hold"
-    return Goal("", State.REJECTED, text, reason="text_too_long", message=message)
+        self._connection.request(Wait((handle.id,), feedback), accepted)

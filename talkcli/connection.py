@@ -1,7 +1,8 @@
 """A client's connection to a server: requests go out, replies and events come in. Any number of threads may use it.
 
 There is no thread behind it: whoever waits for something reads for all, and hands on what is for others. It holds no
-lock while it waits for the server.
+lock while it waits for the server. What was read is handed out under one lock, `changed`, and under it alone: a wait
+whose `done` looks at several things sees them together.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from socket import SHUT_RDWR
+from socket import SHUT_RDWR, SHUT_WR
 from typing import TYPE_CHECKING
 
 from talkcli import wire
@@ -54,7 +55,7 @@ class _Exchange:
 
 
 class Connection:
-    """`on_event` gets every event, in the server's order, in the thread that happens to read."""
+    """`on_event` gets every event, in the server's order, in the thread that happens to read, under `changed`."""
 
     def __init__(
         self,
@@ -69,44 +70,56 @@ class Connection:
         self._patience = patience
         self._on_event = on_event
         self._interrupt = interrupt
-        self._interruptible = True
         self._lines: deque[bytes] = deque(self.line.lines)
         self._exchanges: dict[int, _Exchange] = {}
         self._numbers = itertools.count(1)
-        self._changed = threading.Condition()
+        self.changed = threading.Condition()
         self._sending = threading.Lock()
         self._reading = False
+        self._closing = False
         self._heard = time.monotonic()
         #: what the server said last that was no answer to anything
         self._told: str | None = None
+        #: why nothing more can be sent, once that is so; what was sent before may still be answered
+        self._mute: str | None = None
         #: why there is nothing more to come, once that is so
         self.ended: str | None = None
 
     def close(self) -> None:
         """Close the connection; goals that were sent are spoken all the same."""
-        with self._changed:
+        with self.changed:
             self.ended = self.ended or "the connection was closed"
+            self._closing = True
             with contextlib.suppress(OSError):
                 self.line.socket.shutdown(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
-            self.line.socket.close()
-            self._changed.notify_all()
+            if not self._reading:  # else it would poll a descriptor that may be another file's by now
+                self.line.socket.close()
+            self.changed.notify_all()
 
-    def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
+    def request(
+        self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
+    ) -> tuple[JsonObject, list[JsonObject]]:
         """Send a request and return its reply and the lines of its list.
 
         RequestRefused or a class of it if the server says no; ServerUnavailable or Lost if it says nothing in time.
-        `on_reply` is called with both, once the server said yes, before any event that comes after the reply.
+        `on_reply` is called with both, once the server said yes, before any event that comes after the reply;
+        `slow`: the answer may take any time, in which the server says that it is alive.
         """
         number = next(self._numbers)
         exchange = _Exchange(on_reply)
         self._exchanges[number] = exchange
-        # A goal whose sender was interrupted before it knew the goal's id could not be cancelled any more.
-        self._interruptible = not isinstance(request, Say)
+        # A goal whose sender was interrupted before it knew the goal's id could not be cancelled any more. One that
+        # waits for room isn't accepted yet: who hangs up takes it back.
+        interruptible = slow or not isinstance(request, Say)
         try:
             self._send(wire.encode({"seq": number, **write_request(request)}))
-            self.wait_until(lambda: exchange.reply is not None, lambda: exchange.touched + self._patience)
+            self.wait_until(
+                lambda: exchange.reply is not None,
+                lambda: None if slow else exchange.touched + self._patience,
+                SILENCE_LIMIT if slow else None,
+                interruptible=interruptible,
+            )
         finally:
-            self._interruptible = True
             del self._exchanges[number]
         if exchange.reply is None:
             raise self._no_reply(request)
@@ -125,16 +138,22 @@ class Connection:
         return Lost(f"{words}; it may still be spoken") if isinstance(request, Say) else ServerUnavailable(words)
 
     def wait_until(
-        self, done: Callable[[], bool], deadline: Callable[[], float | None], silence: float | None = None
+        self,
+        done: Callable[[], bool],
+        deadline: Callable[[], float | None],
+        silence: float | None = None,
+        *,
+        interruptible: bool = True,
     ) -> bool:
         """Read until `done()`, and return True; False at the deadline (monotonic), or once the connection ended.
 
-        `silence`: seconds without a line from the server after which the connection counts as ended.
+        `done` is called under `changed`, and no more once it was true; `silence`: seconds without a line from the
+        server after which the connection counts as ended.
         """
         began = time.monotonic()
         last = False
         while True:
-            with self._changed:
+            with self.changed:
                 if done():
                     return True
                 if self.ended is not None:
@@ -151,32 +170,34 @@ class Connection:
                 # What has arrived by the deadline counts: one more look, that doesn't wait.
                 last = rest is not None and rest <= 0
                 if self._reading:
-                    self._changed.wait(None if rest is None else min(max(0.0, rest), threading.TIMEOUT_MAX))
+                    self.changed.wait(None if rest is None else min(max(0.0, rest), threading.TIMEOUT_MAX))
                     continue
                 self._reading = True
             try:
-                self._read(rest)
+                self._read(rest, interruptible)
             finally:
-                with self._changed:
+                with self.changed:
                     self._reading = False
-                    self._changed.notify_all()
+                    if self._closing:
+                        self.line.socket.close()
+                    self.changed.notify_all()
 
-    def _read(self, timeout: float | None) -> None:
+    def _read(self, timeout: float | None, interruptible: bool) -> None:
         """Read what there is, or wait for it, and hand it out."""
-        if not self._lines and not self._fill(timeout):
+        if not self._lines and not self._fill(timeout, interruptible):
             return
         while self._lines:
             try:
                 message = wire.decode(self._lines.popleft())
-            except BadRequest as error:
-                self.ended = f"it sent what is no message: {error}"
+                with self.changed:
+                    self._dispatch(message)
+            except (BadRequest, ValueError) as error:  # ValueError: a goal or an event that is none
+                self.ended = self.ended or f"it sent what is no message: {error}"
                 return
-            with self._changed:
-                self._dispatch(message)
 
-    def _fill(self, timeout: float | None) -> bool:
+    def _fill(self, timeout: float | None, interruptible: bool) -> bool:
         watched = {self.line.socket.fileno(): select.POLLIN}
-        if self._interrupt is not None and self._interruptible:
+        if self._interrupt is not None and interruptible:
             watched[self._interrupt] = select.POLLIN
         try:
             readable = ready(watched, timeout)
@@ -211,13 +232,17 @@ class Connection:
         if "ok" not in message:
             exchange.items.append(message)
             return
-        exchange.reply = message
         if exchange.on_reply and message.get("ok") is True:
             exchange.on_reply(message, exchange.items)
+        exchange.reply = message  # now: what can't be understood is no reply
 
     def _send(self, data: bytes) -> None:
+        """Send a line. What fails here ends nothing that is waited for: the reader still hears what was said before."""
         end = time.monotonic() + ANSWER_LIMIT
         with self._sending:
+            why = self.ended or self._mute
+            if why:
+                raise ServerUnavailable(f"nothing was sent to the server at {self.line.path}: {why}")
             rest = memoryview(data)
             while rest:
                 try:
@@ -225,8 +250,11 @@ class Connection:
                 except BlockingIOError:
                     if not ready({self.line.socket.fileno(): select.POLLOUT}, end - time.monotonic()):
                         # Half a line may be out: nothing that follows could be understood.
-                        self.ended = self.ended or f"it took nothing for {ANSWER_LIMIT:g} s"
+                        self._mute = f"it took nothing for {ANSWER_LIMIT:g} s"
+                        with contextlib.suppress(OSError):
+                            self.line.socket.shutdown(SHUT_WR)
                         raise ServerUnavailable(f"the server at {self.line.path} does not answer") from None
                 except OSError as error:
-                    self.ended = self.ended or "the server went away"
-                    raise ServerUnavailable(f"the server at {self.line.path} went away: {error.strerror}") from None
+                    self._mute = "the server went away"
+                    words = f"the server at {self.line.path} went away: {error.strerror}"
+                    raise ServerUnavailable(words) from None

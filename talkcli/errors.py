@@ -93,14 +93,34 @@ class Busy(RequestRefused):
     exit_code = 5
 
 
+class BadOption(RequestRefused):
+    """A setting that the server doesn't take: a value out of its range, or a voice that it doesn't have."""
+
+    code = "bad_option"
+    exit_code = EXIT_USAGE
+
+
 class BadRequest(RequestRefused):
     """A line on the wire that is no request. `code` says in which way."""
 
     code = "bad_request"
 
 
+class LineTooLong(BadRequest):
+    """A line past its limit. `before`: the lines that were complete before it, which count all the same."""
+
+    code = "line_too_long"
+
+    def __init__(self, limit: int, before: list[bytes]) -> None:
+        super().__init__(f"a line has at most {limit} bytes")
+        self.before = before
+
+
 #: Classes that a client raises for an error code of the server's; any other code is a RequestRefused.
-BY_CODE: dict[str, type[RequestRefused]] = {each.code: each for each in (UnknownGoal, Busy)}
+BY_CODE: dict[str, type[RequestRefused]] = {
+    **{each.code: each for each in (UnknownGoal, Busy, BadOption)},
+    "unknown_voice": BadOption,
+}
 
 
 def refusal(code: str, message: str) -> RequestRefused:

@@ -11,7 +11,7 @@ import json
 import math
 from typing import TYPE_CHECKING
 
-from talkcli.errors import BadRequest, Busy, ProtocolMismatch
+from talkcli.errors import BadRequest, Busy, LineTooLong, ProtocolMismatch
 
 if TYPE_CHECKING:
     from talkcli.messages import JsonObject
@@ -90,29 +90,30 @@ class LineSplitter:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that are complete now, without their newlines; BadRequest line_too_long past the limit.
+        """Return the lines that are complete now, without their newlines; LineTooLong, with those before it, past the
+        limit.
 
         After that error the stream cannot be followed any further: the connection has to be closed.
         """
         self._rest += data
-        if b"\n" not in data:
-            self._check(len(self._rest) + 1)
-            return []
-        *lines, rest = self._rest.split(b"\n")
-        for line in lines:
-            self._check(len(line) + 1)
-        self._rest = rest
-        self._check(len(rest) + 1)
-        return [bytes(line) for line in lines]
+        lines: list[bytes] = []
+        if b"\n" in data:
+            *complete, rest = self._rest.split(b"\n")
+            for line in complete:
+                self._check(line, lines)
+                lines.append(bytes(line))
+            self._rest = rest
+        self._check(self._rest, lines)
+        return lines
 
     @property
     def unfinished(self) -> bool:
         """Whether a line has begun and not ended."""
         return bool(self._rest)
 
-    def _check(self, length: int) -> None:
-        if self._limit is not None and length > self._limit:
-            raise BadRequest(f"a line has at most {self._limit} bytes", "line_too_long")
+    def _check(self, line: bytearray, before: list[bytes]) -> None:
+        if self._limit is not None and len(line) + 1 > self._limit:
+            raise LineTooLong(self._limit, before)
 
 
 def greeting(version: str, pid: int, boot: str) -> JsonObject:

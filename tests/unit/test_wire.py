@@ -11,7 +11,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from talkcli.errors import BadRequest, Busy, ProtocolMismatch
+from talkcli.errors import BadRequest, Busy, LineTooLong, ProtocolMismatch
 from talkcli.wire import (
     MAX_LINE,
     PROTOCOL,
@@ -232,6 +232,15 @@ def test_a_line_without_an_end_is_refused_as_soon_as_it_is_too_long() -> None:
     assert splitter.feed(b"[" * (MAX_LINE - 1)) == []
     with pytest.raises(BadRequest):
         splitter.feed(b"[")
+
+
+@pytest.mark.parametrize("end", [b"", b"\n", b'\n{"request": "status"}\n'])
+def test_lines_before_one_that_is_too_long_are_not_lost(end: bytes) -> None:
+    splitter = LineSplitter()
+    assert splitter.feed(b'{"request":') == []
+    with pytest.raises(LineTooLong) as refused:
+        splitter.feed(b' "cancel"}\n\n' + b"[" * MAX_LINE + end)
+    assert refused.value.before == [b'{"request": "cancel"}', b""]
 
 
 def test_a_longest_text_fits_in_a_line() -> None:
