@@ -1,28 +1,13 @@
 _talk_completion() {
-    local IFS=$'\n'
-    local response
-
-    response=$(env COMP_WORDS="${COMP_WORDS[*]}" COMP_CWORD=$COMP_CWORD _TALK_COMPLETE=bash_complete $1)
-
-    for completion in $response; do
-        IFS=',' read type value <<< "$completion"
-
-        if [[ $type == 'dir' ]]; then
-            COMPREPLY=()
-            compopt -o dirnames
-        elif [[ $type == 'file' ]]; then
-            COMPREPLY=()
-            compopt -o default
-        elif [[ $type == 'plain' ]]; then
-            COMPREPLY+=($value)
-        fi
-    done
-
-    return 0
+    local IFS=$'\n' program=$1 line
+    [[ $program == '~/'* ]] && program=$HOME/${program:2}
+    COMPREPLY=()
+    while IFS= read -r line; do
+        case $line in
+            file) compopt -o default 2>/dev/null ;;
+            plain,*) COMPREPLY+=("${line#*,}") ;;
+        esac
+    done < <(COMP_WORDS=${COMP_LINE:0:COMP_POINT} COMP_CWORD=$2 _TALK_COMPLETE=bash_complete "$program" 2>/dev/null)
 }
 
-_talk_completion_setup() {
-    complete -o nosort -F _talk_completion talk
-}
-
-_talk_completion_setup;
+complete -o nosort -F _talk_completion talk 2>/dev/null || complete -F _talk_completion talk

@@ -1,17 +1,14 @@
-function _talk_completion;
-    set -l response (env _TALK_COMPLETE=fish_complete COMP_WORDS=(commandline -cp) COMP_CWORD=(commandline -t) talk);
+function _talk_completion
+    set -l program (string replace --regex '^~/' "$HOME/" -- (commandline -poc)[1])
+    set -l typed (commandline -pc | string collect)
+    for line in (COMP_WORDS=$typed COMP_CWORD= _TALK_COMPLETE=fish_complete $program 2>/dev/null)
+        switch $line
+            case file
+                __fish_complete_path (commandline -ct)
+            case 'plain,*'
+                string replace 'plain,' '' -- $line
+        end
+    end
+end
 
-    for completion in $response;
-        set -l metadata (string split "," $completion);
-
-        if test $metadata[1] = "dir";
-            __fish_complete_directories $metadata[2];
-        else if test $metadata[1] = "file";
-            __fish_complete_path $metadata[2];
-        else if test $metadata[1] = "plain";
-            echo $metadata[2];
-        end;
-    end;
-end;
-
-complete --no-files --command talk --arguments "(_talk_completion)";
+complete --no-files --command talk --arguments '(_talk_completion)'

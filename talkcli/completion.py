@@ -1,4 +1,4 @@
-"""The completion scripts of bash, zsh and fish, as click makes them from the commands.
+"""The completion scripts of bash, zsh and fish, as they are made from the commands.
 
 `python -m talkcli.completion DIRECTORY` writes them. Those in `completions/` are checked in, and compared by a test.
 """
@@ -9,26 +9,19 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from click.shell_completion import BashComplete, FishComplete, ShellComplete, ZshComplete
+from talkcli.cli import talk
+from talkcli.cli.shells import Bash, Fish, Zsh
 
 if TYPE_CHECKING:
-    from click import Command
+    from click.shell_completion import ShellComplete
 
 #: Under the names by which each shell finds them in its own directory.
-FILES: dict[str, type[ShellComplete]] = {"talk.bash": BashComplete, "_talk": ZshComplete, "talk.fish": FishComplete}
+FILES: dict[str, type[ShellComplete]] = {"talk.bash": Bash, "_talk": Zsh, "talk.fish": Fish}
 
 
 def scripts() -> dict[str, str]:
     """Return the name and the text of each script."""
-    from talkcli.cli import talk
-
-    return {name: _script(kind, talk) for name, kind in FILES.items()}
-
-
-def _script(kind: type[ShellComplete], talk: Command) -> str:
-    made = kind(talk, {}, "talk", "_TALK_COMPLETE")
-    # Not `made.source()`, which for bash first runs the bash of the machine that makes the script to learn its version.
-    return made.source_template.strip() % made.source_vars() + "\n"
+    return {name: kind(talk, {}, "talk", "_TALK_COMPLETE").source() for name, kind in FILES.items()}
 
 
 def main(directory: str) -> None:

@@ -25,6 +25,11 @@ COMMANDS = {
     "wait": "Wait until goals have ended.",
     "cancel": "Stop speaking: everything, or what is named.",
     "status": "What is being said, what will be, what was.",
+    "watch": "Follow all goals as they happen.",
+    "log": "What was said: when, by whom, how it ended.",
+    "pause": "Hold speech where it is.",
+    "resume": "Go on where speech was held.",
+    "set": "Change the running server's settings, or print them.",
     "voices": "List the voices.",
 }
 
@@ -61,6 +66,8 @@ class _Commands(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         name = args[0] if args else ""
+        if ctx.resilient_parsing:  # a shell asks for completion: nothing may be said
+            return super().resolve_command(ctx, args)
         if name and not name.startswith("-") and name not in COMMANDS:
             import difflib
 
@@ -106,10 +113,9 @@ def main() -> NoReturn:
 def run(arguments: list[str]) -> int:
     """Run a command line, and return its exit code."""
     options = Common()
-    _fill_closed_descriptors()
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
+    _prepare_streams()
+    if "_TALK_COMPLETE" in os.environ:
+        return _complete(options)
     try:
         code = talk.main(arguments, prog_name="talk", standalone_mode=False, obj=options)
         if sys.stdout:
@@ -135,13 +141,32 @@ def run(arguments: list[str]) -> int:
     return code if isinstance(code, int) else 0
 
 
-def _fill_closed_descriptors() -> None:
-    """Open /dev/null where 0, 1 or 2 is closed: a socket or a lock must not end up as standard error."""
+def _complete(options: Common) -> int:
+    """Answer a shell that asks for completion: what there is to offer, and never a word besides."""
+    from talkcli.cli import shells
+
+    shells.register()
+    try:
+        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # ends by itself
+    except Exception:
+        if os.environ.get("TALK_DEBUG"):
+            raise
+    return EXIT_ERROR
+
+
+def _prepare_streams() -> None:
+    """Open /dev/null where 0, 1 or 2 is closed: a socket or a lock must not end up as standard error.
+
+    What the locale can't encode is shown escaped.
+    """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # the lowest that is free: this one
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _show_click_error(error: click.ClickException, *, json: bool) -> None:

@@ -11,13 +11,18 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from talkcli import wire
+from talkcli.cli import complete
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from talkcli.client import Client
+    from talkcli.columns import Screen
     from talkcli.errors import TalkError
     from talkcli.messages import JsonObject
+
+#: Columns of a terminal that doesn't say how many it has.
+_USUAL_WIDTH = 80
 
 _F = TypeVar("_F", bound="Callable[..., Any]")
 
@@ -56,6 +61,7 @@ def common_options(command: _F) -> _F:
                 metavar="PATH",
                 expose_value=False,
                 callback=_store,
+                shell_complete=complete.files,
                 help="Socket of the server. [env: TALK_SOCKET; default: the usual places, see the README]",
             ),
             click.option("--json", is_flag=True, expose_value=False, callback=_store, help="One JSON object a line."),
@@ -80,10 +86,24 @@ def number(context: click.Context, parameter: click.Parameter, value: float | No
     return value
 
 
+def seconds(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    """Refuse what is no length of time: NaN, and infinity, for which there is another word: no limit is 0."""
+    if value is not None and math.isinf(value):
+        raise click.BadParameter("no limit is 0.", context, parameter)
+    return number(context, parameter, value)
+
+
+def filled(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+    """Refuse an empty word: it comes from a variable that isn't set, and selects nothing."""
+    if value == "":
+        raise click.BadParameter("is empty: is the variable set that it comes from?", context, parameter)
+    return value
+
+
 def timeout_option(words: str) -> Callable[[_F], _F]:
     """Return the option --timeout; `words` is its help: what the command does when the time is over."""
-    seconds = click.FloatRange(0, min_open=True)
-    return click.option("-t", "--timeout", type=seconds, callback=number, metavar="SEC", help=words)
+    above_zero = click.FloatRange(0, min_open=True)
+    return click.option("-t", "--timeout", type=above_zero, callback=number, metavar="SEC", help=words)
 
 
 def show(line: str) -> None:
@@ -120,3 +140,20 @@ def show_error(error: TalkError, *, json: bool) -> None:
 def colourful() -> bool:
     """Whether standard output takes colour."""
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def screen() -> Screen:
+    """Return what standard output is at this moment: how wide, if it is a terminal, and whether it takes colour."""
+    from talkcli.columns import Screen
+
+    if sys.stdout is None or not sys.stdout.isatty():
+        return Screen()
+    # The terminal first: a COLUMNS that a shell once exported knows nothing of a window that was resized.
+    try:
+        width = os.get_terminal_size(sys.stdout.fileno()).columns
+    except OSError:
+        width = 0
+    if not width:
+        told = os.environ.get("COLUMNS", "")
+        width = int(told) if told.isascii() and told.isdecimal() else 0
+    return Screen(width or _USUAL_WIDTH, colourful())

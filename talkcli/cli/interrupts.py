@@ -1,4 +1,7 @@
-"""Signals that end a client's waiting, turned into a descriptor, so that they never cut a read or a write in two."""
+"""What ends a client's waiting: signals, a timeout, another thread.
+
+All of them become a descriptor that is readable then, so that they never cut a read or a write in two.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +10,29 @@ import os
 import signal
 from typing import TYPE_CHECKING
 
-from talkcli.errors import EXIT_SIGNAL
+from talkcli.errors import EXIT_SIGNAL, EXIT_TIMEOUT
 
 if TYPE_CHECKING:
     from types import FrameType, TracebackType
 
 _CAUGHT = (signal.SIGINT, signal.SIGTERM)
+#: Three years: what the system's timer is sure to take.
+_LONGEST = 1e8
 
 
 class Interrupts:
     """Catches SIGINT and SIGTERM: `descriptor` becomes readable, `number` is the signal. A second one ends at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, timeout: float | None = None) -> None:
+        """`timeout`: seconds after which it becomes readable by itself, and `late` true; counted from the `with`."""
         self.number: int | None = None
+        self.late = False
+        self._timeout = timeout
 
     @property
     def exit_code(self) -> int:
-        return EXIT_SIGNAL + (self.number or 0)
+        """The exit code for what has happened: the signal's, if there was one."""
+        return EXIT_TIMEOUT if self.number is None else EXIT_SIGNAL + self.number
 
     def __enter__(self) -> Interrupts:
         self.descriptor, self._write = os.pipe()
@@ -32,11 +41,16 @@ class Interrupts:
         self._before = {
             each: signal.signal(each, self._caught) for each in _CAUGHT if signal.getsignal(each) != signal.SIG_IGN
         }
+        if self._timeout is not None:
+            self._before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._expired)
+            signal.setitimer(signal.ITIMER_REAL, max(1e-6, min(self._timeout, _LONGEST)))  # 0 would be for never
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._timeout is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0)
         for each, handler in self._before.items():
             signal.signal(each, handler)
         os.close(self.descriptor)
@@ -48,8 +62,17 @@ class Interrupts:
         with contextlib.suppress(BlockingIOError):
             os.read(self.descriptor, 16)
 
+    def wake(self) -> None:
+        """Make the descriptor readable, from any thread: there is something else to see to."""
+        with contextlib.suppress(BlockingIOError):  # it is readable, many times over
+            os.write(self._write, b"\0")
+
     def _caught(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         if self.number is not None:
             os._exit(EXIT_SIGNAL + number)
         self.number = number
-        os.write(self._write, b"\0")
+        self.wake()
+
+    def _expired(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self.late = True
+        self.wake()

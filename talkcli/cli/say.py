@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-import os
-import select
+import math
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
-from talkcli import output
-from talkcli.cli.common import Common, common, common_options, note, show, show_error, show_json, timeout_option
+from talkcli.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
+from talkcli.cli.common import Common, common, common_options, note, number, show, show_error, show_json, timeout_option
 from talkcli.cli.interrupts import Interrupts
-from talkcli.dial import ANSWER_LIMIT, Interrupted, ready
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost, ServerUnavailable, TalkError
-from talkcli.states import EXIT_CODES, State
+from talkcli.cli.outcome import SPEECH_IS_PAUSED, give_up, report, rest, until_ended
+from talkcli.dial import ANSWER_LIMIT, Interrupted
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost
+from talkcli.requests import Say
+from talkcli.states import State
 
 if TYPE_CHECKING:
-    from talkcli.client import GoalHandle
-    from talkcli.messages import Goal
+    from collections.abc import Callable
 
-#: Seconds for which a goal that was given up is awaited to be silent.
-_SILENCE = 1.0
-#: Bytes that are read of standard input: one more than the longest text, so that the server sees that it is too long.
-_MAX_INPUT = 40_001
+    from click.shell_completion import CompletionItem
+
+    from talkcli.cli.feedback import Feedback
+    from talkcli.client import GoalHandle
+
+#: Options of a goal, by the names that `Client.say` has for them.
+_GOAL = ("preempt", "flush", "priority", "ttl", "key", "throttle", "id", "rate", "volume", "voice", "pitch")
+#: Options that mean something to a server alone.
+_SERVER_ONLY = ("wait", "feedback", "lines", "preempt", "flush", "priority", "ttl", "key", "throttle", "id", "name")
 
 
 class _SayCommand(click.Command):
@@ -37,28 +43,96 @@ class _SayCommand(click.Command):
             raise click.UsageError(words, ctx) from error
 
 
+def _seconds(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    """Refuse what is no number of seconds that a server could count."""
+    if value is None or (math.isfinite(value) and value >= 0):
+        return value
+    raise click.BadParameter(f"{value!r} is no number of seconds from 0 on.", context, parameter)
+
+
+def _completed_by(name: str) -> Callable[[click.Context, click.Parameter, str], list[CompletionItem]]:
+    """Return what completes an option's value: a function of `complete`, which is imported when it is called."""
+
+    def complete_value(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        from talkcli.cli import complete
+
+        hooks = {"keys": complete.keys, "voices": complete.voices}
+        return hooks[name](context, parameter, incomplete)
+
+    return complete_value
+
+
 @click.command("say", cls=_SayCommand)
-@click.argument("text", nargs=-1, required=True)
+@click.argument("text", nargs=-1, metavar="TEXT...")
 @click.option("-w", "--wait", is_flag=True, help="Wait until it has ended; the exit code tells how.")
 @timeout_option("With --wait: cancel it after SEC seconds, time in the queue included; exit code 124.")
+@click.option("-f", "--feedback", is_flag=True, help="Show each word as it is heard; implies --wait.")
 @click.option(
     "--preempt/--queue",
     default=None,
     help="Stop what is being spoken and go first, or wait in the queue. [default: as 'talk serve' was told]",
 )
+@click.option("--flush", is_flag=True, help="As --preempt, and drop what is in the queue.")
+@click.option(
+    "--priority",
+    type=int,
+    metavar="N",
+    default=0,
+    show_default=True,
+    help="Higher goes first; what has a higher one is neither stopped nor dropped.",
+)
+@click.option(
+    "--ttl",
+    type=float,
+    callback=_seconds,
+    metavar="SEC",
+    help="Drop it if it has not begun within SEC seconds; 0: never.",
+)
+@click.option(
+    "--key",
+    metavar="KEY",
+    shell_complete=_completed_by("keys"),
+    help=f"A label of up to {MAX_KEY} characters; replaces what waits under the same one.",
+)
+@click.option(
+    "--throttle",
+    type=float,
+    callback=_seconds,
+    metavar="SEC",
+    help="Don't speak it if its key, or else its text, was spoken less than SEC seconds ago.",
+)
+@click.option("--id", metavar="ID", help="An id of your own: sent twice, it is spoken once.")
 @click.option(
     "--as", "name", metavar="NAME", envvar="TALK_NAME", show_envvar=True, help="What the sender calls itself."
 )
+@click.option(
+    "--rate", type=click.IntRange(*RATES), metavar="N", help="Words per minute. [env, with -o: TALK_RATE]"
+)
+@click.option(
+    "--volume",
+    type=click.FloatRange(*VOLUMES),
+    callback=number,
+    metavar="X",
+    help="Loudness. [env, with -o: TALK_VOLUME]",
+)
+@click.option(
+    "--voice",
+    metavar="VOICE",
+    shell_complete=_completed_by("voices"),
+    help="Voice by id, name or language: see 'talk voices'. [env, with -o: TALK_VOICE]",
+)
+@click.option("--pitch", type=click.IntRange(*PITCHES), metavar="N", help="Pitch of the voice; 50 is its own.")
+@click.option("--lines", is_flag=True, help="Speak each line of standard input, as it comes; no TEXT then.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False),
+    metavar="FILE.wav",
+    help="Write it into a file instead of speaking it; needs no server.",
+)
 @common_options
 @click.pass_context
-def command(
-    context: click.Context,
-    text: tuple[str, ...],
-    wait: bool,
-    timeout: float | None,
-    preempt: bool | None,
-    name: str | None,
-) -> int:
+def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> int:
     """Speak TEXT: its words, joined by blanks; or standard input, as one sentence, where TEXT is '-'.
 
     Prints the goal's id. Without --wait it returns as soon as the goal is accepted. With --wait it owns the goal:
@@ -67,101 +141,146 @@ def command(
     \b
       talk say "battery low"
       talk say --wait -- "$text" || echo "nobody heard it"
+      talk say -wf "please step back"         each word as it is heard
+      talk say --key battery --throttle 60 "battery low"
       fortune | talk say -
+      tail -f log | talk say --lines --ttl 10
+      talk say -o hello.wav "hello"
 
-    Exit codes: 0 accepted, or succeeded; 3 no server; 4 aborted; 5 rejected; 6 recalled; 7 preempted; 12 the server
-    went away; 124 timed out.
+    Exit codes: 0 accepted, succeeded, or throttled; 3 no server; 4 aborted; 5 rejected; 6 recalled; 7 preempted;
+    12 the server went away; 124 timed out. With --lines, the first line's that did not succeed.
     """
     began = time.monotonic()
-    if timeout is not None and not wait:
-        raise click.UsageError("--timeout needs --wait: without it, nothing is waited for", context)
+    given["wait"] = given["wait"] or given["feedback"]
+    _check(context, text, given)
+    timeout, options = given["timeout"], common(context)
     end = None if timeout is None else began + timeout
-    sentence = _read_input(end) if text == ("-",) else " ".join(text)
-    options = common(context)
+    goal_options = {name: given[name] for name in _GOAL}
+    fault = bad_option(Say("", **goal_options))
+    if fault is not None:
+        raise click.UsageError(fault, context)
+    if given["lines"]:
+        from talkcli.cli.lines import say_lines
+
+        return say_lines(options, given["name"], goal_options, given["wait"], given["feedback"], timeout)
+    sentence = " ".join(text)
+    if text == ("-",):
+        from talkcli.cli.stdin import read_text
+
+        sentence = read_text(end)
+    if given["output"] is not None:
+        from talkcli.cli.rendering import render_to, settings
+
+        return render_to(given["output"], sentence, settings(context, given), rest(end), options)
     with Interrupts() as interrupts:
         try:
             patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
-            with options.connect(name=name, interrupt=interrupts.descriptor, patience=patience) as client:
+            with options.connect(name=given["name"], interrupt=interrupts.descriptor, patience=patience) as client:
                 if interrupts.number is not None:
                     raise Interrupted
-                goal = client.say(sentence, preempt=preempt, follow=wait)
-                return _tell(goal, options) if not wait else _own(goal, interrupts, end, options)
+                goal = client.say(sentence, follow=given["wait"], feedback=given["feedback"], **goal_options)
+                shown = _feedback(options) if given["feedback"] else None
+                if not given["wait"] or goal.state is State.REJECTED:
+                    return _tell(goal, options, shown)
+                return _wait(goal, interrupts, end, options, shown)
         except Interrupted:
             return interrupts.exit_code
         except Lost as error:
             if interrupts.number is None and (end is None or time.monotonic() < end):
                 raise
             show_error(error, json=options.json)
-            return EXIT_TIMEOUT if interrupts.number is None else interrupts.exit_code
+            return interrupts.exit_code
 
 
-def _tell(goal: GoalHandle, options: Common) -> int:
-    """Print the id of a goal that was accepted."""
+def _check(context: click.Context, text: tuple[str, ...], given: dict[str, Any]) -> None:
+    """Refuse what contradicts itself, or says nothing."""
+
+    def refuse(words: str) -> None:
+        raise click.UsageError(words, context)
+
+    if given["output"] is not None:
+        named = [_spelt(context, each, given[each]) for each in _SERVER_ONLY if _typed(context, each)]
+        if named:
+            refuse(f"--output writes a file, without a server: leave out {', '.join(named)}")
+    if given["lines"] and text:
+        refuse("--lines reads standard input: leave out TEXT")
+    if given["lines"] and given["id"] is not None:
+        refuse("--lines makes a goal of each line, and --id names one: leave out one of them")
+    if not given["lines"] and not text:
+        refuse("Missing argument 'TEXT...'.")
+    if given["flush"] and given["preempt"] is False:
+        refuse("--flush goes first, and --queue does not: leave out one of them")
+    if given["timeout"] is not None and not given["wait"] and given["output"] is None:
+        refuse("--timeout needs --wait: without it, nothing is waited for")
+
+
+def _typed(context: click.Context, name: str) -> bool:
+    return context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+
+
+def _spelt(context: click.Context, name: str, value: object) -> str:
+    """Return an option as it was typed, in its long form."""
+    parameter = next(each for each in context.command.params if each.name == name)
+    return (parameter.secondary_opts if value is False and parameter.secondary_opts else parameter.opts)[-1]
+
+
+def _feedback(options: Common) -> Feedback:
+    from talkcli.cli.feedback import feedback
+
+    return feedback(options)
+
+
+def _tell(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
+    """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
     if goal.state is State.REJECTED:
+        if shown and options.json:
+            until_ended(goal, None, shown)
+        return report(goal.goal, options, shown)
+    _introduce(goal, options, shown)
+    if goal.state.terminal:
         return report(goal.goal, options)
     if options.json:
         show_json(goal.goal.to_json())
-    elif not options.quiet:
-        show(goal.id)
     return EXIT_OK
 
 
-def _own(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common) -> int:
-    """Wait for a goal that this command owns: where it can't wait any longer, the goal ends too."""
-    if goal.state is State.REJECTED:
-        return report(goal.goal, options)
-    if not options.json and not options.quiet:
+def _introduce(goal: GoalHandle, options: Common, shown: Feedback | None) -> None:
+    """Print the id of a goal that was accepted, and why it may take long."""
+    if options.quiet:
+        return
+    if not options.json and shown is None:
         show(goal.id)
+    if goal.speech_paused and not goal.state.terminal:
+        note(SPEECH_IS_PAUSED)
+
+
+def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common, shown: Feedback | None) -> int:
+    """Wait for a goal. It is this command's own: where it can't wait any longer, the goal ends too; unless another
+    `say` had sent it before, with the same id.
+    """
+    _introduce(goal, options, shown)
     try:
-        goal.wait(None if end is None else max(0.0, end - time.monotonic()))
+        if shown:
+            shown.begin([goal.goal])
+        until_ended(goal, rest(end), shown)
     except (Interrupted, TimeoutError):
         timed_out = interrupts.number is None
-        _end(goal, interrupts)
-        code = report(goal.goal, options)
+        if goal.attached:
+            return _leave(goal, interrupts, shown)
+        give_up(goal, interrupts, shown)
+        code = report(goal.goal, options, shown)
         if interrupts.number is not None and not timed_out:
             return interrupts.exit_code
         return code if goal.state is State.SUCCEEDED else EXIT_TIMEOUT
-    return report(goal.goal, options)
+    finally:
+        if shown:
+            shown.close()
+    return report(goal.goal, options, shown)
 
 
-def _end(goal: GoalHandle, interrupts: Interrupts) -> None:
-    """Cancel a goal, and wait a moment for its silence."""
-    interrupts.clear()
-    try:
-        goal.request_cancel()
-        goal.wait(_SILENCE)
-    except TimeoutError:
-        note(f"{goal.id}: cancelled, but the server did not confirm within {_SILENCE:g} s that it is silent")
-    except (Interrupted, ServerUnavailable) as error:
-        note(f"{goal.id}: cancelled, but it is not known whether it is silent: {error or 'interrupted'}")
-
-
-def report(goal: Goal, options: Common) -> int:
-    """Tell how a goal ended, or how it stands, and return the exit code for it."""
-    if options.json:
-        show_json(goal.to_json())
-    if goal.state is not State.SUCCEEDED and goal.state.terminal and not options.quiet:
-        note(output.ending(goal))
-    if goal.reason == "throttled":
-        return EXIT_OK  # not speaking was what the sender asked for
-    return EXIT_CODES.get(goal.state, EXIT_TIMEOUT)
-
-
-def _read_input(end: float | None) -> str:
-    """Return standard input as one sentence: no more of it than the longest text, so that it can be refused."""
-    data = b""
-    while len(data) < _MAX_INPUT:
-        if not ready({0: select.POLLIN}, None if end is None else max(0.0, end - time.monotonic())):
-            raise InputLate("standard input has not ended within the time: nothing was sent")
-        more = os.read(0, _MAX_INPUT - len(data))
-        if not more:
-            break
-        data += more
-    return data.decode(errors="surrogateescape").rstrip("\r\n")
-
-
-class InputLate(TalkError):
-    """What should be spoken was not there in time."""
-
-    code = "timeout"
-    exit_code = EXIT_TIMEOUT
+def _leave(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> int:
+    """Stop watching a goal that is another's, which goes on."""
+    if interrupts.number is None:
+        tell = shown.aside if shown else note
+        tell(f"{goal.id} has not ended within the time, and goes on: it was sent before")
+    return interrupts.exit_code

@@ -6,8 +6,12 @@ import re
 
 import click
 
-from talkcli.cli.common import common, common_options, number
+from talkcli.cli import complete
+from talkcli.cli.common import common, common_options, filled, number, seconds
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE, Settings
+
+#: Milliseconds of silence before a sentence: no output needs longer to wake.
+MAX_LEAD_IN = 5000
 
 
 def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int:
@@ -43,10 +47,21 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     "--voice",
     envvar="TALK_VOICE",
     show_envvar=True,
+    callback=filled,
+    shell_complete=complete.voices,
     help="Voice by id, name or language: see 'talk voices'.",
 )
 @click.option("--pitch", type=click.IntRange(0, 100), default=50, show_default=True, help="Pitch of the voice.")
 @click.option("--preempt", is_flag=True, help="Every goal stops the one before it, unless it says --queue.")
+@click.option(
+    "--ttl",
+    type=click.FloatRange(0),
+    callback=seconds,
+    default=0.0,
+    show_default="0: no limit",
+    metavar="SEC",
+    help="A goal that has not begun after SEC seconds is recalled, unless it brings its own --ttl.",
+)
 @click.option(
     "--max-queue",
     type=click.IntRange(1),
@@ -73,10 +88,25 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     metavar="PLAYER",
     envvar="TALK_PLAYER",
     show_envvar=True,
+    shell_complete=complete.players,
     help="aplay, pacat or pw-cat; null (silent, in real time); file:PATH.wav; or a command that reads 16-bit mono PCM, "
     "with {rate} for its rate. [default: the first of the three that works]",
 )
-@click.option("--device", metavar="NAME", help="Device, by the player's own name for it.")
+@click.option(
+    "--device",
+    metavar="NAME",
+    help="Device, by the player's own name for it: for aplay one that 'aplay -L' lists, such as plughw:1,0; for pacat "
+    "one of 'pactl list short sinks'; for pw-cat the name of a node, as in 'pw-cli ls Node'. Name the --player, too.",
+)
+@click.option(
+    "--lead-in",
+    type=click.IntRange(0, MAX_LEAD_IN),
+    default=0,
+    show_default=True,
+    metavar="MS",
+    help="Milliseconds of silence before each sentence: HDMI, USB and Bluetooth outputs that sleep between sentences "
+    f"swallow its beginning. At most {MAX_LEAD_IN}.",
+)
 @click.option("--driver", metavar="NAME", help="pyttsx3 driver. [default: the one for this system]")
 @click.option(
     "--socket-mode",

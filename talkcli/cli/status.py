@@ -5,12 +5,13 @@ from __future__ import annotations
 import click
 
 from talkcli import output
-from talkcli.cli.common import colourful, common, common_options, show, show_json
+from talkcli.cli import complete
+from talkcli.cli.common import common, common_options, screen, show, show_json
 from talkcli.errors import EXIT_OK
 
 
 @click.command("status")
-@click.argument("goal_id", required=False, metavar="[ID]")
+@click.argument("goal_id", required=False, metavar="[ID]", shell_complete=complete.known_ids)
 @common_options
 @click.pass_context
 def command(context: click.Context, goal_id: str | None) -> int:
@@ -30,13 +31,13 @@ def command(context: click.Context, goal_id: str | None) -> int:
             if options.json:
                 show_json(goal.to_json())
             else:
-                _show_lines(output.goal_lines(goal, colour=colourful()))
+                _show_lines(output.goal_lines(goal, screen()))
             return EXIT_OK
         status = client.status()
     if options.json:
         show_json(status.to_json())
     else:
-        _show_lines(output.status_lines(status, colour=colourful()))
+        _show_lines(output.status_lines(status, screen()))
     return EXIT_OK
 
 

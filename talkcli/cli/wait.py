@@ -9,21 +9,31 @@ import click
 
 from talkcli.cli.common import Common, common, common_options, note, timeout_option
 from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.say import report
+from talkcli.cli.outcome import report, rest
 from talkcli.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
 from talkcli.states import State
 
 if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+
+    from talkcli.cli.feedback import Feedback
     from talkcli.client import GoalHandle
 
 
+def _complete_ids(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    from talkcli.cli.complete import goal_ids
+
+    return goal_ids(context, parameter, incomplete)
+
+
 @click.command("wait")
-@click.argument("ids", nargs=-1, metavar="[ID]...")
+@click.argument("ids", nargs=-1, metavar="[ID]...", shell_complete=_complete_ids)
 @timeout_option("Wait no longer than SEC seconds; the goals go on; exit code 124.")
+@click.option("-f", "--feedback", is_flag=True, help="Show each word as it is heard.")
 @common_options
 @click.pass_context
-def command(context: click.Context, ids: tuple[str, ...], timeout: float | None) -> int:
+def command(context: click.Context, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
     """Wait until these goals have ended, whoever sent them; without an ID, all that are active or pending now.
 
     It only watches: Ctrl-C and --timeout cancel nothing. A goal that has ended already is answered at once.
@@ -42,7 +52,9 @@ def command(context: click.Context, ids: tuple[str, ...], timeout: float | None)
     with Interrupts() as interrupts:
         try:
             with options.connect(interrupt=interrupts.descriptor, patience=patience) as client:
-                return _wait(client.follow(ids or None), end, options, named=bool(ids))
+                goals = client.follow(ids or None, feedback=feedback)
+                shown = _show(goals, end, options) if feedback else None
+                return _wait(goals, end, options, shown, named=bool(ids))
         except Interrupted:
             return interrupts.exit_code
         except TimeoutError as error:
@@ -50,13 +62,28 @@ def command(context: click.Context, ids: tuple[str, ...], timeout: float | None)
             return EXIT_TIMEOUT
 
 
-def _wait(goals: list[GoalHandle], end: float | None, options: Common, *, named: bool) -> int:
+def _show(goals: list[GoalHandle], end: float | None, options: Common) -> Feedback:
+    """Show what happens to the goals until all have ended."""
+    from talkcli.cli.feedback import feedback
+    from talkcli.following import merged
+
+    shown = feedback(options)
+    try:
+        shown.begin([each.goal for each in goals])
+        for goal, event in merged(goals, rest(end)):
+            shown.show(goal.goal, event)
+    finally:
+        shown.close()
+    return shown
+
+
+def _wait(goals: list[GoalHandle], end: float | None, options: Common, shown: Feedback | None, *, named: bool) -> int:
     """Wait for the goals in their order; how those ended that were not named is nobody's failure."""
     first_failure = EXIT_OK
     for goal in goals:
-        ended = goal.wait(None if end is None else max(0.0, end - time.monotonic()))
+        ended = goal.wait(rest(end))
         counts = named or ended.state is State.LOST
-        code = report(ended, options) if counts or options.json else EXIT_OK
+        code = report(ended, options, shown) if counts or options.json else EXIT_OK
         if counts:
             first_failure = first_failure or code
     return first_failure

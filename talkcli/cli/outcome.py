@@ -1,0 +1,71 @@
+"""What `say` and `wait` have in common: waiting for a goal, telling how it ended, giving one up that is one's own."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from talkcli import output
+from talkcli.cli.common import note, show_json
+from talkcli.dial import Interrupted
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
+from talkcli.states import EXIT_CODES, State
+
+if TYPE_CHECKING:
+    from talkcli.cli.common import Common
+    from talkcli.cli.feedback import Feedback
+    from talkcli.cli.interrupts import Interrupts
+    from talkcli.client import GoalHandle
+    from talkcli.messages import Goal
+
+#: Seconds for which a goal that was given up is awaited to be silent.
+SILENCE = 1.0
+#: What the sender of a goal is told that nobody hears yet.
+SPEECH_IS_PAUSED = "speech is paused: talk resume"
+
+
+def rest(end: float | None) -> float | None:
+    """Return the seconds that are left until a monotonic time."""
+    return None if end is None else max(0.0, end - time.monotonic())
+
+
+def until_ended(goal: GoalHandle, timeout: float | None, shown: Feedback | None) -> None:
+    """Wait until a goal has ended, and show what happens meanwhile; TimeoutError, Interrupted."""
+    if shown is None:
+        goal.wait(timeout)
+        return
+    for event in goal.events(timeout):
+        shown.show(goal.goal, event)
+
+
+def give_up(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> None:
+    """Cancel a goal, and wait a moment for its silence."""
+    interrupts.clear()
+    tell = shown.aside if shown else note
+    try:
+        goal.request_cancel()
+        until_ended(goal, SILENCE, shown)
+    except TimeoutError:
+        tell(f"{goal.id}: cancelled, but the server did not confirm within {SILENCE:g} s that it is silent")
+    except (Interrupted, ServerUnavailable) as error:
+        tell(f"{goal.id}: cancelled, but it is not known whether it is silent: {error or 'interrupted'}")
+
+
+def report(goal: Goal, options: Common, shown: Feedback | None = None, words: str = "") -> int:
+    """Tell how a goal ended, or how it stands, and return the exit code for it.
+
+    `shown`: what has shown it already on standard output; `words`: what names it, for one that has no id.
+    """
+    if options.json and shown is None:
+        show_json(goal.to_json())
+    if goal.state is not State.SUCCEEDED and goal.state.terminal and not options.quiet:
+        tell = shown.aside if shown else note
+        tell(words + output.ending(goal))
+    return exit_code(goal)
+
+
+def exit_code(goal: Goal) -> int:
+    """Return the exit code for how a goal ended."""
+    if goal.reason == "throttled":
+        return EXIT_OK  # not speaking was what the sender asked for
+    return EXIT_CODES.get(goal.state, EXIT_TIMEOUT)

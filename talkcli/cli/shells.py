@@ -1,0 +1,183 @@
+"""How each shell asks for completion and takes the answer: scripts and formats of our own, on click's machinery.
+
+click's scripts give a shell the words as it cuts them: bash cuts at `:` and `=`, which ids may hold, and a value with a
+blank, a comma, a quote or a `*` doesn't survive the way back. Here the shell sends the line up to the cursor, as it was
+typed; what goes back is quoted, and begins where the shell puts it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from typing import TYPE_CHECKING
+
+from click.shell_completion import ShellComplete, add_completion_class, split_arg_string
+
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+
+_BASH = """\
+%(complete_func)s() {
+    local IFS=$'\\n' program=$1 line
+    [[ $program == '~/'* ]] && program=$HOME/${program:2}
+    COMPREPLY=()
+    while IFS= read -r line; do
+        case $line in
+            file) compopt -o default 2>/dev/null ;;
+            plain,*) COMPREPLY+=("${line#*,}") ;;
+        esac
+    done < <(COMP_WORDS=${COMP_LINE:0:COMP_POINT} COMP_CWORD=$2 %(complete_var)s=bash_complete "$program" 2>/dev/null)
+}
+
+complete -o nosort -F %(complete_func)s %(prog_name)s 2>/dev/null || complete -F %(complete_func)s %(prog_name)s
+"""
+
+_ZSH = """\
+#compdef %(prog_name)s
+
+%(complete_func)s() {
+    local program=${(Q)words[1]} line typed="${(j: :)words[1,CURRENT-1]} $QIPREFIX$PREFIX"
+    local -a lines plain described
+    [[ $program == '~/'* ]] && program=$HOME/${program#??}
+    lines=("${(@f)$(COMP_WORDS=$typed COMP_CWORD= %(complete_var)s=zsh_complete $program 2>/dev/null)}")
+    for line in $lines; do
+        case $line in
+            file) _files; return ;;
+            described,*) described+=("${line#*,}") ;;
+            plain,*) plain+=("${line#*,}") ;;
+        esac
+    done
+    # What follows the = of --option= is completed by itself.
+    [[ $PREFIX == -*=* ]] && compset -P '*='
+    (( $#described )) && _describe -V talk described
+    (( $#plain )) && compadd -V talk -a plain
+    (( $#described + $#plain ))
+}
+
+if [[ $zsh_eval_context[-1] == loadautofunc ]]; then
+    %(complete_func)s "$@"  # from fpath
+else
+    compdef %(complete_func)s %(prog_name)s  # sourced
+fi
+"""
+
+_FISH = """\
+function %(complete_func)s
+    set -l program (string replace --regex '^~/' "$HOME/" -- (commandline -poc)[1])
+    set -l typed (commandline -pc | string collect)
+    for line in (COMP_WORDS=$typed COMP_CWORD= %(complete_var)s=fish_complete $program 2>/dev/null)
+        switch $line
+            case file
+                __fish_complete_path (commandline -ct)
+            case 'plain,*'
+                string replace 'plain,' '' -- $line
+        end
+    end
+end
+
+complete --no-files --command %(prog_name)s --arguments '(%(complete_func)s)'
+"""
+
+#: What bash takes as it stands; letters and digits of other scripts, too.
+_BASH_PLAIN = re.compile(r"[^\w@%+=:,./-]")
+
+
+class _Line(ShellComplete):
+    """A shell that sends its line up to the cursor in COMP_WORDS."""
+
+    def get_completion_args(self) -> tuple[list[str], str]:
+        line = os.environ["COMP_WORDS"]
+        words = split_arg_string(line)
+        # One more character shows whether it would begin a word or belong to the last one.
+        if len(split_arg_string(f"{line}x")) > len(words):
+            words.append("")
+        return words[1:-1], words[-1]
+
+    def format_completion(self, item: CompletionItem[str]) -> str:
+        """Return a line for what is offered: `file`, or a kind and what the shell shall insert."""
+        return "file" if item.type == "file" else f"plain,{item.value}"
+
+
+class Bash(_Line):
+    """bash replaces what it takes for the word, COMP_CWORD, by what it gets, and quotes nothing."""
+
+    name = "bash"
+    source_template = _BASH
+
+    def format_completion(self, item: CompletionItem[str]) -> str:
+        if item.type == "file":
+            return "file"
+        typed, quote = _last_word(os.environ["COMP_WORDS"])
+        replaced = os.environ["COMP_CWORD"]
+        stays = typed.removesuffix(replaced) if replaced else typed
+        value = _whole(item.value, typed)
+        kept = "".join(split_arg_string(stays))
+        return f"plain,{_quoted(value.removeprefix(kept), quote)}"
+
+
+class Zsh(_Line):
+    """zsh quotes what it inserts; a help stands behind a colon."""
+
+    name = "zsh"
+    source_template = _ZSH
+
+    def format_completion(self, item: CompletionItem[str]) -> str:
+        if item.type == "file" or not item.help:
+            return super().format_completion(item)
+        value = item.value.replace("\\", "\\\\").replace(":", "\\:")
+        return f"described,{value}:{item.help}"
+
+
+class Fish(_Line):
+    """fish quotes what it inserts; a help stands behind a tab."""
+
+    name = "fish"
+    source_template = _FISH
+
+    def format_completion(self, item: CompletionItem[str]) -> str:
+        if item.type == "file":
+            return "file"
+        typed, _ = _last_word(os.environ["COMP_WORDS"])
+        words = f"\t{item.help}" if item.help else ""
+        return f"plain,{_whole(item.value, typed)}{words}"
+
+
+def register() -> None:
+    """Have click use these for their shells."""
+    for each in (Bash, Zsh, Fish):
+        add_completion_class(each)
+
+
+def _last_word(line: str) -> tuple[str, str]:
+    """Return the word at the end of a line as it was typed, and the quote that is open in it."""
+    word, quote, escaped = "", "", False
+    for character in line:
+        if escaped:
+            escaped = False
+        elif character == "\\" and quote != "'":
+            escaped = True
+        elif quote:
+            quote = "" if character == quote else quote
+        elif character in "'\"":
+            quote = character
+        elif character.isspace():
+            word = ""
+            continue
+        word += character
+    return word, quote
+
+
+def _whole(value: str, typed: str) -> str:
+    """Return what is offered for the value of --option=VALUE with its option, as it was typed."""
+    word = "".join(split_arg_string(typed))
+    option, equals, _ = word.partition("=")
+    return f"{option}={value}" if equals and option.startswith("-") else value
+
+
+def _quoted(value: str, quote: str) -> str:
+    """Return the value so that bash reads it as one word, within the quote that is open."""
+    if quote == "'":
+        return value.replace("'", "'\\''")
+    if quote:
+        return re.sub(r'(["\\$`])', r"\\\1", value)
+    return _BASH_PLAIN.sub(lambda found: f"\\{found[0]}", value)

@@ -1,0 +1,111 @@
+"""Standard input, where `say` is told to read it: as one text, or line by line. It never holds more than one text."""
+
+from __future__ import annotations
+
+import os
+import select
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from talkcli.dial import Interrupted, ready
+from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
+from talkcli.text import MAX_BYTES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+#: Bytes that are read at once: what a pipe holds.
+_CHUNK = 65_536
+
+
+class InputLate(TalkError):
+    """What should be spoken was not there in time."""
+
+    code = "timeout"
+    exit_code = EXIT_TIMEOUT
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line of standard input, without its end."""
+
+    #: 1 for the first
+    number: int
+    #: None where it is longer than any text may be
+    text: str | None
+    #: bytes that it has
+    size: int
+
+
+def read_text(end: float | None) -> str:
+    """Return standard input as one text: no more than a byte above the longest one, so that it can be refused.
+
+    `end`: the monotonic time by which it must have been read, else InputLate.
+    """
+    data = b""
+    while len(data) <= MAX_BYTES:
+        if not ready({0: select.POLLIN}, None if end is None else max(0.0, end - time.monotonic())):
+            raise InputLate("standard input has not ended within the time: nothing was sent")
+        more = _read(MAX_BYTES + 1 - len(data))
+        if more == b"":
+            break
+        data += more or b""
+    return _decoded(data)
+
+
+class LineReader:
+    """Cuts standard input into lines. A line that is too long is read to its end, counted and not kept."""
+
+    def __init__(self, interrupt: int) -> None:
+        """`interrupt`: a descriptor that ends the reading with Interrupted as soon as it is readable."""
+        self._interrupt = interrupt
+        self._begun = bytearray()
+        self._size = 0
+        self._number = 0
+
+    def lines(self) -> Iterator[Line]:
+        """Iterate over the lines, each as soon as its newline has come; the last one may lack it."""
+        while True:
+            if self._interrupt in ready({0: select.POLLIN, self._interrupt: select.POLLIN}, None):
+                raise Interrupted
+            data = _read(_CHUNK)
+            if data is None:
+                continue
+            if not data:
+                break
+            *ended, begun = data.split(b"\n")
+            for each in ended:
+                self._take(each)
+                yield self._end()
+            self._take(begun)
+        if self._size:
+            yield self._end()
+
+    def _take(self, data: bytes) -> None:
+        self._size += len(data)
+        # One byte above the longest text: the CR of a line that ends in CRLF.
+        self._begun += data[: MAX_BYTES + 1 - len(self._begun)]
+
+    def _end(self) -> Line:
+        self._number += 1
+        size = self._size
+        text = None if size > MAX_BYTES + 1 else _decoded(bytes(self._begun))
+        self._begun.clear()
+        self._size = 0
+        return Line(self._number, text, size)
+
+
+def _read(count: int) -> bytes | None:
+    """Return what there is of standard input, at most so many bytes; b"" at its end, None if there was nothing yet."""
+    try:
+        return os.read(0, count)
+    except BlockingIOError:  # whoever started this has made it so
+        return None
+    except OSError as error:
+        raise UsageError(f"standard input cannot be read: {error.strerror}") from error
+
+
+def _decoded(data: bytes) -> str:
+    # What is not UTF-8 stays recognisable, so that it is refused as such.
+    return data.decode(errors="surrogateescape").rstrip("\r\n")
