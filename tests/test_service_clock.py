@@ -92,7 +92,7 @@ def test_the_wall_clock_ends_no_goal(monkeypatch: pytest.MonkeyPatch) -> None:
         served = await _queued_behind_another(ttl=600)
         with monkeypatch.context() as patched:
             now = time.time()
-            patched.setattr(service.time, "time", lambda: now + 86_400)
+            patched.setattr(time, "time", lambda: now + 86_400)
             served.now()
         assert served.scheduler.pending_count == 1
 

@@ -1,0 +1,270 @@
+"""What a program can send, be told and end with is in the README's tables, and these have nothing else."""
+
+from __future__ import annotations
+
+import ast
+import re
+from functools import cache
+from typing import TYPE_CHECKING
+
+import click
+import pytest
+
+from talkcli import admission, cli, errors, states, text, wire
+from talkcli.history import MAX_ENDED, MAX_REJECTED
+from talkcli.messages import Goal
+from talkcli.requests import KINDS, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
+from talkcli.server import connection
+from talkcli.server.answers import RECENT
+from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
+from talkcli.states import State
+from tests.wire.readme import ROOT, examples, first_column, section, tables, words
+
+if TYPE_CHECKING:
+    from tests.support.processes import Talk
+
+#: Which argument of a call is a goal's reason; the place of a keyword doesn't matter.
+REASON_AT = {
+    "AudioFailed": 0, "SettingFailed": 0, "StartFailed": 0, "Ended": 2, "_lose_process": 1, "_recall": 1, "_stop": 1,
+    "_end": 2, "_close": 2, "failed": 1,
+}  # fmt: skip
+#: … and which is the code of an error on the wire.
+CODE_AT = {"BadRequest": 1, "failure": 1, "call_later": 2}
+CODE = re.compile(r"[a-z]+(_[a-z]+)*")
+
+
+def requests_table() -> dict[str, dict[str, tuple[str, ...]]]:
+    """Return the rows of each request's fields."""
+    found: dict[str, dict[str, tuple[str, ...]]] = {}
+    kind = ""
+    for row in tables(section("Requests"))[0][1:]:
+        kind = words(row[0])[0] if row[0] else kind
+        fields = found.setdefault(kind, {})
+        if row[1]:
+            fields[words(row[1])[0]] = row
+    return found
+
+
+@cache
+def sources() -> list[tuple[str, ast.AST]]:
+    """Return every node of the sources, with the name of its file."""
+    paths = sorted((ROOT / "talkcli").rglob("*.py"))
+    return [(path.name, node) for path in paths for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
+
+
+def constants(node: ast.AST | None) -> set[str]:
+    """Return the codes that an expression may be."""
+    if isinstance(node, ast.IfExp):
+        return constants(node.body) | constants(node.orelse)
+    if isinstance(node, ast.BoolOp):
+        return set().union(*map(constants, node.values))
+    found = node.value if isinstance(node, ast.Constant) else None
+    return {found} if isinstance(found, str) and CODE.fullmatch(found) else set()
+
+
+def arguments(places: dict[str, int], keyword: str) -> set[str]:
+    """Return the codes that stand at their place in the calls of the sources."""
+    found = set()
+    for _, node in sources():
+        if not isinstance(node, ast.Call):
+            continue
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        if name in places and len(node.args) > places[name]:
+            found |= constants(node.args[places[name]])
+        if name in places or name == "Goal":
+            found |= set().union(*(constants(each.value) for each in node.keywords if each.arg == keyword))
+    return found
+
+
+def reasons() -> set[str]:
+    """Return the reasons that the sources give to goals: by calls, or as the first of a pair with words for people."""
+    found = arguments(REASON_AT, "reason")
+    for name, node in sources():
+        if isinstance(node, ast.Call):  # of `Goal`, or of `replace`
+            found |= set().union(*(constants(each.value) for each in node.keywords if each.arg == "reason"))
+        if isinstance(node, ast.Tuple) and len(node.elts) == 2:
+            first, second = node.elts
+            for_people = isinstance(second, ast.JoinedStr | ast.Call) or " " in str(getattr(second, "value", ""))
+            if name in {"scheduler.py", "text.py", "service.py"} and for_people:
+                found |= constants(first)
+            if name in {"scheduler.py", "selection.py"} and isinstance(first, ast.Name):
+                found |= constants(second)
+    return found
+
+
+def test_reasons_of_the_sources_are_found() -> None:
+    """One of each form, so that a search that finds nothing is seen."""
+    assert reasons() >= {
+        "canceled", "preempted", "replaced", "displaced", "expired", "throttled", "queue_full", "invalid_text",
+        "text_too_long", "unknown_voice", "audio_device", "audio_lost", "engine_hung", "lost", "shutdown",
+    }  # fmt: skip
+
+
+def test_reasons_are_in_the_table() -> None:
+    table = tables(section("States"))[1]
+    assert sorted(first_column(table)) == sorted(reasons())
+    for row in table[1:]:
+        for state in row[1].split(", "):
+            assert State[state].terminal, row
+
+
+def test_states_are_in_the_table() -> None:
+    table = tables(section("States"))[0]
+    documented = {words(row[0])[0]: (int(row[1]), row[3] == "yes") for row in table[1:]}
+    assert documented == {each.name: (int(each), each.terminal) for each in State}
+
+
+def test_requests_and_their_fields_are_in_the_table() -> None:
+    assert {kind: set(fields) for kind, fields in requests_table().items()} == {
+        kind: set(request.fields) for kind, request in KINDS.items()
+    }
+    answered = {each for row in tables(section("Requests"))[1][1:] for each in words(row[0])[:1]}
+    assert answered == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_types_and_defaults_are_those_of_the_code(kind: str) -> None:
+    samples = {"string": "x", "integer": 1, "number": 0.5, "boolean": True, "object": {}, "list": ["x"], "id": "x"}
+    request = KINDS[kind]
+    default = Say("") if issubclass(request, Say) else request()
+    for name, row in requests_table()[kind].items():
+        documented = re.split(r"[ ,]", row[2])[0]
+        check = request.fields[name]
+        check(samples[documented])
+        if documented not in {"string", "id"}:
+            with pytest.raises(ValueError, match="must be"):
+                check("x")
+        if "or null" in row[2]:
+            assert check(None) is None
+        else:
+            with pytest.raises(ValueError, match="must be"):
+                check(None)
+        value = getattr(default, name)
+        if row[3] not in {"needed", "the server's", "all"}:
+            assert row[3].strip("`") == ("null" if value is None else str(value).lower()), row
+        else:
+            assert not value, row
+
+
+def test_ranges_are_those_of_the_code() -> None:
+    for kind in ("say", "set"):
+        fields = requests_table()[kind]
+        for name, limits in (("rate", admission.RATES), ("volume", admission.VOLUMES), ("pitch", admission.PITCHES)):
+            assert f"{limits[0]:g} to {limits[1]:g}" in fields[name][2], name
+    say = requests_table()["say"]
+    assert f"-{admission.MAX_PRIORITY:,} to {admission.MAX_PRIORITY:,}" in say["priority"][2]
+    assert f"1 to {admission.MAX_KEY} characters" in say["key"][2]
+    assert f"1 to {MAX_ID} of" in say["id"][2]
+    assert f"{text.MAX_CHARACTERS:,} characters and {text.MAX_BYTES:,} bytes" in say["text"][2]
+    assert f"1 to {MAX_NAME} characters" in requests_table()["hello"]["name"][2]
+    assert f"to {MAX_IDS:,} ids" in requests_table()["cancel"]["ids"][2]
+    assert f"1 to {MAX_LOG:,}" in requests_table()["log"]["count"][2]
+    assert requests_table()["log"]["count"][3] == str(Log().count)
+    assert Cancel().everything
+    assert RECENT == 10
+    assert f"last {MAX_ENDED:,} goals that ended are kept, and the last {MAX_REJECTED} that were" in section("The goal")
+
+
+def test_limits_are_those_of_the_code() -> None:
+    limits = {row[0]: row[1] for row in tables(section("Errors and limits"))[1][1:]}
+    assert limits["a request"].startswith(f"{wire.MAX_LINE:,} bytes")
+    assert f"within {connection.FIRST_REQUEST:g} s" in limits["the first request"]
+    assert f"within {connection.LINE_LIMIT:g} s" in limits["a line"]
+    assert limits["lines that are no requests"].startswith(f"{connection.MAX_BAD_LINES} ")
+    read = limits["a client that doesn't read"]
+    assert f"{connection.SOFT_OUTPUT // 1024} KiB" in read
+    assert f"{connection.HARD_OUTPUT // 2**20} MiB" in read
+    assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
+    assert limits["queue"].startswith(f"{MAX_QUEUE} ")
+
+
+def test_goal_has_the_keys_of_the_table() -> None:
+    assert first_column(tables(section("The goal"))[0]) == list(Goal("", State.PENDING).to_json())
+
+
+def test_server_has_the_keys_of_the_text(scripted: Talk) -> None:
+    found = re.search(r"^`server` has (.*?)\.$", section("Requests"), re.MULTILINE | re.DOTALL)
+    assert found
+    assert words(found[1]) == list(scripted.request("status")["server"])
+
+
+def test_events_are_in_the_table() -> None:
+    """Every kind that the server sends stands as `{"event": KIND` in the sources."""
+    sent: dict[str, set[str]] = {}
+    for path in (ROOT / "talkcli" / "server").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Dict):
+                keys = [each.value if isinstance(each, ast.Constant) else "" for each in node.keys]
+                if "event" in keys:
+                    value = node.values[keys.index("event")]
+                    assert isinstance(value, ast.Constant), f"{path.name}:{node.lineno}"
+                    sent.setdefault(str(value.value), set()).update(str(each) for each in keys if each)
+    table = {words(row[0])[0]: set(words(row[2])) for row in tables(section("Events"))[0][1:]}
+    assert set(sent) == set(table) >= {"state", "word", "paused", "result", "alive"}
+    for kind, fields in sent.items():
+        assert fields - {"event"} <= table[kind], kind
+
+
+def test_error_codes_are_in_the_table() -> None:
+    classes: list[type[errors.RequestRefused]] = [
+        errors.UnknownGoal,
+        errors.BadRequest,
+        *errors.BadRequest.__subclasses__(),
+    ]
+    codes = arguments(CODE_AT, "code") | {each.code for each in classes}
+    codes |= {"unknown_voice"}  # goes from `voice_fault` into the reply to `set`
+    assert codes >= {"bad_json", "unknown_field", "line_too_long", "too_slow", "bad_option", "internal_error"}
+    assert sorted(first_column(tables(section("Errors and limits"))[0])) == sorted(codes)
+
+
+def test_exit_codes_are_in_the_table() -> None:
+    rows = [row[0] for row in tables(section("Exit codes"))[0][1:]]
+    assert rows[-1] == f"{errors.EXIT_SIGNAL}+n"
+    classes = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.TalkError)]
+    used = {each.exit_code for each in classes} | set(states.EXIT_CODES.values())
+    used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_TIMEOUT}
+    assert sorted(map(int, rows[:-1])) == sorted(used)
+
+
+def command(name: str) -> click.Command:
+    found = cli.talk.get_command(click.Context(cli.talk), name)
+    assert found, name
+    return found
+
+
+def options(name: str) -> set[str]:
+    """Return the options of a command that it doesn't share with all others."""
+    shared = {each.name for each in cli.talk.params}
+    own = [each for each in command(name).params if isinstance(each, click.Option) and each.name not in shared]
+    return {form for each in own for form in (*each.opts, *each.secondary_opts)}
+
+
+def test_commands_and_their_options_are_in_the_table() -> None:
+    rows: dict[str, str] = {}
+    for row in tables(section("Commands"))[0][1:]:
+        rows |= {each.split()[0]: row[2] for each in words(row[0])}
+    assert sorted(rows) == sorted(cli.COMMANDS)
+    for name, documented in rows.items():
+        assert {form for each in words(documented) for form in each.split("/")} == options(name), name
+
+
+def test_every_command_in_the_examples_can_be_read() -> None:
+    """Its options are the command's own; what stands around it is the shell's business."""
+    seen = set()
+    for name, rest in re.findall(r"\btalk (?:--json )?([a-z]+)\b([^|#;&\n]*)", "".join(examples("sh"))):
+        if name not in cli.COMMANDS:
+            continue
+        seen.add(name)
+        shared = {form for each in cli.talk.params for form in each.opts}
+        for option in re.findall(r"(?<!\S)(--?[a-z][a-z-]*)", rest.split(" -- ")[0]):
+            assert option in options(name) | shared, f"talk {name}{rest}"
+    assert seen == set(cli.COMMANDS)
+
+
+def test_readme_has_the_setup_commands_as_they_were() -> None:
+    commands = [each for each in examples("sh") if "venv" in each]
+    assert commands == [
+        "python3 -m venv .venv && . .venv/bin/activate && pip install . && "
+        '{ talk serve & sleep 3; talk say "battery low" --wait; }\n',
+        "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest\n",
+    ]

@@ -1,0 +1,185 @@
+"""Recorded conversations: what a client of protocol 1 sent and was told must hold for as long as the protocol is 1.
+
+The recordings are never edited. A request or a field that is new is recorded in a file of its own, beside the others.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from talkcli import events, wire
+from talkcli.errors import RequestRefused, refusal
+from talkcli.messages import Goal
+from talkcli.replies import ServerStatus
+from talkcli.requests import KINDS
+from tests.conformance.rawsocket import Raw
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from tests.conftest import MakeTalk
+
+RECORDINGS = sorted(Path(__file__).parent.glob("*.txt"))
+#: How the recorded server called itself: the first half of its goals' ids.
+BOOT = "k3fz"
+#: SHA-256 of each recording, so that nobody edits one without meaning to.
+NEVER_EDITED = {
+    "protocol-1": "5a39d2af4e6c797d4d449d37623fd96d9f78ea4f33952ef545dc1e4e552212fd",
+}
+#: What is another with every server, client or run: of these the type is compared.
+VARIES = {
+    "version", "pid", "uid", "command", "parent", "socket", "at", "n", "started_at", "queued_at", "ended_at", "uptime",
+    "time", "duration", "message", "clients", "engine", "driver", "synthesizer", "player",
+}  # fmt: skip
+#: … and these may be null as well, where the system doesn't tell or the engine has not said yet.
+MAY_BE_NULL = {"pid", "uid", "command", "parent", "duration", "synthesizer", "player"}
+
+Message = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line of a recording: "connect", ">" from the client or "<" from the server."""
+
+    number: int
+    what: str
+    text: str
+
+    @property
+    def message(self) -> Message:
+        found = json.loads(self.text)
+        assert isinstance(found, dict), self
+        return found
+
+
+def read(recording: Path) -> list[Line]:
+    rows = enumerate(recording.read_text(encoding="utf-8").splitlines(), 1)
+    lines = [Line(number, *row.partition(" ")[::2]) for number, row in rows if not row.startswith("#")]
+    assert {each.what for each in lines} == {"connect", ">", "<"}
+    return lines
+
+
+def said_by_server() -> list[Line]:
+    return [each for recording in RECORDINGS for each in read(recording) if each.what == "<"]
+
+
+def differences(recorded: object, now: object, varies: Collection[str] = VARIES, name: str = "") -> list[str]:
+    """Return where what is said now is not what was recorded; what was added since is no difference."""
+    if isinstance(recorded, dict) and isinstance(now, dict):
+        found = [f"{name}.{each} is missing" for each in recorded.keys() - now.keys()]
+        for key in recorded.keys() & now.keys():
+            found += differences(recorded[key], now[key], varies, f"{name}.{key}")
+        return found
+    return [] if _alike(name.rpartition(".")[2], recorded, now, varies) else [f"{name}: {recorded!r}, now {now!r}"]
+
+
+def _alike(key: str, recorded: object, now: object, varies: Collection[str]) -> bool:
+    if recorded is None or now is None:
+        return recorded is now or key in MAY_BE_NULL & set(varies)
+    if key == "spoken" and varies:
+        return isinstance(now, str)  # how far a goal came that was stopped
+    kinds = [int if isinstance(each, float) else type(each) for each in (recorded, now)]
+    return kinds[0] is kinds[1] and (key in varies or recorded == now)
+
+
+def next_message(raw: Raw, seen: int, kinds: set[str]) -> tuple[Message, int]:
+    """Return the next message that a client of then would not ignore, and how many lines have been read with it."""
+    while True:
+        message = raw.receive_lines(seen + 1)[seen]
+        seen += 1
+        if "event" not in message or message["event"] in kinds:
+            return message, seen
+
+
+@pytest.mark.parametrize("recording", RECORDINGS, ids=lambda each: each.stem)
+def test_server_still_says_what_was_recorded(recording: Path, make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True, watched=False)
+    with Raw(talk.socket) as raw:
+        boot = raw.receive_lines(1)[0]["boot"]
+    lines = read(recording)
+    kinds = {each.message["event"] for each in lines if each.what == "<" and "event" in each.message} - {"alive"}
+    raw, seen = Raw(talk.socket), 0
+    try:
+        for line in lines:
+            text = line.text.replace(f'"{BOOT}', f'"{boot}')
+            if line.what == "connect":
+                raw.socket.close()
+                raw, seen = Raw(talk.socket), 0
+            elif line.what == ">":
+                raw.send(text.encode() + b"\n")
+            else:
+                message, seen = next_message(raw, seen, kinds)
+                found = differences(json.loads(text), message)
+                assert not found, f"line {line.number} of {recording.name}: {found}\nrecorded: {text}\nnow: {message}"
+    finally:
+        raw.socket.close()
+
+
+def test_differences_are_found() -> None:
+    recorded = {"ok": True, "goal": {"id": "a", "by": None, "at": 1.5}}
+    assert not differences(recorded, {"ok": True, "goal": {"id": "a", "by": None, "at": 2, "new": 1}, "more": []})
+    assert differences(recorded, {"ok": True})
+    assert differences(recorded, {"ok": 1, "goal": recorded["goal"]})
+    for changed in (
+        {"id": "b", "by": None, "at": 1.5},
+        {"id": "a", "at": 1.5},
+        {"id": "a", "by": None, "at": "now"},
+        {"id": "a", "by": None, "at": None},
+        {"id": "a", "by": {}, "at": 1.5},
+    ):
+        assert differences(recorded, {"ok": True, "goal": changed}), changed
+
+
+@pytest.mark.parametrize("recording", RECORDINGS, ids=lambda each: each.stem)
+def test_recording_is_what_it_was(recording: Path) -> None:
+    assert sha256(recording.read_bytes()).hexdigest() == NEVER_EDITED[recording.stem], (
+        f"{recording.name} was edited: record what is new in a file of its own, and add that file's sum here"
+    )
+
+
+def test_every_request_and_field_is_recorded() -> None:
+    recorded: dict[str, set[str]] = {each: set() for each in KINDS}
+    for line in [each for recording in RECORDINGS for each in read(recording) if each.what == ">"]:
+        try:
+            message = line.message
+        except ValueError:
+            continue  # a line that is no request was recorded, too
+        recorded.setdefault(message.get("request", ""), set()).update(message)
+    missing = {kind: set(KINDS[kind].fields) - recorded[kind] for kind in KINDS}
+    assert not any(missing.values()), f"record these in a file of their own beside {RECORDINGS[0].name}: {missing}"
+    assert all("request" in recorded[kind] for kind in KINDS)
+
+
+def test_client_of_today_understands_every_recorded_line() -> None:
+    known = 0
+    for line in said_by_server():
+        message = wire.decode(line.text.encode())
+        assert message == line.message
+        if "talk" in message:
+            wire.check_greeting(message, "any")
+        elif "event" in message:
+            event = events.from_json(message)
+            assert event is not None, line
+            assert not differences(message, event.to_json(), varies=())
+            known += 1
+        elif "error" in message:
+            assert isinstance(refusal(**line.message["error"]), RequestRefused)
+        elif "server" in message:
+            assert ServerStatus.from_reply(message, []).server == message["server"]
+        for name in ("goal", "pending", "recent", "canceled", "ended", "active"):
+            if message.get(name) is not None and message.get("event") != "state":
+                assert not differences(message[name], Goal.from_json(message[name]).to_json(), varies=()), line
+    assert known > 40
+
+
+def test_goal_that_succeeded_was_spoken_whole() -> None:
+    goals = [each.message["goal"] for each in said_by_server() if each.message.get("event") == "result"]
+    whole = [each for each in goals if each["state"] == "SUCCEEDED"]
+    assert whole
+    assert all(each["spoken"] == each["text"] for each in whole)
