@@ -78,15 +78,18 @@ class GoalHandle:
         TimeoutError where the goal has not ended `timeout` seconds after this call. Where the server goes away first,
         the Result is a goal that is LOST, as with `wait`.
         """
-        return self._events(_end(timeout), timeout, feedback=False)
+        end = _end(timeout)
+        self._follow(feedback=False)
+        return self._events(end, timeout)
 
     def feedback(self, timeout: float | None = None) -> Iterator[WordHeard]:
         """Iterate over the goal's words as they are heard, until it has ended; TimeoutError as with `events`.
 
-        A goal that was sent without `feedback` gives those heard from the first step on.
+        A goal that was sent without `feedback` gives those heard from this call on.
         """
-        found = self._events(_end(timeout), timeout, feedback=True)
-        return (each for each in found if isinstance(each, WordHeard))
+        end = _end(timeout)
+        self._follow(feedback=True)
+        return (each for each in self._events(end, timeout) if isinstance(each, WordHeard))
 
     def request_cancel(self) -> None:
         """Ask for the goal to be cancelled, without waiting for it: `wait` tells how it ended."""
@@ -128,8 +131,7 @@ class GoalHandle:
             if not self.state.terminal:
                 self.goal = goal
 
-    def _events(self, end: float | None, timeout: float | None, *, feedback: bool) -> Iterator[Event]:
-        self._follow(feedback=feedback)
+    def _events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
         event: Event | None = None
 
         def arrived() -> bool:

@@ -115,7 +115,8 @@ class Record:
     def snapshot(self, state: State | None = None) -> Goal:
         """Return the goal as it is now; with PENDING, as it was when it was accepted."""
         state = self.state if state is None else state
-        started_at = None if state is State.PENDING else self.started_at
+        accepted = state is State.PENDING
+        started_at = None if accepted else self.started_at
         spoken = None
         if started_at is not None and self.text is not None:
             spoken = self.text[: self.spoken_end]
@@ -123,9 +124,9 @@ class Record:
             id=self.id,
             state=state,
             text=self.text,
-            reason=self.reason,
-            by=self.by,
-            message=self.message,
+            reason=None if accepted else self.reason,
+            by=None if accepted else self.by,
+            message=None if accepted else self.message,
             format=self.format,
             spoken=spoken,
             priority=self.priority,
@@ -136,6 +137,6 @@ class Record:
             paused=self.paused and state is self.state,
             queued_at=self.queued_at,
             started_at=started_at,
-            ended_at=self.ended_at,
+            ended_at=None if accepted else self.ended_at,
             duration=self.duration,
         )

@@ -28,6 +28,8 @@ _TEXT_COLUMNS = 40
 _LEAST_TEXT = 16
 #: Columns of a server's ids, until it has given more than 999.
 _USUAL_ID = 8
+#: Where a line begins that goes on from the one before it: under the state.
+_INDENT = 10
 _CLOCK = "%H:%M:%S"
 _DATE = "%b %d %H:%M:%S"
 
@@ -73,7 +75,7 @@ class Transcript:
         place = f"server {printable(str(status.server.get('pid')))} on {printable(str(status.server.get('socket')))}"
         waiting = f", {len(status.pending)} waiting" if status.pending else ""
         at_work = "paused" if self._paused else "speaking" if status.active else "silent"
-        lines = [_fitted(f"{_clock(now)}{GAP}{pad('watching', 10)}{GAP}{place}: {at_work}{waiting}", screen)]
+        lines = [_fitted(f"{_clock(now)}{GAP}{pad('watching', 10)}{GAP}{at_work}{waiting}; {place}", screen)]
         return lines + [line for goal in known for line in self._goal(goal, goal.state, _since(goal, now), screen)]
 
     def _changed(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
@@ -113,24 +115,25 @@ class Transcript:
         if room is None:
             return [(head + pad(_text(goal), _TEXT_COLUMNS) + GAP + forms[0]).rstrip()]
         tail_room = room // 3
-        tail = next((each for each in forms if columns.width(each) <= tail_room), None)
+        # Who ended it must not give way to its column; who sent it was told when it began.
+        whole = forms[:-1] if ended and goal.by is not None else forms
+        tail = next((each for each in whole if columns.width(each) <= tail_room), None)
         if tail is None and ended:
-            return self._ending(head, goal, forms, room)
+            return self._ending(head, goal, whole, screen)
         tail = columns.cut(forms[-1], tail_room) if tail is None else tail
         text_room = room - tail_room - len(GAP)
         return [(head + pad(columns.shortened(_text(goal), text_room), text_room) + GAP + tail).rstrip()]
 
-    def _ending(self, head: str, goal: Goal, forms: list[str], room: int) -> list[str]:
+    def _ending(self, head: str, goal: Goal, forms: list[str], screen: Screen) -> list[str]:
         """Return the end of a goal whose reason is too long for its column: beside the text, or else under it."""
         text = _text(goal)
+        room = screen.room(columns.width(head)) or 0
         beside = room - len(GAP) - min(columns.width(text), _LEAST_TEXT)
         tail = next((each for each in forms if columns.width(each) <= beside), None)
         if tail is not None:
             return [head + columns.shortened(text, room - len(GAP) - columns.width(tail)) + GAP + tail]
-        return [
-            head + columns.shortened(text, room),
-            " " * columns.width(head) + columns.longest_that_fits(forms, room),
-        ]
+        tail = columns.longest_that_fits(forms, screen.room(_INDENT))
+        return [head + columns.shortened(text, room), " " * _INDENT + tail]
 
     def _head(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
         shown = self._make_room(goal_id, screen)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from talkcli import output
 from talkcli.cli.common import note, show_json
 from talkcli.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
@@ -51,16 +50,18 @@ def give_up(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) ->
         tell(f"{goal.id}: cancelled, but it is not known whether it is silent: {error or 'interrupted'}")
 
 
-def report(goal: Goal, options: Common, shown: Feedback | None = None, words: str = "") -> int:
+def report(goal: Goal, options: Common, shown: Feedback | None = None) -> int:
     """Tell how a goal ended, or how it stands, and return the exit code for it.
 
-    `shown`: what has shown it already on standard output; `words`: what names it, for one that has no id.
+    `shown`: what has shown it already on standard output.
     """
     if options.json and shown is None:
         show_json(goal.to_json())
     if goal.state is not State.SUCCEEDED and goal.state.terminal and not options.quiet:
+        from talkcli import output
+
         tell = shown.aside if shown else note
-        tell(words + output.ending(goal))
+        tell(output.ending(goal))
     return exit_code(goal)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,20 @@ import click
 from click.core import ParameterSource
 
 from talkcli.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
-from talkcli.cli.common import Common, common, common_options, note, number, show, show_error, show_json, timeout_option
+from talkcli.cli import complete
+from talkcli.cli.common import (
+    Common,
+    common,
+    common_options,
+    filled,
+    note,
+    number,
+    seconds,
+    show,
+    show_error,
+    show_json,
+    timeout_option,
+)
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import SPEECH_IS_PAUSED, give_up, report, rest, until_ended
 from talkcli.dial import ANSWER_LIMIT, Interrupted
@@ -19,10 +31,6 @@ from talkcli.requests import Say
 from talkcli.states import State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from click.shell_completion import CompletionItem
-
     from talkcli.cli.feedback import Feedback
     from talkcli.client import GoalHandle
 
@@ -41,25 +49,6 @@ class _SayCommand(click.Command):
         except click.NoSuchOption as error:
             words = f"{error.format_message()} To speak a text that starts with '-', write: talk say -- TEXT"
             raise click.UsageError(words, ctx) from error
-
-
-def _seconds(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
-    """Refuse what is no number of seconds that a server could count."""
-    if value is None or (math.isfinite(value) and value >= 0):
-        return value
-    raise click.BadParameter(f"{value!r} is no number of seconds from 0 on.", context, parameter)
-
-
-def _completed_by(name: str) -> Callable[[click.Context, click.Parameter, str], list[CompletionItem]]:
-    """Return what completes an option's value: a function of `complete`, which is imported when it is called."""
-
-    def complete_value(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        from talkcli.cli import complete
-
-        hooks = {"keys": complete.keys, "voices": complete.voices}
-        return hooks[name](context, parameter, incomplete)
-
-    return complete_value
 
 
 @click.command("say", cls=_SayCommand)
@@ -83,31 +72,30 @@ def _completed_by(name: str) -> Callable[[click.Context, click.Parameter, str], 
 )
 @click.option(
     "--ttl",
-    type=float,
-    callback=_seconds,
+    type=click.FloatRange(0),
+    callback=seconds,
     metavar="SEC",
-    help="Drop it if it has not begun within SEC seconds; 0: never.",
+    help="Drop it if it has not begun within SEC seconds; 0: no limit.",
 )
 @click.option(
     "--key",
     metavar="KEY",
-    shell_complete=_completed_by("keys"),
+    callback=filled,
+    shell_complete=complete.keys,
     help=f"A label of up to {MAX_KEY} characters; replaces what waits under the same one.",
 )
 @click.option(
     "--throttle",
-    type=float,
-    callback=_seconds,
+    type=click.FloatRange(0),
+    callback=seconds,
     metavar="SEC",
     help="Don't speak it if its key, or else its text, was spoken less than SEC seconds ago.",
 )
-@click.option("--id", metavar="ID", help="An id of your own: sent twice, it is spoken once.")
+@click.option("--id", metavar="ID", callback=filled, help="An id of your own: sent twice, it is spoken once.")
 @click.option(
     "--as", "name", metavar="NAME", envvar="TALK_NAME", show_envvar=True, help="What the sender calls itself."
 )
-@click.option(
-    "--rate", type=click.IntRange(*RATES), metavar="N", help="Words per minute. [env, with -o: TALK_RATE]"
-)
+@click.option("--rate", type=click.IntRange(*RATES), metavar="N", help="Words per minute. [env, with -o: TALK_RATE]")
 @click.option(
     "--volume",
     type=click.FloatRange(*VOLUMES),
@@ -118,7 +106,8 @@ def _completed_by(name: str) -> Callable[[click.Context, click.Parameter, str], 
 @click.option(
     "--voice",
     metavar="VOICE",
-    shell_complete=_completed_by("voices"),
+    callback=filled,
+    shell_complete=complete.voices,
     help="Voice by id, name or language: see 'talk voices'. [env, with -o: TALK_VOICE]",
 )
 @click.option("--pitch", type=click.IntRange(*PITCHES), metavar="N", help="Pitch of the voice; 50 is its own.")

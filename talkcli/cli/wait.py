@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from talkcli.cli import complete
 from talkcli.cli.common import Common, common, common_options, note, timeout_option
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import report, rest
@@ -15,20 +16,12 @@ from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
 from talkcli.states import State
 
 if TYPE_CHECKING:
-    from click.shell_completion import CompletionItem
-
     from talkcli.cli.feedback import Feedback
     from talkcli.client import GoalHandle
 
 
-def _complete_ids(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    from talkcli.cli.complete import goal_ids
-
-    return goal_ids(context, parameter, incomplete)
-
-
 @click.command("wait")
-@click.argument("ids", nargs=-1, metavar="[ID]...", shell_complete=_complete_ids)
+@click.argument("ids", nargs=-1, metavar="[ID]...", shell_complete=complete.goal_ids)
 @timeout_option("Wait no longer than SEC seconds; the goals go on; exit code 124.")
 @click.option("-f", "--feedback", is_flag=True, help="Show each word as it is heard.")
 @common_options

@@ -178,6 +178,7 @@ class Playback:
 
     def _go_back(self, feed: Feed) -> None:
         """End a player that holds sound that wasn't heard; the next one begins there."""
+        feed.tick(time.monotonic(), last=False)  # the clock knows no better than this what was heard
         self._let_go(self._unheard() if feed.sink.proven else self._begin)
 
     # -- samples
@@ -259,6 +260,7 @@ class Playback:
 
     def _fall_silent(self, feed: Feed) -> bool:
         """Return when all that the player has of the sentence is heard, or it may go on; False if it was let go of."""
+        self._tick(feed)
         mark, now = feed.written, time.monotonic()
         limit = now + SILENT_WITHIN
         hopeless = feed.taken == 0 or feed.unheard(mark, now) > SILENT_WITHIN
@@ -268,6 +270,7 @@ class Playback:
                 return False
             if not self._feed_silence(feed):
                 self._wait_for(feed, min(limit, now + left))
+            self._tick(feed)
             now = time.monotonic()
         return True
 

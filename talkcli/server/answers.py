@@ -209,12 +209,12 @@ class Answers:
         self._service.now()
         newly = not self._scheduler.paused
         effects = self._scheduler.pause()
-        if newly:
-            self._tell_paused(connection)
-        self._service.apply(effects)
         active = self._scheduler.active
+        if newly:
+            self._tell_paused(connection, active if active and active.paused else None)
+        self._service.apply(effects)
         if active is None or active.id == self._held:
-            self._report_paused(connection, seq)
+            self._report_paused(connection, seq, active)
             return
         connection.owed += 1
         self._pauses.append((connection, seq, active))
@@ -222,13 +222,14 @@ class Answers:
 
     def _resume(self, connection: Connection, seq: int | None, _: Resume) -> None:
         now = self._service.now()
-        newly = self._scheduler.paused
+        newly, active = self._scheduler.paused, self._scheduler.active
+        held = active if active and active.paused else None
         self._held = None
         effects = self._scheduler.resume(now)
         if newly:
-            self._tell_paused(connection)
-        self._report_paused(connection, seq)
+            self._tell_paused(connection, held)
         self._service.apply(effects)
+        self._report_paused(connection, seq, held)
 
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)
@@ -305,11 +306,9 @@ class Answers:
             reply = wire.ok(seq, count=len(ended))
         connection.stream(items, reply)
 
-    def _tell_paused(self, connection: Connection) -> None:
+    def _tell_paused(self, connection: Connection, held: Record | None) -> None:
         """Publish and log that speech is paused, or not any more."""
-        scheduler, by = self._scheduler, By(client=connection.sender)
-        held = scheduler.active
-        paused = scheduler.paused
+        paused, by = self._scheduler.paused, By(client=connection.sender)
         self._service.audience.paused(held.id if held else None, paused=paused, by=by, at=time.time())
         log.line(f"{'paused' if paused else 'resumed'} by {log.who(connection.sender)}")
 
@@ -317,8 +316,8 @@ class Answers:
         """Answer the pauses that waited for this goal to be silent: it is held, or it has ended."""
         due = [each for each in self._pauses if each[2] is record]
         self._pauses = [each for each in self._pauses if each[2] is not record]
-        for connection, seq, _ in due:
-            self._report_paused(connection, seq)
+        for connection, seq, held in due:
+            self._report_paused(connection, seq, held)
             connection.settle()
 
     def _doubt_pauses(self, record: Record) -> None:
@@ -329,7 +328,6 @@ class Answers:
             connection.reply(wire.failure(seq, "not_silent", words))
             connection.settle()
 
-    def _report_paused(self, connection: Connection, seq: int | None) -> None:
-        active = self._scheduler.active
-        goal = None if active is None else active.snapshot().to_json()
+    def _report_paused(self, connection: Connection, seq: int | None, held: Record | None) -> None:
+        goal = None if held is None or held.state.terminal else held.snapshot().to_json()
         connection.reply(wire.ok(seq, paused=self._scheduler.paused, goal=goal))
