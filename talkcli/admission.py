@@ -5,8 +5,8 @@ What depends on the other goals (a full queue, a throttle) is the scheduler's bu
 
 from __future__ import annotations
 
-import math
 import re
+import sys
 from typing import TYPE_CHECKING
 
 from talkcli.requests import MAX_ID
@@ -74,6 +74,7 @@ def _outside(name: str, value: float | None, limits: tuple[float, float], unit: 
 
 
 def _bad_seconds(name: str, value: float | None) -> str | None:
-    if value is None or (math.isfinite(value) and value >= 0):
+    # Written so that NaN is refused, and an integer that is past every float.
+    if value is None or 0 <= value <= sys.float_info.max:
         return None
     return f"the {name} {value} is no number of seconds from 0 on"

@@ -59,7 +59,7 @@ class Watcher:
 
     def goals(self) -> list[str]:
         """Return the ids of all goals that had an event, in the order of their first."""
-        return list(dict.fromkeys(each["id"] for each in self.events() if "id" in each))
+        return list(dict.fromkeys(each["id"] for each in self.events() if each.get("id") is not None))
 
     def terminal_counts(self) -> dict[str, int]:
         """Return for each goal how many terminal events it had; 0 for one that has not ended."""

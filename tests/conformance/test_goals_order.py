@@ -1,0 +1,350 @@
+"""Which goal goes first, which gives way, which never starts: on the wire, with a scripted engine."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.told import assert_recalled, assert_rejected, assert_told_in_order, submit
+from tests.conformance.witness import states
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.support.connection import Message, Wire
+    from tests.support.processes import Talk
+
+
+def begin(talk: Talk, text: str = "never-ends words=1", **fields: object) -> str:
+    """Send a goal and wait for its first word; return its id."""
+    goal_id = str(submit(talk, text, **fields)["id"])
+    talk.watcher.wait_for_word(goal_id)
+    return goal_id
+
+
+def queue(talk: Talk, *priorities: int, text: str = "length=0 waits") -> list[str]:
+    """Send goals of these priorities, which wait; return their ids."""
+    return [str(submit(talk, f"{text} {number}", priority=each)["id"]) for number, each in enumerate(priorities)]
+
+
+def pending(talk: Talk) -> list[str]:
+    """Return the ids of the goals that wait, in their order."""
+    with talk.connect() as wire:
+        assert wire.request("status")["ok"]
+        return [each["pending"]["id"] for each in wire.items if "pending" in each]
+
+
+def spoken(talk: Talk) -> list[str]:
+    """Return the ids of the goals that became ACTIVE, in their order."""
+    return [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"]
+
+
+# -- row 47: a full queue
+
+
+def test_row_47_in_a_full_queue_the_newest_of_the_lowest_priority_gives_way(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "3", scripted=True)
+    active = begin(talk)
+    first, second, third = queue(talk, 0, 0, 0)
+    high = submit(talk, "length=0 urgent", priority=5)
+    assert high["state"] == "PENDING"
+    assert_recalled(talk, third, "displaced", by=high["id"])
+    low = talk.run("--json", "say", "--wait", "--", "length=0 not now")
+    assert (low.code, "Talk rejected: " in low.err) == (5, True)
+    rejected = submit(talk, "length=0 nor now")
+    assert_rejected(rejected, "queue_full", "--max-queue")
+    assert pending(talk) == [high["id"], first, second]
+    assert talk.request("cancel", ids=[active])["ok"]
+    assert states(talk, second)[-1] == "SUCCEEDED"
+    assert spoken(talk) == [active, high["id"], first, second]
+    assert_told_in_order(talk)
+
+
+def test_row_47_a_goal_of_the_same_or_a_lower_priority_displaces_nothing(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "2", scripted=True)
+    begin(talk)
+    waiting = queue(talk, 3, 3)
+    for priority in (3, 2, -1):
+        assert_rejected(submit(talk, "length=0 more", priority=priority), "queue_full")
+    assert pending(talk) == waiting
+    assert talk.request("cancel")["count"] == 3
+
+
+def test_row_47_room_is_counted_after_flush_and_key(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "2", scripted=True)
+    active = begin(talk)
+    keyed = submit(talk, "length=0 old", key="battery")["id"]
+    other = submit(talk, "length=0 other")["id"]
+    newer = submit(talk, "length=0 new", key="battery")["id"]
+    assert_recalled(talk, keyed, "replaced", by=newer)
+    assert pending(talk) == [newer, other]
+    last = submit(talk, "length=0 last", flush=True)["id"]
+    for each in (newer, other):
+        assert_recalled(talk, each, "preempted", by=last)
+    assert states(talk, last)[-1] == "SUCCEEDED"
+    assert states(talk, active)[-1] == "PREEMPTED"
+    assert_told_in_order(talk)
+
+
+def test_row_47_a_goal_that_is_rejected_has_done_nothing(make_talk: MakeTalk) -> None:
+    """Not even where it preempts: the one that is ACTIVE has room for itself alone."""
+    talk = make_talk("--max-queue", "1", scripted=True)
+    active = begin(talk)
+    waiting = queue(talk, 0)
+    assert_rejected(submit(talk, "length=0 not now", preempt=True), "queue_full")
+    assert_rejected(submit(talk, "", flush=True), "invalid_text")
+    assert_rejected(submit(talk, "length=0", flush=True, rate=1), "bad_option", "rate")
+    assert talk.watcher.states(active) == ["PENDING", "ACTIVE"]
+    assert pending(talk) == waiting
+    assert talk.request("cancel")["count"] == 2
+
+
+# -- a sender that waits for room
+
+
+def test_a_patient_goal_is_answered_when_there_is_room(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "2", scripted=True)
+    active = begin(talk)
+    first, second = queue(talk, 0, 0, text="never-ends")
+    with talk.connect() as wire:
+        wire.send({"seq": 1, "request": "say", "text": "length=0 patient", "patient": True, "wait": True})
+        # Answered in between, over the same connection: the server goes on with it.
+        wire.send({"seq": 2, "request": "status", "id": active})
+        assert wire.receive()["seq"] == 2
+        assert talk.request("cancel", ids=[first])["count"] == 1
+        reply = wire.receive()
+        assert (reply["seq"], reply["goal"]["state"]) == (1, "PENDING")
+        patient = reply["goal"]["id"]
+        assert pending(talk) == [second, patient]
+        assert talk.request("cancel", ids=[active, second])["ok"]
+        assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+    recalled, queued = talk.watcher.wait_for(first, "RECALLED"), talk.watcher.wait_for(patient, "PENDING")
+    assert recalled["n"] < queued["n"]
+    assert_told_in_order(talk)
+
+
+def test_patient_goals_keep_the_order_in_which_they_were_sent(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "1", scripted=True)
+    active = begin(talk)
+    (waiting,) = queue(talk, 0)
+    with talk.connect() as wire:
+        for number in range(5):
+            wire.send(
+                {"seq": number, "request": "say", "text": f"length=0 line {number}", "patient": True, "wait": True}
+            )
+        assert talk.request("cancel", ids=[active])["ok"]
+        results = [wire.receive_event("result")["goal"] for _ in range(5)]
+    assert [each["state"] for each in results] == ["SUCCEEDED"] * 5
+    assert [each["text"] for each in results] == [f"length=0 line {number}" for number in range(5)]
+    assert spoken(talk) == [active, waiting, *(each["id"] for each in results)]
+    assert_told_in_order(talk)
+
+
+def test_a_patient_goal_that_is_refused_for_another_reason_does_not_wait(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "1", scripted=True)
+    begin(talk)
+    queue(talk, 0)
+    assert_rejected(submit(talk, "", patient=True), "invalid_text")
+    assert_rejected(submit(talk, "length=0", patient=True, volume=2), "bad_option")
+    assert talk.request("cancel")["count"] == 2
+
+
+# -- flush
+
+
+def test_flush_ends_what_is_spoken_and_all_that_waits_up_to_its_priority(scripted: Talk) -> None:
+    active = begin(scripted, priority=1)
+    zero, one, five, one_more = queue(scripted, 0, 1, 5, 1)
+    newcomer = submit(scripted, "length=0 attention", flush=True, priority=1)["id"]
+    for each in (zero, one, one_more):
+        assert_recalled(scripted, each, "preempted", by=newcomer)
+    assert states(scripted, newcomer)[-1] == "SUCCEEDED"
+    assert states(scripted, active) == ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
+    assert scripted.goal(active)["by"] == {"goal": newcomer}
+    assert spoken(scripted) == [active, five, newcomer]
+    assert_told_in_order(scripted)
+
+
+def test_flush_leaves_an_active_goal_of_a_higher_priority(scripted: Talk) -> None:
+    active = begin(scripted, priority=2)
+    (waiting,) = queue(scripted, 0)
+    newcomer = submit(scripted, "length=0 attention", flush=True, priority=1)["id"]
+    assert_recalled(scripted, waiting, "preempted", by=newcomer)
+    assert scripted.watcher.states(active) == ["PENDING", "ACTIVE"]
+    assert scripted.request("cancel", current=True)["count"] == 1
+    assert states(scripted, newcomer)[-1] == "SUCCEEDED"
+
+
+def test_preempting_goals_that_wait_are_recalled_by_the_next_one_and_the_others_stay(scripted: Talk) -> None:
+    active = begin(scripted, "length=20 slow-stop=0.1 words=1")
+    plain, high = queue(scripted, 0, 5)
+    first = submit(scripted, "length=0 first", preempt=True)["id"]
+    second = submit(scripted, "length=0 second", preempt=True)["id"]
+    assert_recalled(scripted, first, "preempted", by=second)
+    assert states(scripted, plain)[-1] == "SUCCEEDED"
+    assert spoken(scripted) == [active, high, second, plain]
+    assert scripted.goal(active)["by"] == {"goal": first}  # the first stop gives the reason, later ones join it
+    assert_told_in_order(scripted)
+
+
+# -- settings and voices
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("rate", 79), ("rate", 451), ("volume", 1.01), ("volume", -0.1), ("pitch", 101), ("ttl", -1), ("throttle", -1)],
+)
+def test_options_out_of_range_are_rejected_and_interrupt_nothing(scripted: Talk, field: str, value: float) -> None:
+    active = begin(scripted)
+    rejected = submit(scripted, "length=0", flush=True, **{field: value})
+    assert_rejected(rejected, "bad_option", field)
+    assert scripted.goal(active)["state"] == "ACTIVE"
+    assert scripted.request("cancel")["count"] == 1
+
+
+def test_an_unknown_voice_is_rejected_with_near_matches(make_talk: MakeTalk) -> None:
+    talk = make_talk("--player", "null")
+    assert_rejected(submit(talk, "hello", voice="en-uss"), "unknown_voice", "en-uss", "did you mean", "'en-us'")
+    assert_rejected(submit(talk, "hello", voice="klingonisch"), "unknown_voice", "klingonisch", "talk voices")
+    refused = talk.request("set", voice="en-uss")
+    assert (refused["ok"], refused["error"]["code"]) == (False, "unknown_voice")
+    assert "'en-us'" in refused["error"]["message"]
+    assert talk.request("set")["settings"]["voice"] is None
+    goal = submit(talk, "hello", voice="en-us", rate=450)
+    assert states(talk, goal["id"])[-1] == "SUCCEEDED"
+
+
+def test_settings_are_changed_all_together_or_not_at_all(scripted: Talk) -> None:
+    before = scripted.request("set")["settings"]
+    assert before == {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
+    refused = scripted.request("set", rate=300, volume=7)
+    assert (refused["ok"], refused["error"]["code"]) == (False, "bad_option")
+    assert scripted.request("set")["settings"] == before
+    after = scripted.request("set", rate=300, preempt=True, ttl=5)["settings"]
+    assert after == {**before, "rate": 300, "preempt": True, "ttl": 5}
+    active = begin(scripted)
+    goal = submit(scripted, "length=0 preempts now")
+    assert (goal["ttl"], states(scripted, active)[-1]) == (5, "PREEMPTED")
+    assert submit(scripted, "length=0", ttl=0)["ttl"] is None
+    assert scripted.request("set", ttl=0, preempt=False)["settings"]["ttl"] is None
+
+
+# -- feedback
+
+
+def test_words_reach_the_one_who_waits_before_the_result(scripted: Talk) -> None:
+    text = "length=0.2 one two three"
+    with scripted.connect() as sender, scripted.connect() as waiter, scripted.connect() as deaf:
+        goal = sender.request("say", text=text, feedback=True)["goal"]["id"]
+        for wire, feedback in ((waiter, True), (deaf, False)):
+            assert wire.request("wait", ids=[goal], feedback=feedback)["ok"]
+        told = {name: _until_result(each) for name, each in (("s", sender), ("w", waiter), ("d", deaf))}
+    words = scripted.watcher.words(goal)
+    assert [each["word"] for each in words] == text.split()
+    assert [each for each in told["s"] if each["event"] == "word"] == words
+    assert _shapes(told["s"]) == ["PENDING", "ACTIVE", *["word"] * 4, "SUCCEEDED", "result"]
+    # It may have come a word late, and hears all the words from then on.
+    heard = [each for each in told["w"] if each["event"] == "word"]
+    assert heard == words[len(words) - len(heard) :]
+    assert len(heard) >= 2
+    assert _shapes(told["w"])[-3:] == ["word", "SUCCEEDED", "result"]
+    assert "word" not in _shapes(told["d"])
+
+
+def test_words_are_of_the_goal_that_is_followed_alone(scripted: Talk) -> None:
+    with scripted.connect() as wire:
+        first = wire.request("say", text="length=0 one", wait=True)["goal"]["id"]
+        second = wire.request("say", text="length=0 two", feedback=True)["goal"]["id"]
+        told = [*_until_result(wire), *_until_result(wire)]
+    assert {each["id"] for each in told if each["event"] == "word"} == {second}
+    assert [each["goal"]["id"] for each in told if each["event"] == "result"] == [first, second]
+
+
+def _until_result(wire: Wire) -> list[Message]:
+    found: list[Message] = []
+    while not found or found[-1]["event"] != "result":
+        found.append(wire.events.pop(0) if wire.events else wire.receive())
+    return found
+
+
+def _shapes(told: list[Message]) -> list[str]:
+    return [str(each.get("state", each["event"])) for each in told]
+
+
+# -- row 50: what is told, in which order
+
+
+def test_row_50_all_of_it_is_told_once_and_in_order(make_talk: MakeTalk) -> None:
+    """One of each way to end, seen by a watcher from before the first goal, and by those who sent them."""
+    talk = make_talk("--max-queue", "4", scripted=True)
+    wanted: dict[str, str] = {}
+    with talk.connect() as wire:
+        told: list[Message] = []
+
+        def say(reason: str, text: str = "length=0", **fields: object) -> str:
+            wire.send({"request": "say", "text": text, "wait": True, **fields})
+            while "ok" not in (message := _take(wire, told)):
+                pass
+            goal = str(message["goal"]["id"])
+            wanted[goal] = reason
+            return goal
+
+        canceled = say("PREEMPTED canceled", "length=20 words=1", id="robot.1")
+        say("REJECTED invalid_text", "")
+        say("REJECTED bad_option", rate=5)
+        say("REJECTED unknown_voice", voice="klingon")
+        say("REJECTED id_conflict", id="robot.1")
+        say("SUCCEEDED", "length=0 once", throttle=60)
+        say("REJECTED throttled", "length=0 once", throttle=60)
+        late = say("RECALLED expired", ttl=0.3)
+        say("RECALLED replaced", key="battery")
+        say("RECALLED displaced", key="battery")
+        say("ABORTED audio_lost", "length=0.05 fail=audio_lost", priority=2)
+        say("ABORTED engine_crashed", "length=0.05 crash", priority=3)
+        say("REJECTED queue_full", priority=-1)
+        talk.watcher.wait_for_terminal(late)
+        recalled = say("RECALLED canceled", "length=0 not this one")
+        for each in (recalled, canceled):
+            wire.send({"request": "cancel", "ids": [each]})
+            while "ok" not in _take(wire, told):
+                pass
+            # The goal's end is told before the answer that depends on it.
+            assert any(one.get("state") in {"RECALLED", "PREEMPTED"} and one.get("id") == each for one in told)
+        while sum(each.get("event") == "result" for each in told) < len(wanted):
+            _take(wire, told)
+        active = say("PREEMPTED preempted", "length=20 words=1")
+        talk.watcher.wait_for_word(active)
+        say("RECALLED preempted")
+        talk.watcher.wait_for_word(say("PREEMPTED preempted", "length=20 words=1", flush=True))
+        say("SUCCEEDED", "length=0 the last", preempt=True)
+        while sum(each.get("event") == "result" for each in told) < len(wanted):
+            _take(wire, told)
+    _check_replies_first(told)
+    results = {each["goal"]["id"]: each["goal"] for each in told if each.get("event") == "result"}
+    ended = {each: " ".join(filter(None, (goal["state"], goal["reason"]))) for each, goal in results.items()}
+    assert ended == wanted
+    assert_told_in_order(talk)
+    assert sorted(talk.watcher.goals()) == sorted(wanted)
+    last = {each["id"]: each["state"] for each in talk.watcher.events() if each["event"] == "state"}
+    assert last == {each: reason.split()[0] for each, reason in wanted.items()}
+
+
+def _take(wire: Wire, told: list[Message]) -> Message:
+    message = wire.receive()
+    told.append(message)
+    return message
+
+
+def _check_replies_first(told: list[Message]) -> None:
+    """Assert of a connection: the reply to `say` comes before all events of its goal, and PENDING is the first."""
+    known: dict[str, str] = {}
+    for each in told:
+        if "ok" in each and "goal" in each:
+            assert each["goal"]["id"] not in known, each
+            known[each["goal"]["id"]] = "reply"
+        elif each.get("event") == "state":
+            first = known[each["id"]] == "reply"
+            assert first == (each["state"] in {"PENDING", "REJECTED"}), each
+            known[each["id"]] = each["state"]
+        elif each.get("event") == "result":
+            assert known[each["goal"]["id"]] == each["goal"]["state"], each

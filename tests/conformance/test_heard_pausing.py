@@ -1,0 +1,261 @@
+"""Speech that is held and goes on: row 43, compared at the sink, and what happens to goals meanwhile."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from tests.conformance.hearing import HELP, HOME, LONG, LOW, PRECISION, await_word, begin, heard, send
+from tests.conformance.stopped import assert_heard_after_stop
+from tests.conformance.told import assert_recalled, assert_told_in_order, submit
+from tests.support.compare import SAME, assert_begun, assert_heard, assert_resumed, assert_silent, compare, extent
+from tests.support.recording import LOUD
+from tests.support.reference import RATE, render
+from tests.support.timing import STATUS_LIMIT, assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from tests.conformance.hearing import Samples
+    from tests.conftest import MakeTalk
+    from tests.support.connection import Message
+    from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
+STOPPED = ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
+#: Seconds for which a sentence is held, and within which it is silent.
+HELD = 2.0
+SILENT = 0.15
+#: Seconds that may be heard again, where the player had to be started again.
+TWICE = 0.05
+#: Samples that the monitor may lose where a stream starts.
+SLACK = 256
+
+
+def pause(talk: Talk) -> Message:
+    """Hold speech, and return the reply, after which it is silent."""
+    reply = talk.request("pause")
+    assert (reply["ok"], reply["paused"]) == (True, True), reply
+    return reply
+
+
+def resume(talk: Talk) -> Message:
+    """Let speech go on, and return the reply."""
+    reply = talk.request("resume")
+    assert (reply["ok"], reply["paused"]) == (True, False), reply
+    return reply
+
+
+def assert_silent_since(talk: Talk, moment: float, seconds: float) -> None:
+    """Assert that nothing is heard from then on, for so long."""
+    assert talk.recording.wait_until(moment + seconds, seconds + 1)
+    assert_silent(talk.recording.between(moment + PRECISION, moment + seconds))
+
+
+@pytest.mark.parametrize("word", [1, 3, 8])
+@pytest.mark.parametrize("player", ["aplay", "pacat"])
+def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
+    make_talk: MakeTalk, sink: Sink, player: str, word: int
+) -> None:
+    (reference,) = render([LONG])
+
+    def attempt() -> None:
+        talk = make_talk("--player", player, sink=sink)
+        goal = send(talk, LONG)
+        await_word(talk, goal, word)
+        asked = time.monotonic()
+        held = pause(talk)["goal"]
+        silent = time.monotonic()
+        assert (held["id"], held["state"], held["paused"]) == (goal, "ACTIVE", True)
+        assert_silent_since(talk, silent, HELD)
+        status = talk.request("status")
+        assert (status["server"]["paused"], status["active"]["id"], status["active"]["paused"]) == (True, goal, True)
+        going = resume(talk)["goal"]
+        assert (going["id"], going["state"], going["paused"]) == (goal, "ACTIVE", False)
+        assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
+        assert_resumed(heard(talk), reference, pause=HELD - SILENT, twice=TWICE)
+        assert talk.watcher.states(goal) == SPOKEN
+        numbers = [each["number"] for each in talk.watcher.words(goal)]
+        assert numbers == list(range(1, len(numbers) + 1))
+        assert talk.goal(goal)["spoken"] == LONG
+        assert_told_in_order(talk)
+        talk.stop()
+        assert_within(silent - asked, SILENT, f"the silence after a pause at word {word}")
+
+    retry_if_late(attempt)
+
+
+def test_row_43_a_sentence_that_is_held_twice_is_heard_whole(talk: Talk) -> None:
+    goal = begin(talk, LONG)
+    pause(talk)
+    assert_silent_since(talk, time.monotonic(), 0.5)
+    resume(talk)
+    await_word(talk, goal, 8)
+    pause(talk)
+    again = pause(talk)  # twice is success
+    assert again["goal"]["id"] == goal
+    assert_silent_since(talk, time.monotonic(), 0.5)
+    resume(talk)
+    assert resume(talk)["goal"]["id"] == goal
+    assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
+    _assert_held_twice(heard(talk), render([LONG])[0])
+    words = talk.watcher.words(goal)
+    assert [each["number"] for each in words] == list(range(1, len(words) + 1))
+    assert [each["word"] for each in words] == LONG.split()
+
+
+def test_row_43_nothing_starts_while_paused_and_the_sender_is_told(talk: Talk) -> None:
+    assert pause(talk)["goal"] is None
+    reply = talk.request("say", text=HOME)
+    assert (reply["paused"], reply["goal"]["state"]) == (True, "PENDING")
+    preempting = talk.request("say", text=LOW, preempt=True)
+    assert preempting["paused"] is True
+    assert_silent_since(talk, time.monotonic(), 0.5)
+    assert talk.request("status")["server"]["paused"] is True
+    resume(talk)
+    assert talk.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
+    assert_heard(heard(talk), render([LOW, HOME]))
+    assert "paused" not in talk.request("say", text=LOW)
+    heard(talk)
+
+
+@pytest.mark.parametrize("selection", [{}, {"current": True}, {"before": "held"}], ids=["all", "current", "before"])
+def test_row_43_a_held_goal_is_cancelled_and_is_never_heard_again(talk: Talk, selection: dict[str, Any]) -> None:
+    goal = begin(talk, LONG, id="held")
+    pause(talk)
+    assert talk.request("cancel", **selection)["count"] == 1
+    assert talk.watcher.states(goal) == STOPPED
+    ended = talk.goal(goal)
+    assert (ended["reason"], ended["paused"]) == ("canceled", False)
+    after = send(talk, LOW)
+    assert_silent_since(talk, time.monotonic(), 0.3)
+    resume(talk)
+    assert talk.watcher.wait_for_terminal(after) == "SUCCEEDED"
+    assert_heard_after_stop(heard(talk), LONG, [LOW])
+
+
+def test_row_43_the_cancel_of_a_held_goal_is_answered_in_time(talk: Talk) -> None:
+    def attempt() -> None:
+        goal = begin(talk, LONG)
+        pause(talk)
+        began = time.monotonic()
+        assert talk.request("cancel", ids=[goal])["count"] == 1
+        seconds = time.monotonic() - began
+        resume(talk)
+        assert_within(seconds, SILENT, "the cancel of a held goal")
+
+    retry_if_late(attempt)
+
+
+def test_row_43_a_pending_goal_is_cancelled_and_its_time_runs_out_while_paused(talk: Talk) -> None:
+    held = begin(talk, LONG)
+    pause(talk)
+    expiring, canceled, kept = send(talk, HELP, ttl=0.3), send(talk, HELP), send(talk, LOW)
+    assert talk.request("cancel", ids=[canceled])["count"] == 1
+    assert_recalled(talk, canceled, "canceled")
+    assert_recalled(talk, expiring, "expired")
+    resume(talk)
+    assert talk.watcher.wait_for_terminal(kept, 10) == "SUCCEEDED"
+    assert talk.watcher.states(held) == SPOKEN
+    assert_told_in_order(talk)
+
+
+def test_row_43_the_timeout_of_a_client_runs_out_while_paused(talk: Talk) -> None:
+    """It owns the goal: that is cancelled, and the client ends at its time, silent already."""
+
+    def attempt() -> None:
+        known = {None, *talk.watcher.goals()}
+        client = talk.start("say", "--wait", "--timeout", "1.5", "--", LONG)
+        began = time.monotonic()
+        goal = str(talk.watcher.wait_until(lambda each: each.get("id") not in known)["id"])
+        await_word(talk, goal)
+        pause(talk)
+        done = talk.finish(client)
+        took = time.monotonic() - began
+        assert (done.code, done.id) == (124, goal)
+        assert took >= 1.4
+        assert talk.watcher.states(goal) == STOPPED
+        resume(talk)
+        assert_within(took, 2.2, "a timeout of 1.5 s")
+
+    retry_if_late(attempt, control=talk.status, control_limit=STATUS_LIMIT)
+
+
+@pytest.mark.parametrize("how", ["preempt", "flush"])
+def test_row_43_a_goal_that_preempts_ends_the_held_one_and_waits(talk: Talk, how: str) -> None:
+    held = begin(talk, LONG)
+    pause(talk)
+    newcomer = send(talk, LOW, **{how: True})
+    assert talk.watcher.wait_for_terminal(held) == "PREEMPTED"
+    assert talk.goal(held)["by"] == {"goal": newcomer}
+    assert_silent_since(talk, time.monotonic(), 0.5)
+    assert talk.goal(newcomer)["state"] == "PENDING"
+    resume(talk)
+    assert talk.watcher.wait_for_terminal(newcomer) == "SUCCEEDED"
+    assert_heard_after_stop(heard(talk), LONG, [LOW])
+    assert_told_in_order(talk)
+
+
+def test_row_43_a_lower_priority_leaves_the_held_one(talk: Talk) -> None:
+    held = begin(talk, LONG, priority=1)
+    pause(talk)
+    newcomer = submit(talk, LOW, preempt=True)["id"]
+    assert_silent_since(talk, time.monotonic(), 0.3)
+    assert talk.goal(held)["paused"] is True
+    resume(talk)
+    assert talk.watcher.wait_for_terminal(newcomer, 10) == "SUCCEEDED"
+    assert talk.watcher.states(held) == SPOKEN
+
+
+def test_row_43_the_watchdog_leaves_a_sentence_alone_that_is_held_for_longer_than_its_limits(talk: Talk) -> None:
+    goal = begin(talk, LONG)
+    pause(talk)
+    assert_silent_since(talk, time.monotonic(), 5)
+    assert talk.goal(goal)["paused"] is True
+    resume(talk)
+    assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
+    assert_resumed(heard(talk), render([LONG])[0], pause=5, twice=TWICE)
+
+
+def test_row_43_all_who_listen_are_told_who_paused(talk: Talk) -> None:
+    with talk.connect() as follower:
+        goal = follower.request("say", text=LONG, feedback=True)["goal"]["id"]
+        await_word(talk, goal)
+        pause(talk)
+        resume(talk)
+        told = [follower.receive_event("paused") for _ in range(2)]
+        assert follower.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+    assert [(each["paused"], each["id"]) for each in told] == [(True, goal), (False, goal)]
+    assert all(each["by"]["client"]["pid"] for each in told)
+    watched = [each for each in talk.watcher.events() if each["event"] == "paused"]
+    assert watched == told
+    assert_told_in_order(talk)
+
+
+def test_a_server_that_is_terminated_while_paused_ends_all(talk: Talk) -> None:
+    held = begin(talk, LONG)
+    pause(talk)
+    waiting = send(talk, LOW)
+    talk.stop(timeout=2)
+    assert talk.watcher.states(held) == STOPPED
+    assert talk.watcher.states(waiting) == ["PENDING", "RECALLED"]
+    assert_begun(heard(talk), render([LONG])[0])
+
+
+def _assert_held_twice(samples: Samples, reference: Samples) -> None:
+    """Assert that three parts were heard, which together are the sentence, nothing of it missing or heard twice."""
+    loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
+    cuts = np.sort(np.argsort(np.diff(loud))[-2:])
+    starts, ends = [loud[0], *loud[cuts + 1]], [*loud[cuts], loud[-1]]
+    begin, end = extent(reference) or (0, 0)
+    wanted = reference[begin:end]
+    reached = 0
+    for part in (samples[start : stop + 1] for start, stop in zip(starts, ends, strict=True)):
+        found = compare(wanted, part)
+        assert found.correlation > SAME, found
+        assert found.offset >= reached - TWICE * RATE - SLACK, f"{(reached - found.offset) / RATE:.3f} s heard twice"
+        assert extent(wanted[reached + SLACK : max(0, found.offset - SLACK)]) is None, f"missing before {found}"
+        reached = found.offset + len(part)
+    assert reached >= len(wanted) - SLACK, f"{(len(wanted) - reached) / RATE:.3f} s missing at the end"

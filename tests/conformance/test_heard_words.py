@@ -1,0 +1,150 @@
+"""Word feedback comes when the word is heard: measured at the sink, against where libespeak-ng says the word is."""
+
+from __future__ import annotations
+
+import re
+import statistics
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.hearing import LONG, await_word, heard, send
+from tests.support.compare import assert_begun, compare, extent, time_heard
+from tests.support.reference import RATE, Rendering, Sentence, render_with_words
+from tests.support.timing import LateError, assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.support.connection import Message
+    from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+#: Seconds between a word's feedback and the moment it is heard: of the word in the middle, and of the worst.
+MEDIAN, WORST = 0.03, 0.1
+#: Thirty words, of which libespeak-ng says some neighbours as one. It begins with a moment of silence, see `hearing`.
+THIRTY = (
+    "coming home to the charger in the kitchen, because the battery of this robot is low; "
+    "please bring the small red box from the table to me and then wait"
+)
+#: Ten words with characters of one to four bytes; "from the" and "this one" are said as one, 東京 is told repeatedly.
+TEN = "coming from the café 東京 is 😀 naïve, this one"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A sentence that was spoken: its word events, and for each by how many seconds it came after its word."""
+
+    words: list[Message]
+    received: list[float]  # by the watcher
+    stamped: list[float]  # by `at`, the server's own clock
+
+    def __str__(self) -> str:
+        return ", ".join(
+            f"{name} median {statistics.median(late) * 1000:.1f} ms, {min(late) * 1000:.1f} to {max(late) * 1000:.1f}"
+            for name, late in (("received", self.received), ("stamped", self.stamped))
+        )
+
+    def assert_in_time(self) -> None:
+        """Assert the limits: a word that is told before it is heard is as wrong as one that is told after."""
+        for late in (self.received, self.stamped):
+            assert_within(statistics.median(map(abs, late)), MEDIAN, f"the median of words ({self})")
+            assert_within(max(map(abs, late)), WORST, f"the worst of words ({self})")
+
+
+def measure(talk: Talk, text: str, rate: int) -> Measured:
+    """Speak a server's first sentence to its end, and measure it; LateError if it was not heard in one piece."""
+    wall = time.time() - time.monotonic()
+    done = talk.run("say", "--wait", "--", text, timeout=60)
+    assert (done.code, done.err) == (0, "")
+    samples = heard(talk)
+    (reference,) = render_with_words([Sentence(text, rate)])
+    compared = compare(samples, reference.samples)
+    if not compared.same:  # a machine that is late makes gaps in the sound, and what follows one is not where it was
+        raise LateError(f"the sentence was not heard as it should: {compared}")
+    words = talk.watcher.words(done.id)
+    moments = [
+        time_heard(talk.recording, compared, reference.samples, position(reference, each["start"])) for each in words
+    ]
+    received = [talk.watcher.arrived(each) - moment for each, moment in zip(words, moments, strict=True)]
+    stamped = [each["at"] - wall - moment for each, moment in zip(words, moments, strict=True)]
+    return Measured(words, received, stamped)
+
+
+def position(reference: Rendering, start: int) -> float:
+    """Return where in the sound a word begins, as libespeak-ng tells it, the first time if it does so repeatedly."""
+    return next(seconds for offset, _, seconds in reference.words if offset == start)
+
+
+@pytest.mark.parametrize(("player", "rate"), [("aplay", 100), ("aplay", 200), ("aplay", 350), ("pacat", 200)])
+def test_done_when_thirty_words_are_told_as_they_are_heard(
+    make_talk: MakeTalk, sink: Sink, player: str, rate: int
+) -> None:
+    assert len(THIRTY.split()) == 30
+
+    def attempt() -> None:
+        talk = make_talk("--rate", str(rate), "--player", player, sink=sink)
+        measured = measure(talk, THIRTY, rate)
+        talk.stop()
+        told = [THIRTY[each["start"] : each["end"]] for each in measured.words]
+        merged = re.sub(r"\b(in|from|of) the\b", r"\1", re.sub("[,;]", "", THIRTY))
+        assert told == merged.split()
+        print(f"{player}, rate {rate}: {measured}")
+        measured.assert_in_time()
+
+    retry_if_late(attempt)
+
+
+def test_row_42_ten_words_of_any_script_are_told_once_each_in_their_place(make_talk: MakeTalk, sink: Sink) -> None:
+    assert len(TEN.split()) == 10
+
+    def attempt() -> None:
+        talk = make_talk(sink=sink)
+        measured = measure(talk, TEN, 200)
+        talk.stop()
+        words = measured.words
+        assert [each["word"] for each in words] == ["coming", "from", "café", "東京", "is", "😀", "naïve", "this"]
+        assert [each["start"] for each in words] == [TEN.index(each["word"]) for each in words]
+        assert [each["end"] - each["start"] for each in words] == [len(each["word"]) for each in words]
+        assert [each["number"] for each in words] == list(range(1, 9))
+        times = [each["time"] for each in words]
+        assert times == sorted(times)
+        assert times[0] == 0
+        print(measured)
+        measured.assert_in_time()
+
+    retry_if_late(attempt)
+
+
+@pytest.mark.parametrize("number", [2, 5, 8])
+def test_row_42_a_stopped_goal_has_spoken_what_was_heard_of_it(make_talk: MakeTalk, sink: Sink, number: int) -> None:
+    (reference,) = render_with_words([LONG])
+    begins = extent(reference.samples)
+    assert begins is not None
+
+    def attempt() -> None:
+        talk = make_talk(sink=sink)
+        goal_id = send(talk, LONG)
+        await_word(talk, goal_id, number)
+        assert talk.request("cancel", ids=[goal_id])["ok"]
+        goal = talk.goal(goal_id)
+        assert (goal["state"], goal["message"]) == ("PREEMPTED", "Talk preempted")
+        last = talk.watcher.words(goal_id)[-1]
+        assert last["number"] >= number
+        assert goal["spoken"] == LONG[: last["end"]]
+        heard(talk)
+        # To where it was heard: the last word that was told had begun by then, the next one had not.
+        try:
+            until = begins[0] / RATE + assert_begun(talk.recording, reference.samples)
+        except AssertionError as error:
+            raise LateError(str(error)) from error  # gaps, as above
+        later = [seconds for start, _, seconds in reference.words if start > last["start"]]
+        following = min(later, default=len(reference.samples) / RATE)
+        talk.stop()
+        assert_within(
+            position(reference, last["start"]) - until, WORST, f"the word {last['word']!r}, before its sound,"
+        )
+        assert_within(until - following, WORST, f"the word after {last['word']!r}, heard and not told,")
+
+    retry_if_late(attempt)

@@ -1,0 +1,107 @@
+"""What must hold of all that a watcher was told since before the first goal, whatever the goals were.
+
+It reads events alone and knows nothing of what was asked for: it is the same for every mix of requests.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tests.support.watcher import TERMINAL
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from tests.support.connection import Message
+    from tests.support.processes import Talk
+
+#: All the ways that a goal may take.
+WAYS = (
+    ["REJECTED"],
+    ["PENDING", "RECALLED"],
+    ["PENDING", "ACTIVE", "SUCCEEDED"],
+    ["PENDING", "ACTIVE", "ABORTED"],
+    ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"],
+    ["PENDING", "ACTIVE", "PREEMPTING", "SUCCEEDED"],
+)
+
+
+def submit(talk: Talk, text: str, **fields: Any) -> Message:
+    """Send a goal and return it as the reply has it, REJECTED too."""
+    reply = talk.request("say", text=text, **fields)
+    assert reply["ok"], reply
+    goal: Message = reply["goal"]
+    return goal
+
+
+def assert_rejected(goal: Message, reason: str, *words: str) -> None:
+    """Assert that a goal was REJECTED for that reason, with these words in its message."""
+    assert (goal["state"], goal["reason"]) == ("REJECTED", reason), goal
+    assert goal["message"].startswith("Talk rejected: "), goal
+    for each in words:
+        assert each in goal["message"], goal
+
+
+def assert_recalled(talk: Talk, goal_id: str, reason: str, by: str | None = None) -> None:
+    """Assert that a goal was taken out of the queue for that reason, by that goal."""
+    assert talk.watcher.wait_for_terminal(goal_id, 10) == "RECALLED"
+    assert talk.watcher.states(goal_id) == ["PENDING", "RECALLED"]
+    goal = talk.goal(goal_id)
+    assert goal["reason"] == reason, goal
+    assert goal["started_at"] is None
+    assert by is None or goal["by"] == {"goal": by}, goal
+
+
+def assert_told_in_order(talk: Talk) -> None:
+    """Assert the order of section 9 of all goals that there were; all of them must have ended."""
+    for goal_id in talk.watcher.goals():
+        if talk.watcher.states(goal_id) != ["REJECTED"]:
+            talk.watcher.wait_for_terminal(goal_id)
+    events = talk.watcher.events()
+    numbers = [each["n"] for each in events]
+    assert numbers == list(range(1, len(events) + 1)), "events are missing"
+    for goal_id in talk.watcher.goals():
+        _check_goal([each for each in events if each.get("id") == goal_id and each["event"] != "paused"])
+    _check_one_at_a_time(events)
+    _check_newcomers(events)
+
+
+def _check_goal(events: list[Message]) -> None:
+    """One goal: its states are one of the ways, its words are between ACTIVE and its end."""
+    told = [each.get("state", "word") for each in events]
+    states = [each for each in told if each != "word"]
+    assert states in WAYS, events
+    assert told[0] != "word" != told[-1], told
+    assert "word" not in told or told.index("word") > told.index("ACTIVE"), told
+    for each in (each for each in events if each["event"] == "state"):
+        with_goal = each["state"] == "PENDING" or each["state"] in TERMINAL
+        assert ("goal" in each) == with_goal, each
+        assert not with_goal or (each["goal"]["id"], each["goal"]["state"]) == (each["id"], each["state"]), each
+    words = [each["number"] for each in events if each["event"] == "word"]
+    assert words == sorted(set(words)), words
+
+
+def _check_one_at_a_time(events: Iterable[Message]) -> None:
+    """No goal becomes ACTIVE before the one before it has ended."""
+    active = None
+    for each in events:
+        if each.get("state") == "ACTIVE":
+            assert active is None, f"{each['id']} became ACTIVE while {active} was"
+            active = each["id"]
+        elif each.get("state") in TERMINAL and each["id"] == active:
+            active = None
+
+
+def _check_newcomers(events: Iterable[Message]) -> None:
+    """A goal that another one replaced, preempted or displaced: told between that one's PENDING and its ACTIVE."""
+    seen: dict[str, str] = {}
+    for each in events:
+        if each["event"] != "state":
+            continue
+        seen[each["id"]] = each["state"]
+        newcomer = (each.get("goal", {}).get("by") or {}).get("goal")
+        if newcomer is not None and each["state"] in {"RECALLED", "PREEMPTED"}:
+            told = f"{each['id']} ended by {newcomer}, which was {seen.get(newcomer)}"
+            # One that was stopped may end long after the newcomer was recalled in its turn.
+            allowed = {"PENDING"} if each["state"] == "RECALLED" else {"PENDING", "RECALLED"}
+            assert seen.get(newcomer) in allowed, told
