@@ -35,6 +35,8 @@ class Spawned:
         limits: Mapping[str, float] | None = None,
         before: str = "",
         environment: Mapping[str, str] | None = None,
+        lead_in: int = 0,
+        list_voices: bool = True,
     ) -> None:
         """`limits` replaces constants of the playback, `before` is code that runs in the process first."""
         self.events: list[protocol.Event] = []
@@ -56,7 +58,7 @@ class Spawned:
                 start_new_session=True,
             )
         os.close(inherited)
-        self.send(protocol.Configure(server or os.getpid(), driver, player, device, voice))
+        self.send(protocol.Configure(server or os.getpid(), driver, player, device, voice, lead_in, list_voices))
 
     def __enter__(self) -> Spawned:
         return self
@@ -72,7 +74,11 @@ class Spawned:
             self.process.stderr.close()
 
     def send(self, command: protocol.Command) -> None:
-        self._socket.sendall(protocol.encode(command))
+        self.send_raw(protocol.encode(command))
+
+    def send_raw(self, lines: bytes) -> None:
+        """Send commands in one piece, so that they are read at once."""
+        self._socket.sendall(lines)
 
     def hang_up(self) -> None:
         """Do what the kernel does when the server dies."""
@@ -80,6 +86,16 @@ class Spawned:
 
     def say(self, text: str, goal: str = "g1", *, rate: int = 200, voice: str | None = None, pitch: int = 50) -> None:
         self.send(protocol.Say(goal, text, rate, 1.0, voice, pitch))
+
+    def pause(self, goal: str = "g1") -> float:
+        """Hold the sentence and return the seconds until the process said that it is silent."""
+        asked = time.monotonic()
+        self.send(protocol.Pause(goal))
+        assert self.until(protocol.Paused).id == goal
+        return time.monotonic() - asked
+
+    def resume(self, goal: str = "g1") -> None:
+        self.send(protocol.Resume(goal))
 
     def event(self) -> protocol.Event | None:
         """Return the next event, None at the end of the connection."""

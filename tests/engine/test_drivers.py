@@ -46,6 +46,46 @@ module.buildDriver = Driver
 sys.modules[module.__name__] = module
 """
 
+#: A driver that reports each word as it says it, 0.1 s a word, and writes what it is told to say to standard error.
+TIMED_DRIVER = """
+import re, time, types
+class Driver:
+    def __init__(self, proxy):
+        self.proxy, self.plan, self.stopped = proxy, [], False
+    def destroy(self): pass
+    def iterate(self):
+        self.proxy.setBusy(False)
+        while True:
+            while self.plan and time.monotonic() >= self.plan[0][0]:
+                _, topic, values = self.plan.pop(0)
+                if topic == "finished-utterance":
+                    self.proxy.notify(topic, completed=not self.stopped)
+                    self.proxy.setBusy(False)
+                    break
+                self.proxy.notify(topic, **values)
+            yield
+    def say(self, text):
+        self.proxy.setBusy(True)
+        self.stopped = False
+        print(text, file=sys.stderr, flush=True)
+        at = time.monotonic()
+        for match in re.finditer(r"[^ ]+", text):
+            at += 0.1
+            values = {"name": None, "location": match.start(), "length": len(match.group())}
+            self.plan.append((at, "started-word", values))
+        self.plan.append((at + 0.1, "finished-utterance", {}))
+    def stop(self):
+        if self.plan:
+            self.stopped, self.plan = True, [(time.monotonic() + 0.2, "finished-utterance", {})]
+    def getProperty(self, name):
+        return {"voices": [], "voice": "only"}[name]
+    def setProperty(self, name, value):
+        raise KeyError(f"unknown property {name}")
+module = types.ModuleType("pyttsx3.drivers.timed")
+module.buildDriver = Driver
+sys.modules[module.__name__] = module
+"""
+
 #: A system whose library is not there.
 NO_LIBRARY = """
 import ctypes
@@ -70,11 +110,10 @@ def test_the_dummy_driver_speaks_and_reports_words() -> None:
     with Spawned(driver="dummy") as engine:
         ready = engine.until(protocol.Ready)
         assert (ready.driver, ready.player) == ("dummy", None)
+        assert engine.until(protocol.Voices).voices[0].id == "dummy.voice1"
         for goal in ("g1", "g2"):
             assert engine.spoken("battery low", goal).outcome == protocol.COMPLETED
             assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
-            if goal == "g1":  # between the first two, as there was no quiet moment before
-                assert engine.until(protocol.Voices).voices[0].id == "dummy.voice1"
 
 
 def test_a_driver_without_pitch_fails_only_who_asks_for_it() -> None:
@@ -114,6 +153,79 @@ def test_a_stop_of_a_slow_driver_ends_when_it_says_so() -> None:
         assert engine.until(protocol.Ended).outcome == protocol.STOPPED
         assert time.monotonic() - asked < 0.15
         assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+
+
+def _timed(text: str = "battery low, please come home") -> Spawned:
+    engine = Spawned(driver="timed", before=TIMED_DRIVER)
+    engine.until(protocol.Voices)
+    engine.say(text)
+    return engine
+
+
+def _texts(engine: Spawned) -> list[str]:
+    """Return what the driver was told to say; ends the process."""
+    engine.send(protocol.Quit())
+    return engine.errors().splitlines()
+
+
+def test_a_driver_without_a_pause_goes_on_from_the_last_word() -> None:
+    with _timed() as engine:
+        while engine.until(protocol.Word).number < 3:
+            pass
+        assert engine.pause() >= 0.2, "it is silent only when the driver says so"
+        assert isinstance(engine.event(), protocol.Alive)
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert [word.start for word in engine.words()] == [0, 8, 13, 20, 25]
+        assert [word.number for word in engine.words()] == [1, 2, 3, 4, 5]
+        assert engine.words()[-1].time < 0.5 + 0.2 + 0.1 + 0.15, "the pause counts"
+        assert _texts(engine) == ["battery low, please come home", "please come home"]
+
+
+def test_a_driver_is_paused_twice_in_a_sentence() -> None:
+    with _timed() as engine:
+        for number in (2, 4):
+            while engine.until(protocol.Word).number < number:
+                pass
+            engine.pause()
+            engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert [word.start for word in engine.words()] == [0, 8, 13, 20, 25]
+        assert _texts(engine) == ["battery low, please come home", "low, please come home", "come home"]
+
+
+def test_a_driver_that_has_not_said_a_word_says_all_of_it_after_a_pause() -> None:
+    with _timed() as engine:
+        engine.until(protocol.Started)
+        engine.pause()
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert len(engine.words()) == 5
+        assert set(_texts(engine)) == {"battery low, please come home"}
+
+
+def test_a_driver_that_is_resumed_before_it_is_silent_goes_on_when_it_is() -> None:
+    with _timed() as engine:
+        engine.until(protocol.Word)
+        engine.send(protocol.Pause("g1"))
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert len(engine.words()) == 5
+        assert not any(isinstance(event, protocol.Paused) for event in engine.events)
+
+
+@pytest.mark.parametrize("silent", [True, False])
+def test_a_stop_ends_a_driver_that_is_paused(silent: bool) -> None:
+    with _timed() as engine:
+        engine.until(protocol.Word)
+        if silent:
+            engine.pause()
+        else:
+            engine.send(protocol.Pause("g1"))
+        engine.send(protocol.Stop("g1"))
+        assert engine.until(protocol.Ended) == protocol.Ended("g1", protocol.STOPPED)
+        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+        assert _texts(engine) == ["battery low, please come home", "yes"]
 
 
 def test_a_driver_that_raises_fails_the_goal_and_not_the_next() -> None:

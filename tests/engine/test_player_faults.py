@@ -284,9 +284,8 @@ def test_no_player_at_all_says_what_to_install(tmp_path: Path) -> None:
 
 def test_no_descriptor_is_left_over(player: Player) -> None:
     with Spawned(player.command("raise SystemExit(1)")) as engine:
-        engine.until(protocol.Ready)
-        engine.spoken(TEXT, "g0")
         engine.until(protocol.Voices)  # they are read from files, once
+        engine.spoken(TEXT, "g0")
         before = os.listdir(f"/proc/{engine.process.pid}/fd")
         for number in range(1, 6):
             engine.spoken(TEXT, f"g{number}")

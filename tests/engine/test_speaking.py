@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import signal
@@ -13,21 +14,35 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import Spawned, children
+from tests.engine.spawned import Spawned
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 
-def test_a_process_gets_ready_and_lists_its_voices_when_it_is_idle() -> None:
+def test_a_process_gets_ready_and_lists_its_voices() -> None:
     with Spawned() as engine:
         ready = engine.until(protocol.Ready)
         assert ready.driver == "espeak"
         assert ready.version is not None
         assert ready.version.startswith("eSpeak NG ")
         assert ready.player == "null"
-        voices = engine.until(protocol.Voices).voices
-        assert any(voice.language == "en-us" and voice.id == "gmw/en-US" for voice in voices)
+        engine.say("yes")
+        told = engine.event()
+        assert isinstance(told, protocol.Voices)
+        assert any(voice.language == "en-us" and voice.id == "gmw/en-US" for voice in told.voices)
+        assert isinstance(engine.event(), protocol.Started)
+
+
+def test_voices_that_are_known_are_not_listed() -> None:
+    with Spawned(list_voices=False) as engine:
+        engine.until(protocol.Ready)
+        assert engine.spoken("yes").outcome == protocol.COMPLETED
+        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+        engine.send(protocol.Quit())
+        assert engine.event() is None
+        assert not any(isinstance(event, protocol.Voices) for event in engine.events)
 
 
 def test_a_sentence_lasts_as_long_as_its_audio() -> None:
@@ -162,26 +177,28 @@ def test_an_orphan_ends_before_it_starts() -> None:
 
 
 def test_the_process_ends_with_its_server(tmp_path: Path) -> None:
-    with Spawned(f"{_sleeper(tmp_path)}") as engine:
-        engine.until(protocol.Ready)
-        engine.say("one two three")
-        engine.until(protocol.Started)
-        while not children(engine.process.pid):
-            time.sleep(0.002)
+    with _speaking(tmp_path) as engine:
         engine.hang_up()
         assert engine.all_gone()
         assert engine.process.wait(5) == 0
 
 
 def test_the_player_dies_with_a_killed_process(tmp_path: Path) -> None:
-    with Spawned(f"{_sleeper(tmp_path)}") as engine:
-        engine.until(protocol.Ready)
-        engine.say("one two three")
-        engine.until(protocol.Started)
-        while not children(engine.process.pid):
-            time.sleep(0.002)
+    with _speaking(tmp_path) as engine:
         os.kill(engine.process.pid, signal.SIGKILL)
         assert engine.all_gone()
+
+
+def test_a_stop_and_a_quit_that_come_with_the_sentence_are_obeyed() -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Voices)
+        say = protocol.encode(protocol.Say("g1", "one two three four five", 200, 1.0, None, 50))
+        engine.send_raw(say + protocol.encode(protocol.Stop("g1")))
+        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        engine.send_raw(say + protocol.encode(protocol.Quit()))
+        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        assert engine.event() is None
+        assert engine.words() == []
 
 
 def test_quit_stops_the_sentence_and_ends_the_process() -> None:
@@ -200,17 +217,24 @@ def test_an_idle_process_does_not_wake_up() -> None:
     with Spawned() as engine:
         engine.until(protocol.Ready)
         engine.until(protocol.Voices)
-        time.sleep(0.05)
+        time.sleep(0.05)  # it goes to rest, and says nowhere when it has
         before = _switches(engine.process.pid)
-        time.sleep(1)
+        time.sleep(1)  # the time that is looked at
         assert _switches(engine.process.pid) == before
 
 
-def _sleeper(folder: Path) -> str:
-    script = folder / "sleeper"
-    script.write_text("#!/bin/sh\nexec sleep 100\n")
+@contextlib.contextmanager
+def _speaking(folder: Path) -> Iterator[Spawned]:
+    """Give a process with a goal in hand and a player that runs, takes nothing and never ends."""
+    begun, script = folder / "begun", folder / "sleeper"
+    os.mkfifo(begun)
+    script.write_text(f"#!/bin/sh\necho > {begun}\nexec sleep 100\n")
     script.chmod(0o755)
-    return str(script)
+    with Spawned(str(script)) as engine:
+        engine.until(protocol.Ready)
+        engine.say("one two three")
+        begun.read_text()
+        yield engine
 
 
 def _switches(pid: int) -> str:

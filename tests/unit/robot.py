@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from talkcli.effects import Cancelled, Changed, Effect, Now, Submitted
 from talkcli.messages import By, Sender
 from talkcli.requests import Cancel, Say
-from talkcli.scheduler import Cancelled, Changed, Effect, Now, Scheduler
+from talkcli.scheduler import Scheduler
 
 if TYPE_CHECKING:
     from talkcli.record import Record
@@ -23,11 +24,12 @@ class Robot:
 
     preempt: bool = False
     max_queue: int = 100
+    ttl: float = 0.0
     seconds: float = 100.0
     seen: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.scheduler = Scheduler("k3fz", preempt=self.preempt, max_queue=self.max_queue)
+        self.scheduler = Scheduler("k3fz", preempt=self.preempt, max_queue=self.max_queue, ttl=self.ttl)
 
     @property
     def now(self) -> Now:
@@ -39,15 +41,27 @@ class Robot:
             self.seen.append(f"{effect.record.number} {what}")
         return effects
 
-    def says(self, text: str = "door open", *, preempt: bool | None = None) -> Record:
-        record, effects = self.scheduler.submit(Say(text, preempt=preempt), ARM, self.now)
-        self.see(effects)
-        return record
-
-    def cancels(self, *ids: str, current: bool = False, before: str | None = None) -> Cancelled:
-        done = self.scheduler.cancel(Cancel(ids or None, current, before), DOOR, self.now)
+    def submits(self, say: Say, fault: tuple[str, str] | None = None) -> Submitted:
+        done = self.scheduler.submit(say, ARM, self.now, fault)
         self.see(done.effects)
         return done
+
+    def asks(self, say: Say) -> Record:
+        return self.submits(say).record
+
+    def says(self, text: str = "door open", *, preempt: bool | None = None, priority: int = 0) -> Record:
+        return self.asks(Say(text, preempt=preempt, priority=priority))
+
+    def cancels(self, *ids: str, current: bool = False, before: str | None = None, key: str | None = None) -> Cancelled:
+        done = self.scheduler.cancel(Cancel(ids or None, current, before, key), DOOR, self.now)
+        self.see(done.effects)
+        return done
+
+    def pauses(self) -> None:
+        self.see(self.scheduler.pause())
+
+    def resumes(self) -> None:
+        self.see(self.scheduler.resume(self.now))
 
     def shuts_down(self) -> None:
         self.see(self.scheduler.shutdown(self.now))
@@ -63,6 +77,15 @@ class Robot:
                 self.see(self.scheduler.failed(goal_id, "audio_lost", "device is gone", 1.5, self.now))
             case "stopped":
                 self.see(self.scheduler.stopped(goal_id, self.now))
+
+    def speaks_the_rest(self) -> list[str]:
+        """Let the engine speak to the end all that is active or waits; return the texts from the next one on."""
+        spoken = []
+        while self.scheduler.active:
+            self.tells("completed", self.scheduler.active.id)
+            if self.scheduler.active:
+                spoken.append(str(self.scheduler.active.text))
+        return spoken
 
     def waits(self, seconds: float) -> None:
         self.seconds += seconds

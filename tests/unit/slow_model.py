@@ -1,82 +1,48 @@
 """A slow model of the scheduler: the README's rules for goals, order and cancel, told again with plain lists.
 
 Rules for this file: it imports nothing of `talkcli` and is written from the rules, never from the scheduler's code: two
-tellings that agree are worth something, two copies are not. Speed is no aim. A new option is a field of `SlowGoal`, a
-line in `SlowModel.refusals` or `SlowModel.submit`, and a place in `SlowModel.insert`.
+tellings that agree are worth something, two copies are not. Speed is no aim. A new option is a field of `Wish` and of
+`SlowGoal`, a line in `SlowModel.refusals` or `SlowModel.given_up_for`, and a place in `SlowModel.insert`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import re
 
-#: The table of states, as a watcher sees it: what may follow what. RECALLING is transient and never published.
-TABLE: dict[str, set[str]] = {
-    "PENDING": {"ACTIVE", "RECALLED"},
-    "ACTIVE": {"PREEMPTING", "SUCCEEDED", "ABORTED"},
-    "PREEMPTING": {"PREEMPTED", "SUCCEEDED", "ABORTED"},
-}
-#: What a goal that just arrived may be.
-FIRST = {"PENDING", "REJECTED"}
-ENDS = {"PREEMPTED", "SUCCEEDED", "ABORTED", "REJECTED", "RECALLED"}
+from tests.unit.slow_goal import ENDS, Outcome, Selection, SlowGoal, Wish
 
 #: Seconds after the first stop by which silence is confirmed or given up.
 SILENCE = 2.0
+#: Seconds for which a cancel of an id that nobody knows yet is remembered.
+EARLY_CANCEL = 60.0
 
 
 class Refused(Exception):
     """The model's own word for an event that doesn't fit the state of its goal."""
 
 
-@dataclass
-class SlowGoal:
-    """One goal. `by` is "goal ID", "client NAME", or None where the server or nobody ended it."""
-
-    id: str
-    text: str
-    preempt: bool
-    state: str = "PENDING"
-    reason: str | None = None
-    by: str | None = None
-    spoken: int = 0
-    duration: float | None = None
-    #: when it was told to stop first, and what for
-    stopped_at: float | None = None
-    times: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass
-class Selection:
-    """What a cancel names; nothing named is everything, but a list of no ids names none."""
-
-    ids: list[str] | None = None
-    current: bool = False
-    before: str | None = None
-
-
-@dataclass
-class Outcome:
-    """What a cancel answers, by id. Whether `before` is noted where that goal has ended is left open."""
-
-    recalled: list[str] = field(default_factory=list)
-    stopping: str | None = None
-    ended: list[str] = field(default_factory=list)
-    unknown: list[str] = field(default_factory=list)
+def own_form(goal_id: str) -> bool:
+    """Whether a client may have made this id: neither all digits nor of the server's form."""
+    return not goal_id.isdecimal() and not re.fullmatch(r"[a-z0-9]{4}-[0-9]+", goal_id)
 
 
 class SlowModel:
     """All goals of one server, in lists. Each step appends what it did to `events` and `orders`."""
 
-    def __init__(self, *, preempt: bool, max_queue: int) -> None:
+    def __init__(self, *, preempt: bool, max_queue: int, ttl: float = 0.0) -> None:
         self.preempt = preempt
         self.max_queue = max_queue
+        self.ttl = ttl
         self.all: list[SlowGoal] = []  # in order of arrival
         self.queue: list[SlowGoal] = []  # in the order in which they will be spoken
         self.voice: list[SlowGoal] = []  # being spoken: none or one
+        self.early: dict[str, tuple[float, str]] = {}  # cancels of ids to come: when, by whom
+        self.paused = False
         self.closed = False
         self.monotonic = 0.0
         self.wall = 0.0
         self.events: list[tuple[str, str]] = []  # (id, state), in order within one goal
-        self.orders: list[tuple[str, str]] = []  # what the engine is told: (start, stop or give up; id)
+        self.orders: list[tuple[str, str]] = []  # what the engine is told: (start, stop, hold, …; id)
 
     def begin(self, monotonic: float, wall: float) -> None:
         """Begin a step at this time."""
@@ -85,41 +51,124 @@ class SlowModel:
 
     # Requests
 
-    def refusals(self, fault: str | None, *, preempt: bool | None) -> set[str]:
-        """Return every reason for which a goal would be REJECTED now; `fault` is its text's or its options'."""
-        reasons = set() if fault is None else {fault}
+    def first_of(self, wish: Wish) -> SlowGoal | None:
+        """Return the goal that used this id up. A REJECTED one doesn't; it never even has the id."""
+        return next((each for each in self.all if each.id == wish.id), None)
+
+    def refusals(self, wish: Wish, fault: str | None = None) -> dict[str, set[str | None]]:
+        """Return every reason for which a goal would be REJECTED now, with what `by` may be then.
+
+        `fault` is its text's or its options'. Where there are several, it is left open which one is told.
+        """
+        reasons: dict[str, set[str | None]] = {} if fault is None else {fault: {None}}
         if self.closed:
-            reasons.add("shutdown")
-        stays = [each for each in self.queue if not (self.wants_preempt(preempt) and each.preempt)]
-        if self.voice and len(stays) >= self.max_queue:
-            reasons.add("queue_full")
+            reasons["shutdown"] = {None}
+        first = self.first_of(wish)
+        if first is not None and first.text != wish.text:
+            reasons["id_conflict"] = {None}
+        throttling = self.throttling(wish)
+        if throttling:
+            reasons["throttled"] = {f"goal {each.id}" for each in throttling}
+        if self.cancelled_early(wish) is None and self.full_for(wish) and self.displaced_by(wish) is None:
+            reasons["queue_full"] = {None}
         return reasons
 
-    def submit(self, goal_id: str, text: str, *, preempt: bool | None, refused: str | None) -> None:
-        """Take a goal, or refuse it for the reason `refused`, which is one of `refusals`."""
-        goal = SlowGoal(goal_id, text, self.wants_preempt(preempt), times={"queued": self.wall})
+    def throttling(self, wish: Wish) -> list[SlowGoal]:
+        """Return the goals for which this one would be said too often."""
+        if wish.throttle is None:
+            return []
+        alike = [each for each in self.all if each.state != "REJECTED"]
+        if wish.key is not None:
+            alike = [each for each in alike if each.key == wish.key]
+        else:
+            alike = [each for each in alike if each.text == wish.text]
+        spoken = [each for each in alike if each in self.voice]
+        waiting = [each for each in self.queue if each in alike][:1] if wish.key is None else []
+        recent = [
+            each
+            for each in alike
+            if each.state in {"SUCCEEDED", "PREEMPTED"}
+            and each.spoken > 0
+            and each.began_at is not None
+            and self.monotonic - each.began_at < wish.throttle
+        ]
+        return spoken + waiting + recent
+
+    def given_up_for(self, wish: Wish) -> dict[str, str]:
+        """Return the pending goals that this one recalls for its own options, id to reason."""
+        doomed = {}
+        for each in self.queue:
+            if wish.key is not None and each.key == wish.key:
+                doomed[each.id] = "replaced"
+            elif self.preempts(wish) and each.priority <= wish.priority and (wish.flush or each.preempt):
+                doomed[each.id] = "preempted"
+        return doomed
+
+    def staying(self, wish: Wish) -> list[SlowGoal]:
+        return [each for each in self.queue if each.id not in self.given_up_for(wish)]
+
+    def full_for(self, wish: Wish) -> bool:
+        return len(self.staying(wish)) >= self.max_queue
+
+    def displaced_by(self, wish: Wish) -> SlowGoal | None:
+        """Return the newest pending goal of the lowest priority, where that is lower than this one's."""
+        lowest = min(each.priority for each in self.staying(wish))
+        if lowest >= wish.priority:
+            return None
+        return [each for each in self.all if each in self.staying(wish) and each.priority == lowest][-1]
+
+    def cancelled_early(self, wish: Wish) -> str | None:
+        """Return who cancelled this id before it was there, a short while ago."""
+        when, client = self.early.get(wish.id or "", (0.0, None))
+        return client if self.monotonic - when < EARLY_CANCEL else None
+
+    def submit(self, goal_id: str, wish: Wish, refused: tuple[str, str | None] | None = None) -> None:
+        """Take a goal, or refuse it for a reason and its `by`, which are among the `refusals`."""
+        goal = SlowGoal(goal_id, wish.text, self.preempts(wish), wish.priority, wish.key)
+        goal.ttl = (self.ttl if wish.ttl is None else wish.ttl) or None
+        goal.accepted_at, goal.times["queued"] = self.monotonic, self.wall
         self.all.append(goal)
         if refused is not None:
-            self.end(goal, "REJECTED", refused, None)
+            self.end(goal, "REJECTED", *refused)
             return
         self.change(goal, "PENDING")
-        if goal.preempt:
-            for older in [each for each in self.queue if each.preempt]:
-                self.recall(older, "preempted", f"goal {goal.id}")
-            for active in self.voice:
-                self.stop(active, "preempted", f"goal {goal.id}")
-        self.insert(goal)
+        client = self.cancelled_early(wish)
+        if client is not None:
+            self.recall(goal, "canceled", client)
+            return
+        self.make_way(goal, wish)
         self.speak_next()
 
-    def wants_preempt(self, preempt: bool | None) -> bool:
-        return self.preempt if preempt is None else preempt
+    def make_way(self, goal: SlowGoal, wish: Wish) -> None:
+        by = f"goal {goal.id}"
+        doomed = self.given_up_for(wish)
+        victim = self.displaced_by(wish) if self.full_for(wish) else None
+        old_queue = self.queue
+        for each in old_queue:
+            if each.id in doomed:
+                self.recall(each, doomed[each.id], by)
+            elif each is victim:
+                self.recall(each, "displaced", by)
+        for active in self.voice:
+            if goal.preempt and active.priority <= goal.priority:
+                self.stop(active, "preempted", by)
+        same_place = [
+            each for each in old_queue if doomed.get(each.id) == "replaced" and each.priority == goal.priority
+        ]
+        if same_place and not goal.preempt:
+            self.queue = [goal if each is same_place[0] else each for each in old_queue]
+        else:
+            self.insert(goal)
+
+    def preempts(self, wish: Wish) -> bool:
+        return wish.flush or (self.preempt if wish.preempt is None else wish.preempt)
 
     def insert(self, goal: SlowGoal) -> None:
-        """Put a goal in its place: at the end, or first where it preempts."""
-        if goal.preempt:
-            self.queue = [goal, *self.queue]
-        else:
-            self.queue = [*self.queue, goal]
+        """Put a goal among the pending: before or behind those of its priority, for higher ones go before lower."""
+        higher = [each for each in self.queue if each.priority > goal.priority]
+        equal = [each for each in self.queue if each.priority == goal.priority]
+        lower = [each for each in self.queue if each.priority < goal.priority]
+        self.queue = higher + ([goal, *equal] if goal.preempt else [*equal, goal]) + lower
 
     def cancel(self, selection: Selection, client: str) -> Outcome:
         outcome = Outcome()
@@ -131,12 +180,13 @@ class SlowModel:
         for goal in [each for each in self.voice if each in chosen]:
             self.stop(goal, "canceled", by)
             outcome.stopping = goal.id
+        self.early.update({each: (self.monotonic, by) for each in outcome.unknown if own_form(each)})
         return outcome
 
     def selected(self, selection: Selection, outcome: Outcome) -> list[SlowGoal]:
         """Return the goals that have not ended among those selected; note in `outcome` what else was named."""
         living = self.voice + self.queue
-        if selection.ids is None and not selection.current and selection.before is None:
+        if selection == Selection():
             return living
         ids = selection.ids or []
         named = list(ids) if selection.before is None else [*ids, selection.before]
@@ -148,7 +198,23 @@ class SlowModel:
             chosen += self.voice
         if selection.before in known:
             chosen += self.all[: self.all.index(known[selection.before]) + 1]
+        if selection.key is not None:
+            chosen += [each for each in living if each.key == selection.key]
         return [each for each in living if each in chosen]
+
+    def pause(self) -> None:
+        if not self.paused:
+            self.paused = True
+            for goal in [each for each in self.voice if each.state == "ACTIVE"]:
+                goal.paused = True
+                self.orders.append(("hold", goal.id))
+
+    def resume(self) -> None:
+        self.paused = False
+        for goal in [each for each in self.voice if each.paused]:
+            goal.paused = False
+            self.orders.append(("resume", goal.id))
+        self.speak_next()
 
     def shutdown(self) -> None:
         self.closed = True
@@ -186,29 +252,40 @@ class SlowModel:
         self.end(goal, "PREEMPTED", goal.reason, goal.by)
         self.speak_next()
 
-    def tick(self) -> None:
-        for goal in list(self.voice):
-            if goal.stopped_at is not None and self.monotonic - goal.stopped_at >= SILENCE:
-                self.end(goal, "ABORTED", "not_silent", goal.by)
-                self.orders.append(("give up", goal.id))
-                self.speak_next()
-
     def spoken(self, goal_id: str) -> SlowGoal:
         for goal in self.voice:
             if goal.id == goal_id:
                 return goal
         raise Refused(f"{goal_id} is not being spoken")
 
+    # Time
+
+    def tick(self) -> None:
+        self.recall_what_is_too_late()
+        for goal in list(self.voice):
+            if goal.stopped_at is not None and self.monotonic - goal.stopped_at >= SILENCE:
+                self.end(goal, "ABORTED", "not_silent", goal.by)
+                self.orders.append(("give up", goal.id))
+                self.speak_next()
+
+    def recall_what_is_too_late(self) -> None:
+        for goal in self.queue:
+            if goal.ttl is not None and self.monotonic - goal.accepted_at >= goal.ttl:
+                self.recall(goal, "expired", None)
+
     # The steps that all of these share
 
     def speak_next(self) -> None:
-        if self.voice or not self.queue:
+        """Begin with the first that is not too late."""
+        if self.voice or self.paused:
             return
-        goal, *self.queue = self.queue
-        self.voice = [goal]
-        goal.times["started"] = self.wall
-        self.change(goal, "ACTIVE")
-        self.orders.append(("start", goal.id))
+        self.recall_what_is_too_late()
+        if self.queue:
+            goal, *self.queue = self.queue
+            self.voice = [goal]
+            goal.began_at, goal.times["started"] = self.monotonic, self.wall
+            self.change(goal, "ACTIVE")
+            self.orders.append(("start", goal.id))
 
     def recall(self, goal: SlowGoal, reason: str, by: str | None) -> None:
         self.end(goal, "RECALLED", reason, by)
@@ -217,12 +294,12 @@ class SlowModel:
         """Tell the engine to stop; a later stop joins the first, which gives reason and `by`."""
         if goal.state == "PREEMPTING":
             return
-        goal.reason, goal.by, goal.stopped_at = reason, by, self.monotonic
+        goal.reason, goal.by, goal.stopped_at, goal.paused = reason, by, self.monotonic, False
         self.change(goal, "PREEMPTING")
         self.orders.append(("stop", goal.id))
 
     def end(self, goal: SlowGoal, state: str, reason: str | None, by: str | None) -> None:
-        goal.reason, goal.by = reason, by
+        goal.reason, goal.by, goal.paused = reason, by, False
         goal.times["ended"] = self.wall
         self.change(goal, state)
         self.queue = [each for each in self.queue if each is not goal]

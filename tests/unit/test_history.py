@@ -59,6 +59,33 @@ def test_latest_are_the_newest_first_without_rejected_ones() -> None:
     assert list(history.latest(0)) == []
 
 
+def test_the_log_has_all_that_ended_in_the_order_of_their_ends_the_newest_first() -> None:
+    history = History()
+    for number in (5, 1, 4, 0, 3):
+        history.add(ended(number, State.REJECTED if number % 2 else State.RECALLED))
+    assert [each.number for each in history.log(10)] == [3, 0, 4, 1, 5]
+    assert [each.number for each in history.log(2)] == [3, 0]
+    assert list(history.log(0)) == []
+    assert list(History().log(5)) == []
+
+
+def test_the_log_forgets_what_the_history_forgets() -> None:
+    history = History()
+    for number in range(2_500):
+        history.add(ended(number, State.REJECTED if number % 2 else State.SUCCEEDED))
+    kept = [each.number for each in history.log(10_000)]
+    assert kept == sorted([*range(500, 2_500, 2), *range(2_101, 2_500, 2)], reverse=True)
+
+
+def test_an_id_that_was_forgotten_may_come_again() -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "MAX_ENDED", 2)
+        history = History()
+        for number in (1, 2, 3, 1):
+            history.add(ended(number))
+        assert [each.number for each in history.log(5)] == [1, 3]
+
+
 def test_an_unknown_id_is_not_found() -> None:
     assert History().find("k3fz-1") is None
 
@@ -120,6 +147,7 @@ def test_limits_hold_after_any_goals_and_only_the_oldest_texts_are_gone(goals: l
     assert [each for each in kept if each.state is State.RECALLED] == [
         each for each in records if each.state is State.RECALLED
     ][-7:]
+    assert list(history.log(100)) == kept[::-1]
     assert sum(len(each.text.encode()) for each in kept if each.text is not None) <= 40
     with_text = [each.text is not None for each in kept]
     assert with_text == sorted(with_text), "a newer text went before an older one"

@@ -14,11 +14,16 @@ from talkcli.requests import (
     MAX_DATA,
     MAX_ID,
     MAX_IDS,
+    MAX_LOG,
     MAX_NAME,
     Cancel,
     Hello,
+    Log,
+    Pause,
     Request,
+    Resume,
     Say,
+    Set,
     Status,
     Voices,
     Wait,
@@ -43,30 +48,56 @@ values = st.recursive(
 goal_ids = st.text(min_size=1, max_size=MAX_ID)
 id_lists = st.lists(goal_ids, max_size=4).map(tuple)
 data = st.none() | st.dictionaries(st.text(max_size=5), st.none() | st.booleans() | st.text(max_size=5), max_size=3)
+integers = st.none() | st.integers(-(10**18), 10**18)
+numbers = st.none() | st.integers(-(10**18), 10**18) | st.floats(allow_nan=False, allow_infinity=False)
+words = st.none() | st.text(max_size=5)
+flags = st.none() | st.booleans()
 requests: st.SearchStrategy[Request] = st.one_of(
     st.builds(Hello, name=st.none() | st.text(min_size=1, max_size=MAX_NAME), urgent=st.booleans()),
     st.builds(
         Say,
         text=st.text(),
         wait=st.booleans(),
-        preempt=st.none() | st.booleans(),
+        feedback=st.booleans(),
+        patient=st.booleans(),
+        preempt=flags,
+        flush=st.booleans(),
+        priority=st.integers(-(10**18), 10**18),
+        ttl=numbers,
+        key=words,
+        throttle=numbers,
+        id=words,
+        rate=integers,
+        volume=numbers,
+        voice=words,
+        pitch=integers,
         data=data,
         format=st.text(max_size=8),
     ),
-    st.builds(Wait, ids=id_lists),
-    st.builds(Cancel, ids=id_lists, current=st.booleans(), before=st.none() | goal_ids),
+    st.builds(Wait, ids=st.none() | id_lists, feedback=st.booleans()),
+    st.builds(Cancel, ids=st.none() | id_lists, current=st.booleans(), before=st.none() | goal_ids, key=words),
     st.builds(Status, id=st.none() | goal_ids),
     st.just(Voices()),
     st.just(Watch()),
+    st.builds(Log, count=st.integers(1, MAX_LOG)),
+    st.builds(Set, rate=integers, volume=numbers, voice=words, pitch=integers, preempt=flags, ttl=numbers),
+    st.just(Pause()),
+    st.just(Resume()),
 )
+SETTINGS = {"rate", "volume", "voice", "pitch", "preempt", "ttl"}
 FIELDS = {
     "hello": {"name", "urgent"},
-    "say": {"text", "wait", "preempt", "data", "format"},
-    "wait": {"ids"},
-    "cancel": {"ids", "current", "before"},
+    "say": {"text", "wait", "feedback", "patient", "flush", "priority", "key", "throttle", "id", "data", "format"}
+    | SETTINGS,
+    "wait": {"ids", "feedback"},
+    "cancel": {"ids", "current", "before", "key"},
     "status": {"id"},
     "voices": set(),
     "watch": set(),
+    "log": {"count"},
+    "set": SETTINGS,
+    "pause": set(),
+    "resume": set(),
 }
 ALL_FIELDS = sorted(set().union(*FIELDS.values()))
 
@@ -83,7 +114,7 @@ def test_a_request_goes_over_the_wire_and_is_the_same(request: Request) -> None:
     assert read_request(decode(encode(write_request(request)))) == request
 
 
-@pytest.mark.parametrize("request_", [Hello(), Say("hi"), Wait(), Cancel(), Status(), Voices(), Watch()])
+@pytest.mark.parametrize("request_", [each("hi") if each is Say else each() for each in KINDS.values()])
 def test_fields_at_their_defaults_are_not_written(request_: Request) -> None:
     written = write_request(request_)
     assert written == {"request": request_.kind} | ({"text": "hi"} if isinstance(request_, Say) else {})
@@ -98,7 +129,17 @@ def test_cancel_and_status_without_fields_are_what_they_are_in_every_protocol() 
     assert read_request({"request": "status"}) == Status()
 
 
-@pytest.mark.parametrize("selection", [Cancel(("k3fz-1",)), Cancel(current=True), Cancel(before="k3fz-1")])
+@pytest.mark.parametrize(
+    "selection",
+    [
+        Cancel(("k3fz-1",)),
+        Cancel(()),
+        Cancel(current=True),
+        Cancel(before="k3fz-1"),
+        Cancel(key="battery"),
+        Cancel(key=""),
+    ],
+)
 def test_a_cancel_that_selects_is_not_of_everything(selection: Cancel) -> None:
     assert not selection.everything
 
@@ -138,13 +179,34 @@ WRONG: list[tuple[str, str, list[object]]] = [
     ("hello", "urgent", [None, 0, 1, "yes"]),
     ("say", "text", [None, 1, True, ["hi"], {}]),
     ("say", "wait", [None, 0, 1, "true", []]),
+    ("say", "feedback", [None, 0, 1, "true"]),
+    ("say", "patient", [None, 0, 1, "true"]),
     ("say", "preempt", [0, 1, "no", {}]),
+    ("say", "flush", [None, 0, 1, "no"]),
+    ("say", "priority", [None, 1.0, 0.5, "5", True, [5]]),
+    ("say", "ttl", ["1", True, [1]]),
+    ("say", "throttle", ["1", False, {}]),
+    ("say", "key", [1, True, ["battery"]]),
+    ("say", "id", [1, True, ["mine"]]),
+    ("say", "rate", [200.0, "200", True]),
+    ("say", "volume", ["1", True, [1]]),
+    ("say", "voice", [1, True, ["en"]]),
+    ("say", "pitch", [50.0, "50", True]),
     ("say", "data", [1, "a", [], True, {"a": "b" * MAX_DATA}]),
     ("say", "format", [None, 1, True, []]),
+    ("wait", "feedback", [None, 0, "yes"]),
     ("wait", "ids", ["k3fz-1", {"k3fz-1": 1}, [1], [None], [""], ["a" * 65], [["k3fz-1"]], ["a"] * 4_097]),
     ("cancel", "ids", ["k3fz-1", 7, [7], [True], [""], ["a" * 65], ["a"] * 4_097]),
     ("cancel", "current", [None, 0, 1, "yes"]),
     ("cancel", "before", ["", 7, True, ["k3fz-1"], "a" * 65]),
+    ("cancel", "key", [7, True, ["battery"]]),
+    ("log", "count", [None, 0, -1, 1_201, 1.0, "20", True]),
+    ("set", "rate", [200.0, "200", True]),
+    ("set", "volume", ["1", True]),
+    ("set", "voice", [1, True]),
+    ("set", "pitch", [50.0, "50", True]),
+    ("set", "preempt", [0, "no"]),
+    ("set", "ttl", ["1", True]),
     ("status", "id", ["", 7, False, [], "a" * 65]),
 ]
 
@@ -172,11 +234,25 @@ def test_values_at_their_limits_are_taken() -> None:
     longest = "a" * MAX_ID
     assert read_request({"request": "status", "id": longest}) == Status(longest)
     assert read_request({"request": "wait", "ids": [longest] * MAX_IDS}) == Wait((longest,) * MAX_IDS)
+    assert read_request({"request": "log", "count": 1}) == Log(1)
+    assert read_request({"request": "log", "count": MAX_LOG}) == Log(MAX_LOG)
+
+
+def test_values_out_of_range_are_read_so_that_the_goal_itself_can_be_rejected() -> None:
+    wild: JsonObject = {"rate": 10**6, "volume": -1, "pitch": 101, "ttl": -0.5, "throttle": -1, "key": "", "id": "-"}
+    read = read_request({"request": "say", "text": "hi", "priority": 10**12, **wild})
+    assert isinstance(read, Say)
+    assert {name: getattr(read, name) for name in wild} == wild
+    assert read.priority == 10**12
 
 
 def test_null_is_the_default_where_there_may_be_nothing() -> None:
     assert read_request({"request": "say", "text": "hi", "preempt": None, "data": None}) == Say("hi")
-    assert read_request({"request": "cancel", "before": None}) == Cancel()
+    for name in ("ttl", "key", "throttle", "id", "rate", "volume", "voice", "pitch"):
+        assert read_request({"request": "say", "text": "hi", name: None}) == Say("hi")
+    assert read_request({"request": "set"} | dict.fromkeys(SETTINGS)) == Set()
+    assert read_request({"request": "wait", "ids": None}) == Wait()
+    assert read_request({"request": "cancel", "ids": None, "before": None, "key": None}) == Cancel()
     assert read_request({"request": "status", "id": None}) == Status()
     assert read_request({"request": "hello", "name": None}) == Hello()
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from talkcli.effects import Cancelled, Changed, Now
 from talkcli.messages import By
 from talkcli.requests import Say
-from talkcli.scheduler import Cancelled, Changed, Now
 from talkcli.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending, numbers
 
@@ -63,7 +63,7 @@ def test_a_goal_that_waits_has_nothing_spoken_and_no_end() -> None:
 
 
 def test_data_and_format_travel_with_the_goal() -> None:
-    record, _ = Robot().scheduler.submit(Say("hi", data={"page": 3}), ARM, Now(0, 0))
+    record = Robot().scheduler.submit(Say("hi", data={"page": 3}), ARM, Now(0, 0)).record
     assert (record.snapshot().data, record.snapshot().format) == ({"page": 3}, "text")
 
 
@@ -141,8 +141,9 @@ def test_a_rejected_goal_has_its_reason_and_interrupts_nothing(say: Say, reason:
     robot = Robot()
     active, pending = robot.says(), robot.says(preempt=False)
     before = active.snapshot(), pending.snapshot(), robot.waiting()
-    record, effects = robot.scheduler.submit(say, ARM, robot.now)
-    assert effects == [Changed(record, State.REJECTED)]
+    done = robot.submits(say)
+    record = done.record
+    assert done.effects == [Changed(record, State.REJECTED)]
     assert (record.reason, record.started_at, record.ended_at) == (reason, None, robot.now.wall)
     assert str(record.message).startswith("Talk rejected: ")
     assert (active.snapshot(), pending.snapshot(), robot.waiting()) == before

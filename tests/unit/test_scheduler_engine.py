@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from talkcli.effects import GiveUp, Now, Start, Stop
 from talkcli.messages import By
-from talkcli.scheduler import SILENCE_LIMIT, GiveUp, Now, Start, Stop
+from talkcli.scheduler import SILENCE_LIMIT
 from talkcli.states import IllegalTransition, State
 from tests.unit.robot import DOOR, Robot, ending
 

@@ -1,0 +1,151 @@
+"""Silence before a sentence, for devices that wake up slowly: only where the device was idle, and never counted."""
+
+from __future__ import annotations
+
+import time
+import wave
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine import outlet, protocol
+from tests.engine.spawned import Spawned
+from tests.engine.test_player_faults import Player, player
+from tests.support import compare
+from tests.support.reference import RATE, render
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.support.sink import Sink
+
+__all__ = ["player"]
+
+TEXTS = ["battery low, please come home", "thank you very much"]
+#: Milliseconds, and the bytes of that.
+LEAD_IN = 400
+_LEAD = LEAD_IN * RATE // 1000 * 2
+
+
+def _bytes() -> list[bytes]:
+    return [samples.astype("<i2").tobytes() for samples in render(TEXTS)]
+
+
+def test_it_is_heard_before_the_first_sentence_and_not_before_the_next(sink: Sink) -> None:
+    def attempt() -> None:
+        with Spawned("aplay", environment=sink.env, lead_in=LEAD_IN) as engine:
+            engine.until(protocol.Voices)
+            onsets = []
+            with sink.record() as recording:
+                for number, text in enumerate(TEXTS):
+                    goal = f"g{number}"
+                    asked = time.monotonic()
+                    engine.say(text, goal)
+                    word = engine.until(protocol.Word)
+                    heard = time.monotonic()
+                    onset = recording.wait_for_sound()
+                    onsets.append(onset - asked)
+                    assert word.time < 0.1
+                    assert abs(onset - (heard - word.time)) < 0.1, "the word did not come as it was heard"
+                    ended = engine.until(protocol.Ended)
+                    assert ended.outcome == protocol.COMPLETED
+                    recording.wait_until_quiet(0.1)
+            compare.assert_heard(recording, render(TEXTS))
+            assert onsets[0] > LEAD_IN / 1000
+            assert_within(onsets[0], LEAD_IN / 1000 + 0.2, "the first sentence")
+            assert_within(onsets[1], 0.2, "the second sentence")
+
+    retry_if_late(attempt)
+
+
+def test_a_player_gets_it_once_and_it_does_not_count(player: Player) -> None:
+    sentences = _bytes()
+    with Spawned(player.plays(), lead_in=LEAD_IN) as engine:
+        engine.until(protocol.Voices)
+        began = time.monotonic()
+        for number, text in enumerate(TEXTS):
+            ended = engine.spoken(text, f"g{number}")
+            assert ended.outcome == protocol.COMPLETED
+            duration = len(sentences[number]) / RATE / 2
+            assert ended.duration == pytest.approx(duration, abs=1e-4)
+            if number == 0:
+                assert time.monotonic() - began >= duration + LEAD_IN / 1000 - 0.1
+    assert player.heard.read_bytes() == bytes(_LEAD) + sentences[0] + sentences[1]
+
+
+def test_a_device_that_was_idle_gets_it_again(player: Player) -> None:
+    sentences = _bytes()
+    before = "from talkcli.engine import outlet\noutlet.IDLE_AFTER = 0.0"
+    with Spawned(player.plays(), lead_in=LEAD_IN, before=before) as engine:
+        engine.until(protocol.Voices)
+        for number, text in enumerate(TEXTS):
+            assert engine.spoken(text, f"g{number}").outcome == protocol.COMPLETED
+    assert player.heard.read_bytes() == bytes(_LEAD) + sentences[0] + bytes(_LEAD) + sentences[1]
+
+
+def test_a_player_after_a_long_pause_gets_it_again(player: Player) -> None:
+    before = "from talkcli.engine import outlet\noutlet.IDLE_AFTER = 0.2"
+    with Spawned(player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": 0.1}, before=before) as engine:
+        engine.until(protocol.Voices)
+        engine.say(TEXTS[0])
+        engine.until(protocol.Word)
+        engine.pause()
+        assert isinstance(engine.event(), protocol.Alive)
+        held = player.heard.stat().st_size
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+    heard = player.heard.read_bytes()
+    assert heard[held : held + _LEAD] == bytes(_LEAD)
+    sentence = _bytes()[0]
+    rest = heard[held + _LEAD :]
+    assert sentence.endswith(rest)
+    assert heard[_LEAD : len(sentence) - len(rest) + _LEAD] == sentence[: -len(rest)]
+
+
+def test_a_pause_within_it_loses_nothing(player: Player) -> None:
+    with Spawned(player.plays(), lead_in=LEAD_IN) as engine:
+        engine.until(protocol.Voices)
+        engine.say(TEXTS[0])
+        engine.until(protocol.Started)
+        while not (player.heard.exists() and player.heard.stat().st_size):
+            time.sleep(0.002)  # what another process writes is no event
+        engine.pause()
+        assert engine.words() == []
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+    heard, sentence = player.heard.read_bytes(), _bytes()[0]
+    assert heard.endswith(sentence)
+    assert len(heard) > _LEAD + len(sentence)
+    assert not any(heard[: -len(sentence)])
+
+
+def test_a_player_that_ends_within_it_did_not_say_the_sentence(player: Player) -> None:
+    with Spawned(player.command("import os\nwhile os.read(0, 65536): pass"), lead_in=2000) as engine:
+        engine.until(protocol.Voices)
+        began = time.monotonic()
+        ended = engine.spoken("yes")
+        assert time.monotonic() - began < 1.5
+        assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_lost")
+
+
+def test_a_file_gets_none(tmp_path: Path) -> None:
+    target = tmp_path / "speech.wav"
+    with Spawned(f"file:{target}", lead_in=LEAD_IN) as engine:
+        engine.until(protocol.Ready)
+        assert engine.spoken(TEXTS[0]).outcome == protocol.COMPLETED
+    with wave.open(str(target), "rb") as file:
+        assert file.readframes(file.getnframes()) == _bytes()[0]
+
+
+def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    found = outlet.Outlet("null", None, lead_in=0.4)
+    assert found.lead_in() == 0.4
+    found.let_go()
+    now += outlet.IDLE_AFTER - 0.01
+    assert found.lead_in() == 0.0
+    now += 0.02
+    assert found.lead_in() == 0.4
+    assert outlet.Outlet("null", None).lead_in() == 0.0

@@ -1,0 +1,353 @@
+"""Rendering into a file: espeak-ng's own samples, whole or not at all, with nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import stat
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+import wave
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.dial import Interrupted
+from talkcli.engine import render as rendering
+from talkcli.engine import spawn
+from talkcli.engine.render import CannotWrite, RenderFailed, render
+from talkcli.errors import TalkError, UsageError
+from tests.support.reference import RATE, Sentence
+from tests.support.reference import render as reference
+from tests.support.surroundings import MARK, assert_none_left, needs
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+TEXT = "battery low, please recharge"
+#: Some seconds of work: 10,000 characters.
+LONGEST = "one two three. " * 666
+BEFORE = b"what was there before"
+
+
+def samples(path: Path) -> bytes:
+    with wave.open(str(path)) as file:
+        assert (file.getframerate(), file.getnchannels(), file.getsampwidth()) == (RATE, 1, 2)
+        data: bytes = file.readframes(file.getnframes())
+        return data
+
+
+@pytest.fixture(autouse=True)
+def _nothing_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Assert after each test that no engine process and no hidden file is left, nor one that is empty."""
+    mark = uuid.uuid4().hex
+    monkeypatch.setenv(MARK, mark)
+    yield
+    monkeypatch.delenv(MARK)
+    assert_none_left(mark, 2)
+    assert not [each for each in os.listdir(tmp_path) if each.startswith(".")]
+    assert not (tmp_path / "x.wav").exists() or (tmp_path / "x.wav").stat().st_size
+
+
+def failed(text: str, path: Path | str, **settings: object) -> TalkError:
+    with pytest.raises(TalkError) as caught:
+        render(text, str(path), **settings)  # type: ignore[arg-type]
+    return caught.value
+
+
+def test_the_file_has_espeak_ngs_own_samples(tmp_path: Path) -> None:
+    path = tmp_path / "x.wav"
+    seconds = render(TEXT, str(path))
+    (expected,) = reference([TEXT])
+    assert samples(path) == expected.tobytes()
+    assert seconds == pytest.approx(len(expected) / RATE, abs=1e-5)
+    needs("espeak-ng")
+    subprocess.run(["espeak-ng", "-s", "200", "-w", str(tmp_path / "own.wav"), TEXT], check=True)
+    assert path.read_bytes() == (tmp_path / "own.wav").read_bytes()
+    assert sorted(os.listdir(tmp_path)) == ["own.wav", "x.wav"]
+
+
+def test_settings_are_those_of_a_goal(tmp_path: Path) -> None:
+    path = tmp_path / "x.wav"
+    render(TEXT, str(path), rate=120, volume=0.5, voice="en-GB+F3", pitch=80)
+    (expected,) = reference([Sentence(TEXT, 120, 0.5, "gmw/en+f3", 80)])
+    assert samples(path) == expected.tobytes()
+
+
+def test_the_longest_text_is_rendered(tmp_path: Path) -> None:
+    path = tmp_path / "x.wav"
+    seconds = render(LONGEST, str(path))
+    assert len(samples(path)) == round(seconds * RATE) * 2
+    assert seconds > 300
+
+
+def test_what_was_there_is_replaced_and_the_umask_decides_who_may_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.wav"
+    path.write_bytes(BEFORE)
+    before = os.umask(0o027)
+    try:
+        render("yes", str(path))
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert samples(path)
+
+
+def test_a_relative_path_and_names_of_any_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = ["x.wav", "a b'\"\n😀.wav", "n" * 255, os.fsdecode(b"\xff.wav"), "-x", "file:x"]
+    for name in names:
+        render("yes", name)
+        assert samples(tmp_path / name)
+    assert sorted(os.listdir(tmp_path)) == sorted(names)
+
+
+def test_what_a_link_points_to_is_replaced_and_the_link_stays(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    for name in ("old.wav", "new.wav"):
+        (tmp_path / name).symlink_to(tmp_path / "there" / name)
+    (tmp_path / "there" / "old.wav").write_bytes(BEFORE)
+    for name in ("old.wav", "new.wav"):
+        render("yes", str(tmp_path / name))
+        assert (tmp_path / name).is_symlink()
+        assert samples(tmp_path / "there" / name)
+    assert sorted(os.listdir(tmp_path / "there")) == ["new.wav", "old.wav"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("", "'' is no name of a file"),
+        ("-", "'-' is no name of a file"),
+        ("{0}/", "is no name of a file"),
+        ("{0}/a\0b", "is no name of a file"),
+        ("{0}", "{0} is a directory: name a file in it"),
+        ("{0}/missing/x.wav", "{0}/missing/x.wav cannot be written: there is no directory {0}/missing"),
+        ("{0}/file/x.wav", "{0}/file/x.wav cannot be written: Not a directory"),
+        ("{0}/pipe", "{0}/pipe is no file that can be replaced"),
+        ("{0}/loop", "{0}/loop cannot be written: Too many levels of symbolic links"),
+        ("/dev/null", "/dev/null is no file that can be replaced"),
+        ("/dev/stdout", "/dev/stdout is no file that can be replaced"),
+        ("{0}/" + "n" * 256, "cannot be written: File name too long"),
+    ],
+)
+def test_what_cannot_be_written_is_told_before_anything_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, words: str
+) -> None:
+    monkeypatch.setattr(spawn, "EngineProcess", None)  # calling it would be a TypeError
+    (tmp_path / "file").touch()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to("loop")
+    error = failed("yes", name.format(tmp_path))
+    assert isinstance(error, CannotWrite)
+    assert words.format(tmp_path) in str(error)
+    assert (error.code, error.exit_code) == ("cannot_write", 1)
+
+
+def test_a_file_that_the_shell_has_open_for_our_output_is_not_replaced(tmp_path: Path) -> None:
+    code = (
+        f"import sys; sys.path[:] = {sys.path!r}; from talkcli.engine.render import render; render('yes', sys.argv[1])"
+    )
+    for path in ("/dev/stdout", str(tmp_path / "out")):
+        with (tmp_path / "out").open("wb") as out:
+            done = subprocess.run(
+                [sys.executable, "-c", code, path],
+                stdout=out,
+                stderr=subprocess.PIPE,
+                text=True,
+                timeout=60,
+                check=False,
+            )
+        assert done.returncode == 1
+        assert f"{path} is no file that can be replaced" in done.stderr
+        assert (tmp_path / "out").read_bytes() == b""
+
+
+#: A program that has no right to write there: root, who may write everywhere, becomes nobody first.
+AS_NOBODY = """
+import os, sys
+sys.path[:] = {path!r}
+from talkcli.engine.render import CannotWrite, render
+if os.geteuid() == 0:
+    os.setgroups([])
+    os.setgid({nobody})
+    os.setuid({nobody})
+try:
+    render("yes", sys.argv[1])
+except CannotWrite as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("protected", ["directory", "file"])
+def test_a_protected_directory_or_file_is_told_and_left_as_it_was(protected: str) -> None:
+    with tempfile.TemporaryDirectory() as directory:  # pytest's own can't be entered by nobody
+        path = os.path.join(directory, "x.wav")
+        with open(path, "wb") as file:
+            file.write(BEFORE)
+        os.chmod(path, 0o444 if protected == "file" else 0o666)
+        os.chmod(directory, 0o777 if protected == "file" else 0o555)
+        program = [sys.executable, "-c", AS_NOBODY.format(path=sys.path, nobody=65534), path]
+        told = subprocess.run(program, capture_output=True, text=True, timeout=60, check=True).stdout
+        os.chmod(directory, 0o755)
+        assert told.startswith(f"{path} cannot be written: ")
+        assert os.listdir(directory) == ["x.wav"]
+        with open(path, "rb") as file:
+            assert file.read() == BEFORE
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 KiB."""
+    needs("mount", "umount")
+    place = tmp_path / "small"
+    place.mkdir()
+    options = ["-t", "tmpfs", "-o", "size=64k", "none"]
+    done = subprocess.run(["mount", *options, str(place)], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"needs root's right to mount: {done.stderr.strip()}")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def test_a_full_disk_is_told_and_what_was_there_is_left(small_disk: Path) -> None:
+    path = small_disk / "x.wav"
+    path.write_bytes(BEFORE)
+    error = failed(TEXT * 3, path)
+    assert isinstance(error, CannotWrite)
+    assert str(error) == f"{path} cannot be written: No space left on device"
+    assert error.exit_code == 1
+    assert path.read_bytes() == BEFORE
+    assert os.listdir(small_disk) == ["x.wav"]
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "code", "exit_code", "words"),
+    [
+        ("", {}, "invalid_text", 5, "the text is empty"),
+        ("a\0b", {}, "invalid_text", 5, "NUL"),
+        ("a" * 10_001, {}, "text_too_long", 5, "10,001 characters"),
+        ("yes", {"voice": "en-uss"}, "unknown_voice", 5, "did you mean 'en-us'"),
+        ("yes", {"voice": "en+nosuch"}, "unknown_voice", 5, 'unknown voice "en+nosuch"'),
+        ("yes", {"driver": "parrot"}, "engine_failed", 4, 'unknown driver "parrot"'),
+        ("...", {}, "nothing_to_say", 4, "nothing in the text can be spoken"),
+        ("a." * 85, {}, "engine_crashed", 4, "the engine crashed: it was killed by SIG"),
+    ],
+)
+def test_what_fails_leaves_the_file_as_it_was(
+    tmp_path: Path, text: str, settings: dict[str, str], code: str, exit_code: int, words: str
+) -> None:
+    path = tmp_path / "x.wav"
+    path.write_bytes(BEFORE)
+    error = failed(text, path, **settings)
+    assert isinstance(error, RenderFailed)
+    assert (error.code, error.exit_code) == (code, exit_code)
+    assert words in str(error)
+    assert path.read_bytes() == BEFORE
+
+
+def test_a_driver_that_plays_by_itself_is_refused(tmp_path: Path) -> None:
+    error = failed("yes", tmp_path / "x.wav", driver="dummy")
+    assert isinstance(error, UsageError)
+    assert str(error).startswith('the driver "dummy" cannot write a file')
+
+
+def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "x.wav"
+    path.write_bytes(BEFORE)
+    began = time.monotonic()
+    with pytest.raises(TimeoutError):
+        render(LONGEST, str(path), timeout=0.3)
+    assert time.monotonic() - began < 2
+    reader, writer = os.pipe()
+    try:
+        os.write(writer, b"x")
+        with pytest.raises(Interrupted):
+            render(LONGEST, str(path), interrupt=reader)
+    finally:
+        os.close(reader)
+        os.close(writer)
+    assert path.read_bytes() == BEFORE
+
+
+@pytest.mark.parametrize(
+    ("before", "reason", "words"),
+    [
+        ("import time; time.sleep(60)", "engine_failed", "the engine was not ready after 0.3 s"),
+        ("raise RuntimeError('no tongue')", "engine_crashed", "RuntimeError: no tongue"),
+        (
+            "import time; from talkcli.engine import session; session.Session._say = lambda *_: time.sleep(60)",
+            "engine_hung",
+            "the engine gave no sign of life for 0.5 s",
+        ),
+    ],
+)
+def test_an_engine_that_is_of_no_use_is_told_and_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, reason: str, words: str
+) -> None:
+    interpreter, option, code = spawn.engine_command()
+    path, rest = code.split("; from ", 1)
+    monkeypatch.setattr(spawn, "engine_command", lambda: [interpreter, option, f"{path}\n{before}\nfrom {rest}"])
+    monkeypatch.setattr(rendering, "START_LIMIT", 0.3 if reason == "engine_failed" else 10)
+    monkeypatch.setattr(rendering, "HANG_AFTER", 0.5)
+    error = failed("yes", tmp_path / "x.wav")
+    assert error.code == reason
+    assert words in str(error)
+
+
+def test_an_interpreter_that_cannot_be_started_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spawn, "engine_command", lambda: ["/nonesuch"])
+    error = failed("yes", tmp_path / "x.wav")
+    assert (error.code, "/nonesuch" in str(error)) == ("engine_failed", True)
+
+
+#: A program that renders, and dies with whoever started it.
+PROGRAM = """
+import sys
+sys.path[:] = {path!r}
+from talkcli.engine.render import render
+print("begun", flush=True)
+render(sys.argv[1], sys.argv[2])
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_killed_at_any_moment_there_is_no_half_file_and_no_process(tmp_path: Path, how: signal.Signals) -> None:
+    text = "one two three four five. " * 20
+    (expected,) = reference([text])
+    path = tmp_path / "x.wav"
+    command = [sys.executable, "-c", PROGRAM.format(path=sys.path), text, str(path)]
+    began = time.monotonic()
+    subprocess.run(command, stdout=subprocess.DEVNULL, check=True, timeout=60)
+    whole = time.monotonic() - began
+    moments = random.Random(how)
+    outcomes = set()
+    for _ in range(20):
+        path.write_bytes(BEFORE)
+        mark = uuid.uuid4().hex
+        with subprocess.Popen(
+            command, env={**os.environ, MARK: mark}, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        ) as program:
+            assert program.stdout is not None
+            program.stdout.readline()
+            time.sleep(moments.uniform(0, whole))  # any moment is the point, there is nothing to wait for
+            program.send_signal(how)
+        assert_none_left(mark, 2)
+        hidden = [each for each in os.listdir(tmp_path) if each != "x.wav"]
+        if how == signal.SIGKILL:
+            assert len(hidden) <= 1
+            for each in hidden:
+                assert each.startswith(".talk-")
+                os.unlink(tmp_path / each)
+        else:
+            assert hidden == []
+        done = path.read_bytes() != BEFORE
+        outcomes.add(done)
+        if done:
+            assert samples(path) == expected.tobytes()
+    assert False in outcomes

@@ -1,0 +1,223 @@
+"""Voices: what is found is what the library sets, whoever wrote it how; and a goal's voice is that goal's alone."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import wave
+from functools import cache
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine import protocol, voices
+from talkcli.engine.protocol import Voice
+from talkcli.engine.voices import find_voice, unknown_voice
+from tests.engine.spawned import Spawned
+from tests.support.reference import Sentence, render
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+#: Sets each voice by its id in the library itself and says which one it has then.
+SET_ALL = """
+import json, sys
+sys.path[:] = json.loads(sys.argv[1])
+from talkcli.engine.library import load
+espeak = load().espeak
+current = []
+for each in json.load(sys.stdin):
+    status = espeak.SetVoiceByName(each.encode())
+    current.append([status, espeak.GetCurrentVoice().contents.identifier.decode()])
+json.dump(current, sys.stdout)
+"""
+
+TEXT = "the battery is low, please come home"
+
+
+@cache
+def listed() -> tuple[Voice, ...]:
+    with Spawned() as engine:
+        return engine.until(protocol.Voices).voices
+
+
+def plain() -> list[Voice]:
+    return [each for each in listed() if not each.id.startswith("+")]
+
+
+def variants() -> list[Voice]:
+    return [each for each in listed() if each.id.startswith("+")]
+
+
+def test_the_variants_are_listed_after_the_voices() -> None:
+    assert len(plain()) > 100
+    assert [*plain(), *variants()] == list(listed())
+    assert Voice("+f3", None, "variant female3") in variants()
+
+
+def test_every_word_of_every_voice_is_found_whatever_its_case() -> None:
+    for voice in listed():
+        for word in (voice.id, voice.name, voice.id.rpartition("/")[2], voice.language):
+            for each in (word, word.upper(), word.lower()) if word else ():
+                found = find_voice(each, listed())
+                assert found is not None, each
+                assert word == voice.language or found.id.endswith(voice.id), (each, found)
+                assert word != voice.language or found.language == voice.language, (each, found)
+
+
+def test_what_is_found_is_what_the_library_sets() -> None:
+    wanted = [each.id for each in listed()] + [f"{voice.id}+Andy" for voice in plain()]
+    found = [find_voice(each, listed()) for each in wanted]
+    ids = [each.id for each in found if each is not None]
+    assert len(ids) == len(wanted)
+    done = subprocess.run(
+        [sys.executable, "-c", SET_ALL, json.dumps(sys.path)],
+        input=json.dumps(ids),
+        capture_output=True,
+        encoding="utf-8",
+        timeout=60,
+        check=True,
+    )
+    assert json.loads(done.stdout) == [[0, each] for each in ids]
+
+
+def test_every_voice_can_be_spoken_with_under_each_of_its_words(tmp_path: Path) -> None:
+    with Spawned(f"file:{tmp_path / 'x.wav'}") as engine:
+        engine.until(protocol.Ready)
+        words = [word for voice in plain() for word in (voice.id, voice.name, voice.language) if word]
+        for number, word in enumerate(words):
+            ended = engine.spoken("a", f"g{number}", voice=word, rate=450)
+            # In the wheel's library one voice has nothing for this text.
+            assert ended.outcome == protocol.COMPLETED or ended.reason == "nothing_to_say", (word, ended)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        ("en-gb", "gmw/en"),
+        ("EN", "gmw/en"),
+        ("en-us", "gmw/en-US"),
+        ("gmw/EN-us", "gmw/en-US"),
+        ("english (america)", "gmw/en-US"),
+        ("fr-fr", "roa/fr"),
+        ("fr", "roa/fr"),
+        ("pt", "roa/pt"),
+        ("yue", "sit/yue"),
+        ("en+f3", "gmw/en+f3"),
+        ("en-GB+F3", "gmw/en+f3"),
+        ("en-us+whisper", "gmw/en-US+whisper"),
+        ("English (America)+andy", "gmw/en-US+Andy"),
+        ("pt-br+Mr Serious", "roa/pt-BR+Mr serious"),
+        ("en+2", "gmw/en+m2"),
+        ("de+12", "gmw/de+f2"),
+        ("+f3", "gmw/en+f3"),
+        ("variant female3", "gmw/en+f3"),
+    ],
+)
+def test_a_voice_is_found_as_users_write_it(wanted: str, expected: str) -> None:
+    found = find_voice(wanted, listed())
+    assert found is not None
+    assert found.id == expected
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        "",
+        "+",
+        "en+",
+        "en+nosuch",
+        "en+f3+f2",
+        "en+female3",
+        "en+99",
+        "+99",
+        "f3",
+        "../lang/gmw/en",
+        "!v/f3",
+        "nosuch+f3",
+    ],
+)
+def test_what_the_library_would_refuse_or_pass_over_is_not_found(wanted: str) -> None:
+    assert find_voice(wanted, listed()) is None
+
+
+@pytest.mark.parametrize(
+    ("wanted", "near"),
+    [
+        ("en-uk", ["en-us", "en-gb"]),
+        ("en-uss", ["en-us"]),
+        ("de-de", ["de"]),
+        ("germna", ["German"]),
+        ("English", ["English (America)"]),
+        ("en-us+whispr", ["en-us+whisper"]),
+        ("+whispr", ["+whisper"]),
+        ("germna+f3", ["German"]),
+    ],
+)
+def test_an_unknown_voice_is_told_what_comes_near(wanted: str, near: list[str]) -> None:
+    told = unknown_voice(wanted, listed())
+    assert told.startswith(f'unknown voice "{wanted}": did you mean ')
+    assert told.endswith('? "talk voices" lists them')
+    assert told.count(" or ") < 3
+    for each in near:
+        assert repr(each) in told
+
+
+def test_a_word_of_any_length_is_answered_shortly() -> None:
+    for wanted in ("x" * 60_000, "en-us+" + "y" * 60_000):
+        assert find_voice(wanted, listed()) is None
+        assert len(unknown_voice(wanted, listed())) < 200
+
+
+def test_a_plus_in_the_name_of_another_drivers_voice_is_part_of_it() -> None:
+    others = (Voice("voice.1", "en", "Anna+"), Voice("voice.2", None, "Bert"))
+    assert find_voice("anna+", others) == others[0]
+    assert find_voice("bert+f3", others) is None
+    assert "'Bert'" in unknown_voice("Berta", others)
+
+
+def test_mbrolas_voices_are_there_where_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = [("mb/mb-de4-en", "en", "german-mbrola-4-en"), ("mb/mb-us1", "en-us", "us-mbrola-1")]
+    monkeypatch.setattr(voices, "_listed", lambda _: known)
+    monkeypatch.setattr(voices, "_MBROLA_PLACES", (f"{tmp_path}/{{0}}/{{0}}",))
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    (tmp_path / "us1").mkdir()
+    (tmp_path / "us1" / "us1").touch()
+    assert voices._mbrola_voices() == []
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "mbrola").touch(0o755)
+    assert voices._mbrola_voices() == [Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
+
+
+@pytest.mark.parametrize("voice", ["zle/be", "piqd", "en+fast", "en-us+whisper"])
+def test_after_a_goals_own_voice_the_default_sounds_as_before(tmp_path: Path, voice: str) -> None:
+    """As the library's own, which sets everything anew for each sentence; some voices leave their speed behind."""
+    target = tmp_path / "x.wav"
+    with Spawned(f"file:{target}") as engine:
+        engine.until(protocol.Ready)
+        durations = [
+            engine.spoken(TEXT, "g1").duration,
+            engine.spoken(TEXT, "g2", voice=voice).duration,
+            engine.spoken(TEXT, "g3").duration,
+        ]
+    with wave.open(str(target)) as file:
+        samples = file.readframes(file.getnframes())
+    own = find_voice(voice, listed())
+    assert own is not None
+    references = render([Sentence(TEXT, voice="gmw/en"), Sentence(TEXT, voice=own.id), Sentence(TEXT, voice="gmw/en")])
+    assert samples == b"".join(each.tobytes() for each in references)
+    assert durations[2] == pytest.approx(durations[0], abs=0.05)
+
+
+@pytest.mark.parametrize("unknown", ["en-us+nosuch", "nosuch", "mb-us1"])
+def test_an_unknown_voice_between_leaves_the_voice_as_it_was(tmp_path: Path, unknown: str) -> None:
+    files = [tmp_path / "with.wav", tmp_path / "without.wav"]
+    for target in files:
+        with Spawned(f"file:{target}") as engine:
+            engine.until(protocol.Ready)
+            assert engine.spoken(TEXT, "g1", voice="en-us").outcome == protocol.COMPLETED
+            if target == files[0]:
+                assert engine.spoken(TEXT, "g2", voice=unknown).reason == "unknown_voice"
+            assert engine.spoken(TEXT, "g3", voice="en-us").outcome == protocol.COMPLETED
+    assert files[0].read_bytes() == files[1].read_bytes()

@@ -1,0 +1,76 @@
+"""The words of a text as libespeak-ng tells them: each once, forward, with its own place."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from talkcli.engine.words import Words
+from tests.support.reference import Sentence, render_with_words
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+def reported(text: str, places: Iterable[tuple[int, int]]) -> list[str]:
+    words = Words(text)
+    found = [each for each in (words.next(start, length) for start, length in places) if each is not None]
+    assert [each.number for each in found] == list(range(1, len(found) + 1))
+    assert all(first.end <= second.start for first, second in itertools.pairwise(found))
+    return [text[each.start : each.end] for each in found]
+
+
+def spoken(text: str, voice: str = "gmw/en") -> list[str]:
+    """Return the words of what libespeak-ng itself tells."""
+    (rendering,) = render_with_words([Sentence(text, voice=voice)])
+    return reported(text, [(start, end - start) for start, end, _ in rendering.words if end > start])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("battery low, please!", "battery low please"),
+        ("is in the kitchen", "is in kitchen"),
+        ("I go. this one is. the box. of the man. end", "I go this is the box of man end"),
+        ("it's don’t they're", "it's don’t they're"),
+        ("well-known e-mail, state-of-the-art", "well-known e-mail state-of-the-art"),
+        ("3.14 1,000 10:30 12345 50% 2-3 next", "3.14 1,000 10 30 12345 50 % 2 - 3 next"),
+        ("in the U.S.A. today", "in U.S.A today"),
+        ("café 日本 é 😀 now 😀. then 😀", "café 日本 é 😀 now 😀 then 😀"),
+        ("foo_bar foo/bar fooBar v1.2", "foo _bar foo / bar foo Bar v 1.2"),
+        ("привет мир", "привет мир"),
+        ("one\ttwo\n three\n\nfour", "one two three four"),
+    ],
+)
+def test_the_words_of_a_sentence(text: str, words: str) -> None:
+    assert spoken(text) == words.split()
+
+
+def test_the_words_of_other_languages() -> None:
+    assert spoken("l'homme est là", "roa/fr") == ["l'homme", "est", "là"]
+    assert spoken("dell'acqua c'è", "roa/it") == ["dell'acqua", "c'è"]
+    assert spoken("世界、人", "sit/cmn") == ["世", "界", "人"]
+
+
+def test_what_is_repeated_behind_or_outside_is_none() -> None:
+    text = "this one é 日本 😀 ! battery"
+    places = [(0, 4), (0, 4), (5, 0), (9, 1), (-1, 0), (-1, 5), (11, 2), (11, 2), (3, 2), (13, 1), (14, 1), (18, 99)]
+    assert reported(text, places) == ["this", "é", "日本", "😀", "battery"]
+    assert reported("a", [(5, 3), (1, 1), (0, 50)]) == ["a"]
+
+
+@given(st.text(max_size=40), st.lists(st.tuples(st.integers(-3, 45), st.integers(-1, 10)), max_size=30))
+def test_whatever_is_reported_words_go_forward_within_the_text(text: str, places: list[tuple[int, int]]) -> None:
+    words = Words(text)
+    end = 0
+    for location, length in places:
+        found = words.next(location, length)
+        if found is not None:
+            assert end <= found.start < found.end <= len(text)
+            word = text[found.start : found.end]
+            assert word.split() == [word]
+            end = found.end

@@ -1,0 +1,193 @@
+"""A terminal for a test: a program runs in it, what it writes is drawn, and what can be seen is asked for.
+
+It draws what a real one would: characters that take two columns, marks over others, lines that are wrapped, and the
+few control sequences that `talk` may use. Any other is an error of the test.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+import unicodedata
+from typing import TYPE_CHECKING
+
+from tests.support.connection import PATIENCE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+_CONTROL = re.compile(r"\x1b\[(?P<numbers>[0-9;]*)(?P<letter>[A-Za-z])")
+_IN_A_TERMINAL = (
+    "import fcntl, os, sys, termios; os.setsid(); fcntl.ioctl(1, termios.TIOCSCTTY, 0);"
+    "os.execvp(sys.argv[1], sys.argv[1:])"
+)
+
+
+class Screen:
+    """What is drawn. A cell is a character and its attributes; a wide character is followed by an empty cell."""
+
+    def __init__(self, columns: int) -> None:
+        self.columns = columns
+        self.rows: list[list[tuple[str, str]]] = [[]]
+        #: how often a line was continued on the next row because it was too long
+        self.wraps = 0
+        self.column = 0
+        self.attributes = ""
+
+    def draw(self, text: str) -> None:
+        """Draw what a program has written; control sequences must be whole."""
+        place = 0
+        while place < len(text):
+            control = _CONTROL.match(text, place)
+            if control:
+                self._control(control["letter"], control["numbers"])
+                place = control.end()
+                continue
+            self._character(text[place])
+            place += 1
+
+    @property
+    def lines(self) -> list[str]:
+        """The rows as text, without blanks at their ends."""
+        return ["".join(each for each, _ in row).rstrip() for row in self.rows]
+
+    @property
+    def last(self) -> str:
+        """The row with the cursor, as text."""
+        return self.lines[-1]
+
+    def marked(self, attribute: str, row: int = -1) -> str:
+        """Return the characters of a row that have an attribute: "7" is reversed, "2" is dim."""
+        return "".join(each for each, has in self.rows[row] if attribute in has.split(";"))
+
+    def _character(self, character: str) -> None:
+        if character == "\r":
+            self.column = 0
+        elif character == "\n":
+            self.rows.append([])
+            self.column = 0
+        elif unicodedata.category(character) in {"Mn", "Me"}:
+            self._over(character)
+        else:
+            assert character.isprintable(), f"{character!r} reached the terminal"
+            wide = 2 if unicodedata.east_asian_width(character) in "WF" else 1
+            if self.column + wide > self.columns:
+                self.wraps += 1
+                self.rows.append([])
+                self.column = 0
+            row = self.rows[-1]
+            row.extend([(" ", "")] * (self.column - len(row)))
+            row[self.column : self.column + wide] = [(character, self.attributes)] + [("", "")] * (wide - 1)
+            self.column += wide
+
+    def _over(self, character: str) -> None:
+        row = self.rows[-1]
+        place = max((each for each in range(min(self.column, len(row))) if row[each][0]), default=None)
+        if place is not None:
+            row[place] = (row[place][0] + character, row[place][1])
+
+    def _control(self, letter: str, numbers: str) -> None:
+        if letter == "m":
+            self.attributes = "" if numbers in {"", "0"} else numbers
+        elif letter == "K" and numbers == "2":
+            self.rows[-1] = []
+        else:
+            raise AssertionError(f"unknown control sequence: ESC[{numbers}{letter}")
+
+
+class Terminal:
+    """A program in a terminal of its own, which is its standard output and error."""
+
+    def __init__(self, command: Sequence[str], env: Mapping[str, str], columns: int = 80) -> None:
+        self._changed = threading.Condition()
+        self._ours, theirs = os.openpty()
+        self._resize(columns)
+        self.raw = b""
+        self._drawn = 0
+        self.screen = Screen(columns)
+        self._failure: Exception | None = None
+        self.process = subprocess.Popen(
+            [sys.executable, "-S", "-c", _IN_A_TERMINAL, *command],
+            env={"TERM": "xterm", **env},
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+        )
+        os.close(theirs)
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def wait_until(self, seen: Callable[[Screen], bool], timeout: float = PATIENCE) -> None:
+        """Wait until the screen looks like this."""
+        end = time.monotonic() + timeout
+        with self._changed:
+            while not seen(self.screen):
+                left = end - time.monotonic()
+                assert left > 0, f"this is shown: {self.screen.rows}; this was written: {self.raw!r}"
+                self._changed.wait(left)
+
+    def resize(self, columns: int) -> None:
+        """Make it wider or narrower; the program gets SIGWINCH."""
+        with self._changed:
+            self.screen.columns = columns
+        self._resize(columns)
+
+    def type(self, keys: bytes) -> None:
+        """Press keys; ^C is a signal."""
+        os.write(self._ours, keys)
+
+    def finish(self, timeout: float = 20) -> int:
+        """Wait for the program's end, and until all is drawn; return its exit code."""
+        try:
+            code = self.process.wait(timeout)
+        finally:
+            self.close()
+        if self._failure is not None:
+            raise self._failure
+        return code
+
+    def close(self) -> None:
+        """End the program, however it is."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        self._reader.join(PATIENCE)
+        with contextlib.suppress(OSError):
+            os.close(self._ours)
+
+    def _resize(self, columns: int) -> None:
+        fcntl.ioctl(self._ours, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+
+    def _read(self) -> None:
+        pending = b""
+        while True:
+            try:
+                data = os.read(self._ours, 65536)
+            except OSError:  # nobody has the other end any more
+                return
+            with self._changed:
+                self.raw += data
+                pending = self._draw(pending + data)
+                self._changed.notify_all()
+
+    def _draw(self, data: bytes) -> bytes:
+        """Draw all that is whole; return the rest: half a character, or half a control sequence."""
+        whole = len(data)
+        escape = data.rfind(b"\x1b")
+        if escape >= 0 and not _CONTROL.match(data[escape:].decode(errors="ignore")):
+            whole = escape
+        text = data[:whole].decode(errors="ignore")
+        rest = data[len(text.encode()) :]
+        try:
+            self.screen.draw(text)
+        except AssertionError as error:
+            self._failure = self._failure or error
+        return rest
