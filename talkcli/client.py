@@ -143,7 +143,7 @@ class Client:
 
         UsageError for a value out of its range, ServerUnavailable where the server is gone: nothing was sent then.
         Lost where it was sent and not answered: it may be spoken. Interrupted only while a patient one waits for room:
-        close the client then, and it is not spoken.
+        close the client then, and it is not spoken once the server has seen that, within 5 s.
         """
         request = Say(
             text,

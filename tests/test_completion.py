@@ -1,8 +1,12 @@
-"""The completion scripts: those that are checked in are what the commands make of them, and shells take them."""
+"""Completion: the scripts that are checked in, what is offered for a line, and what real shells make of it."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import select
+import sys
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -10,12 +14,64 @@ import pytest
 from talkcli import completion
 from talkcli.cli import COMMANDS
 from tests.conformance.bareserve import TALK, environment, run
-from tests.support.surroundings import needs
+from tests.conformance.rawsocket import GREETING, FakeServer
+from tests.support.connection import PATIENCE
+from tests.support.surroundings import needs, short_directory
+from tests.support.terminal import Terminal
 
 if TYPE_CHECKING:
     import pathlib
+    from collections.abc import Mapping
+
+    from tests.support.processes import Talk
 
 CHECKED_IN = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "completions")
+#: A key with all that a shell or a format could stumble over.
+KEY = 'low battery, now: it\'s $5 "x" *\\ ~a;b|c&'
+#: Each shell, how it is told to complete and to write its command line to the file OUT when ^G is pressed.
+SHELLS = {
+    "bash": (
+        ["bash", "--noprofile", "--norc", "-i"],
+        """source SCRIPTS/talk.bash; bind -x '"\\C-g": printf "%s\\n" "$READLINE_LINE" > OUT'; PS1='rea''dy> '\n""",
+    ),
+    "zsh": (
+        ["zsh", "-f", "-i"],
+        "autoload -U compinit; compinit -u -D; source SCRIPTS/_talk; show() { print -r -- $BUFFER > OUT }; "
+        "zle -N show; bindkey '^G' show; PS1='rea''dy> '\n",
+    ),
+    "fish": (
+        ["fish", "--no-config", "-i"],
+        "source SCRIPTS/talk.fish; bind \\cg 'commandline > OUT'; function fish_prompt; echo 'rea''dy> '; end\n",
+    ),
+}
+
+
+def offered(line: str, env: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Return the values that are offered at the end of a line, with their help; nothing else may be said."""
+    asked = {"_TALK_COMPLETE": "fish_complete", "COMP_WORDS": line, "COMP_CWORD": ""}
+    done = run(TALK, {**env, **asked})
+    assert (done.code in {0, 1}, done.err) == (True, ""), done
+    lines = [each.removeprefix("plain,").partition("\t") for each in done.out.splitlines() if each]
+    return [(value, words) for value, _, words in lines]
+
+
+def values(line: str, talk: Talk) -> list[str]:
+    return [value for value, _ in offered(line, talk.env)]
+
+
+@pytest.fixture
+def busy(scripted: Talk) -> tuple[Talk, list[str]]:
+    """A server that has said one goal, says one and will say one; the ids of these."""
+    ended = scripted.run("say", "--wait", "--key", "over", "length=0").id
+    active = scripted.request("say", text="moving, slowly: never-ends\t\x1b[31m", key=KEY, id="door:open.1")["goal"][
+        "id"
+    ]
+    scripted.watcher.wait_for_word(active)
+    pending = scripted.run("say", "--key", "plain", "battery low").id
+    return scripted, [ended, active, pending]
+
+
+# The scripts
 
 
 def test_scripts_that_are_checked_in_are_those_of_this_version(tmp_path: pathlib.Path) -> None:
@@ -33,6 +89,9 @@ def test_scripts_have_no_syntax_error(shell: str, name: str) -> None:
     assert (done.code, done.err) == (0, "")
 
 
+# What is offered
+
+
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
@@ -40,10 +99,189 @@ def test_scripts_have_no_syntax_error(shell: str, name: str) -> None:
         ("talk sta", {"status"}),
         ("talk say --pre", {"--preempt"}),
         ("talk serve --vo", {"--volume", "--voice"}),
+        ("talk serve --player ", {"aplay", "pacat", "pw-cat", "null"}),
+        ("talk serve --player=p", {"--player=pacat", "--player=pw-cat"}),
+        ("talk --socket /etc/pa", {"file"}),
+        ("talk say -o x", {"file"}),
+        ("talk say ", set()),
+        ("talk nonsense ", set()),
+        ("talk nonsense --x", set()),
+        ("talk cancel --nonsense", set()),
+        ('talk cancel "', set()),
     ],
 )
-def test_bash_completes_commands_and_options(tmp_path: pathlib.Path, line: str, expected: set[str]) -> None:
-    words = line.split(" ")
-    env = environment(str(tmp_path), _TALK_COMPLETE="bash_complete", COMP_WORDS=line, COMP_CWORD=str(len(words) - 1))
-    done = run(TALK, env)
-    assert {each.partition(",")[2] for each in done.out.splitlines()} == expected
+def test_what_needs_no_server(tmp_path: pathlib.Path, line: str, expected: set[str]) -> None:
+    env = environment(str(tmp_path), TALK_SOCKET=f"{tmp_path}/none")
+    assert {value for value, _ in offered(line, env)} == expected
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_is_offered_with_its_help(tmp_path: pathlib.Path, command: str) -> None:
+    env = environment(str(tmp_path), TALK_SOCKET=f"{tmp_path}/none", COLUMNS="200")
+    options = dict(offered(f"talk {command} --", env))
+    assert {"--socket", "--json", "--quiet", "--help"} <= options.keys()
+    assert all(options.values())
+    shown = run([*TALK, command, "--help"], env).out
+    assert not [each for each in options if each not in shown]
+
+
+def test_ids_of_goals_are_offered_with_their_texts(busy: tuple[Talk, list[str]]) -> None:
+    talk, (ended, active, pending) = busy
+    for line in ("talk cancel ", "talk wait ", "talk cancel --before ", f"talk wait {pending} "):
+        assert values(line, talk) == [active, pending]
+    assert values("talk status ", talk) == [active, pending, ended]
+    assert values("talk cancel --before=do", talk) == ["--before=door:open.1"]
+    helps = dict(offered("talk status ", talk.env))
+    assert helps[active] == r"ACTIVE moving, slowly: never-ends\t\x1b[31m"
+    assert helps[pending] == "PENDING battery low"
+    assert helps[ended] == "SUCCEEDED length=0"
+    number = pending.partition("-")[2]
+    assert values(f"talk cancel {number}", talk) == [number]
+    assert values("talk cancel 999", talk) == []
+
+
+def test_long_texts_are_shortened(scripted: Talk) -> None:
+    scripted.run("say", "never-ends", "x" * 1000)
+    ((_, words),) = offered("talk cancel ", scripted.env)
+    assert len(words) < 80
+    assert words.endswith("…")
+
+
+def test_keys_and_voices_are_offered(busy: tuple[Talk, list[str]]) -> None:
+    talk, _ = busy
+    assert values("talk cancel --key ", talk) == [KEY, "plain"]
+    assert values("talk say --key ", talk) == [KEY, "plain", "over"]
+    assert values("talk say --key pl", talk) == ["plain"]
+    for line in ("talk say --voice ", "talk set --voice ", "talk serve --voice ", "talk set --voice e"):
+        assert offered(line, talk.env) == [("en", "scripted")]
+    assert values("talk set --voice scr", talk) == ["scripted"]
+    assert values("talk set --voice=e", talk) == ["--voice=en"]
+
+
+def test_keys_that_cannot_be_typed_are_not_offered(scripted: Talk) -> None:
+    scripted.request("say", text="never-ends", key="a\x1b[31mb")
+    scripted.request("say", text="waits", key="two\nlines")
+    scripted.request("say", text="waits", key="fine")
+    assert values("talk cancel --key ", scripted) == ["fine"]
+
+
+def test_socket_on_the_line_is_the_one_that_is_asked(busy: tuple[Talk, list[str]]) -> None:
+    talk, (_, active, pending) = busy
+    env = {**talk.env, "TALK_SOCKET": "/nowhere"}
+    assert offered("talk cancel ", env) == []
+    for line in (
+        f"talk --socket {talk.socket} cancel ",
+        f"talk --socket={talk.socket} cancel ",
+        f"talk cancel --socket {talk.socket} ",
+        f"talk --json --socket '{talk.socket}' cancel -q ",
+    ):
+        assert [value for value, _ in offered(line, env)] == [active, pending]
+    assert offered("talk --socket /nowhere cancel ", talk.env) == []
+
+
+LINES = ["talk cancel ", "talk status ", "talk cancel --key ", "talk say --voice "]
+
+
+@pytest.mark.parametrize("says", [b"", GREETING, b'{"talk": 9}\n', b"no server of ours\n", None])
+def test_it_is_silent_and_quick_whatever_answers(says: bytes | None) -> None:
+    with short_directory() as home, contextlib.ExitStack() as stack:
+        if says is not None:
+            stack.enter_context(FakeServer(f"{home}/s", [says]))
+        env = environment(home, TALK_SOCKET=f"{home}/s")
+        for line in LINES:
+            began = time.monotonic()
+            assert offered(line, env) == []
+            assert time.monotonic() - began < 3  # two times its patience at most, and the start of a program
+
+
+def test_a_server_that_hangs_holds_nobody_up(scripted: Talk) -> None:
+    scripted.freeze()
+    began = time.monotonic()
+    assert offered("talk cancel ", scripted.env) == []
+    assert time.monotonic() - began < 3
+    scripted.thaw()
+
+
+# What real shells make of it
+
+
+class Shell:
+    """An interactive shell that completes `talk`, in a terminal."""
+
+    def __init__(self, name: str, talk: Talk, stack: contextlib.ExitStack) -> None:
+        needs(name)
+        directory = talk.directory
+        command, setup = SHELLS[name]
+        os.makedirs(f"{directory}/bin")
+        with open(f"{directory}/bin/talk", "w", encoding="utf-8") as program:
+            program.write(f'#!/bin/sh\nexec "{sys.executable}" -m talkcli "$@"\n')
+        os.chmod(program.name, 0o755)
+        os.mkfifo(f"{directory}/out")
+        self._out = os.open(f"{directory}/out", os.O_RDWR)
+        stack.callback(os.close, self._out)
+        env = {**talk.env, "PATH": f"{directory}/bin:{os.environ['PATH']}", "TERM": "xterm", "HISTFILE": ""}
+        self.terminal = stack.enter_context(Terminal(command, env, 500))
+        self.terminal.type(setup.replace("SCRIPTS", CHECKED_IN).replace("OUT", f"{directory}/out").encode())
+        self.terminal.wait_for("ready> ", 20)
+
+    def complete(self, line: str) -> str:
+        """Type a line and TAB, and return the command line that this makes; it is empty again then."""
+        self.terminal.type(line.encode() + b"\t\x07")
+        written = b""
+        while not written.endswith(b"\n"):
+            assert select.select([self._out], [], [], 4 * PATIENCE)[0], f"{line!r}: {self.terminal.text[-500:]!r}"
+            written += os.read(self._out, 4096)
+        self.terminal.type(b"\x15")
+        return written.decode().removesuffix("\n")
+
+
+ESCAPED = r"low\ battery,\ now:\ it\'s\ \$5\ \"x\"\ \*\\\ \~a\;b\|c\&"
+IN_DOUBLE = r'"low battery, now: it' + "'" + r's \$5 \"x\" *\\ ~a;b|c&"'
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_shells_complete_what_is_there_and_quote_it(busy: tuple[Talk, list[str]], name: str) -> None:
+    talk, (_, _, pending) = busy
+    in_single = {"fish": r"'low battery, now: it\'s $5 \"x\" *\\ ~a;b|c&'".replace('\\"', '"')}.get(
+        name, r"""'low battery, now: it'\''s $5 "x" *\ ~a;b|c&'"""
+    )
+    number = pending.partition("-")[2]
+    expected = {
+        "talk st": "talk status ",
+        "talk say --fl": "talk say --flush ",
+        "talk cancel d": "talk cancel door:open.1 ",
+        "talk cancel door:o": "talk cancel door:open.1 ",
+        "talk cancel 'door:o": "talk cancel 'door:open.1' ",
+        "talk cancel --before=door:": "talk cancel --before=door:open.1 ",
+        f"talk wait {number}": f"talk wait {number} ",
+        f"talk wait {pending[:3]}": f"talk wait {pending} ",
+        "talk cancel --key p": "talk cancel --key plain ",
+        "talk cancel --key=p": "talk cancel --key=plain ",
+        "talk cancel --key lo": f"talk cancel --key {ESCAPED} ",
+        r"talk cancel --key low\ b": f"talk cancel --key {ESCAPED} ",
+        "talk cancel --key=lo": f"talk cancel --key={ESCAPED} ",
+        "talk cancel --key 'low b": f"talk cancel --key {in_single} ",
+        'talk cancel --key "low b': f"talk cancel --key {IN_DOUBLE} ",
+        "talk serve --player=pa": "talk serve --player=pacat ",
+        f"talk --socket {talk.socket[:-1]}": f"talk --socket {talk.socket} ",
+        "talk --socket /nowhere cancel d": "talk --socket /nowhere cancel d",
+        "talk cancel nothing": "talk cancel nothing",
+        "talk nonsense x": "talk nonsense x",
+        "~/bin/talk cancel d": "~/bin/talk cancel door:open.1 ",
+    }
+    with contextlib.ExitStack() as stack:
+        shell = Shell(name, talk, stack)
+        found = {line: shell.complete(line) for line in expected}
+    assert found == expected
+    assert "Traceback" not in shell.terminal.text
+    assert "Error" not in shell.terminal.text
+
+
+@pytest.mark.parametrize("name", ["zsh", "fish"])
+def test_shells_that_show_a_help_show_the_texts(busy: tuple[Talk, list[str]], name: str) -> None:
+    talk, _ = busy
+    with contextlib.ExitStack() as stack:
+        shell = Shell(name, talk, stack)
+        shell.terminal.type(b"talk cancel \t")
+        shell.terminal.wait_for(r"ACTIVE moving, slowly: never-ends\\t\\x1b", 20)
+        shell.terminal.wait_for("PENDING battery low", 20)

@@ -24,10 +24,6 @@ def command(context: click.Context) -> int:
     options = common(context)
     with options.connect() as client:
         goal = client.resume()
-    tell(
-        options,
-        goal,
-        paused=False,
-        words=f"{printable(goal.id)} goes on" if goal else "speech goes on, no goal was held",
-    )
+    words = f"speech goes on with {printable(goal.id)}" if goal else "speech goes on"
+    tell(options, goal, paused=False, words=words)
     return EXIT_OK

@@ -1,0 +1,323 @@
+"""Events of the client library: their form in JSON, and what a handle and a watch hear of a real server."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+import talkcli
+from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard, events
+from talkcli.backlog import MAX_FEEDBACK, MAX_STATES, Backlog
+from talkcli.errors import Lost, UnknownGoal
+from talkcli.messages import By, Goal, Sender
+from talkcli.replies import ServerStatus
+from tests.support.connection import PATIENCE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from talkcli.events import Event
+    from talkcli.messages import JsonObject
+    from tests.support.processes import Talk
+
+GOAL = Goal("k3fz-7", State.ACTIVE, "moving back", client=Sender(7, 0, "talk", "sh", "patrol"), queued_at=1.5)
+EVENTS: list[Event] = [
+    StateChanged("k3fz-7", State.ACTIVE, 2.5, 42),
+    StateChanged("k3fz-7", State.SUCCEEDED, 2.5, 42, GOAL),
+    WordHeard("k3fz-7", "back", 7, 11, 2, 0.25, 2.5, 43),
+    PausedChanged(True, "k3fz-7", By(client=Sender(7, 0)), 2.5, 44),
+    PausedChanged(False, None, None, 2.5, 45),
+    Result(GOAL),
+    Snapshot(ServerStatus({"pid": 1}, GOAL, (GOAL,), (GOAL, GOAL))),
+    Snapshot(ServerStatus({}, None, (), ())),
+]
+
+
+@pytest.fixture
+def client(scripted: Talk) -> Iterator[Client]:
+    with Client(scripted.socket) as result:
+        yield result
+
+
+# Form
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_event_goes_to_json_and_back(event: Event) -> None:
+    message = json.loads(json.dumps(event.to_json()))
+    assert next(iter(message)) == "event"
+    assert events.from_json(message) == event
+    assert events.from_json({**message, "new": 1}) == event
+
+
+def test_events_in_json_are_those_of_the_wire(scripted: Talk) -> None:
+    with scripted.connect() as wire:
+        wire.request("watch")
+        wire.request("say", text="length=0.1 one two", feedback=True)
+        wire.request("pause")
+        wire.request("resume")
+        came = [*wire.events]
+        while came[-1]["event"] != "result":
+            came.append(wire.receive(PATIENCE))
+    came = [each for each in came if each["event"] != "alive"]
+    assert {each["event"] for each in came} == {"state", "word", "paused", "result"}
+    for each in came:
+        event = events.from_json(each)
+        assert event
+        assert event.to_json() == each
+        assert list(event.to_json()) == list(each)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"event": "state", "id": "g", "state": "BORED"},
+        {"event": "state", "id": 7, "state": "ACTIVE"},
+        {"event": "state", "id": "g", "state": "ACTIVE", "goal": {}},
+        {"event": "state", "id": "g", "state": "ACTIVE", "n": True},
+        {"event": "word", "id": "g", "word": "a", "start": 0, "end": 1, "number": 1},
+        {"event": "paused", "paused": 1},
+        {"event": "result"},
+        {"event": "snapshot", "active": {}},
+        {"event": "snapshot", "pending": [1]},
+    ],
+)
+def test_what_is_no_event_of_its_kind_is_an_error(message: JsonObject) -> None:
+    with pytest.raises(ValueError, match=r"goal|event"):
+        events.from_json(message)
+
+
+@pytest.mark.parametrize("message", [{}, {"event": "alive"}, {"event": None}, {"event": ["state"]}, {"ok": True}])
+def test_kinds_not_known_here_are_none(message: JsonObject) -> None:
+    assert events.from_json(message) is None
+
+
+def test_library_is_imported_from_one_place() -> None:
+    for name in talkcli.__all__:
+        assert getattr(talkcli, name)
+    with pytest.raises(AttributeError, match="Speaker"):
+        _ = talkcli.Speaker
+
+
+def test_backlog_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
+    backlog = Backlog()
+    state, word = StateChanged("g", State.ACTIVE), WordHeard("g", "a", 0, 1, 1, 0.0)
+    for number in range(MAX_FEEDBACK + 2):
+        backlog.add(WordHeard("g", "a", 0, 1, number, 0.0))
+        if number == 5:
+            backlog.add(state)
+    assert backlog.take() == WordHeard("g", "a", 0, 1, 2, 0.0)  # 0 and 1 were dropped
+    assert [backlog.take() for _ in range(4)][3] == state
+    assert backlog.take() == WordHeard("g", "a", 0, 1, 6, 0.0)
+    while backlog.take():
+        pass
+    for _ in range(MAX_STATES):
+        backlog.add(state)
+    assert not backlog.overrun
+    backlog.add(state)
+    backlog.add(word)
+    assert backlog.overrun
+    taken = 0
+    while backlog.take():
+        taken += 1
+    assert taken == MAX_STATES  # nothing that came after what is missing
+
+
+# A goal's events
+
+
+def told(found: list[Event]) -> list[object]:
+    """Return the events in short: states, words, and results as types."""
+    return [
+        each.state if isinstance(each, StateChanged) else each.word if isinstance(each, WordHeard) else type(each)
+        for each in found
+    ]
+
+
+def test_events_of_a_goal_end_with_its_result(client: Client) -> None:
+    handle = client.say("length=0.2 one", feedback=True)
+    found = list(handle.events(5))
+    assert told(found) == [State.PENDING, State.ACTIVE, "length=0.2", "one", State.SUCCEEDED, Result]
+    assert found[-1] == Result(handle.goal)
+    assert [each.id for each in found if not isinstance(each, Result | Snapshot)] == [handle.id] * 5
+    word = found[3]
+    assert isinstance(word, WordHeard)
+    assert (word.number, handle.goal.text and handle.goal.text[word.start : word.end]) == (2, "one")
+    assert list(handle.events()) == [Result(handle.goal)]
+    assert list(handle.feedback()) == []
+    assert handle.wait(0) is handle.goal
+
+
+def test_events_without_feedback_are_states(client: Client) -> None:
+    assert told(list(client.say("length=0.1").events(5))) == [State.PENDING, State.ACTIVE, State.SUCCEEDED, Result]
+
+
+def test_feedback_of_a_goal_sent_without_it_begins_with_the_question(client: Client, scripted: Talk) -> None:
+    for follow in (True, False):
+        first = client.say("never-ends", follow=follow)
+        handle = client.say("length=0.1 one", follow=follow)
+        scripted.watcher.wait_for(handle.id, "PENDING")
+        words = handle.feedback(5)
+        first.cancel()
+        assert [each.word for each in words] == ["length=0.1", "one"]
+        assert handle.state is State.SUCCEEDED
+
+
+def test_goal_that_was_rejected_has_a_result_and_no_words(client: Client) -> None:
+    for handle in (client.say(""), client.say("a" * 100_000, feedback=True)):
+        assert list(handle.events(1)) == [Result(handle.goal)]
+        assert list(handle.feedback(1)) == []
+        assert handle.cancel() is handle.goal
+        handle.request_cancel()  # there is nothing to cancel
+    assert client.log()[-1].state is State.REJECTED
+
+
+def test_iterator_that_is_broken_off_is_taken_up_again(client: Client) -> None:
+    handle = client.say("length=0.3 one two three", feedback=True)
+    seen: list[str] = []
+    for word in handle.feedback(5):
+        seen.append(word.word)
+        if word.word == "one":
+            break
+    assert client.goal(handle.id).state is State.ACTIVE  # the connection is as before
+    assert client.say("length=0", follow=False).state is State.PENDING
+    seen.extend(each.word for each in handle.feedback(5))
+    assert seen == ["length=0.3", "one", "two", "three"]
+    assert handle.wait(5).state is State.SUCCEEDED
+
+
+def test_two_handles_of_a_goal_hear_the_same(client: Client, scripted: Talk) -> None:
+    client.say("never-ends", key="first")
+    handle = client.say("length=0.1 one", feedback=True)
+    (other,) = client.follow([handle.id], feedback=True)
+    (plain,) = client.follow([handle.id])
+    scripted.watcher.wait_for(handle.id, "PENDING")
+    client.cancel(key="first")
+    mine, others = list(handle.events(5)), list(other.events(5))
+    assert mine[1:] == others  # all but PENDING, which was before
+    assert told(list(plain.events(5))) == [State.ACTIVE, State.SUCCEEDED, Result]
+
+
+def test_events_of_a_goal_that_is_cancelled_while_they_are_iterated(client: Client) -> None:
+    handle = client.say("never-ends one", feedback=True)
+    found: list[Event] = []
+    for event in handle.events(5):
+        found.append(event)
+        if isinstance(event, WordHeard) and event.number == 1:
+            assert handle.cancel().state is State.PREEMPTED
+    assert told(found)[-3:] == [State.PREEMPTING, State.PREEMPTED, Result]
+
+
+def test_events_time_out_and_the_goal_goes_on(client: Client, scripted: Talk) -> None:
+    handle = client.say("never-ends words=1", feedback=True)
+    scripted.watcher.wait_for_word(handle.id)
+    found: list[Event] = []
+    with pytest.raises(TimeoutError, match=handle.id):
+        found.extend(handle.events(0.3))
+    assert told(found) == [State.PENDING, State.ACTIVE, "never-ends"]
+    assert scripted.goal(handle.id)["state"] == "ACTIVE"
+    handle.cancel()
+    assert told(list(handle.events(5))) == [State.PREEMPTING, State.PREEMPTED, Result]
+
+
+def test_goal_is_lost_with_its_server(client: Client, scripted: Talk) -> None:
+    handle = client.say("never-ends words=1", feedback=True)
+    watch = client.events()
+    for _ in handle.feedback(5):
+        scripted.kill()
+    assert (handle.state, handle.goal.reason) == (State.LOST, "lost")
+    *_, last = handle.events()
+    assert last == Result(handle.goal)
+    with pytest.raises(Lost, match="went away"):
+        list(watch)
+    with pytest.raises(StopIteration):
+        next(watch)
+
+
+def test_late_feedback_of_an_unknown_goal_is_an_error(client: Client) -> None:
+    with pytest.raises(UnknownGoal):
+        GoalHandle(client, Goal("none-1", State.ACTIVE)).feedback(1)
+
+
+# All events
+
+
+def until_all_ended(watch: Iterator[Event], count: int) -> list[Event]:
+    """Return what a watch says until so many goals have ended."""
+    found: list[Event] = []
+    for event in watch:
+        found.append(event)
+        count -= isinstance(event, StateChanged) and event.state.terminal
+        if not count:
+            break
+    return found
+
+
+def test_watch_begins_with_a_snapshot_and_tells_everything(client: Client, scripted: Talk) -> None:
+    said = client.say("length=0").wait(5)
+    active, pending = client.say("never-ends words=1"), client.say("length=0")
+    scripted.watcher.wait_for_word(active.id)
+    watch = client.events()
+    snapshot = next(watch)
+    assert isinstance(snapshot, Snapshot)
+    status = snapshot.status
+    assert status.active
+    assert (status.active.id, [each.id for each in status.pending]) == (active.id, [pending.id])
+    assert status.recent == (said,)
+    with Client(scripted.socket, name="another") as other:
+        other.pause()
+        other.resume()
+        other.say("length=0 hello", follow=False)
+        other.cancel([active.id])
+    found = until_all_ended(watch, 3)
+    goals = [each.goal for each in found if isinstance(each, StateChanged) and each.goal]
+    assert [each.state for each in goals] == [State.PENDING, State.PREEMPTED, State.SUCCEEDED, State.SUCCEEDED]
+    assert goals[0].client
+    assert goals[0].client.name == "another"
+    assert [each.word for each in found if isinstance(each, WordHeard)].count("hello") == 1
+    assert [each.paused for each in found if isinstance(each, PausedChanged)] == [True, False]
+    numbers = [each.n or 0 for each in found if not isinstance(each, Result | Snapshot)]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # nothing twice, nothing missing
+    handle = client.say("length=0 one", feedback=True)
+    assert told(until_all_ended(watch, 1)) == told(list(handle.events(5)))[:-1]
+
+
+def test_two_watches_of_a_client_hear_the_same(client: Client) -> None:
+    first, second = client.events(), client.events()
+    handles = [client.say(f"length=0 {number}", feedback=True) for number in range(3)]
+    one, two = until_all_ended(first, 3), until_all_ended(second, 3)
+    assert one[1:] == two[1:]
+    assert [type(each) for each in (one[0], two[0])] == [Snapshot, Snapshot]
+    assert [len([each for each in handle.feedback(5)]) for handle in handles] == [2, 2, 2]  # noqa: C416
+
+
+def test_watch_that_is_broken_off_can_be_begun_anew(client: Client) -> None:
+    for turn in range(3):
+        watch = client.events()
+        handle = client.say(f"length=0 {turn}")
+        assert len(until_all_ended(watch, 1)) >= 4
+        assert handle.wait(5).state is State.SUCCEEDED
+    assert isinstance(next(client.events()), Snapshot)
+
+
+def test_close_ends_the_watch_of_another_thread(client: Client) -> None:
+    ended: list[str] = []
+    begun = threading.Event()
+
+    def watch() -> None:
+        try:
+            for _ in client.events():
+                begun.set()
+        except Lost as error:
+            ended.append(str(error))
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    assert begun.wait(5)
+    client.close()
+    thread.join(5)
+    assert len(ended) == 1
+    assert "closed" in ended[0]

@@ -1,0 +1,286 @@
+"""The client library against a server that follows a script: how long it waits, and how it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from talkcli import Client
+from talkcli.dial import Interrupted
+from talkcli.errors import Lost, ServerUnavailable
+from talkcli.events import Event, PausedChanged, Result, Snapshot, StateChanged, WordHeard
+from talkcli.states import State
+from tests.support.connection import PATIENCE
+from tests.support.scripted_peer import OVERVIEW, Peer, goal, result, serving
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+
+# How long is waited
+
+
+def unanswered(peer: Peer) -> None:
+    peer.receive("say")
+
+
+def test_answer_to_a_patient_say_may_take_long_as_long_as_the_server_is_alive() -> None:
+    def play(peer: Peer) -> None:
+        seq = peer.receive("say")["seq"]
+        for _ in range(6):
+            time.sleep(0.1)
+            peer.send({"event": "alive"})
+        peer.send({"seq": seq, "ok": True, "goal": goal("PENDING"), "paused": True})
+        peer.reply("status", **OVERVIEW)
+        peer.send(result())
+
+    with serving(play) as path, Client(path, patience=0.2) as client:
+        handle = client.say("a", patient=True)
+        assert (handle.state, handle.speech_paused, handle.attached) == (State.PENDING, True, False)
+        client.status()
+        assert handle.wait(5).state is State.SUCCEEDED
+
+
+def test_answer_to_pause_may_take_long() -> None:
+    def play(peer: Peer) -> None:
+        seq = peer.receive("pause")["seq"]
+        time.sleep(0.5)
+        peer.send({"seq": seq, "ok": True, "paused": True, "goal": goal("ACTIVE")})
+        peer.reply("resume", paused=False, goal=None)
+
+    with serving(play) as path, Client(path, patience=0.2) as client:
+        held = client.pause()
+        assert held
+        assert held.state is State.ACTIVE
+        assert client.resume() is None
+
+
+def test_answer_to_any_other_say_must_come_in_time() -> None:
+    with serving(unanswered) as path, Client(path, patience=0.2) as client:
+        began = time.monotonic()
+        with pytest.raises(Lost, match="may still be spoken"):
+            client.say("a")
+        assert 0.2 <= time.monotonic() - began < 1
+
+
+def test_server_that_says_nothing_at_all_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("talkcli.connection.SILENCE_LIMIT", 0.3)
+    with serving(unanswered) as path, Client(path, patience=5) as client:
+        began = time.monotonic()
+        with pytest.raises(Lost, match=r"nothing for 0\.3 s"):
+            client.say("a", patient=True)
+        assert 0.3 <= time.monotonic() - began < 1
+        with pytest.raises(ServerUnavailable, match="nothing was sent"):
+            client.status()
+
+
+def test_watch_goes_on_as_long_as_the_server_is_alive(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("talkcli.client.SILENCE_LIMIT", 0.4)
+
+    def play(peer: Peer) -> None:
+        peer.reply("watch", **OVERVIEW)
+        for _ in range(6):
+            time.sleep(0.1)
+            peer.send({"event": "alive"})
+        peer.send(peer.state("ACTIVE"))
+
+    with serving(play) as path, Client(path) as client:
+        snapshot, state = itertools.islice(watch := client.events(), 2)
+        assert (type(snapshot), type(state)) == (Snapshot, StateChanged)
+        with pytest.raises(Lost, match=r"nothing for 0\.4 s"):
+            next(watch)
+
+
+def test_feedback_times_out_while_words_go_on() -> None:
+    def play(peer: Peer) -> None:
+        peer.accept()
+        with contextlib.suppress(OSError):
+            while True:
+                peer.send(peer.word())
+
+    with serving(play) as path, Client(path) as client:
+        handle = client.say("a", feedback=True)
+        began = time.monotonic()
+        words: list[WordHeard] = []
+        with pytest.raises(TimeoutError, match=r"g has not ended after 0\.3 s"):
+            words.extend(handle.feedback(0.3))
+        assert words
+        assert 0.3 <= time.monotonic() - began < 3  # what had been read by then is handed out, and no more
+
+
+@pytest.mark.parametrize("timeout", [0, 0.1])
+def test_what_has_arrived_by_the_deadline_counts(timeout: float) -> None:
+    def play(peer: Peer) -> None:
+        peer.accept()
+        peer.send(peer.state("PENDING"), peer.state("ACTIVE"))
+        sent.set()
+
+    sent = threading.Event()
+    with serving(play) as path, Client(path) as client:
+        handle = client.say("a")
+        assert sent.wait(PATIENCE)
+        seen: list[Event] = []
+        with pytest.raises(TimeoutError):
+            seen.extend(handle.events(timeout))
+        assert [each.state for each in seen if isinstance(each, StateChanged)] == [State.PENDING, State.ACTIVE]
+        with pytest.raises(TimeoutError):
+            next(handle.events(timeout))  # each event is handed out once
+
+
+# The end of the connection
+
+
+def test_result_that_came_before_the_server_went_away_counts() -> None:
+    gone = threading.Event()
+
+    def play(peer: Peer) -> None:
+        peer.accept()
+        peer.send(peer.state("ACTIVE"), peer.state("PREEMPTED"), result("PREEMPTED"))
+        peer.hang_up()
+        gone.set()
+
+    with serving(play) as path, Client(path) as client:
+        handle = client.say("a")
+        assert gone.wait(PATIENCE)
+        with pytest.raises(ServerUnavailable):
+            client.status()
+        with pytest.raises(ServerUnavailable):
+            client.say("b")
+        assert handle.wait(5).state is State.PREEMPTED
+
+
+@pytest.mark.parametrize("how", ["events", "feedback", "wait"])
+def test_goal_of_a_server_that_goes_away_is_lost(how: str) -> None:
+    def play(peer: Peer) -> None:
+        peer.accept()
+        peer.send(peer.state("ACTIVE"), peer.word())
+        peer.hang_up()
+
+    with serving(play) as path, Client(path) as client:
+        handle = client.say("a", feedback=True)
+        if how == "events":
+            *seen, last = handle.events(5)
+            assert [type(each) for each in seen] == [StateChanged, WordHeard]
+            assert last == Result(handle.goal)
+        elif how == "feedback":
+            assert len(list(handle.feedback(5))) == 1
+        else:
+            assert handle.wait(5) is handle.goal
+        assert (handle.state, handle.goal.reason) == (State.LOST, "lost")
+        assert "may still be spoken" in str(handle.goal.message)
+        assert [each for each in handle.events() if isinstance(each, Result)] == [Result(handle.goal)]
+
+
+@pytest.mark.parametrize("word", [{"word": 1}, {"start": "0"}, {"number": True}, {"time": None}, {"id": None}])
+def test_message_that_is_none_ends_the_connection_and_hangs_nobody(word: dict[str, Any]) -> None:
+    def play(peer: Peer) -> None:
+        peer.accept()
+        peer.send({**peer.word(), **word})
+
+    with serving(play) as path, Client(path) as client:
+        goal = client.say("a", feedback=True).wait(5)
+        assert goal.state is State.LOST
+        assert "what is no message" in str(goal.message)
+
+
+def test_reply_without_a_goal_is_no_goal() -> None:
+    def play(peer: Peer) -> None:
+        peer.reply("say", goal={"id": "g", "state": "BORED"})
+
+    with serving(play) as path, Client(path) as client:
+        with pytest.raises(Lost):
+            client.say("a")
+        with pytest.raises(ServerUnavailable):
+            client.say("a")
+
+
+def test_events_of_kinds_not_known_here_are_ignored() -> None:
+    def play(peer: Peer) -> None:
+        peer.accept()
+        peer.send({"event": "viseme", "id": "g"}, {**peer.word(), "viseme": "o"}, {"event": None}, result())
+
+    with serving(play) as path, Client(path) as client:
+        assert len(list(client.say("a", feedback=True).feedback(5))) == 1
+
+
+# Interrupts
+
+
+@pytest.fixture
+def interrupt() -> Iterator[tuple[int, int]]:
+    """A descriptor that interrupts, and the one that is written to for it."""
+    pipe = os.pipe()
+    yield pipe
+    for each in pipe:
+        os.close(each)
+
+
+@pytest.mark.parametrize("how", ["events", "feedback", "wait"])
+def test_interrupt_ends_the_wait_for_a_goal_and_loses_nothing(interrupt: tuple[int, int], how: str) -> None:
+    def play(peer: Peer) -> None:
+        peer.accept()
+        peer.send(peer.state("ACTIVE"))
+        os.write(interrupt[1], b"x")
+        peer.reply("status", **OVERVIEW)
+        peer.send(peer.word(), result())
+
+    with serving(play) as path, Client(path, interrupt=interrupt[0]) as client:
+        handle = client.say("a", feedback=True)
+        waiting: dict[str, Callable[[], object]] = {
+            "events": lambda: list(handle.events(5)),
+            "feedback": lambda: list(handle.feedback(5)),
+            "wait": handle.wait,
+        }
+        with pytest.raises(Interrupted):
+            waiting[how]()
+        os.read(interrupt[0], 1)
+        client.status()
+        assert [type(each) for each in handle.events(5)][-2:] == [WordHeard, Result]
+
+
+@pytest.mark.parametrize("how", ["watch", "say", "pause"])
+def test_interrupt_ends_what_may_take_long(interrupt: tuple[int, int], how: str) -> None:
+    def play(peer: Peer) -> None:
+        request = peer.receive(how)
+        if how == "watch":
+            peer.send({"seq": request["seq"], "ok": True, **OVERVIEW})
+        os.write(interrupt[1], b"x")
+
+    with serving(play) as path, Client(path, interrupt=interrupt[0]) as client:
+        doing: dict[str, Callable[[], object]] = {
+            "watch": lambda: list(client.events()),
+            "say": lambda: client.say("a", patient=True),
+            "pause": client.pause,
+        }
+        with pytest.raises(Interrupted):
+            doing[how]()
+
+
+def test_pause_of_all_speech_is_told_to_those_who_follow_with_feedback() -> None:
+    by = {"client": {"pid": 7, "uid": 0, "command": "talk", "parent": None, "name": "me"}}
+    paused = {"event": "paused", "paused": True, "id": "g", "by": by, "n": 50, "at": 3.5}
+
+    def play(peer: Peer) -> None:
+        peer.accept(state="ACTIVE")
+        peer.send(paused)
+        peer.reply("status", **OVERVIEW)
+        peer.receive("cancel")
+        peer.send({**paused, "paused": False, "n": 51}, result())
+
+    with serving(play) as path, Client(path) as client:
+        handle = client.say("a", feedback=True)
+        client.status()
+        assert (handle.speech_paused, handle.goal.paused) == (True, True)
+        handle.request_cancel()
+        first, second, _ = handle.events(5)
+        assert isinstance(first, PausedChanged)
+        assert first.to_json() == paused
+        assert isinstance(second, PausedChanged)
+        assert not second.paused
+        assert (handle.speech_paused, handle.goal.paused) == (False, False)

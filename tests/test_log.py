@@ -1,0 +1,115 @@
+"""`talk log`: what was said, when, by whom, how it ended and who ended it."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.columns import width
+from talkcli.requests import MAX_LOG
+from tests.conformance.bareserve import TALK, environment, run
+from tests.support.surroundings import short_directory
+from tests.support.terminal import Terminal
+
+if TYPE_CHECKING:
+    from tests.support.processes import Talk
+
+LONG = "please step back from the door and from the lift " * 5
+
+
+@pytest.fixture
+def history(scripted: Talk) -> list[str]:
+    """One goal of each end; their ids, oldest end first."""
+    talk = scripted
+    succeeded = talk.run("say", "--wait", "--as", "patrol", "length=0").id
+    aborted = talk.run("say", "--wait", "fail=audio_lost message=no_cable").id
+    rejected = json.loads(talk.run("--json", "say", "").out)["id"]
+    active = talk.run("say", "--", f"never-ends {LONG}").id
+    talk.watcher.wait_for_word(active)
+    pending = talk.run("say", "waits").id
+    talk.run("cancel", pending)
+    talk.run("cancel")
+    return [succeeded, aborted, rejected, pending, active]
+
+
+def test_a_line_tells_when_how_what_who_and_why(scripted: Talk, history: list[str]) -> None:
+    done = scripted.run("log")
+    assert (done.code, done.err) == (0, "")
+    lines = done.out.splitlines()
+    assert [each.split()[2] for each in lines] == history
+    states = ["SUCCEEDED", "ABORTED", "REJECTED", "RECALLED", "PREEMPTED"]
+    assert [each.split()[1] for each in lines] == states
+    assert all(re.match(r"\d\d:\d\d:\d\d  \w", each) for each in lines)
+    script = re.escape(sys.executable.split("/")[-1][:6])
+    assert re.search(rf'"length=0" +\S*{script}.*, pid \d+, as "patrol"  0\.0 s$', lines[0])
+    assert re.search(r", pid \d+  audio_lost: no cable$", lines[1])
+    assert re.search(r'"" .*, pid \d+ +invalid_text: the text is empty$', lines[2])
+    assert re.search(rf'"waits" .*, pid \d+ +canceled by \S*{script}.*, pid \d+$', lines[3])
+    assert f'"never-ends {LONG}"' in lines[4]  # in a pipe, the whole text
+    assert "\x1b" not in done.out
+
+
+def test_count_and_order(scripted: Talk, history: list[str]) -> None:
+    assert [each.split()[2] for each in scripted.run("log", "-n", "2").out.splitlines()] == history[-2:]
+    assert [each.split()[2] for each in scripted.run("log", "--count", str(MAX_LOG)).out.splitlines()] == history
+    for count in ("0", "-1", str(MAX_LOG + 1), "many"):
+        done = scripted.run("log", "-n", count)
+        assert (done.code, done.out, "-n" in done.err) == (2, "", True)
+
+
+def test_twenty_are_shown_by_default(scripted: Talk) -> None:
+    for number in range(22):
+        scripted.request("say", text=f"length=0 {number}", wait=True)
+    scripted.run("wait")
+    lines = scripted.run("log").out.splitlines()
+    assert len(lines) == 20
+    assert '"length=0 2"' in lines[0]
+    assert '"length=0 21"' in lines[-1]
+
+
+def test_json_is_a_goal_a_line(scripted: Talk, history: list[str]) -> None:
+    done = scripted.run("--json", "log")
+    goals = [json.loads(each) for each in done.out.splitlines()]
+    assert [each["id"] for each in goals] == history
+    assert goals[-1] == scripted.goal(history[-1])
+
+
+def test_nothing_was_said(scripted: Talk) -> None:
+    assert (scripted.run("log").out, scripted.run("log").code, scripted.run("--json", "log").out) == ("", 0, "")
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120])
+def test_lines_fit_the_terminal_and_line_up(scripted: Talk, history: list[str], columns: int) -> None:
+    env = {"TERM": "xterm", **scripted.env}
+    with Terminal([*TALK, "log"], env, columns) as shown:
+        assert shown.finish() == 0
+        lines, coloured = shown.lines, shown.raw
+    assert [each.split()[2] for each in lines] == history
+    assert max(map(width, lines)) <= columns
+    assert '…"' in lines[-1]
+    assert len({each.index('"') for each in lines}) == 1
+    assert "audio_lost"[:8] in lines[1]
+    assert b"\x1b[32mSUCCEEDED\x1b[0m" in coloured
+    assert b"\x1b[31mREJECTED \x1b[0m" in coloured
+    with Terminal([*TALK, "log"], {**env, "NO_COLOR": "1"}, columns) as plain:
+        plain.finish()
+        assert (plain.lines, b"\x1b" in plain.raw) == (lines, False)
+
+
+def test_text_of_others_is_shown_escaped(scripted: Talk) -> None:
+    hostile = "a\x1b[31mred\u202egnp.exe\nfake line\x07"
+    scripted.run("say", "--wait", "--as", hostile, "--", hostile)
+    done = scripted.run("log")
+    assert done.out.count(r"a\x1b[31mred\u202egnp.exe\nfake line\x07") == 2
+    assert not re.search("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202e]", done.out)
+    assert done.out.count("\n") == 1
+
+
+def test_without_a_server_it_is_3() -> None:
+    with short_directory() as home:
+        done = run([*TALK, "log"], environment(home, TALK_SOCKET=f"{home}/s"))
+    assert (done.code, done.out) == (3, "")

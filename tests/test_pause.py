@@ -1,0 +1,101 @@
+"""`talk pause` and `talk resume`: what they say, print and return. What is heard meanwhile is tested elsewhere."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.bareserve import TALK, environment, run
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+
+@pytest.fixture
+def held(scripted: Talk) -> str:
+    """The id of a goal that is being spoken."""
+    goal_id = scripted.run("say", "never-ends and on").id
+    scripted.watcher.wait_for_word(goal_id)
+    return goal_id
+
+
+def test_pause_tells_what_is_held_and_resume_what_goes_on(scripted: Talk, held: str) -> None:
+    done = scripted.run("pause")
+    assert (done.code, done.out) == (0, "")
+    assert done.err.startswith(f'talk: {held} is held, after "never-ends')
+    assert done.err.endswith("\"; 'talk resume' goes on\n")
+    assert scripted.goal(held)["paused"] is True
+    again = scripted.run("pause")
+    assert (again.code, f"{held} is held" in again.err) == (0, True)
+    resumed = scripted.run("resume")
+    assert (resumed.code, resumed.out, resumed.err) == (0, "", f"talk: speech goes on with {held}\n")
+    assert scripted.goal(held)["paused"] is False
+    assert scripted.run("resume").code == 0
+    scripted.run("cancel")
+
+
+def test_json_is_one_object(scripted: Talk, held: str) -> None:
+    for _ in range(2):
+        done = scripted.run("--json", "pause")
+        told = json.loads(done.out)
+        assert (told.keys(), done.err, done.code) == ({"paused", "goal"}, "", 0)
+        assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (True, held, True)
+    told = json.loads(scripted.run("resume", "--json").out)
+    assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (False, held, False)
+    assert json.loads(scripted.run("resume", "--json").out)["paused"] is False
+    scripted.run("cancel")
+
+
+def test_quiet_says_nothing(scripted: Talk, held: str) -> None:
+    for words in (["-q", "pause"], ["pause", "-q"], ["-q", "resume"]):
+        done = scripted.run(*words)
+        assert (done.code, done.out, done.err) == (0, "", "")
+    scripted.run("cancel", held)
+
+
+def test_status_shows_what_is_held(scripted: Talk, held: str) -> None:
+    scripted.run("pause")
+    status = scripted.run("status").out
+    assert "paused   speech is held: talk resume\n" in status
+    assert f"now      {held}  ACTIVE" in status
+    assert "  held, for " in status
+    assert "state    ACTIVE, paused\n" in scripted.run("status", held).out
+    assert json.loads(scripted.run("--json", "status").out)["server"]["paused"] is True
+    scripted.run("resume")
+    assert "speech is held" not in scripted.run("status").out
+    scripted.run("cancel")
+
+
+def test_what_was_heard_last_is_shown_escaped(scripted: Talk) -> None:
+    goal_id = scripted.run("say", "--", "never-ends \x1b[31m\u202e").id
+    scripted.watcher.wait_until(lambda each: each["id"] == goal_id and each.get("number") == 2)
+    done = scripted.run("pause")
+    assert "\x1b" not in done.err
+    assert r"\x1b[31m\u202e" in done.err
+    scripted.run("resume")
+    scripted.run("cancel")
+
+
+def test_where_nothing_is_spoken_it_is_success_too(make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True, watched=False)
+    done = talk.run("pause")
+    assert (done.code, done.out, "nothing is being spoken" in done.err) == (0, "", True)
+    assert json.loads(talk.run("--json", "pause").out) == {"paused": True, "goal": None}
+    waiting = talk.run("say", "length=0").id
+    assert talk.goal(waiting)["state"] == "PENDING"
+    done = talk.run("resume")
+    assert (done.code, done.out, done.err.startswith("talk: speech goes on")) == (0, "", True)
+    assert talk.run("wait", waiting).code == 0
+    assert talk.run("-q", "resume").code == 0
+    assert json.loads(talk.run("--json", "resume").out) == {"paused": False, "goal": None}
+
+
+def test_without_a_server_it_is_3() -> None:
+    with short_directory() as home:
+        for command in ("pause", "resume"):
+            done = run([*TALK, command], environment(home, TALK_SOCKET=f"{home}/s"))
+            assert (done.code, done.out) == (3, "")

@@ -1,0 +1,191 @@
+"""`say --feedback` and `wait --feedback` in a pipe: a line or an object for each event, at once."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    import subprocess
+    from collections.abc import Iterator
+
+    from tests.support.processes import Talk
+
+
+def lines_of(client: subprocess.Popen[str]) -> Iterator[str]:
+    """Return what a client prints, line by line as it comes."""
+    assert client.stdout
+    return (each.rstrip("\n") for each in client.stdout)
+
+
+#: Spoken until it is stopped, with a word in each tenth of a second: who follows it prints something soon.
+TALKING = "never-ends length=60 " + "word " * 600
+
+
+def objects(out: str) -> list[dict[str, Any]]:
+    return [json.loads(each) for each in out.splitlines()]
+
+
+def test_each_event_is_a_line_that_can_be_cut(scripted: Talk) -> None:
+    done = scripted.run("say", "-wf", "--", "length=0.4 battery d'été 日本")
+    goal_id = scripted.watcher.goals()[0]
+    assert done.code == 0
+    assert done.err == ""
+    assert done.out.splitlines() == [
+        f"{goal_id} PENDING",
+        f"{goal_id} ACTIVE",
+        f"{goal_id} word 1 0-10 0.000 length=0.4",
+        f"{goal_id} word 2 11-18 0.100 battery",
+        f"{goal_id} word 3 19-24 0.200 d'été",
+        f"{goal_id} word 4 25-27 0.300 日本",
+        f"{goal_id} SUCCEEDED",
+    ]
+
+
+def test_feedback_alone_waits(scripted: Talk) -> None:
+    assert scripted.run("say", "--feedback", "fail=audio_lost").code == 4
+    done = scripted.run("say", "-f", "-t", "0.3", "never-ends")
+    assert done.code == 124
+    assert done.out.splitlines()[-2:] == [
+        f"{scripted.watcher.goals()[-1]} {each}" for each in ("PREEMPTING", "PREEMPTED")
+    ]
+
+
+def test_lines_come_as_the_words_are_heard(scripted: Talk) -> None:
+    client = scripted.start("say", "-wf", "--", "never-ends words=1")
+    lines = lines_of(client)
+    assert [next(lines).split(" ", 1)[1] for _ in range(3)] == ["PENDING", "ACTIVE", "word 1 0-10 0.000 never-ends"]
+    client.send_signal(signal.SIGTERM)
+    assert [each.split(" ")[1] for each in lines] == ["PREEMPTING", "PREEMPTED"]
+    assert client.wait(10) == 143
+
+
+def test_objects_are_the_wires_own_and_the_last_is_the_result(scripted: Talk) -> None:
+    done = scripted.run("--json", "say", "-wf", "--", "length=0.2 battery low")
+    *events, result = objects(done.out)
+    goal_id = events[0]["id"]
+    # Those who watch all get the whole goal, too.
+    told = [
+        {name: value for name, value in each.items() if name != "goal"} for each in scripted.watcher.events(goal_id)
+    ]
+    assert events == told
+    assert [each["event"] for each in events] == ["state", "state", "word", "word", "word", "state"]
+    assert events[3].keys() == {"event", "id", "word", "start", "end", "number", "time", "n", "at"}
+    assert result == {"event": "result", "goal": scripted.goal(goal_id)}
+
+
+@pytest.mark.parametrize(("text", "code", "state"), [("", 5, "REJECTED"), ("fail=audio_lost", 4, "ABORTED")])
+def test_whatever_happens_the_last_object_is_the_result(scripted: Talk, text: str, code: int, state: str) -> None:
+    done = scripted.run("--json", "say", "-wf", "--", text)
+    last = objects(done.out)[-1]
+    assert (done.code, last["event"], last["goal"]["state"]) == (code, "result", state)
+    assert last["goal"]["message"] in done.err
+
+
+def test_goal_that_is_rejected_prints_no_line(scripted: Talk) -> None:
+    done = scripted.run("say", "-wf", "")
+    assert (done.code, done.out) == (5, "")
+    assert "the text is empty" in done.err
+
+
+def test_lost_server_ends_the_events_with_a_result(scripted: Talk) -> None:
+    as_lines = scripted.start("say", "-wf", "--", TALKING)
+    lines = lines_of(as_lines)
+    goal_id = next(lines).split()[0]
+    as_objects = scripted.start("--json", "wait", "-f", goal_id)
+    found = lines_of(as_objects)
+    assert json.loads(next(found))["id"] == goal_id
+    scripted.kill()
+    assert list(lines)[-1] == f"{goal_id} LOST"
+    assert as_lines.wait(10) == 12
+    last = json.loads(list(found)[-1])
+    assert (last["event"], last["goal"]["state"]) == ("result", "LOST")
+    assert as_objects.wait(10) == 12
+
+
+def test_pause_and_resume_are_shown(scripted: Talk) -> None:
+    client = scripted.start("say", "-wf", "--", "never-ends words=1")
+    lines = lines_of(client)
+    goal_id = next(lines).split()[0]
+    scripted.watcher.wait_for_word(goal_id)
+    for command in ("pause", "resume", "cancel"):
+        assert scripted.run(command).code == 0
+    shown = [each.split()[1] for each in lines]
+    assert shown == ["ACTIVE", "word", "PAUSED", "RESUMED", "PREEMPTING", "PREEMPTED"]
+    assert client.wait(10) == 7
+
+
+def test_text_of_others_is_escaped_in_lines(scripted: Talk) -> None:
+    text = "length=0.1 a\x1b[31mred\u202e\x07b"
+    done = scripted.run("say", "-wf", "--", text)
+    assert re.search(r"(?m) word 2 11-23 0\.050 a\\x1b\[31mred\\u202e\\x07b$", done.out)
+    assert objects(scripted.run("--json", "say", "-wf", "--", text).out)[-1]["goal"]["text"] == text
+
+
+# wait
+
+
+def test_wait_follows_several_goals_in_the_servers_order(scripted: Talk) -> None:
+    blocking = scripted.run("say", TALKING).id
+    scripted.watcher.wait_for_word(blocking)
+    low = scripted.run("say", "length=0.1 low").id
+    high = scripted.run("say", "--priority", "1", "length=0.1 high").id
+    client = scripted.start("--json", "wait", "-f", low, high, low, blocking)
+    lines = lines_of(client)
+    first = next(lines)
+    scripted.run("cancel", "--current")
+    found = [json.loads(each) for each in (first, *lines)]
+    assert client.wait(10) == 7
+    ids = [each["id"] if "id" in each else each["goal"]["id"] for each in found]
+    assert list(dict.fromkeys(ids)) == [blocking, high, low]
+    numbers = [each["n"] for each in found if "n" in each]
+    assert numbers == sorted(set(numbers))
+    assert [each["goal"]["id"] for each in found if each["event"] == "result"] == [blocking, high, low]
+    for goal_id in (low, high):
+        own = [each.get("state", each["event"]) for each in found if each.get("id") == goal_id]
+        assert own == ["ACTIVE", "word", "word", "SUCCEEDED"]
+
+
+def test_wait_without_ids_follows_all_that_is_there(scripted: Talk) -> None:
+    assert scripted.run("wait", "-f").out == ""
+    first = scripted.run("say", TALKING).id
+    scripted.watcher.wait_for_word(first)
+    second = scripted.run("say", "fail=audio_lost").id
+    client = scripted.start("wait", "-f")
+    lines = lines_of(client)
+    assert next(lines).startswith(f"{first} word ")
+    for words in (["pause"], ["resume"], ["cancel", first]):
+        assert scripted.run(*words).code == 0
+    states = [each for each in lines if " word " not in each]
+    assert states == [
+        f"{first} PAUSED",  # once, not once for each goal
+        f"{first} RESUMED",
+        f"{first} PREEMPTING",
+        f"{first} PREEMPTED",
+        f"{second} ACTIVE",
+        f"{second} ABORTED",
+    ]
+    assert scripted.finish(client).err == ""
+    assert client.returncode == 0  # how those end that were not named is nobody's failure
+
+
+def test_wait_for_a_goal_that_has_ended_shows_its_end(scripted: Talk) -> None:
+    goal_id = scripted.run("say", "--wait", "fail=audio_lost").id
+    done = scripted.run("wait", "--feedback", goal_id)
+    assert (done.code, done.out) == (4, f"{goal_id} ABORTED\n")
+    found = objects(scripted.run("--json", "wait", "-f", goal_id).out)
+    assert found == [{"event": "result", "goal": scripted.goal(goal_id)}]
+
+
+def test_wait_that_gives_up_cancels_nothing(scripted: Talk) -> None:
+    goal_id = scripted.run("say", "never-ends words=1").id
+    scripted.watcher.wait_for_word(goal_id)
+    done = scripted.run("wait", "-f", "-t", "0.2", goal_id)
+    assert done.code == 124
+    assert "has not ended" in done.err
+    assert scripted.run("wait", "-f", "none-1").code == 8
+    assert scripted.goal(goal_id)["state"] == "ACTIVE"

@@ -1,0 +1,356 @@
+"""`say --lines`: each line of standard input is a goal as it comes; none is lost, none is spoken twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.conformance.bareserve import TALK, environment
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+ENDLESS = "never-ends words=1\n"
+
+
+def texts(talk: Talk, *states: str) -> list[str]:
+    """Return the texts of the goals that came to one of these states, in the order in which they did."""
+    known = {each["id"]: each["goal"]["text"] for each in talk.watcher.events() if each.get("goal")}
+    return [known[each["id"]] for each in talk.watcher.events() if each.get("state") in states]
+
+
+class Typing:
+    """A client whose standard input stays open."""
+
+    def __init__(self, talk: Talk, *words: str) -> None:
+        self._talk = talk
+        self.client = talk.start(*words, stdin=subprocess.PIPE)
+
+    def type(self, text: str) -> None:
+        assert self.client.stdin
+        self.client.stdin.write(text)
+        self.client.stdin.flush()
+
+    def line(self) -> str:
+        """Return the next line that the client prints."""
+        assert self.client.stdout
+        return self.client.stdout.readline().rstrip("\n")
+
+    def end(self, number: signal.Signals | None = None) -> tuple[int, list[str], str]:
+        """Send it a signal, or close its input; return its exit code, what it prints from now on, and its notes."""
+        assert self.client.stdin
+        assert self.client.stdout
+        assert self.client.stderr
+        if number is None:
+            self.client.stdin.close()
+        else:
+            self.client.send_signal(number)
+        out, err = self.client.stdout.read().splitlines(), self.client.stderr.read()
+        code = self.client.wait(20)
+        if not self.client.stdin.closed:
+            self.client.stdin.close()
+        assert "Traceback" not in err, err
+        return code, out, err
+
+
+def test_each_line_is_a_goal_and_its_id_is_printed(scripted: Talk) -> None:
+    done = scripted.run("say", "--lines", stdin="length=0 one\n\n   \nlength=0 two\r\nlength=0 -x 日本\nlength=0 last")
+    assert (done.code, done.err) == (0, "")
+    ids = done.out.split()
+    assert len(ids) == 4
+    scripted.watcher.wait_for_terminal(ids[-1])
+    said = ["length=0 one", "length=0 two", "length=0 -x 日本", "length=0 last"]
+    assert [scripted.goal(each)["text"] for each in ids] == said
+    assert texts(scripted, "ACTIVE") == said
+
+
+def test_input_that_never_ends_is_spoken_line_by_line(scripted: Talk) -> None:
+    typing = Typing(scripted, "say", "--lines")
+    for text in ("length=0 one", "length=0 two"):
+        typing.type(f"{text}\n")
+        assert scripted.goal(typing.line())["text"] == text
+    typing.type("half a li")
+    typing.type("ne\n")
+    assert scripted.goal(typing.line())["text"] == "half a line"
+    typing.type("length=0 without a newline")
+    code, out, err = typing.end()
+    assert (code, err) == (0, "")
+    assert scripted.goal(out[0])["text"] == "length=0 without a newline"
+
+
+def test_nothing_to_say_is_success(scripted: Talk) -> None:
+    for words in ([], ["--wait"], ["-f"], ["-w", "--json"]):
+        done = scripted.run("say", "--lines", *words, stdin="\n\r\n")
+        assert (done.code, done.out, done.err) == (0, "", "")
+    client = scripted.run("say", "--lines", "-w")  # /dev/null
+    assert client.code == 0
+
+
+def test_options_hold_for_each_line(scripted: Talk) -> None:
+    done = scripted.run(
+        "--json", "say", "--lines", "--as", "reader", "--priority", "3", "--ttl", "9", "--key", "k", stdin="a\nb\n"
+    )
+    for line in done.out.splitlines():
+        goal = json.loads(line)
+        assert (goal["priority"], goal["ttl"], goal["key"], goal["client"]["name"]) == (3, 9, "k", "reader")
+
+
+def test_a_line_that_is_refused_is_reported_by_its_number_and_the_rest_goes_on(scripted: Talk) -> None:
+    text = "length=0 one\n\nnul \0\nlength=0 two\n" + "x" * 10_001 + "\n" + "y" * 300_000 + "\nlength=0 three\n"
+    for words in (["say", "--lines"], ["say", "--lines", "-w"]):
+        done = scripted.run(*words, stdin=text)
+        assert done.code == 5
+        assert len(done.out.split()) == 3
+        notes = done.err.splitlines()
+        assert [each.split(":")[1] for each in notes] == [" line 3", " line 5", " line 6"]
+        assert "NUL" in notes[0]
+        assert "10,001 characters" in notes[1]
+        assert "300,000 bytes" in notes[2]
+    quiet = scripted.run("-q", "say", "--lines", stdin=text)
+    assert (quiet.code, quiet.out, quiet.err) == (5, "", "")
+    invalid = run_bytes(scripted, b"length=0 one\n\xff\xfe\nlength=0 two\n")
+    assert (invalid.returncode, len(invalid.stdout.split())) == (5, 2)
+    assert b"line 2: " in invalid.stderr
+
+
+def run_bytes(talk: Talk, data: bytes, *words: str) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(
+        [*TALK, "say", "--lines", *words], env=talk.env, input=data, capture_output=True, timeout=60, check=False
+    )
+
+
+def test_the_longest_text_fits_and_one_byte_more_does_not(make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True)
+    longest = "日" * 10_000
+    widest = "👩" * 10_000  # 40,000 bytes
+    done = run_bytes(talk, f"{longest}\r\n{widest}\r\n{widest}a\n".encode())
+    assert done.returncode == 5
+    assert len(done.stdout.split()) == 2
+    assert done.stderr.startswith(b"talk: line 3: ")
+    assert done.stderr.count(b"\n") == 1
+    talk.run("cancel")
+
+
+def test_wait_tells_how_each_ended_and_the_first_failure(scripted: Talk) -> None:
+    text = "length=0 fine\nfail=audio_lost message=no_cable\n\0\nlength=0 too\n"
+    done = scripted.run("say", "--lines", "--wait", stdin=text)
+    assert done.code == 4
+    ids = done.out.split()
+    assert f"talk: {ids[1]}: Talk aborted: no cable" in done.err.splitlines()
+    refused_first = scripted.run("say", "--lines", "--wait", stdin="\0\nfail=audio_lost\n")
+    assert refused_first.code == 5
+    assert scripted.run("say", "--lines", "--wait", stdin="length=0\nlength=0 b\n").code == 0
+
+
+def test_json_is_the_goal_as_accepted_or_as_it_ended(scripted: Talk) -> None:
+    accepted = [
+        json.loads(each) for each in scripted.run("--json", "say", "--lines", stdin="a\n\0\nb\n").out.splitlines()
+    ]
+    assert [each["text"] for each in accepted] == ["a", "\0", "b"]
+    assert accepted[1]["state"] == "REJECTED"
+    ended = scripted.run("--json", "say", "--lines", "-w", stdin="length=0\nfail=audio_lost\n")
+    assert [json.loads(each)["state"] for each in ended.out.splitlines()] == ["SUCCEEDED", "ABORTED"]
+    assert ended.code == 4
+
+
+def test_feedback_of_all_lines(scripted: Talk) -> None:
+    done = scripted.run("say", "--lines", "-f", stdin="length=0.1 a\nlength=0.1 b\n")
+    assert done.code == 0
+    shown = [each.split(" ", 1) for each in done.out.splitlines()]
+    assert [each for _, each in shown] == [
+        "PENDING", "ACTIVE", "word 1 0-10 0.000 length=0.1", "word 2 11-12 0.050 a", "SUCCEEDED",
+        "PENDING", "ACTIVE", "word 1 0-10 0.000 length=0.1", "word 2 11-12 0.050 b", "SUCCEEDED",
+    ]  # fmt: skip
+    as_objects = scripted.run("--json", "say", "--lines", "-f", stdin="length=0\n\0\n")
+    found = [json.loads(each) for each in as_objects.out.splitlines()]
+    assert [each["goal"]["state"] for each in found if each["event"] == "result"].count("REJECTED") == 1
+    assert {"word", "state", "result"} == {each["event"] for each in found}
+
+
+def test_throttled_lines_are_no_failure(scripted: Talk) -> None:
+    done = scripted.run("say", "--lines", "-w", "--key", "k", "--throttle", "60", stdin="length=0 a\nlength=0 b\n")
+    assert done.code == 0, done.err
+    alike = scripted.run("say", "--lines", "--throttle", "60", stdin="length=0 same\n" * 2)
+    assert (alike.code, len(alike.out.split())) == (0, 1)
+    assert "line 2: " in alike.err
+
+
+# Room, speed, memory
+
+
+@pytest.mark.parametrize("words", [[], ["--wait"]])
+def test_lines_wait_for_room_and_none_is_lost(make_talk: MakeTalk, words: list[str]) -> None:
+    talk = make_talk("--max-queue", "3", scripted=True)
+    lines = [f"length=0.02 {number}" for number in range(60)]
+    done = talk.run("say", "--lines", *words, stdin="".join(f"{each}\n" for each in lines))
+    assert (done.code, done.err) == (0, "")
+    ids = done.out.split()
+    talk.watcher.wait_for_terminal(ids[-1])
+    assert texts(talk, "SUCCEEDED") == lines
+    assert len(set(ids)) == len(lines)
+
+
+def test_several_hundred_lines_a_second(make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True, watched=False)
+    lines = [f"length=0 {number}" for number in range(600)]
+    for words in ([], ["--wait"]):
+        control = talk.status()
+        done = talk.run("say", "--lines", *words, stdin="\n".join(lines))
+        assert (done.code, len(done.out.split())) == (0, len(lines))
+        # 600 in a second here, on an idle machine; a third of that where the start of a client takes 0.2 s
+        assert done.seconds < max(3.0, 15 * control), f"{len(lines)} lines in {done.seconds:.2f} s"
+
+
+def test_a_line_without_an_end_is_read_in_bounded_memory(scripted: Talk) -> None:
+    limited = ["sh", "-c", 'ulimit -v 400000 && exec "$@"', "sh", *TALK, "say", "--lines"]
+    client = subprocess.Popen(
+        limited, env=scripted.env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert client.stdin
+    for _ in range(600):
+        client.stdin.write(b"x" * 1_000_000)
+    out, err = client.communicate(b"\nlength=0 next\n", timeout=60)
+    assert client.returncode == 5, err
+    assert b"line 1: Talk rejected: the line has 600,000,000 bytes" in err
+    assert len(out.split()) == 1
+
+
+# Ends before the input's
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_cancels_what_is_its_own_and_nothing_else(make_talk: MakeTalk, number: signal.Signals) -> None:
+    talk = make_talk("--max-queue", "4", scripted=True)
+    theirs = talk.run("say", "--priority", "-1", "length=0 theirs").id
+    talk.watcher.wait_for_terminal(theirs)
+    typing = Typing(talk, "say", "--lines", "--wait")
+    typing.type(ENDLESS + "second\nthird\n")
+    ids = [typing.line() for _ in range(3)]
+    theirs = talk.run("say", "length=0 theirs").id
+    talk.watcher.wait_for_word(ids[0])
+    began = time.monotonic()
+    code, out, err = typing.end(number)
+    assert time.monotonic() - began < 3
+    assert (code, out) == (128 + number, [])
+    assert f"talk: {ids[0]}: Talk preempted" in err
+    assert "2 that waited: recalled" in err
+    assert [talk.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED", "RECALLED"]
+    assert talk.watcher.wait_for_terminal(theirs) == "SUCCEEDED"
+    assert talk.watcher.states(ids[2]) == ["PENDING", "RECALLED"]
+
+
+@pytest.mark.parametrize("words", [["--wait"], ["--json", "--wait"], ["-f"], ["-f", "--json"]])
+def test_line_that_waits_for_room_is_never_spoken_after_the_signal(make_talk: MakeTalk, words: list[str]) -> None:
+    talk = make_talk("--max-queue", "1", scripted=True)
+    typing = Typing(talk, "say", "--lines", *words)
+    typing.type(ENDLESS + "second\nthird\nfourth\n")
+    talk.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
+    # The third is on its way: it has got no answer, and gives no event.
+    talk.request("hello")
+    code, out, err = typing.end(signal.SIGINT)
+    assert code == 130
+    assert "line 3 may not have been accepted; what follows it was not sent" in err
+    assert texts(talk, "ACTIVE") == [ENDLESS.rstrip()]
+    assert texts(talk, "PENDING")[:2] == [ENDLESS.rstrip(), "second"]
+    if "--json" in words:
+        last = [json.loads(each) for each in out][-2:]
+        states = [each["goal"]["state"] if "event" in each else each["state"] for each in last]
+        assert sorted(states) == ["PREEMPTED", "RECALLED"]
+    assert talk.run("--json", "status").out.count('"PENDING"') == 0
+
+
+def test_signal_without_wait_just_ends(scripted: Talk) -> None:
+    typing = Typing(scripted, "say", "--lines")
+    typing.type(ENDLESS + "second\n")
+    first, second = typing.line(), typing.line()
+    code, out, err = typing.end(signal.SIGTERM)
+    assert (code, out, err) == (143, [], "")
+    scripted.watcher.wait_for_word(first)
+    assert scripted.goal(second)["state"] == "PENDING"
+
+
+def test_timeout_is_for_all_lines(scripted: Talk) -> None:
+    typing = Typing(scripted, "say", "--lines", "-w", "-t", "1")
+    typing.type(ENDLESS + "second\n")
+    ids = [typing.line(), typing.line()]
+    code, _, err = typing.end()
+    assert code == 124
+    assert "Talk preempted" in err
+    assert [scripted.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED"]
+    began = time.monotonic()
+    silent = Typing(scripted, "say", "--lines", "-w", "-t", "0.5")
+    assert silent.client.wait(10) == 124  # with nothing to read, and nothing to wait for
+    assert time.monotonic() - began >= 0.5
+    assert scripted.run("say", "--lines", "-w", "-t", "1e300", stdin="length=0\n").code == 0
+
+
+@pytest.mark.parametrize("words", [[], ["--wait"], ["-f"]])
+def test_server_that_goes_away(scripted: Talk, words: list[str]) -> None:
+    typing = Typing(scripted, "say", "--lines", *words)
+    typing.type(ENDLESS)
+    first = typing.line().split()[0]
+    scripted.watcher.wait_for_word(first)
+    scripted.kill()
+    if not words:
+        typing.type("into the void\n")
+    code, out, err = typing.end() if not words else (typing.client.wait(10), *typing.end()[1:])
+    assert code == (12 if words else 3), err
+    if words:
+        assert "it may still be spoken" in err
+    else:
+        assert "line 2 may not have been accepted" in err
+    assert [each for each in out if "LOST" in each] == ([f"{first} LOST"] if words == ["-f"] else [])
+
+
+def test_no_server_is_told_before_anything_is_read() -> None:
+    with short_directory() as home:
+        client = subprocess.Popen(
+            [*TALK, "say", "--lines"],
+            env=environment(home, TALK_SOCKET=f"{home}/s"),
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        assert client.wait(10) == 3
+        _, err = client.communicate()
+        assert b"talk serve" in err
+
+
+@pytest.mark.parametrize("words", [[], ["--json"], ["--wait", "--json"], ["-f"]])
+def test_closed_standard_output_is_141(scripted: Talk, words: list[str]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as closed:
+        client: Any = subprocess.Popen(
+            [*TALK, "say", "--lines", *words],
+            env=scripted.env,
+            stdin=subprocess.PIPE,
+            stdout=closed,
+            stderr=subprocess.PIPE,
+        )
+    client.stdin.write(b"length=0 a\n")
+    client.stdin.flush()  # and stays open: that output is closed ends it all the same
+    assert client.wait(10) == 141
+    assert client.stderr.read() == b""
+    client.stdin.close()
+    client.stderr.close()
+
+
+def test_standard_input_that_cannot_be_read_is_told(scripted: Talk) -> None:
+    for words in (["--lines"], ["-"]):
+        directory = os.open("/", os.O_RDONLY)
+        try:
+            done = subprocess.run(
+                [*TALK, "say", *words], env=scripted.env, stdin=directory, capture_output=True, timeout=20, check=False
+            )
+        finally:
+            os.close(directory)
+        assert (done.returncode, done.stdout) == (2, b"")
+        assert b"standard input cannot be read: Is a directory" in done.stderr

@@ -1,0 +1,308 @@
+"""The options of `say`: each does what its help says; what contradicts itself is refused before anything is sent."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import wave
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.conformance.bareserve import TALK, environment, run
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+
+def alone(*words: str, **extra: str) -> Any:
+    """Run `talk` where there is no server."""
+    with short_directory() as home:
+        return run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", **extra))
+
+
+def busy(talk: Talk) -> str:
+    """Have something spoken that does not end, and return its id."""
+    goal_id = talk.run("say", "never-ends words=1").id
+    talk.watcher.wait_for_word(goal_id)
+    return goal_id
+
+
+# Refused
+
+
+@pytest.mark.parametrize(
+    ("words", "hints"),
+    [
+        (["--flush", "--queue", "hello"], ["--flush", "--queue"]),
+        (["--timeout", "3", "hello"], ["--timeout", "--wait"]),
+        (["--lines", "hello"], ["--lines", "TEXT"]),
+        (["--lines", "-"], ["--lines", "TEXT"]),
+        (["--lines", "--id", "mine"], ["--lines", "--id"]),
+        (["--lines", "--timeout", "3"], ["--timeout", "--wait"]),
+        ([], ["TEXT"]),
+        (["-o", "x.wav"], ["TEXT"]),
+        (["-o", "x.wav", "-w", "--key", "k", "hello"], ["--output", "--wait, --key"]),
+        (["-o", "x.wav", "--queue", "hello"], ["--output", "--queue"]),
+        (["-o", "x.wav", "--preempt", "hello"], ["--output", "--preempt"]),
+        (["-o", "x.wav", "--lines"], ["--output", "--lines"]),
+        (["-o", "x.wav", "-f", "hello"], ["--output", "--feedback"]),
+        (["-o", "x.wav", "--flush", "--priority", "0", "hello"], ["--flush, --priority"]),
+        (["-o", "x.wav", "--ttl", "0", "--throttle", "0", "hello"], ["--ttl, --throttle"]),
+        (["-o", "x.wav", "--id", "mine", "--as", "me", "hello"], ["--id, --as"]),
+        (["--rate", "79", "hello"], ["--rate", "80"]),
+        (["--rate", "451", "hello"], ["--rate", "450"]),
+        (["--rate", "1e3", "hello"], ["--rate"]),
+        (["--volume", "1.01", "hello"], ["--volume"]),
+        (["--volume", "nan", "hello"], ["--volume"]),
+        (["--pitch", "-1", "hello"], ["--pitch"]),
+        (["--voice", "", "hello"], ["--voice", "variable"]),
+        (["--ttl", "-1", "hello"], ["--ttl"]),
+        (["--ttl", "inf", "hello"], ["--ttl", "0"]),
+        (["--throttle", "nan", "hello"], ["--throttle"]),
+        (["--key", "", "hello"], ["--key"]),
+        (["--key", "k" * 65, "hello"], ["key", "64"]),
+        (["--priority", "1000001", "hello"], ["priority"]),
+        (["--priority", "high", "hello"], ["--priority"]),
+        (["--id", "12", "hello"], ["id '12'"]),
+        (["--id", "k3fz-7", "hello"], ["k3fz-7"]),
+        (["--id", "a b", "hello"], ["a b"]),
+        (["--id", "", "hello"], ["--id"]),
+    ],
+)
+def test_contradictions_and_values_out_of_range_are_usage_errors(words: list[str], hints: list[str]) -> None:
+    done = alone("say", *words)
+    assert (done.code, done.out) == (2, ""), done
+    assert [each for each in hints if each not in done.err] == [], done.err
+
+
+# Order
+
+
+def test_preempt_and_queue(make_talk: MakeTalk) -> None:
+    talk = make_talk("--preempt", scripted=True)
+    first = busy(talk)
+    queued = talk.run("say", "--queue", "length=0").id
+    assert talk.watcher.states(queued) == ["PENDING"]
+    assert talk.run("say", "--wait", "--preempt", "length=0").code == 0
+    assert talk.watcher.wait_for_terminal(first) == "PREEMPTED"
+    assert talk.watcher.wait_for_terminal(queued) == "SUCCEEDED"
+
+
+def test_flush_drops_what_waits(scripted: Talk) -> None:
+    first = busy(scripted)
+    pending = scripted.run("say", "pending").id
+    important = scripted.run("say", "--priority", "1", "length=0 important").id
+    done = scripted.run("say", "--wait", "--flush", "length=0 now")
+    assert done.code == 0
+    ends = [scripted.watcher.wait_for_terminal(each) for each in (first, pending, important)]
+    assert ends == ["PREEMPTED", "RECALLED", "SUCCEEDED"]
+
+
+def test_priority_goes_first(scripted: Talk) -> None:
+    first = busy(scripted)
+    ids = [scripted.run("say", "--priority", each, "length=0").id for each in ("-1", "0", "5")]
+    scripted.run("cancel", first)
+    for each in ids:
+        scripted.watcher.wait_for_terminal(each)
+    begun = [each["id"] for each in scripted.watcher.events() if each.get("state") == "ACTIVE"]
+    assert begun == [first, *reversed(ids)]
+
+
+def test_ttl_and_key_and_wait_tell_what_became_of_it(scripted: Talk) -> None:
+    busy(scripted)
+    expired = scripted.run("--json", "say", "--wait", "--ttl", "0.2", "too late")
+    goal = json.loads(expired.out)
+    assert (expired.code, goal["reason"], goal["ttl"]) == (6, "expired", 0.2)
+    older = scripted.start("say", "--wait", "--key", "battery", "battery at 20 %")
+    older_id = scripted.watcher.wait_until(lambda each: each["n"] > 0 and _text(each) == "battery at 20 %")["id"]
+    newer = scripted.run("say", "--key", "battery", "battery at 19 %").id
+    done = scripted.finish(older)
+    assert (done.code, done.out) == (6, f"{older_id}\n")
+    assert newer in done.err
+
+
+def _text(event: dict[str, Any]) -> str | None:
+    goal = event.get("goal")
+    return goal["text"] if goal else None
+
+
+def test_throttled_is_success_without_a_word_on_standard_output(scripted: Talk) -> None:
+    throttled = ["say", "--key", "battery", "--throttle", "60"]
+    assert scripted.run(*throttled, "--wait", "length=0").code == 0
+    for words in ([], ["--wait"], ["-f"]):
+        done = scripted.run(*throttled, *words, "length=0")
+        assert (done.code, done.out) == (0, ""), done
+        assert "less than 60 s ago" in done.err
+        assert done.err.count("\n") == 1
+    quiet = scripted.run(*throttled, "-q", "length=0")
+    assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
+    goal = json.loads(scripted.run("--json", *throttled, "length=0").out)
+    assert (goal["state"], goal["reason"]) == ("REJECTED", "throttled")
+
+
+def test_settings_of_a_goal_are_sent_and_the_environment_is_not(make_talk: MakeTalk) -> None:
+    env = {"TALK_RATE": "111", "TALK_VOLUME": "0.1", "TALK_VOICE": "nobody"}
+    talk = make_talk(scripted=True)
+    done = run([*TALK, "say", "--wait", "length=0"], {**talk.env, **env})
+    assert done.code == 0, done.err
+    for option, value in (("--rate", "250"), ("--volume", "0.5"), ("--pitch", "20"), ("--voice", "en")):
+        assert talk.run("say", "--wait", option, value, "length=0").code == 0
+    unknown = talk.run("say", "--voice", "nobody-speaks-it", "length=0")
+    assert (unknown.code, unknown.out) == (5, "")
+    assert "nobody-speaks-it" in unknown.err
+
+
+def test_speech_that_is_paused_is_noted(scripted: Talk) -> None:
+    held = busy(scripted)
+    assert scripted.run("pause").code == 0
+    note = "talk: speech is paused: talk resume\n"
+    done = scripted.run("say", "length=0")
+    assert (done.code, done.err) == (0, note)
+    assert re.fullmatch(r"\w{4}-\d+\n", done.out)
+    assert scripted.run("say", "-q", "length=0").err == ""
+    waiting = scripted.start("say", "-w", "length=0")
+    assert waiting.stdout
+    assert re.fullmatch(r"\w{4}-\d+\n", waiting.stdout.readline())
+    assert scripted.run("resume").code == 0
+    scripted.run("cancel", held)
+    ended = scripted.finish(waiting)
+    assert (ended.code, ended.err) == (0, note)
+    assert scripted.run("say", "length=0").err == ""
+
+
+# Ids of one's own
+
+
+def test_own_id_is_printed_and_spoken_once(scripted: Talk) -> None:
+    for words in ([], ["--wait"], ["--wait", "-f"]):
+        done = scripted.run("say", "--id", "dock-17a", *words, "length=0")
+        assert (done.code, done.err) == (0, "")
+        assert done.out == ("dock-17a SUCCEEDED\n" if "-f" in words else "dock-17a\n")
+        scripted.watcher.wait_for_terminal("dock-17a")
+    assert scripted.watcher.states("dock-17a") == ["PENDING", "ACTIVE", "SUCCEEDED"]
+    conflict = scripted.run("say", "--id", "dock-17a", "another text")
+    assert (conflict.code, conflict.out) == (5, "")
+
+
+def test_own_id_that_has_ended_tells_its_end_without_waiting(scripted: Talk) -> None:
+    assert scripted.run("say", "--wait", "--id", "mine", "fail=audio_lost message=no_cable").code == 4
+    again = scripted.run("say", "--id", "mine", "fail=audio_lost message=no_cable")
+    assert (again.code, again.out) == (4, "mine\n")
+    assert again.err == "talk: mine: Talk aborted: no cable\n"
+    goal = json.loads(scripted.run("--json", "say", "--id", "mine", "fail=audio_lost message=no_cable").out)
+    assert (goal["id"], goal["state"]) == ("mine", "ABORTED")
+
+
+@pytest.mark.parametrize("feedback", [[], ["-f"]])
+def test_who_attached_cancels_nothing(scripted: Talk, feedback: list[str]) -> None:
+    text = "never-ends length=60 " + "word " * 600  # one in a tenth of a second
+    scripted.run("say", "--id", "mine", text)
+    scripted.watcher.wait_for_word("mine")
+    late = scripted.run("say", "--wait", *feedback, "-t", "0.3", "--id", "mine", text)
+    assert late.code == 124
+    assert "goes on" in late.err
+    for number in (signal.SIGINT, signal.SIGTERM):
+        attached = scripted.start("say", "--wait", *feedback, "--id", "mine", text)
+        assert attached.stdout
+        assert attached.stdout.readline().startswith("mine word " if feedback else "mine\n")
+        attached.send_signal(number)
+        assert attached.wait(10) == 128 + number
+    assert scripted.goal("mine")["state"] == "ACTIVE"
+    waiting = scripted.start("say", "--wait", "--id", "mine", text)
+    assert waiting.stdout
+    assert waiting.stdout.readline() == "mine\n"
+    scripted.run("cancel", "mine")
+    assert scripted.finish(waiting).code == 7
+
+
+# Rendering
+
+
+def test_output_writes_a_file_without_a_server(tmp_path: Path) -> None:
+    file = tmp_path / "said.wav"
+    done = alone("say", "-o", str(file), "--", "battery", "low")
+    assert (done.code, done.out, done.err) == (0, "", "")
+    with wave.open(str(file)) as found:
+        seconds = found.getnframes() / found.getframerate()
+    told = json.loads(alone("--json", "say", "-o", str(file), "battery low").out)
+    assert told["output"] == str(file)
+    assert told["text"] == "battery low"
+    assert told["seconds"] == pytest.approx(seconds, abs=0.05)
+
+
+def _seconds_of(tmp_path: Path, *words: str, **env: str) -> float:
+    done = alone("--json", "say", "-o", str(tmp_path / "x.wav"), *words, "one two three four five six", **env)
+    assert done.code == 0, done.err
+    return float(json.loads(done.out)["seconds"])
+
+
+def test_output_takes_settings_from_options_then_from_the_environment(tmp_path: Path) -> None:
+    usual = _seconds_of(tmp_path)
+    slow = _seconds_of(tmp_path, TALK_RATE="100")
+    assert slow > 1.5 * usual
+    assert _seconds_of(tmp_path, "--rate", "100") == pytest.approx(slow, abs=0.1)
+    assert _seconds_of(tmp_path, "--rate", "200", TALK_RATE="100") == pytest.approx(usual, abs=0.1)
+    assert _seconds_of(tmp_path, TALK_RATE="") == pytest.approx(usual, abs=0.1)
+    for variable, value in (("TALK_RATE", "5"), ("TALK_RATE", "fast"), ("TALK_VOLUME", "nan")):
+        done = alone("say", "-o", str(tmp_path / "never.wav"), "hello", **{variable: value})
+        assert done.code == 2
+        assert variable in done.err
+    unknown = alone("say", "-o", str(tmp_path / "never.wav"), "hello", TALK_VOICE="nobody-speaks-it")
+    assert unknown.code == 5
+    assert "nobody-speaks-it" in unknown.err
+    assert os.listdir(tmp_path) == ["x.wav"]
+
+
+def test_output_that_fails_says_why_and_leaves_nothing(tmp_path: Path) -> None:
+    for words, code in (
+        (["-o", f"{tmp_path}/no/x.wav", "hello"], 1),
+        (["-o", str(tmp_path), "hello"], 2),
+        (["-o", f"{tmp_path}/x.wav", ""], 5),
+        (["-o", f"{tmp_path}/x.wav", "-t", "0.001", "hello"], 124),
+    ):
+        done = alone("say", *words)
+        assert (done.code, done.out) == (code, ""), done
+        assert done.err
+    assert os.listdir(tmp_path) == []
+
+
+def test_output_that_is_interrupted_leaves_nothing(tmp_path: Path) -> None:
+    with short_directory() as home:
+        client = subprocess.Popen(
+            [*TALK, "say", "-o", str(tmp_path / "x.wav"), "--rate", "80", "--", "one two three. " * 600],
+            env=environment(home),
+        )
+        while not os.listdir(tmp_path):  # the hidden file appears as the engine starts
+            assert client.poll() is None
+            time.sleep(0.005)
+        client.send_signal(signal.SIGINT)
+        assert client.wait(10) == 130
+    assert os.listdir(tmp_path) == []
+
+
+def test_as_from_the_environment_is_no_contradiction_of_output(tmp_path: Path) -> None:
+    assert alone("say", "-o", str(tmp_path / "x.wav"), "hello", TALK_NAME="patrol").code == 0
+
+
+# What it costs
+
+
+def test_say_loads_nothing_that_it_does_not_use(scripted: Talk) -> None:
+    unused = ["lighting", "following", "columns", "engine", "cli.feedback", "cli.lines", "cli.rendering", "cli.stdin"]
+    code = (
+        "import sys; from talkcli.cli import run; assert run({}) == 0;"
+        "print([m for m in {} if 'talkcli.' + m in sys.modules])"
+    )
+    for words in (["say", "--wait", "length=0"], ["say", "--key", "k", "--priority", "3", "--ttl", "9", "length=0"]):
+        done = run([sys.executable, "-c", code.format(words, unused)], scripted.env)
+        assert done.out.splitlines()[-1] == "[]", done

@@ -1,0 +1,210 @@
+"""`say -wf` and `wait -f` on a terminal: the sentence lights up as it is heard, and its line is left whole."""
+
+from __future__ import annotations
+
+import signal
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.bareserve import TALK
+from tests.support.screen import Screen, Terminal
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from tests.support.processes import Talk
+
+#: Attributes of a cell: the word being heard, and what is still to come.
+LIT, AHEAD = "7", "2"
+
+
+@pytest.fixture
+def in_terminal(scripted: Talk) -> Iterator[Callable[..., Terminal]]:
+    """Runs `talk` in a terminal: `in_terminal("say", "-wf", "--", text, columns=40)`."""
+    opened: list[Terminal] = []
+
+    def start(*words: str, columns: int = 80, **env: str) -> Terminal:
+        opened.append(Terminal([*TALK, *words], {**scripted.env, **env}, columns))
+        return opened[-1]
+
+    yield start
+    for each in opened:
+        each.close()
+
+
+def test_each_word_is_lit_as_it_is_heard_and_the_line_is_left_whole(
+    scripted: Talk, in_terminal: Callable[..., Terminal]
+) -> None:
+    seen: list[str] = []
+    terminal = in_terminal("say", "-wf", "--", "length=0.6 battery low now")
+
+    def every_word(screen: Screen) -> bool:
+        lit = screen.marked(LIT)
+        if lit and lit not in seen:
+            seen.append(lit)
+            text = "length=0.6 battery low now"
+            assert f"  ACTIVE     {text}" in screen.last
+            assert screen.marked(AHEAD) == text[text.index(lit) + len(lit) :]
+        return len(seen) == 4
+
+    terminal.wait_until(every_word)
+    assert terminal.finish() == 0
+    goal_id = scripted.watcher.goals()[0]
+    assert seen == ["length=0.6", "battery", "low", "now"]
+    assert terminal.screen.lines == [f"{goal_id}  SUCCEEDED  length=0.6 battery low now", ""]
+    assert not terminal.screen.marked(LIT, 0)
+    assert not terminal.screen.marked(AHEAD, 0)
+    assert terminal.screen.attributes == ""
+
+
+def test_a_long_text_is_followed_within_the_width_and_whole_at_the_end(
+    scripted: Talk, in_terminal: Callable[..., Terminal]
+) -> None:
+    words = [f"word{number}" for number in range(60)]
+    text = " ".join(["length=1.5", *words])
+    terminal = in_terminal("say", "-wf", "--", text, columns=50)
+    lit: list[str] = []
+
+    def at_the_end(screen: Screen) -> bool:
+        if screen.marked(LIT):
+            lit.append(screen.marked(LIT))
+            assert screen.wraps == 0
+        return screen.marked(LIT) == words[-1]
+
+    terminal.wait_until(at_the_end)
+    assert terminal.finish() == 0
+    assert set(words) & set(lit) == set(lit) - {"length=1.5"}  # each whole, never cut
+    assert len(set(lit)) > 20
+    goal_id = scripted.watcher.goals()[0]
+    whole = f"{goal_id}  SUCCEEDED  {text}"
+    assert "".join(each.ljust(50) for each in terminal.screen.lines).rstrip() == whole
+
+
+@pytest.mark.parametrize("columns", [5, 12, 30, 79])
+def test_wide_characters_never_break_the_line(in_terminal: Callable[..., Terminal], columns: int) -> None:
+    text = "length=0.5 日本語の文章です とても長い文 👩👩👩👩 é é é の終わり"
+    terminal = in_terminal("say", "-wf", "--", text, columns=columns)
+    wrapped: list[int] = []
+
+    def at_the_end(screen: Screen) -> bool:
+        ended = "SUCCEEDED" in "".join(screen.lines)  # which is on two lines where the terminal is that narrow
+        if not ended:
+            wrapped.append(screen.wraps)
+        return ended
+
+    terminal.wait_until(at_the_end)
+    assert terminal.finish() == 0
+    assert terminal.screen.lines[-1] == ""
+    assert max(wrapped, default=0) == 0
+    assert text.replace(" ", "") in "".join(terminal.screen.lines).replace(" ", "")
+
+
+def test_a_terminal_that_is_resized_is_painted_anew(scripted: Talk, in_terminal: Callable[..., Terminal]) -> None:
+    text = "never-ends words=1 " + " ".join(f"word{number}" for number in range(20))
+    terminal = in_terminal("say", "-wf", "--", text, columns=100)
+    terminal.wait_until(lambda screen: screen.marked(LIT) == "never-ends")
+    assert len(terminal.screen.last) == 99
+    terminal.resize(60)
+    terminal.wait_until(lambda screen: len(screen.last) == 59 and screen.last.endswith("…"))
+    terminal.resize(120)
+    terminal.wait_until(lambda screen: len(screen.last) == 119)
+    assert terminal.screen.wraps == 0
+    scripted.run("cancel")
+    assert terminal.finish() == 7
+
+
+def test_ctrl_c_cancels_and_leaves_the_terminal_clean(scripted: Talk, in_terminal: Callable[..., Terminal]) -> None:
+    terminal = in_terminal("say", "-wf", "--", "never-ends words=2 and so on", columns=200)
+    terminal.wait_until(lambda screen: screen.marked(LIT) == "words=2")
+    terminal.type(b"\x03")
+    assert terminal.finish() == 128 + signal.SIGINT
+    goal_id = scripted.watcher.goals()[0]
+    assert scripted.goal(goal_id)["state"] == "PREEMPTED"
+    first, second, last = terminal.screen.lines
+    assert first == f"{goal_id}  PREEMPTED  never-ends words=2 and so on"
+    assert terminal.screen.marked(AHEAD, 0) == " and so on"  # what was not heard
+    assert second.startswith(f"talk: {goal_id}: Talk preempted")
+    assert last == ""
+    assert terminal.screen.attributes == ""
+
+
+def test_timeout_leaves_the_line_whole(scripted: Talk, in_terminal: Callable[..., Terminal]) -> None:
+    terminal = in_terminal("say", "-f", "-t", "0.5", "--", "never-ends words=1 text")
+    assert terminal.finish() == 124
+    assert terminal.screen.lines[0] == f"{scripted.watcher.goals()[0]}  PREEMPTED  never-ends words=1 text"
+
+
+def test_server_that_is_gone_leaves_the_line_whole(scripted: Talk, in_terminal: Callable[..., Terminal]) -> None:
+    terminal = in_terminal("say", "-wf", "--", "never-ends words=1 text")
+    terminal.wait_until(lambda screen: screen.marked(LIT) == "never-ends")
+    scripted.kill()
+    assert terminal.finish() == 12
+    assert "  LOST       never-ends words=1 text" in terminal.screen.lines[0]
+    assert "it may still be spoken" in terminal.screen.lines[1]
+
+
+def test_controls_of_others_never_reach_the_terminal(in_terminal: Callable[..., Terminal]) -> None:
+    terminal = in_terminal("say", "-wf", "--", "length=0.3 a\x1b[31mred \u202egnp.exe\nfake \x07")
+    assert terminal.finish() == 0  # the screen fails at any control sequence but those of talk
+    shown = terminal.screen.lines[0]
+    assert shown.endswith("length=0.3 a\\x1b[31mred \\u202egnp.exe\\nfake \\x07")
+    assert "\x1b[31m" not in terminal.raw.decode()
+
+
+def test_a_failure_leaves_what_was_heard_and_its_reason(in_terminal: Callable[..., Terminal]) -> None:
+    terminal = in_terminal(
+        "say", "-wf", "--", "length=0.4 fail=audio_lost message=no_cable words=2 never heard", columns=200
+    )
+    assert terminal.finish() == 4
+    first, second, last = terminal.screen.lines
+    assert "  ABORTED    length=0.4 " in first
+    assert terminal.screen.marked(AHEAD, 0).endswith("never heard")
+    assert second.endswith("Talk aborted: no cable")
+    assert last == ""
+
+
+@pytest.mark.parametrize("extra", [{"NO_COLOR": "1"}, {"TERM": "dumb"}])
+def test_terminal_without_colour_gets_a_line_an_event(
+    scripted: Talk, in_terminal: Callable[..., Terminal], extra: dict[str, str]
+) -> None:
+    terminal = in_terminal("say", "-wf", "length=0.2", "low", **extra)
+    assert terminal.finish() == 0
+    goal_id = scripted.watcher.goals()[0]
+    assert terminal.screen.lines == [
+        f"{goal_id} PENDING",
+        f"{goal_id} ACTIVE",
+        f"{goal_id} word 1 0-10 0.000 length=0.2",
+        f"{goal_id} word 2 11-14 0.100 low",
+        f"{goal_id} SUCCEEDED",
+        "",
+    ]
+    assert b"\x1b" not in terminal.raw
+
+
+def test_wait_shows_the_goal_that_is_spoken_and_each_end(scripted: Talk, in_terminal: Callable[..., Terminal]) -> None:
+    first = scripted.run("say", "never-ends words=1 first").id
+    second = scripted.run("say", "length=0.3 second").id
+    third = scripted.run("say", "length=0.3 third").id
+    scripted.watcher.wait_for_word(first)
+    terminal = in_terminal("wait", "-f", third, first, second, columns=200)
+    terminal.wait_until(lambda screen: screen.last == f"{first}  ACTIVE     never-ends words=1 first")
+    scripted.run("cancel", third)
+    terminal.wait_until(lambda screen: f"{third}  RECALLED   length=0.3 third" in screen.lines)
+    terminal.wait_until(lambda screen: screen.last == f"{first}  ACTIVE     never-ends words=1 first")
+    scripted.run("cancel", first)
+    assert terminal.finish() == 6  # the first in order
+    shown = [each.split("  ")[0:2] for each in terminal.screen.lines[:3]]
+    assert shown == [[third, "RECALLED"], [first, "PREEMPTED"], [second, "SUCCEEDED"]]
+    assert [each[:5] for each in terminal.screen.lines[3:]] == ["talk:", "talk:", ""]
+
+
+def test_paused_speech_is_shown_as_such(scripted: Talk, in_terminal: Callable[..., Terminal]) -> None:
+    terminal = in_terminal("say", "-wf", "--", "never-ends words=1 text")
+    terminal.wait_until(lambda screen: screen.marked(LIT) == "never-ends")
+    assert scripted.run("pause").code == 0
+    terminal.wait_until(lambda screen: "  PAUSED     never-ends words=1 text" in screen.last)
+    assert scripted.run("resume").code == 0
+    terminal.wait_until(lambda screen: "  ACTIVE     never-ends words=1 text" in screen.last)
+    scripted.run("cancel")
+    assert terminal.finish() == 7

@@ -1,0 +1,165 @@
+"""`talk set`: the running server's settings, changed and printed; and those that `serve` starts with."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.bareserve import TALK, environment, run
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+DEFAULTS = {"rate": "200", "volume": "1", "voice": "default", "pitch": "50", "preempt": "no", "ttl": "0"}
+
+
+def settings(talk: Talk) -> dict[str, str]:
+    """Return what `talk set` prints."""
+    done = talk.run("set")
+    assert (done.code, done.err) == (0, "")
+    return dict(each.split() for each in done.out.splitlines())
+
+
+def test_alone_it_prints_them(scripted: Talk) -> None:
+    assert settings(scripted) == DEFAULTS
+    done = scripted.run("set", "--json")
+    assert json.loads(done.out) == {
+        "rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None,
+    }  # fmt: skip
+    assert done.out.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value", "shown"),
+    [
+        (["--rate", "80"], "rate", 80, "80"),
+        (["--rate", "450"], "rate", 450, "450"),
+        (["--volume", "0"], "volume", 0.0, "0"),
+        (["--volume", "0.25"], "volume", 0.25, "0.25"),
+        (["--voice", "en"], "voice", "en", "en"),
+        (["--voice", "default"], "voice", None, "default"),
+        (["--pitch", "0"], "pitch", 0, "0"),
+        (["--pitch", "100"], "pitch", 100, "100"),
+        (["--preempt"], "preempt", True, "yes"),
+        (["--no-preempt"], "preempt", False, "no"),
+        (["--ttl", "2.5"], "ttl", 2.5, "2.5"),
+        (["--ttl", "0"], "ttl", None, "0"),
+    ],
+)
+def test_one_is_changed_and_the_others_stay(
+    scripted: Talk, words: list[str], name: str, value: object, shown: str
+) -> None:
+    assert scripted.run("voices").code == 0  # now they are known
+    done = scripted.run("set", *words)
+    assert (done.code, done.out, done.err) == (0, "", "")
+    assert settings(scripted) == {**DEFAULTS, name: shown}
+    changed = json.loads(scripted.run("--json", "set", *words).out)
+    assert changed[name] == value
+    assert json.loads(scripted.run("--json", "set").out) == changed
+    described = json.loads(scripted.run("--json", "status").out)["server"]
+    assert {each: described[each] for each in changed} == changed
+
+
+def test_what_is_printed_can_be_given_back(scripted: Talk) -> None:
+    scripted.run("set", "--rate", "150", "--volume", "0.1", "--ttl", "1.5", "--pitch", "60", "--voice", "en")
+    before = settings(scripted)
+    words = [word for name, value in before.items() if name != "preempt" for word in (f"--{name}", value)]
+    assert scripted.run("set", *words).code == 0
+    assert settings(scripted) == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--rate", "79"], ["--rate", "451"], ["--rate", "fast"], ["--rate", "100.5"], ["--volume", "1.01"],
+        ["--volume", "-0.1"], ["--volume", "nan"], ["--volume", "inf"], ["--pitch", "101"], ["--pitch", "-1"],
+        ["--ttl", "-1"], ["--ttl", "nan"], ["--ttl", "inf"], ["--voice", ""], ["--rate"],
+    ],
+)  # fmt: skip
+def test_out_of_range_is_a_usage_error_and_nothing_is_changed(scripted: Talk, words: list[str]) -> None:
+    done = scripted.run("set", "--pitch", "60", *words)
+    assert (done.code, done.out, words[0] in done.err) == (2, "", True)
+    as_json = scripted.run("--json", "set", *words)
+    assert json.loads(as_json.err)["error"]["exit"] == 2
+    assert settings(scripted) == DEFAULTS
+    assert scripted.run("set", "60").code == 2
+
+
+def test_unknown_voice_is_told_with_what_comes_near(scripted: Talk) -> None:
+    assert scripted.run("voices").code == 0
+    done = scripted.run("set", "--rate", "150", "--voice", "scirpted")
+    assert (done.code, done.out) == (2, "")
+    assert "did you mean 'scripted'?" in done.err
+    error = json.loads(scripted.run("--json", "set", "--voice", "x\x1b[31my").err)["error"]
+    assert (error["code"], error["exit"]) == ("unknown_voice", 2)
+    assert "\x1b" not in error["message"]
+    assert settings(scripted) == DEFAULTS
+
+
+def test_variables_of_serve_change_nothing(scripted: Talk) -> None:
+    env = {**scripted.env, "TALK_RATE": "100", "TALK_VOLUME": "0.1", "TALK_VOICE": "none"}
+    assert run([*TALK, "set", "--pitch", "50"], env).code == 0
+    assert settings(scripted) == DEFAULTS
+
+
+def test_changes_hold_for_what_comes(make_talk: MakeTalk) -> None:
+    talk = make_talk("--player", "null")
+    talk.run("set", "--rate", "450", "--ttl", "30")
+    fast = json.loads(talk.run("--json", "say", "--wait", "one two three four five six").out)
+    talk.run("set", "--rate", "150", "--ttl", "0")
+    slow = json.loads(talk.run("--json", "say", "--wait", "one two three four five six").out)
+    assert (fast["ttl"], slow["ttl"]) == (30, None)
+    assert slow["duration"] > fast["duration"] * 1.5
+
+
+def test_preempt_holds_for_what_comes(scripted: Talk) -> None:
+    first = scripted.run("say", "never-ends").id
+    scripted.watcher.wait_for_word(first)
+    scripted.run("set", "--preempt")
+    scripted.run("say", "--wait", "length=0")
+    assert scripted.goal(first)["state"] == "PREEMPTED"
+
+
+def test_serve_begins_with_its_options(make_talk: MakeTalk) -> None:
+    talk = make_talk("--ttl", "0.5", "--rate", "100", "--pitch", "40", "--preempt", "--lead-in", "250", scripted=True)
+    assert settings(talk) == {**DEFAULTS, "ttl": "0.5", "rate": "100", "pitch": "40", "preempt": "yes"}
+    server = json.loads(talk.run("--json", "status").out)["server"]
+    assert (server["ttl"], server["lead_in"]) == (0.5, 250)
+    status = talk.run("status").out
+    assert "ttl 0.5 s" in status
+    assert "lead-in 250 ms" in status
+    talk.run("set", "--no-preempt")
+    active = talk.run("say", "never-ends").id
+    talk.watcher.wait_for_word(active)
+    late = talk.run("say", "too late").id
+    assert talk.watcher.wait_for_terminal(late) == "RECALLED"
+    assert talk.goal(late)["reason"] == "expired"
+    talk.run("cancel")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--ttl", "-1"], ["--ttl", "nan"], ["--ttl", "inf"], ["--lead-in", "-1"], ["--lead-in", "5001"], ["--voice", ""]],
+)
+def test_serve_refuses_what_is_out_of_range(words: list[str]) -> None:
+    with short_directory() as home:
+        done = run([*TALK, "serve", *words], environment(home, TALK_SOCKET=f"{home}/s"))
+    assert (done.code, done.out, words[0] in done.err) == (2, "", True)
+
+
+def test_help_of_serve_names_what_swallows_a_beginning() -> None:
+    with short_directory() as home:
+        words = " ".join(run([*TALK, "serve", "--help"], environment(home, COLUMNS="80")).out.split())
+    for each in ("HDMI", "USB", "Bluetooth", "aplay -L", "pactl list short sinks", "[default: 0"):
+        assert each in words
+
+
+def test_without_a_server_it_is_3() -> None:
+    with short_directory() as home:
+        for words in ([], ["--rate", "100"]):
+            done = run([*TALK, "set", *words], environment(home, TALK_SOCKET=f"{home}/s"))
+            assert (done.code, done.out) == (3, "")

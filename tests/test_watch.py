@@ -1,0 +1,256 @@
+"""`talk watch`: the transcript that a person reads over ssh, and the feed that a program reads from a pipe."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.columns import width
+from tests.conformance.bareserve import TALK, environment, run
+from tests.support.surroundings import short_directory
+from tests.support.terminal import Terminal
+
+if TYPE_CHECKING:
+    from tests.support.processes import Talk
+
+LONG = "moving to the charger on the second floor, please step back from the door and from the lift never-ends"
+HOSTILE = "a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end"
+
+
+class Lines:
+    """A `talk watch` whose standard output is a pipe."""
+
+    def __init__(self, talk: Talk, *words: str) -> None:
+        self.process = talk.start("watch", *words)
+        self.lines: list[str] = []
+        self.next("")  # the first line says that it watches
+
+    def next(self, words: str) -> str:
+        """Read on to the line that has these words, and return it."""
+        assert self.process.stdout
+        for line in self.process.stdout:
+            self.lines.append(line.rstrip("\n"))
+            if words in line:
+                return self.lines[-1]
+        raise AssertionError(f"no line with {words!r} in {self.lines}")
+
+    def end(self) -> int:
+        """Press Ctrl-C, and return its exit code; it may not say a word more."""
+        self.process.send_signal(signal.SIGINT)
+        code = self.process.wait(10)
+        assert self.process.stdout
+        assert self.process.stderr
+        assert (self.process.stdout.read(), self.process.stderr.read()) == ("", "")
+        return code
+
+
+def at_terminal(talk: Talk, columns: int, *words: str, **env: str) -> Terminal:
+    return Terminal([*TALK, *words], {"TERM": "xterm", **talk.env, **env}, columns)
+
+
+def test_in_a_pipe_every_event_is_a_full_line_at_once(scripted: Talk) -> None:
+    watch = Lines(scripted)
+    assert re.fullmatch(rf"\d\d:\d\d:\d\d  watching    silent; server {scripted.pid} on \S+", watch.lines[0])
+    goal_id = scripted.run("say", "--as", "patrol", "--", LONG).id
+    assert watch.next("PENDING").endswith('as "patrol"')
+    active = watch.next("ACTIVE")
+    assert re.match(rf'\d\d:\d\d:\d\d  ACTIVE      {goal_id} +"{LONG}"  .*pid \d+, as "patrol"$', active)
+    scripted.watcher.wait_for_word(goal_id)
+    scripted.run("cancel", goal_id)
+    watch.next("PREEMPTING")
+    assert re.search(rf'PREEMPTED   {goal_id} +"{LONG}"  canceled by .*, pid \d+$', watch.next("PREEMPTED"))
+    assert watch.end() == 130
+    assert not any("\x1b" in each or "never-ends  " in each or " word " in each for each in watch.lines)
+
+
+def test_it_begins_with_what_is_now(scripted: Talk) -> None:
+    active = scripted.run("say", "never-ends").id
+    pending = scripted.run("say", "waits").id
+    scripted.watcher.wait_for_word(active)
+    watch = Lines(scripted)
+    watch.next(pending)
+    assert "  speaking, 1 waiting; " in watch.lines[0]
+    assert ["ACTIVE" in watch.lines[1], active in watch.lines[1], '"never-ends"' in watch.lines[1]] == [True] * 3
+    assert ["PENDING" in watch.lines[2], '"waits"' in watch.lines[2], len(watch.lines)] == [True, True, 3]
+    scripted.run("cancel")
+    assert re.search(r'"never-ends" +canceled by ', watch.next("PREEMPTED"))
+    assert watch.end() == 130
+
+
+@pytest.mark.parametrize("option", ["--words", "-f"])
+def test_words_are_shown_where_they_are_asked_for(scripted: Talk, option: str) -> None:
+    watch = Lines(scripted, option)
+    goal_id = scripted.run("say", "battery low").id
+    watch.next("SUCCEEDED")
+    words = [each for each in watch.lines if "  word  " in each]
+    assert [re.sub(r".*" + goal_id + " +", "", each) for each in words] == ["battery  0.00 s", "low  0.05 s"]
+    assert watch.end() == 130
+
+
+def test_json_is_the_wires_own_events(scripted: Talk) -> None:
+    watch = Lines(scripted, "--json")
+    snapshot = json.loads(watch.lines[0])
+    assert list(snapshot) == ["event", "server", "active", "pending", "recent"]
+    assert (snapshot["event"], snapshot["active"], snapshot["pending"]) == ("snapshot", None, [])
+    goal_id = scripted.run("say", "length=0.1 and more").id
+    watch.next("SUCCEEDED")
+    assert watch.end() == 130
+    scripted.watcher.wait_for_terminal(goal_id)
+    assert [json.loads(each) for each in watch.lines[1:]] == scripted.watcher.events()
+
+
+def test_who_paused_and_who_resumed_is_told(scripted: Talk) -> None:
+    talk = scripted
+    goal_id = talk.run("say", "never-ends").id
+    talk.watcher.wait_for_word(goal_id)
+    watch, feed = Lines(talk), Lines(talk, "--json")
+    talk.run("pause")
+    assert re.search(rf"  paused      {goal_id} +by .*, pid \d+$", watch.next("paused"))
+    event = json.loads(feed.next("paused"))
+    assert (event["event"], event["paused"], event["id"]) == ("paused", True, goal_id)
+    late = Lines(talk)
+    assert "  paused; " in late.lines[0]
+    assert "  ACTIVE  " in late.next(goal_id)
+    talk.run("resume")
+    late.next("resumed")
+    assert re.search(rf"  resumed     {goal_id} +by .*, pid \d+$", watch.next("resumed"))
+    assert json.loads(feed.next('"paused": false'))["by"]["client"]["pid"]
+    assert (watch.end(), feed.end(), late.end()) == (130, 130, 130)
+    talk.run("cancel")
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120])
+def test_lines_fit_the_terminal_and_line_up(scripted: Talk, columns: int) -> None:
+    with at_terminal(scripted, columns, "watch") as watch:
+        watch.wait_for("silent")
+        goal_id = scripted.run("say", "--as", "patrol", "--", f"{LONG} 日本語日本語").id
+        watch.wait_for("ACTIVE")
+        behind = scripted.run("say", "battery low").id
+        watch.wait_for("PENDING")
+        scripted.run("cancel", goal_id)
+        watch.wait_for("SUCCEEDED")
+        watch.process.send_signal(signal.SIGINT)
+        assert watch.finish() == 130
+        lines = watch.lines
+    assert [each for each in lines if width(each) > columns] == []
+    goals = [each for each in lines if '"' in each]
+    # What is over at once is left out: that the first one waited, and that it was being stopped.
+    states = [each.split()[1] for each in goals]
+    assert states == ["ACTIVE", "PENDING", "PREEMPTED", "ACTIVE", "SUCCEEDED"], lines
+    assert {each.index('"') for each in goals} == {goals[0].index('"')}
+    assert '…"' in goals[0]
+    senders = [re.search(rf"{behind} +\"battery low\" +(?=\S)", each) for each in goals if behind in each]
+    assert len({each.end() for each in senders if each}) == 1
+    # Where the column is too narrow for who stopped it, that has a line of its own.
+    assert re.search(rf"{goal_id} +\".*\"\n? +canceled by \S", "\n".join(lines))
+
+
+def test_lines_follow_a_window_that_is_resized(scripted: Talk) -> None:
+    with at_terminal(scripted, 80, "watch", COLUMNS="200") as watch:
+        watch.wait_for("silent")
+        first = scripted.run("say", "--", LONG).id
+        watch.wait_for(f"ACTIVE +{first} .*\n")
+        for columns in (120, 60):
+            watch.resize(columns)
+            goal_id = scripted.run("say", "--", f"{LONG}").id
+            line = watch.wait_for(f".*PENDING +{goal_id} .*(?=\n)")[0]
+            assert columns - 45 < width(line) <= columns
+            text = line[line.index('"') : line.rindex('"') + 1]
+            assert len(text) == (columns - 32) - (columns - 32) // 3 - 2
+        scripted.run("cancel")
+
+
+def test_reason_that_is_too_long_for_its_column_has_a_line_of_its_own(scripted: Talk) -> None:
+    message = "audio_open_error:_No_such_file_or_directory"
+    text = f"fail=audio_device message={message}"
+    with at_terminal(scripted, 80, "watch") as watch:
+        watch.wait_for("silent")
+        scripted.run("say", "--", text)
+        watch.wait_for("ABORTED.*\n.*\n")
+        scripted.run("say", "")
+        watch.wait_for("REJECTED.*\n")
+        lines = watch.lines
+    at = next(place for place, each in enumerate(lines) if "ABORTED" in each)
+    assert lines[at].split('"')[1].startswith("fail=audio_device")
+    assert lines[at + 1] == " " * 10 + "audio_device: audio open error: No such file or directory"
+    # It had no line before that could have told who sent it.
+    assert re.search(r'"" +invalid_text: the text is empty, from \S', lines[-1])
+    assert all(width(each) <= 80 for each in lines)
+
+
+def test_colour_by_outcome_on_a_terminal_alone(scripted: Talk) -> None:
+    for extra in ({}, {"NO_COLOR": "1"}, {"TERM": "dumb"}):
+        with at_terminal(scripted, 80, "watch", **extra) as watch:
+            watch.wait_for("silent")
+            scripted.run("say", "length=0")
+            watch.wait_for("SUCCEEDED.*\n")
+            scripted.run("say", "fail=audio_lost")
+            watch.wait_for("ABORTED.*\n")
+            coloured = [code in watch.raw for code in (b"\x1b[32mSUCCEEDED", b"\x1b[31mABORTED", b"\x1b[")]
+        assert coloured == [not extra] * 3
+
+
+def test_text_of_others_is_shown_escaped(scripted: Talk) -> None:
+    watch = Lines(scripted, "--words")
+    scripted.run("say", "--as", HOSTILE[:60], "--wait", "--", HOSTILE)
+    watch.next("SUCCEEDED")
+    assert watch.end() == 130
+    shown = "\n".join(watch.lines)
+    assert r'"a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end"' in shown
+    assert not re.search("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u202e]", shown), repr(shown)
+    assert not any(each.startswith("fake") for each in watch.lines)
+
+
+def test_a_server_that_goes_away_is_told(scripted: Talk) -> None:
+    watch = Lines(scripted)
+    goal_id = scripted.run("say", "never-ends").id
+    watch.next("ACTIVE")
+    scripted.watcher.wait_for_word(goal_id)
+    scripted.stop()
+    assert watch.next("PREEMPTED").endswith("  shutdown")
+    done = scripted.finish(watch.process)
+    assert (done.code, done.out, "went away" in done.err) == (12, "", True), done
+
+
+def test_without_a_server_it_is_3() -> None:
+    with short_directory() as home:
+        done = run([*TALK, "watch"], environment(home, TALK_SOCKET=f"{home}/s"))
+    assert (done.code, done.out) == (3, "")
+    assert "talk serve" in done.err
+
+
+@pytest.mark.parametrize("words", [[], ["--json"]])
+def test_it_ends_when_its_reader_has_gone_though_nothing_happens(scripted: Talk, words: list[str]) -> None:
+    reader, writer = os.pipe()
+    with os.fdopen(writer, "wb") as stdout, os.fdopen(reader, "rb") as lines:
+        watch = subprocess.Popen([*TALK, "watch", *words], env=scripted.env, stdout=stdout, stderr=subprocess.PIPE)
+        assert lines.readline()
+    assert watch.stderr
+    with watch.stderr:
+        assert (watch.wait(10), watch.stderr.read()) == (141, b"")
+
+
+def test_an_idle_watcher_costs_nothing(scripted: Talk) -> None:
+    watch = Lines(scripted)
+    before = _switches(watch.process.pid)
+    scripted.run("voices")  # time passes, and no goal is sent
+    scripted.run("status")
+    assert _switches(watch.process.pid) - before <= 1  # the server's sign of life may fall into it
+    assert watch.end() == 130
+
+
+def _switches(pid: int) -> int:
+    with open(f"/proc/{pid}/status", encoding="utf-8") as status:
+        return int(re.findall(r"(?m)^voluntary_ctxt_switches:\s+(\d+)", status.read())[0])
+
+
+def test_it_ends_by_sigterm_too(scripted: Talk) -> None:
+    watch = Lines(scripted)
+    watch.process.send_signal(signal.SIGTERM)
+    assert watch.process.wait(10) == 143
