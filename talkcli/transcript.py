@@ -116,7 +116,7 @@ class Transcript:
             return [(head + pad(_text(goal), _TEXT_COLUMNS) + GAP + forms[0]).rstrip()]
         tail_room = room // 3
         # Who ended it must not give way to its column; who sent it was told when it began.
-        whole = forms[:-1] if ended and goal.by is not None else forms
+        whole = forms[:-1] if ended and goal.by is not None and len(forms) > 1 else forms
         tail = next((each for each in whole if columns.width(each) <= tail_room), None)
         if tail is None and ended:
             return self._ending(head, goal, whole, screen)

@@ -297,5 +297,5 @@ def test_nothing_is_spoken_while_speech_is_paused(make_talk: MakeTalk) -> None:
         with pytest.raises(TimeoutError):
             list(handle.feedback(0.2))
         assert handle.state is State.PENDING
-        assert client.resume()
+        assert client.resume() is None  # it was not begun, so that it was not held
         assert [each.word for each in handle.feedback(5)] == ["length=0", "one"]

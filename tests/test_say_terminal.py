@@ -208,3 +208,21 @@ def test_paused_speech_is_shown_as_such(scripted: Talk, in_terminal: Callable[..
     terminal.wait_until(lambda screen: "  ACTIVE     never-ends words=1 text" in screen.last)
     scripted.run("cancel")
     assert terminal.finish() == 7
+
+
+def test_lines_that_are_typed_light_up_one_after_the_other(
+    scripted: Talk, in_terminal: Callable[..., Terminal]
+) -> None:
+    terminal = in_terminal("say", "--lines", "-f", columns=100)
+    terminal.type(b"length=0.5 words=1 one\n")
+    terminal.wait_until(lambda screen: screen.marked(LIT) == "length=0.5")
+    terminal.resize(90)
+    terminal.type(b"\xff\nlength=0.1 two\n\x04")
+    assert terminal.finish() == 5
+    first, second = (each for each in scripted.watcher.goals() if "ACTIVE" in scripted.watcher.states(each))
+    lines = terminal.screen.lines
+    assert f"{first}  SUCCEEDED  length=0.5 words=1 one" in lines
+    assert f"{second}  SUCCEEDED  length=0.1 two" in lines
+    assert [each for each in lines if each.startswith("talk: line 2: ")] != []
+    assert lines[-1] == ""
+    assert terminal.screen.attributes == ""

@@ -124,8 +124,9 @@ class Zsh(_Line):
     def format_completion(self, item: CompletionItem[str]) -> str:
         if item.type == "file" or not item.help:
             return super().format_completion(item)
-        value = item.value.replace("\\", "\\\\").replace(":", "\\:")
-        return f"described,{value}:{item.help}"
+        value, words = (each.replace("\\", "\\\\") for each in (item.value, item.help))
+        value = value.replace(":", "\\:")
+        return f"described,{value}:{words}"
 
 
 class Fish(_Line):

@@ -1,0 +1,213 @@
+"""Lines for people, at any width: nothing is wider than its terminal, the columns line up, and what counts is there."""
+
+from __future__ import annotations
+
+import time
+import unicodedata
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from talkcli import columns, output
+from talkcli.columns import Screen, width
+from talkcli.events import PausedChanged, ServerStatus, Snapshot, StateChanged, WordHeard
+from talkcli.messages import By, Goal, Sender
+from talkcli.senders import who_forms, why_forms
+from talkcli.states import State
+from talkcli.transcript import Transcript, log_lines
+
+PATROL = Sender(812, 1000, "talk", "/bin/bash /home/robot/bin/patrol.sh --fast", "night watch")
+NOON = time.mktime((2024, 5, 17, 12, 0, 0, 0, 0, -1))
+GOAL = Goal("k3fz-7", State.PENDING, "battery low", client=PATROL, queued_at=NOON)
+SERVER = {"pid": 1, "socket": "/run/talk/talk.sock", "boot": "k3fz"}
+
+TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=80)
+NAMES = st.none() | TEXTS
+SENDERS = st.none() | st.builds(
+    Sender,
+    st.none() | st.integers(1, 2**22),
+    st.just(1000),
+    st.just("talk"),
+    NAMES,
+    NAMES.map(lambda each: each or None),
+)
+BYS = st.none() | st.builds(By, goal=st.sampled_from(["k3fz-1", "x" * 64])) | st.builds(By, client=SENDERS)
+GOALS = st.builds(
+    Goal,
+    id=st.sampled_from(["k3fz-1", "k3fz-123456", "i" * 64, "door:open"]),
+    state=st.sampled_from([each for each in State if each.terminal]),
+    text=NAMES,
+    reason=st.sampled_from([None, "canceled", "audio_device"]),
+    by=BYS,
+    message=st.none() | TEXTS.map("Talk aborted: {}".format),
+    client=SENDERS,
+    ended_at=st.none() | st.sampled_from([NOON, NOON - 1e6]),
+    duration=st.none() | st.just(12.3),
+)
+WIDTHS = st.integers(60, 200)
+
+
+def plain(line: str) -> bool:
+    """Return whether a line has nothing that a terminal would act on."""
+    return not any(unicodedata.category(each) in {"Cc", "Cf", "Zl", "Zp"} for each in line)
+
+
+def test_width_counts_columns() -> None:
+    assert [width(each) for each in ("", "abc", "日本", "é", "e\u0301", "\x1b[1;32mok\x1b[0m")] == [0, 3, 4, 1, 1, 2]
+
+
+@given(TEXTS, st.integers(1, 100))
+def test_cut_fits_and_is_no_shorter_than_it_must_be(text: str, room: int) -> None:
+    cut = columns.cut(text, room)
+    assert width(cut) <= room
+    assert cut == text or cut.endswith("…")
+    if cut != text:
+        assert text.startswith(cut[:-1])
+        assert width(cut) >= room - 1  # the one that did not fit may have taken two columns
+
+
+@given(st.lists(st.tuples(st.integers(0, 200), st.integers(1, 5)), min_size=1, max_size=5), st.integers(0, 200))
+def test_shares_are_within_what_is_wanted_and_what_is_there(asked: list[tuple[int, int]], room: int) -> None:
+    wanted, weights = zip(*asked, strict=True)
+    given_out = columns.share(wanted, weights, room)
+    assert all(0 <= got <= each for got, each in zip(given_out, wanted, strict=True))
+    assert sum(given_out) <= room
+    if sum(wanted) <= room:
+        assert given_out == list(wanted)
+
+
+@given(st.lists(GOALS, max_size=5), WIDTHS)
+def test_a_log_fits_and_lines_up(goals: list[Goal], room: int) -> None:
+    lines = log_lines(goals, Screen(room), NOON)
+    assert len(lines) == len(goals)
+    assert all(width(each) <= room for each in lines)
+    assert all(map(plain, lines))
+    for line, goal in zip(lines, goals, strict=True):
+        assert goal.state.name in line
+    starts = {width(each[: each.index('"')]) for each, goal in zip(lines, goals, strict=True) if goal.text is not None}
+    assert len(starts) <= 1
+
+
+@given(st.lists(GOALS, max_size=5))
+def test_a_log_without_a_terminal_is_whole(goals: list[Goal]) -> None:
+    for line, goal in zip(log_lines(goals, Screen(), NOON), goals, strict=True):
+        assert goal.id in line
+        assert who_forms(goal.client)[0].rstrip() in line
+        assert why_forms(goal)[0].rstrip() in line
+
+
+@given(GOALS, WIDTHS, st.booleans())
+def test_a_transcript_fits(goal: Goal, room: int, full: bool) -> None:
+    transcript = Transcript(full=full, words=True)
+    pending = replace(goal, state=State.PENDING)
+    events = [
+        Snapshot(ServerStatus(SERVER, replace(GOAL, state=State.ACTIVE), (pending,), ())),
+        StateChanged(goal.id, State.ACTIVE, NOON),
+        PausedChanged(True, goal.id, By(client=goal.client), NOON),
+        StateChanged(goal.id, State.PREEMPTING, NOON),
+        StateChanged(goal.id, goal.state, NOON, goal=goal),
+    ]
+    for event in events:
+        lines = transcript.lines(event, Screen(room), NOON)
+        assert all(width(each) <= room and plain(each) for each in lines), lines
+    assert lines
+
+
+@given(st.lists(GOALS, max_size=4), GOALS, WIDTHS)
+def test_a_status_fits(goals: list[Goal], active: Goal, room: int) -> None:
+    now = replace(active, state=State.ACTIVE, started_at=NOON, paused=True, key="k" * 64, priority=10**6)
+    waiting = tuple(replace(each, state=State.PENDING, ttl=5.0, queued_at=NOON) for each in goals)
+    lines = output.status_lines(ServerStatus(SERVER, now, waiting, tuple(goals)), Screen(room), NOON)
+    assert all(width(each) <= room and plain(each) for each in lines), lines
+
+
+def test_dates_are_shown_of_another_day_alone() -> None:
+    ended = replace(GOAL, state=State.SUCCEEDED, ended_at=NOON)
+    yesterday = replace(ended, ended_at=NOON - 86400)
+    assert log_lines([ended], Screen(), NOON)[0].startswith("12:00:00  SUCCEEDED")
+    lines = log_lines([yesterday, ended], Screen(), NOON)
+    assert lines[0].startswith("May 16 12:00:00  SUCCEEDED")
+    assert lines[1].startswith("       12:00:00  SUCCEEDED")
+    assert log_lines([replace(ended, ended_at=None)], Screen(), NOON)[0].startswith("--:--:--  ")
+
+
+def test_what_is_over_at_once_is_left_out_on_a_terminal() -> None:
+    def told(*states: State, full: bool, paused: bool = False) -> list[str]:
+        transcript = Transcript(full=full, words=False)
+        transcript.lines(Snapshot(ServerStatus({**SERVER, "paused": paused}, None, (), ())), Screen(), NOON)
+        lines = []
+        for state in states:
+            goal = replace(GOAL, state=state) if state is State.PENDING or state.terminal else None
+            lines += transcript.lines(StateChanged(GOAL.id, state, NOON, goal=goal), Screen(), NOON)
+        return [each.split()[1] for each in lines]
+
+    course = State.PENDING, State.ACTIVE, State.PREEMPTING, State.PREEMPTED
+    assert told(*course, full=True) == [each.name for each in course]
+    assert told(*course, full=False) == ["ACTIVE", "PREEMPTED"]
+    assert told(*course, full=False, paused=True) == ["PENDING", "ACTIVE", "PREEMPTED"]
+    assert told(State.PENDING, State.RECALLED, full=False) == ["RECALLED"]
+
+
+def test_what_waits_behind_another_is_shown() -> None:
+    transcript = Transcript(full=False, words=False)
+    transcript.lines(Snapshot(ServerStatus(SERVER, replace(GOAL, id="a", state=State.ACTIVE), (), ())), Screen(), NOON)
+    waits = StateChanged(GOAL.id, State.PENDING, NOON, goal=GOAL)
+    assert '"battery low"' in transcript.lines(waits, Screen(80), NOON)[0]
+    transcript.lines(StateChanged("a", State.SUCCEEDED, NOON), Screen(80), NOON)
+    active = transcript.lines(StateChanged(GOAL.id, State.ACTIVE, NOON), Screen(80), NOON)
+    assert '"battery low"' in active[0]  # the event itself has no text
+
+
+def test_an_event_of_a_goal_that_is_not_known_is_shown_all_the_same() -> None:
+    lines = Transcript(full=True, words=False).lines(StateChanged("k3fz-9", State.ACTIVE, NOON), Screen(), NOON)
+    assert lines == ["12:00:00  ACTIVE      k3fz-9"]
+
+
+@pytest.mark.parametrize(("words", "count"), [(True, 1), (False, 0)])
+def test_words_are_lines_where_they_are_wanted(words: bool, count: int) -> None:
+    event = WordHeard("k3fz-7", "low", 8, 11, 2, 0.51, NOON)
+    lines = Transcript(full=False, words=words).lines(event, Screen(80), NOON)
+    assert lines == ["12:00:00  word        k3fz-7    low  0.51 s"] * count
+
+
+def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
+    assert who_forms(PATROL) == [
+        '/bin/bash /home/robot/bin/patrol.sh --fast, pid 812, as "night watch"',
+        'patrol.sh, pid 812, as "night watch"',
+        'patrol.sh as "night watch"',
+        "patrol.sh",
+    ]
+    assert who_forms(None) == ["nobody known"]
+    scripts = {
+        "python3 -m robot": "python3",
+        "/usr/bin/python3.11 /opt/a.py x": "a.py",
+        "-bash": "-bash",
+        "bash -c talk say x": "bash",
+        "./patrol": "patrol",
+        "/": "/",
+    }
+    for parent, script in scripts.items():
+        assert who_forms(Sender(parent=parent))[-1] == script
+
+
+def test_why_a_goal_ended() -> None:
+    def why(state: State, reason: str | None = None, by: By | None = None, message: str | None = None) -> list[str]:
+        return why_forms(replace(GOAL, state=state, reason=reason, by=by, message=message, duration=2.04))
+
+    assert why(State.SUCCEEDED) == ["2.0 s"]
+    assert why(State.PREEMPTED, "preempted", By("k3fz-8"), "Talk preempted")[0] == "preempted by k3fz-8"
+    canceled = why(State.PREEMPTED, "canceled", By(client=PATROL), "Talk preempted")
+    assert canceled[-2:] == ["canceled by patrol.sh", "canceled"]
+    expired = why(State.RECALLED, "expired", None, "Talk recalled: its time was over")
+    assert expired == ["expired: its time was over", "expired"]
+    assert why(State.ABORTED, "audio_device", None, "Talk aborted: no: device") == ["audio_device: no: device"]
+    throttled = why(State.REJECTED, "throttled", By("k3fz-1"), "Talk rejected: the same text")
+    assert throttled == ["throttled by k3fz-1: the same text"]
+    assert why(State.PREEMPTED, None) == ["preempted", "preempted"]
+
+
+def test_settings_are_shown_as_their_options_take_them() -> None:
+    lines = output.setting_lines({"rate": 200, "volume": 0.5, "voice": None, "preempt": True, "ttl": None, "new": None})
+    assert lines == ["rate     200", "volume   0.5", "voice    default", "preempt  yes", "ttl      0", "new      -"]
