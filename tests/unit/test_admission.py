@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from talkcli.admission import MAX_KEY, MAX_PRIORITY, bad_option, bad_setting, is_clients_id
 from talkcli.requests import Say, Set
 
-NO_SECONDS = [-1, -0.001, math.nan, math.inf, -math.inf, 10**400, -(10**400)]
+NO_SECONDS: list[object] = [-1, -0.001, math.nan, math.inf, -math.inf, 10**400, -(10**400)]
 GOOD: list[tuple[str, list[object]]] = [
     ("rate", [80, 200, 450]),
     ("volume", [0, 0.0, 0.5, 1, 1.0]),

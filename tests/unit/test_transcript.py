@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from talkcli import columns, output
 from talkcli.columns import Screen, width
-from talkcli.events import PausedChanged, ServerStatus, Snapshot, StateChanged, WordHeard
+from talkcli.events import Event, PausedChanged, Snapshot, StateChanged, WordHeard
 from talkcli.messages import By, Goal, Sender
+from talkcli.replies import ServerStatus
 from talkcli.senders import who_forms, why_forms
 from talkcli.states import State
 from talkcli.transcript import Transcript, log_lines
@@ -102,7 +103,7 @@ def test_a_log_without_a_terminal_is_whole(goals: list[Goal]) -> None:
 def test_a_transcript_fits(goal: Goal, room: int, full: bool) -> None:
     transcript = Transcript(full=full, words=True)
     pending = replace(goal, state=State.PENDING)
-    events = [
+    events: list[Event] = [
         Snapshot(ServerStatus(SERVER, replace(GOAL, state=State.ACTIVE), (pending,), ())),
         StateChanged(goal.id, State.ACTIVE, NOON),
         PausedChanged(True, goal.id, By(client=goal.client), NOON),
