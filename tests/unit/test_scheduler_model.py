@@ -11,7 +11,7 @@ from collections import defaultdict
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, precondition, rule
 
@@ -390,4 +390,8 @@ def told(by: By | None) -> str | None:
 #: Where it fails, it takes its time to find the shortest sequence.
 TestScheduler = pytest.mark.timeout(900)(SchedulerMachine.TestCase)
 #: More than other tests have: what goes wrong only where three options meet is rare.
-TestScheduler.settings = settings(max_examples=3 * settings().max_examples, stateful_step_count=60)
+TestScheduler.settings = settings(
+    max_examples=3 * settings().max_examples,
+    stateful_step_count=60,
+    suppress_health_check=[HealthCheck.too_slow],  # a busy machine is no fault of it
+)
