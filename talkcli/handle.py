@@ -163,7 +163,7 @@ class GoalHandle:
         """Conclude that the goal is lost, where nothing more can be heard of it; else raise TimeoutError."""
         ended = self._client._connection.ended
         if ended is None:
-            raise TimeoutError(f"{self.id} has not ended after {timeout or 0:g} s")
+            raise TimeoutError(f"{self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
         words = f"Talk lost: {ended}; it may still be spoken"
         self._settle(replace(self.goal, state=State.LOST, reason="lost", message=words))
 

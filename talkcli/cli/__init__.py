@@ -5,6 +5,7 @@ A command's module is imported when the command is run, so that no command pays 
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import signal
@@ -32,6 +33,10 @@ COMMANDS = {
     "set": "Change the running server's settings, or print them.",
     "voices": "List the voices.",
 }
+
+
+#: What writing says where there is no room, or the terminal is gone.
+_OUTPUT_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 
 
 class _OutputClosed(Exception):
@@ -130,15 +135,23 @@ def run(arguments: list[str]) -> int:
     except (click.Abort, KeyboardInterrupt):
         return EXIT_SIGNAL + signal.SIGINT
     except (_OutputClosed, BrokenPipeError):
-        # Whoever read standard output has gone; nothing more may be written to it, not even at the interpreter's end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        _give_up_output()
         return EXIT_SIGNAL + signal.SIGPIPE
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in _OUTPUT_FULL:
+            _give_up_output()
+            note(f"standard output can't be written: {error.strerror}")
+            return EXIT_ERROR
         if os.environ.get("TALK_DEBUG"):
             raise
         note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
         return EXIT_ERROR
     return code if isinstance(code, int) else 0
+
+
+def _give_up_output() -> None:
+    """Write nothing more to standard output, which takes nothing; not even at the interpreter's end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def _complete(options: Common) -> int:

@@ -35,10 +35,10 @@ def command(context: click.Context, ids: tuple[str, ...], current: bool, before:
     Prints the ids of the goals that ended because of it. Nothing to cancel is success. Selectors add up.
 
     \b
-      talk cancel               everything, now
-      talk cancel --current     this sentence; the next one follows
-      talk cancel --key battery what was sent with --key battery
-      talk cancel 12 13         these goals of this server
+      talk cancel                 everything, now
+      talk cancel --current       this sentence; the next one follows
+      talk cancel --key battery   what was sent with --key battery
+      talk cancel 12 13           these goals of this server
 
     Exit codes: 0 done; 3 no server; 8 an ID is unknown (the others are cancelled all the same).
     """

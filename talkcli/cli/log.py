@@ -17,7 +17,7 @@ from talkcli.requests import MAX_LOG
     default=20,
     show_default=True,
     metavar="N",
-    help=f"The last N goals, at most {MAX_LOG}.",
+    help="The last N goals that ended.",
 )
 @common_options
 @click.pass_context

@@ -57,10 +57,10 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     "--ttl",
     type=click.FloatRange(0),
     callback=seconds,
-    default=0.0,
-    show_default="0: no limit",
+    default=0,
+    show_default=True,
     metavar="SEC",
-    help="A goal that has not begun after SEC seconds is recalled, unless it brings its own --ttl.",
+    help="A goal that has not begun after SEC seconds is recalled, unless it brings its own --ttl; 0: no limit.",
 )
 @click.option(
     "--max-queue",

@@ -128,9 +128,10 @@ def _create(hidden: str, path: str) -> None:
     """Make the file, so that its mode is what the umask makes of it and nobody else's file is written to."""
     try:
         os.close(os.open(hidden, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
-    except FileNotFoundError as error:
-        raise CannotWrite(path, f"cannot be written: there is no directory {os.path.dirname(hidden)}") from error
     except OSError as error:
+        directory = os.path.dirname(hidden)
+        if not os.path.isdir(directory):
+            raise CannotWrite(path, f"cannot be written: there is no directory {directory}") from error
         raise _unwritable(path, error) from error
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from talkcli import __version__, wire
@@ -30,6 +30,15 @@ RECENT = 10
 PAUSE_LIMIT = 2.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _AwaitedPause:
+    """A pause that is answered when the goal that it holds is silent, or in doubt after a while."""
+
+    connection: Connection
+    seq: int | None
+    record: Record
+
+
 class Answers:
     """Answers the requests of a service's clients."""
 
@@ -39,7 +48,7 @@ class Answers:
         #: cancels that are answered when the goal they stopped is silent
         self._cancels: list[tuple[Connection, int | None, Cancelled]] = []
         #: pauses that are answered when the goal that they hold is silent
-        self._pauses: list[tuple[Connection, int | None, Record]] = []
+        self._pauses: list[_AwaitedPause] = []
         #: the goal that is known to be held and silent
         self._held: str | None = None
         self._by_kind: dict[type[Request], Callable[..., None]] = {
@@ -65,7 +74,7 @@ class Answers:
     def left(self, connection: Connection) -> None:
         """Owe a connection that is gone nothing more."""
         self._cancels = [each for each in self._cancels if each[0] is not connection]
-        self._pauses = [each for each in self._pauses if each[0] is not connection]
+        self._pauses = [each for each in self._pauses if each.connection is not connection]
 
     def ended(self, record: Record) -> None:
         """Answer those who wait for this goal to be silent."""
@@ -92,13 +101,17 @@ class Answers:
         def submit() -> None:
             self._submit(connection, seq, request)
 
+        def submit_in_time() -> None:
+            if request.patient and self._scheduler.lacks_room(request):
+                later.until_room(connection, submit, lambda: not self._scheduler.lacks_room(request))
+            else:
+                submit()
+
         later = self._service.later
         if later.awaits_voices or (request.voice is not None and self._voices_awaited()):
-            later.until_voices(connection, submit)
-        elif request.patient and self._scheduler.lacks_room(request):
-            later.until_room(connection, submit, lambda: not self._scheduler.lacks_room(request))
+            later.until_voices(connection, submit_in_time)
         else:
-            submit()
+            submit_in_time()
 
     def _submit(self, connection: Connection, seq: int | None, request: Say) -> None:
         now = self._service.now()
@@ -217,8 +230,9 @@ class Answers:
             self._report_paused(connection, seq, active)
             return
         connection.owed += 1
-        self._pauses.append((connection, seq, active))
-        self._service.call_later(PAUSE_LIMIT, lambda: self._doubt_pauses(active))
+        pause = _AwaitedPause(connection, seq, active)
+        self._pauses.append(pause)
+        self._service.call_later(PAUSE_LIMIT, lambda: self._doubt(pause))
 
     def _resume(self, connection: Connection, seq: int | None, _: Resume) -> None:
         now = self._service.now()
@@ -229,6 +243,8 @@ class Answers:
         if newly:
             self._tell_paused(connection, held)
         self._service.apply(effects)
+        if held:
+            self._answer_pauses(held)  # they will not see it silent any more
         self._report_paused(connection, seq, held)
 
     def _find(self, goal_id: str) -> Record:
@@ -314,19 +330,20 @@ class Answers:
 
     def _answer_pauses(self, record: Record) -> None:
         """Answer the pauses that waited for this goal to be silent: it is held, or it has ended."""
-        due = [each for each in self._pauses if each[2] is record]
-        self._pauses = [each for each in self._pauses if each[2] is not record]
-        for connection, seq, held in due:
-            self._report_paused(connection, seq, held)
-            connection.settle()
+        due = [each for each in self._pauses if each.record is record]
+        self._pauses = [each for each in self._pauses if each.record is not record]
+        for each in due:
+            self._report_paused(each.connection, each.seq, record)
+            each.connection.settle()
 
-    def _doubt_pauses(self, record: Record) -> None:
-        due = [each for each in self._pauses if each[2] is record]
-        self._pauses = [each for each in self._pauses if each[2] is not record]
-        for connection, seq, _ in due:
-            words = f"speech is paused, but {record.id} was not known to be silent within {PAUSE_LIMIT:g} s"
-            connection.reply(wire.failure(seq, "not_silent", words))
-            connection.settle()
+    def _doubt(self, pause: _AwaitedPause) -> None:
+        """Answer a pause whose goal was not known to be silent in time."""
+        if pause not in self._pauses:
+            return
+        self._pauses.remove(pause)
+        words = f"speech is paused, but {pause.record.id} was not known to be silent within {PAUSE_LIMIT:g} s"
+        pause.connection.reply(wire.failure(pause.seq, "not_silent", words))
+        pause.connection.settle()
 
     def _report_paused(self, connection: Connection, seq: int | None, held: Record | None) -> None:
         goal = None if held is None or held.state.terminal else held.snapshot().to_json()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from math import inf
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -27,13 +28,19 @@ class _Waiting:
     connection: Connection
     carry_out: Callable[[], None]
     may_go: Callable[[], bool]
+    #: the loop's time at which it goes anyway
+    until: float
 
 
 class Later:
     """The requests that wait. Whatever waits keeps its connection open, and is forgotten with it."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, audience: Audience) -> None:
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, audience: Audience, failed: Callable[[str, Exception], None]
+    ) -> None:
+        """`failed` is told of what could not be carried out for a reason of the server's own."""
         self._loop = loop
+        self._failed = failed
         self._audience = audience
         self._for_voices: deque[_Waiting] = deque()
         self._for_room: deque[_Waiting] = deque()
@@ -46,12 +53,13 @@ class Later:
 
     def until_voices(self, connection: Connection, carry_out: Callable[[], None]) -> None:
         """Carry it out as soon as the voices are known, at the latest after VOICES_LIMIT seconds."""
-        if self._add(self._for_voices, _Waiting(connection, carry_out, lambda: True)):
-            self._loop.call_later(VOICES_LIMIT, self.voices_known)
+        until = self._loop.time() + VOICES_LIMIT
+        if self._add(self._for_voices, _Waiting(connection, carry_out, lambda: True, until)):
+            self._loop.call_at(until, self._give_up_voices)
 
     def until_room(self, connection: Connection, carry_out: Callable[[], None], may_go: Callable[[], bool]) -> None:
         """Carry it out as soon as it may go; the client is told meanwhile that the server is alive."""
-        if self._add(self._for_room, _Waiting(connection, carry_out, may_go)):
+        if self._add(self._for_room, _Waiting(connection, carry_out, may_go, inf)):
             self._audience.keep_waiting(connection)
 
     def voices_known(self) -> None:
@@ -70,6 +78,10 @@ class Later:
         """Forget what waits for a client that is gone."""
         self._for_voices = deque(each for each in self._for_voices if each.connection is not connection)
         self._for_room = deque(each for each in self._for_room if each.connection is not connection)
+
+    def _give_up_voices(self) -> None:
+        while self._for_voices and self._for_voices[0].until <= self._loop.time():
+            self._go(self._for_voices.popleft())
 
     def _add(self, line: deque[_Waiting], waiting: _Waiting) -> bool:
         if sum(each.connection is waiting.connection for each in line) >= MAX_WAITING:
@@ -94,5 +106,10 @@ class Later:
             self.look()  # those that went may have made room for others
 
     def _go(self, waiting: _Waiting) -> None:
-        waiting.carry_out()
-        waiting.connection.settle()
+        try:
+            waiting.carry_out()
+        except Exception as error:  # noqa: BLE001 - those behind it must not wait for ever because of it
+            self._failed("a request that had to wait", error)
+            waiting.connection.drop()
+        finally:
+            waiting.connection.settle()

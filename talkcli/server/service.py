@@ -74,7 +74,7 @@ class Service:
         self.began = self._now()
         self._loop = asyncio.get_running_loop()
         self.audience = Audience(self._loop)
-        self.later = Later(self._loop, self.audience)
+        self.later = Later(self._loop, self.audience, self.failed)
         self._answers = Answers(self)
         self._closing = False
         self._timer: asyncio.TimerHandle | None = None
@@ -184,9 +184,9 @@ class Service:
             )
         )
 
-    def call_later(self, seconds: float, action: Callable[[], None]) -> None:
-        """Do something after a while, whatever happens meanwhile."""
-        self._loop.call_later(seconds, action)
+    def call_later(self, seconds: float, action: Callable[[], None]) -> asyncio.TimerHandle:
+        """Do something after a while; what is returned can be cancelled."""
+        return self._loop.call_later(seconds, action)
 
     def voice_fault(self, voice: str | None) -> tuple[str, str] | None:
         """Return reason and words why a voice can't be had; None also where the voices aren't known."""

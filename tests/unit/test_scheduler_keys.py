@@ -369,6 +369,13 @@ def test_a_thousand_cancels_are_remembered_and_the_oldest_goes_first() -> None:
     assert robot.asks(Say("door open", id="goal:1")).state is State.ACTIVE
 
 
+def test_cancels_of_ids_that_no_client_can_choose_drive_out_nothing() -> None:
+    robot = Robot()
+    robot.cancels("mine")
+    robot.cancels(*(f"zzzz-{number}" for number in range(1_000)))
+    assert robot.asks(Say("door open", id="mine")).state is State.RECALLED
+
+
 @pytest.mark.parametrize("goal_id", ["k3fz-1", "zzzz-7", "17", "-x", "a b", ""])
 def test_a_cancel_of_an_id_that_no_client_can_choose_cancels_nothing_to_come(goal_id: str) -> None:
     robot = Robot()
