@@ -145,7 +145,8 @@ class _Light:
             self._paint()
         elif self._takes(goal, event):
             if isinstance(event, StateChanged):
-                self._state = event.state
+                # A line begins with the goal as it is now, which may be further than its first event.
+                self._state = self._state if event.state is State.PENDING else event.state
             elif isinstance(event, WordHeard):
                 self._word = (event.start, event.end)
             self._paint()
@@ -175,7 +176,8 @@ class _Light:
         return True
 
     def _begin(self, goal: Goal) -> None:
-        self._goal, self._state, self._paused = goal, goal.state, goal.paused
+        self._goal, self._paused = goal, goal.paused
+        self._state = State.PENDING if goal.state.terminal else goal.state
         self._sentence = Sentence(_text(goal))
         heard = len(goal.spoken or "")
         self._word = (heard, heard)

@@ -90,7 +90,7 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     show_envvar=True,
     shell_complete=complete.players,
     help="aplay, pacat or pw-cat; null (silent, in real time); file:PATH.wav; or a command that reads 16-bit mono PCM, "
-    "with {rate} for its rate. [default: the first of the three that works]",
+    "with {rate} for its rate and {device} for the --device. [default: the first of the three that works]",
 )
 @click.option(
     "--device",
@@ -104,8 +104,8 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     default=0,
     show_default=True,
     metavar="MS",
-    help="Milliseconds of silence before each sentence: HDMI, USB and Bluetooth outputs that sleep between sentences "
-    f"swallow its beginning. At most {MAX_LEAD_IN}.",
+    help="Milliseconds of silence before a sentence, where the output was idle: HDMI, USB and Bluetooth outputs fall "
+    "asleep, and swallow what comes while they wake.",
 )
 @click.option("--driver", metavar="NAME", help="pyttsx3 driver. [default: the one for this system]")
 @click.option(

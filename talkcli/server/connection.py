@@ -15,7 +15,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Protocol, cast
 
 from talkcli import wire
-from talkcli.errors import BadRequest
+from talkcli.errors import BadRequest, LineTooLong
 from talkcli.requests import Cancel, Hello, Request, Status, read_request
 
 if TYPE_CHECKING:
@@ -108,7 +108,10 @@ class Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         try:
             self._lines.extend(self._splitter.feed(data))
-        except BadRequest as error:
+        except LineTooLong as error:
+            self._lines.extend(error.before)
+            while self._open and not self._congested and self._step():
+                pass  # they were asked for, and are answered
             self.refuse(error.code, str(error))
             return
         if b"\n" in data:
@@ -220,9 +223,12 @@ class Connection(asyncio.Protocol):
         """Take what a client sent that closed without reading: the error hid it, but it is still in the socket."""
         assert self._transport is not None
         descriptor = self._transport.get_extra_info("socket").fileno()
-        with contextlib.suppress(OSError, BadRequest):
-            while data := os.read(descriptor, SOFT_OUTPUT):
-                self._lines.extend(self._splitter.feed(data))
+        try:
+            with contextlib.suppress(OSError):
+                while data := os.read(descriptor, SOFT_OUTPUT):
+                    self._lines.extend(self._splitter.feed(data))
+        except LineTooLong as error:
+            self._lines.extend(error.before)
         while self._lines:
             self._take(self._lines.popleft())
 
