@@ -180,6 +180,15 @@ def test_line_that_is_too_long_ends_the_connection(talk: Talk) -> None:
         assert raw.receive_lines(3)[2]["ok"]
 
 
+def test_requests_that_stand_before_a_line_that_is_too_long_are_carried_out(talk: Talk) -> None:
+    with Raw(talk.socket) as raw:
+        raw.send(b'{"seq": 1, "request": "cancel"}\n{"seq": 2, "request": "resume"}\n' + b"a" * (MAX_LINE + 1))
+        _, canceled, resumed, error = raw.receive_all()
+        assert (canceled["seq"], canceled["ok"]) == (1, True)
+        assert (resumed["seq"], resumed["paused"]) == (2, False)
+        assert_error(error, "line_too_long")
+
+
 def test_nothing_but_bad_lines_end_the_connection(talk: Talk) -> None:
     for lines in (
         b"\n" * 10_000,
