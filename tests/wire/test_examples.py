@@ -124,6 +124,7 @@ def test_client_in_shell(text: str, state: str, scripted: Talk, tmp_path: Path) 
     done = run(scripted, "sh", shell_client(tmp_path), text)
     codes = {each.name: code for each, code in EXIT_CODES.items()}
     assert (done.stdout, done.returncode) == (f"{state}\n", codes[state])
+    scripted.watcher.wait_for(None, state)
     (goal,) = [each["goal"] for each in scripted.watcher.events() if "goal" in each and each["state"] == state]
     assert goal["text"] == text.replace("\n", " ")
 
