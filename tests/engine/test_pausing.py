@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from typing import TYPE_CHECKING
 
@@ -10,14 +9,14 @@ import numpy as np
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import Spawned, children
+from tests.engine.spawned import Spawned, children, late_if_it_differs
 from tests.support import compare
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, render
-from tests.support.timing import LateError, assert_within, retry_if_late
+from tests.support.timing import assert_within, retry_if_late
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from tests.support.compare import Samples
     from tests.support.recording import Recording
@@ -37,15 +36,6 @@ _STARTED = RATE // 20
 def reference() -> Samples:
     (samples,) = render([TEXT])
     return samples
-
-
-@contextlib.contextmanager
-def _late_if_it_differs() -> Iterator[None]:
-    """Take sound that differs for that of a machine that is late: players run dry then. `retry_if_late` knows."""
-    try:
-        yield
-    except AssertionError as error:
-        raise LateError(str(error)) from error
 
 
 def _assert_resumed(recording: Recording, reference: Samples, pause: float, twice: float = 0.0) -> float:
@@ -104,7 +94,7 @@ def test_a_pause_is_silent_in_time_and_the_sentence_goes_on_with_the_next_sample
             recording.wait_until_quiet()
             assert last - asked <= took, "it said that it was silent before it was"
             assert_within(took, SILENT_WITHIN, "the pause")
-            with _late_if_it_differs():
+            with late_if_it_differs():
                 _assert_resumed(recording, reference, 2.0)
 
     retry_if_late(attempt)
@@ -154,7 +144,7 @@ def test_a_long_pause_lets_go_of_the_device(sink: Sink, reference: Samples, play
             engine.resume()
             assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
             recording.wait_until_quiet()
-            with _late_if_it_differs():
+            with late_if_it_differs():
                 _assert_restarted(recording.samples[:heard], recording.samples[heard:], reference)
             assert [word.number for word in engine.words()] == list(range(1, len(engine.words()) + 1))
 
@@ -178,7 +168,7 @@ def test_a_device_that_is_lost_during_a_pause_and_comes_back_is_no_error(
             engine.resume()
             assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
             recording.wait_until_quiet()
-            with _late_if_it_differs():
+            with late_if_it_differs():
                 _assert_restarted(recording.samples[:heard], recording.samples[tone:], reference)
 
     retry_if_late(attempt)
@@ -232,7 +222,7 @@ def test_a_pause_before_the_first_sound_holds_all_of_it(sink: Sink, reference: S
             engine.resume()
             assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
             recording.wait_until_quiet()
-            with _late_if_it_differs():
+            with late_if_it_differs():
                 compare.assert_heard(recording, [reference])
 
     retry_if_late(attempt)

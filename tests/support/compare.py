@@ -185,7 +185,7 @@ def _at(samples: Samples, wanted: Samples, offset: int, heard: float) -> Compari
         products = np.correlate(around, part, "valid")
         squares = np.concatenate([[0.0], np.cumsum(around**2)])
         energy = squares[len(part) :] - squares[: -len(part)]
-        best = int(np.argmax(products))
+        best = int(np.argmax(products / np.sqrt(np.maximum(energy, 1.0))))
         own = float(part @ part)
         dots += float(products[best])
         energies += float(energy[best])

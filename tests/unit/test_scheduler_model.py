@@ -1,13 +1,10 @@
 """The scheduler against a slow model of its own: any requests, engine events and time, compared after each step.
 
-What is compared: each goal's states in their order, what the engine is told, who waits and in which order, reasons,
-`by`, times, what was spoken, what a cancel answers. `witness` holds what must be true of any sequence of effects,
-whatever the model says.
+What is compared, and how, is in `side_by_side`; here is what may happen.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,31 +12,17 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, precondition, rule
 
-from talkcli.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start, Stop
+from talkcli.effects import Now
 from talkcli.messages import Sender
-from talkcli.requests import Cancel, Say
-from talkcli.scheduler import Scheduler
-from talkcli.states import IllegalTransition, State
-from tests.unit.random_goals import BAD_SAYS, BOOT, MAX_TEXT, OPTIONS, OWN_IDS, TEXTS, says_with
-from tests.unit.slow_goal import ENDS, Selection, Wish
-from tests.unit.slow_model import Refused, SlowModel
-from tests.unit.witness import Witness
+from talkcli.requests import Say
+from tests.unit.random_goals import BAD_SAYS, BOOT, OPTIONS, OWN_IDS, TEXTS, says_with
+from tests.unit.side_by_side import SideBySide
 
 if TYPE_CHECKING:
     from hypothesis.stateful import MultipleResults
 
-    from talkcli.effects import Submitted
-    from talkcli.messages import By, Goal
-    from talkcli.record import Record
     from tests.unit.random_goals import Fields
-
-ORDERS: dict[type[Effect], str] = {
-    Start: "start",
-    Stop: "stop",
-    GiveUp: "give up",
-    Hold: "hold",
-    Resume: "resume",
-}
+    from tests.unit.slow_goal import SlowGoal
 
 NOBODYS_IDS = [f"{BOOT}-900", "zzzz-1", "17"]
 
@@ -57,113 +40,79 @@ class SchedulerMachine(RuleBasedStateMachine):
 
     goals = Bundle("goals")
 
-    @initialize(preempt=st.booleans(), max_queue=st.sampled_from([2, 3, 1, 5, 8]), ttl=st.sampled_from([0.0, 0.0, 2.0]))
+    @initialize(
+        preempt=st.sampled_from([False, False, True]),
+        max_queue=st.sampled_from([2, 3, 1, 5, 8]),
+        ttl=st.sampled_from([0.0, 0.0, 2.0]),
+    )
     def open(self, *, preempt: bool, max_queue: int, ttl: float) -> None:
-        self.real = Scheduler(BOOT, preempt=preempt, max_queue=max_queue, max_text=MAX_TEXT, ttl=ttl)
-        self.model = SlowModel(preempt=preempt, max_queue=max_queue, ttl=ttl)
-        self.witness = Witness()
-        self.records: dict[str, Record] = {}
-        self.finished: dict[str, Goal] = {}
-        self.now = Now(1_000.0, 1.7e9)
+        self.both = SideBySide(preempt=preempt, max_queue=max_queue, ttl=ttl)
+
+    @property
+    def speaking(self) -> SlowGoal | None:
+        return self.both.model.voice[0] if self.both.model.voice else None
+
+    @property
+    def stopping(self) -> bool:
+        return self.speaking is not None and self.speaking.state == "PREEMPTING"
 
     # Time. The wall clock jumps as it likes, and nothing may depend on it.
 
     @rule(step=steps, jump=jumps)
-    def time_goes_on(self, step: float, jump: float) -> None:
+    def time_goes_on(self, step: float, jump: float = 0.0) -> None:
         self.time_goes_on_unseen(step, jump)
-        self.begin()
-        self.model.tick()
-        self.compare(self.real.tick(self.now))
+        self.both.tick()
 
     @rule(step=steps, jump=jumps)
     def time_goes_on_unseen(self, step: float, jump: float) -> None:
         """Other things may come before the tick that is due."""
-        self.now = Now(self.now.monotonic + step, self.now.wall + step + jump)
+        now = self.both.now
+        self.both.now = Now(now.monotonic + step, now.wall + step + jump)
 
     # Requests
 
-    @rule(target=goals, say=says_with("preempt"), sender=clients)
+    @rule(target=goals, say=says_with("preempt", "key"), sender=clients)
     def say(self, say: Fields, sender: Sender) -> str:
-        return self.submit(Say(**say), sender)
+        return self.both.submit(Say(**say), sender)
 
     @rule(target=goals, say=says_with(*OPTIONS), sender=clients)
     def say_with_options(self, say: Fields, sender: Sender) -> str:
-        return self.submit(Say(**say), sender)
+        return self.both.submit(Say(**say), sender)
 
     @rule(target=goals, say=says_with("priority", "preempt", "flush", "key"), sender=clients)
     def say_in_some_order(self, say: Fields, sender: Sender) -> str:
-        return self.submit(Say(**say), sender)
+        return self.both.submit(Say(**say), sender)
 
     @rule(target=goals, goal=goals, keyed=st.booleans(), throttle=st.sampled_from(OPTIONS["throttle"]), sender=clients)
     def say_again(self, goal: str, *, keyed: bool, throttle: float, sender: Sender) -> str:
         """Say what was said before, but not too often."""
-        earlier = self.records[goal]
+        earlier = self.both.records[goal]
         text = earlier.text if earlier.text in TEXTS else TEXTS[0]
-        return self.submit(Say(text, key=earlier.key if keyed else None, throttle=throttle), sender)
+        return self.both.submit(Say(text, key=earlier.key if keyed else None, throttle=throttle), sender)
 
-    @precondition(lambda self: self.model.early)
-    @rule(target=goals, say=says_with("priority", "flush", "key", "throttle"), data=st.data(), sender=clients)
+    @precondition(lambda self: not (self.speaking or self.both.model.paused))
+    @rule(target=goals, say=says_with("key", "throttle"), times=st.lists(steps, min_size=2, max_size=4), sender=clients)
+    def say_again_and_again(self, say: Fields, times: list[float], sender: Sender) -> MultipleResults[str]:
+        sent = []
+        for step in times:
+            sent.append(self.both.submit(Say(**say), sender))
+            self.time_goes_on(step)
+            self.speak_to_the_end()
+        return multiple(*sent)
+
+    @precondition(lambda self: self.both.model.early)
+    @rule(target=goals, say=says_with("flush", "key"), data=st.data(), sender=clients)
     def say_what_was_cancelled_before(self, say: Fields, data: st.DataObject, sender: Sender) -> str:
-        goal_id = data.draw(st.sampled_from(sorted(self.model.early)))
-        return self.submit(Say(**say, id=goal_id), sender)
+        goal_id = data.draw(st.sampled_from(sorted(self.both.model.early)))
+        return self.both.submit(Say(**say, id=goal_id), sender)
 
-    @rule(target=goals, priorities=st.lists(st.sampled_from([0, 1]), min_size=2, max_size=4), sender=clients)
-    def say_some(self, priorities: list[int], sender: Sender) -> MultipleResults[str]:
-        return multiple(*[self.submit(Say("one of some", priority=each), sender) for each in priorities])
+    @rule(target=goals, says=st.lists(says_with("priority", "preempt", "key"), min_size=2, max_size=6), sender=clients)
+    def say_some(self, says: list[Fields], sender: Sender) -> MultipleResults[str]:
+        return multiple(*[self.both.submit(Say(**each), sender) for each in says])
 
     @rule(target=goals, say=st.sampled_from(BAD_SAYS), sender=clients)
     def say_what_is_refused(self, say: tuple[Fields, str], sender: Sender) -> str:
-        return self.submit(Say(**say[0]), sender, fault=say[1])
-
-    def submit(self, say: Say, sender: Sender, fault: str | None = None) -> str:
-        self.begin()
-        wish = Wish(say.text, say.preempt, say.flush, say.priority, say.ttl, say.key, say.throttle, say.id)
-        first = self.model.first_of(wish)
-        refusals = self.model.refusals(wish, fault)
-        before = list(self.real.pending()), self.real.unfinished()
-        could_wait = self.real.lacks_room(say)
-        outside = ("unknown_voice", "no such voice") if fault == "unknown_voice" else None
-        done = self.real.submit(say, sender, self.now, outside)
-        if done.attached:
-            assert not could_wait
-            assert first is not None
-            assert first.text == say.text
-            assert (done.record, done.effects) == (self.records[first.id], [])
-            self.compare(done.effects)
-            return first.id
-        assert fault or first is None or first.text != say.text, "an id was used twice"
-        self.compare_answer(say, sender, done, refusals)
-        record = done.record
-        if record.reason == "queue_full":
-            assert could_wait
-        if record.state.name == "REJECTED":
-            assert (list(self.real.pending()), self.real.unfinished()) == before
-            self.model.submit(record.id, wish, (str(record.reason), told(record.by)))
-        else:
-            self.model.submit(record.id, wish)
-        self.compare(done.effects)
-        return record.id
-
-    def compare_answer(self, say: Say, sender: Sender, done: Submitted, refusals: dict[str, set[str | None]]) -> None:
-        record = done.record
-        assert record.number == len(self.records) + 1
-        assert record.id not in self.records
-        self.records[record.id] = record
-        ttl = self.model.ttl if say.ttl is None else say.ttl
-        if ttl:
-            self.witness.over[record.id] = self.now.monotonic + ttl
-        assert record.snapshot().client == sender
-        refused = record.state.name == "REJECTED"
-        assert refused == bool(refusals), f"{record.state.name}, but there is {refusals or 'no reason'}"
-        assert record.id == (f"{BOOT}-{record.number}" if refused or say.id is None else say.id)
-        if refused:
-            assert told(record.by) in refusals.get(str(record.reason), set()), record.reason
-            assert done.effects == [Changed(record, State.REJECTED)]
-            return
-        assert done.effects[0] == Changed(record, State.PENDING), "it comes before all that it causes"
-        begun = [each for each in done.effects if isinstance(each, Start)]
-        if begun:
-            assert done.effects[-2:] == [Changed(begun[0].record, State.ACTIVE), *begun], "it waits for others' ends"
+        return self.both.submit(Say(**say[0]), sender, fault=say[1])
 
     @rule(
         ids=st.none() | st.lists(goals | any_ids, max_size=3),
@@ -175,216 +124,120 @@ class SchedulerMachine(RuleBasedStateMachine):
     def cancel(
         self, ids: list[str] | None, *, current: bool, before: str | None, key: str | None, sender: Sender
     ) -> None:
-        self.begin()
-        expected = self.model.cancel(Selection(ids, current, before, key), str(sender.name))
-        chosen = Cancel(None if ids is None else tuple(ids), current, before, key)
-        done = self.real.cancel(chosen, sender, self.now)
-        self.compare(done.effects)
-        assert sorted(each.id for each in done.recalled) == sorted(expected.recalled)
-        assert (None if done.stopping is None else done.stopping.id) == expected.stopping
-        assert {each.id for each in done.ended} - {before} == set(expected.ended) - {before}
-        assert set(done.unknown) == set(expected.unknown)
+        self.both.cancel(ids, sender, current=current, before=before, key=key)
 
     @rule(goal=goals | any_ids, sender=clients)
     def cancel_one(self, goal: str, sender: Sender) -> None:
-        self.cancel([goal], current=False, before=None, key=None, sender=sender)
+        self.both.cancel([goal], sender)
 
     @rule(key=keys, sender=clients)
     def cancel_a_key(self, key: str, sender: Sender) -> None:
-        self.cancel(None, current=False, before=None, key=key, sender=sender)
+        self.both.cancel(None, sender, key=key)
 
     @rule(preempt=st.booleans())
     def set_preempt(self, *, preempt: bool) -> None:
-        self.real.preempt = self.model.preempt = preempt
+        self.both.real.preempt = self.both.model.preempt = preempt
 
     @rule(ttl=st.sampled_from([0.0, 1.0, 3.0]))
     def set_ttl(self, ttl: float) -> None:
-        self.real.ttl = self.model.ttl = ttl
+        self.both.real.ttl = self.both.model.ttl = ttl
 
     @rule()
     def pause(self) -> None:
-        self.begin()
-        self.witness.paused = True
-        self.model.pause()
-        self.compare(self.real.pause())
+        self.both.pause()
 
     @rule()
     def resume(self) -> None:
-        self.begin()
-        self.witness.paused = False
-        self.model.resume()
-        self.compare(self.real.resume(self.now))
+        self.both.resume()
 
-    @precondition(lambda self: len(self.records) > 25)
+    @precondition(lambda self: len(self.both.records) > 25)
     @rule()
     def shut_down(self) -> None:
-        self.begin()
-        self.model.shutdown()
-        self.compare(self.real.shutdown(self.now))
+        self.both.shut_down()
 
     # The engine, with what it may truly say
 
-    @precondition(lambda self: self.model.voice)
+    @precondition(lambda self: self.speaking)
     @rule(end=st.integers(0, 12))
     def hears(self, end: int) -> None:
-        self.engine_says("heard", self.model.voice[0].id, end=end)
+        self.tell("heard", end=end)
 
-    @precondition(lambda self: self.model.voice)
+    @precondition(lambda self: self.speaking)
     @rule(duration=durations)
     def completes(self, duration: float | None) -> None:
-        self.engine_says("completed", self.model.voice[0].id, duration=duration)
+        self.tell("completed", duration=duration)
 
-    @precondition(lambda self: self.model.voice)
+    @precondition(lambda self: self.speaking)
     @rule(count=st.integers(1, 4), step=st.sampled_from([0.0, 0.5, 1.0]))
     def speaks_some(self, count: int, step: float) -> None:
         for _ in range(count):
-            self.time_goes_on(step, 0.0)
-            if self.model.voice:
-                self.completes(1.0)
+            self.time_goes_on(step)
+            self.speak_to_the_end()
 
-    @precondition(lambda self: self.model.voice)
+    @precondition(lambda self: self.speaking)
     @rule(reason=reasons, duration=durations)
     def fails(self, reason: str, duration: float | None) -> None:
-        self.engine_says("failed", self.model.voice[0].id, reason=reason, duration=duration)
+        self.tell("failed", reason=reason, duration=duration)
 
-    @precondition(lambda self: self.model.voice and self.model.voice[0].state == "PREEMPTING")
+    @precondition(lambda self: self.stopping)
     @rule()
     def stops(self) -> None:
-        self.engine_says("stopped", self.model.voice[0].id)
+        self.tell("stopped")
 
-    @precondition(lambda self: self.model.voice and self.model.voice[0].state == "PREEMPTING")
+    @precondition(lambda self: self.speaking)
+    @rule(end=st.integers(0, 4), sender=clients)
+    def stops_in_the_middle(self, end: int, sender: Sender) -> None:
+        self.tell("heard", end=end)
+        self.both.cancel(None, sender, current=True)
+        self.tell("stopped")
+
+    @precondition(lambda self: self.stopping)
     @rule()
     def cannot_confirm_silence(self) -> None:
-        self.engine_says("failed", self.model.voice[0].id, reason="not_silent")
+        self.tell("failed", reason="not_silent")
 
     @rule(event=st.sampled_from(["heard", "completed", "failed", "stopped"]), goal=goals | any_ids)
     def says_anything(self, event: str, goal: str) -> None:
         """An event of any goal: one that waits, one that ended, one that never was, or by chance the right one."""
-        self.engine_says(event, goal, reason="engine_crashed")
+        self.both.engine_says(event, goal, reason="engine_crashed")
 
-    def engine_says(self, event: str, goal: str, end: int = 1, reason: str = "", duration: float | None = None) -> None:
-        self.begin()
-        try:
-            match event:
-                case "heard":
-                    self.model.heard(goal, end)
-                case "completed":
-                    self.model.completed(goal, duration)
-                case "failed":
-                    self.model.failed(goal, reason, duration)
-                case "stopped":
-                    self.model.stopped(goal)
-        except Refused:
-            with pytest.raises(IllegalTransition):
-                self.tell(event, goal, end, reason, duration)
-            self.compare([])
-        else:
-            self.compare(self.tell(event, goal, end, reason, duration))
+    def speak_to_the_end(self) -> None:
+        if self.speaking:
+            self.tell("completed", duration=1.0)
 
-    def tell(self, event: str, goal: str, end: int, reason: str, duration: float | None) -> list[Effect]:
-        match event:
-            case "heard":
-                assert self.real.heard(goal, end) is self.records[goal]
-                return []
-            case "completed":
-                return self.real.completed(goal, duration, self.now)
-            case "failed":
-                return self.real.failed(goal, reason, "underrun at last", duration, self.now)
-            case _:
-                return self.real.stopped(goal, self.now)
+    def tell(self, event: str, *, end: int = 1, reason: str = "", duration: float | None = None) -> None:
+        assert self.speaking
+        self.both.engine_says(event, self.speaking.id, end, reason, duration)
 
-    # Comparing
-
-    def begin(self) -> None:
-        self.model.begin(self.now.monotonic, self.now.wall)
-        self.witness.now = self.now.monotonic
-
-    def compare(self, effects: list[Effect]) -> None:
-        """Compare what a step did with what the model did in it."""
-        self.witness.see(effects)
-        real = [(each.record.id, each.state.name) for each in effects if isinstance(each, Changed)]
-        assert by_goal(real) == by_goal(self.model.events)
-        orders = [(ORDERS[type(each)], each.record.id) for each in effects if not isinstance(each, Changed)]
-        assert orders == self.model.orders
+    # What is so after every step
 
     @invariant()
-    def it_is_paused_as_the_model_is(self) -> None:
-        assert self.real.paused == self.model.paused
-
-    @invariant()
-    def the_same_goals_wait_in_the_same_order(self) -> None:
-        assert [each.id for each in self.real.pending()] == [each.id for each in self.model.queue]
-        assert self.real.pending_count == len(self.model.queue)
-        assert {each.id for each in self.real.unfinished()} == {each.id for each in self.model.voice + self.model.queue}
-
-    @invariant()
-    def every_goal_is_as_in_the_model(self) -> None:
-        for expected in self.model.all:
-            if expected.id in self.finished:
-                continue
-            record = self.records[expected.id]
-            assert self.real.find(expected.id) is record
-            goal = record.snapshot()
-            assert (goal.state.name, goal.text, goal.paused) == (expected.state, expected.text, expected.paused)
-            assert (goal.priority, goal.key, goal.ttl) == (expected.priority, expected.key, expected.ttl)
-            assert goal.queued_at == expected.times["queued"]
-            assert goal.started_at == expected.times.get("started")
-            assert goal.ended_at == expected.times.get("ended")
-            assert goal.spoken == (expected.text[: expected.spoken] if "started" in expected.times else None)
-            if expected.state in ENDS:
-                assert (goal.reason, told(goal.by), goal.duration) == (expected.reason, expected.by, expected.duration)
-                assert goal.message
-                self.finished[goal.id] = goal
+    def both_are_alike(self) -> None:
+        real, model = self.both.real, self.both.model
+        assert real.paused == model.paused
+        assert [each.id for each in real.pending()] == [each.id for each in model.queue]
+        assert real.pending_count == len(model.queue)
+        assert {each.id for each in real.unfinished()} == {each.id for each in model.voice + model.queue}
+        self.both.compare_goals()
+        self.both.compare_deadline()
 
     @invariant()
     def higher_priorities_go_first_and_equals_in_the_order_in_which_they_came(self) -> None:
-        waiting = list(self.real.pending())
+        waiting = list(self.both.real.pending())
         assert [each.priority for each in waiting] == sorted((each.priority for each in waiting), reverse=True)
         plain = [(-each.priority, each.number) for each in waiting if each.key is None and not each.preempt]
         assert plain == sorted(plain)
-        keys = [each.key for each in waiting if each.key is not None]
-        assert len(keys) == len(set(keys)), "two goals with one key wait"
-
-    @invariant()
-    def there_is_a_deadline_for_silence_and_for_what_waits(self) -> None:
-        over = [each.accepted_at + each.ttl for each in self.model.queue if each.ttl is not None]
-        stopped = [each.stopped_at for each in self.model.voice if each.stopped_at is not None]
-        deadline = self.real.deadline()
-        if deadline is None:
-            assert not over
-            assert not stopped
-        else:
-            in_silence = bool(stopped) and stopped[0] < deadline <= stopped[0] + 2.0
-            assert deadline in over or in_silence
-            assert deadline <= min([*over, *(each + 2.0 for each in stopped)])
+        with_key = [each.key for each in waiting if each.key is not None]
+        assert len(with_key) == len(set(with_key)), "two goals with one key wait"
 
     def teardown(self) -> None:
         """After the last step everything is ended, and each goal has one terminal event."""
-        if not hasattr(self, "model"):
+        if not hasattr(self, "both") or self.both.amidst:
             return
-        self.shut_down()
-        if self.model.voice:
+        self.both.shut_down()
+        if self.stopping:
             self.stops()
-        for path in self.witness.paths.values():
-            assert [state for state in path if state in ENDS] == path[-1:]
-        assert self.witness.paths.keys() == self.records.keys()
-        for goal_id, goal in self.finished.items():
-            assert self.records[goal_id].snapshot() == goal, "a goal that had ended was changed"
-        assert self.witness.speaking is None
-
-
-def by_goal(events: list[tuple[str, str]]) -> dict[str, list[str]]:
-    paths = defaultdict(list)
-    for goal_id, state in events:
-        paths[goal_id].append(state)
-    return dict(paths)
-
-
-def told(by: By | None) -> str | None:
-    """Return `by` as the model has it."""
-    if by is None:
-        return None
-    return f"goal {by.goal}" if by.goal is not None else f"client {by.client.name if by.client else None}"
+        self.both.all_has_ended_once()
 
 
 #: Where it fails, it takes its time to find the shortest sequence.
