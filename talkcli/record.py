@@ -26,6 +26,7 @@ class Record:
         "ended_at",
         "expires_at",
         "format",
+        "holds",
         "id",
         "key",
         "message",
@@ -85,6 +86,8 @@ class Record:
         self.spoken_end = 0
         #: held in the middle of being spoken
         self.paused = False
+        #: how often that was asked for
+        self.holds = 0
         #: monotonic time at which it was handed to the engine
         self.began = 0.0
         self.started_at: float | None = None
@@ -96,6 +99,11 @@ class Record:
     def become(self, state: State) -> None:
         """Change the state as the table allows, or raise IllegalTransition and change nothing."""
         self.state = follow(self.state, state)
+
+    def hold(self) -> None:
+        """Be held, once more."""
+        self.paused = True
+        self.holds += 1
 
     def take_options(self, say: Say) -> None:
         """Take over what the goal's sender asked for, but for what the server decides: preempt and ttl."""

@@ -157,7 +157,7 @@ class Scheduler:
         self.paused = True
         if self.active is None or self.active.state is not State.ACTIVE:
             return []
-        self.active.paused = True
+        self.active.hold()
         return [Hold(self.active)]
 
     def resume(self, now: Now) -> list[Effect]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -34,7 +35,8 @@ def test_pause_tells_what_is_held_and_resume_what_goes_on(scripted: Talk, held: 
     resumed = scripted.run("resume")
     assert (resumed.code, resumed.out, resumed.err) == (0, "", f"talk: speech goes on with {held}\n")
     assert scripted.goal(held)["paused"] is False
-    assert scripted.run("resume").code == 0
+    again = scripted.run("resume")
+    assert (again.code, again.out, again.err) == (0, "", f"talk: speech goes on with {held}\n")
     scripted.run("cancel")
 
 
@@ -76,6 +78,54 @@ def test_what_was_heard_last_is_shown_escaped(scripted: Talk) -> None:
     done = scripted.run("pause")
     assert "\x1b" not in done.err
     assert r"\x1b[31m\u202e" in done.err
+    scripted.run("resume")
+    scripted.run("cancel")
+
+
+def begin(talk: Talk, text: str) -> str:
+    goal_id = talk.run("say", text).id
+    talk.watcher.wait_for(goal_id, "ACTIVE")
+    return goal_id
+
+
+def test_a_pause_that_is_called_off_before_it_is_silent_is_answered_by_the_resume(scripted: Talk) -> None:
+    goal = begin(scripted, "never-ends slow-pause=1")
+    with scripted.connect() as wire:
+        wire.send({"seq": 1, "request": "pause"})
+        wire.send({"seq": 2, "request": "resume"})
+        first, second = wire.receive(), wire.receive()
+        assert [(each["seq"], each["ok"], each["paused"]) for each in (first, second)] == [
+            (1, True, False),
+            (2, True, False),
+        ]
+        assert first["goal"]["id"] == second["goal"]["id"] == goal
+    scripted.run("cancel")
+
+
+def test_silence_of_an_earlier_pause_answers_no_later_one(scripted: Talk) -> None:
+    begin(scripted, "never-ends stale-pause slow-pause=0.4")
+    with scripted.connect() as wire:
+        wire.send({"seq": 1, "request": "pause"})
+        wire.send({"seq": 2, "request": "resume"})
+        asked = time.monotonic()
+        wire.send({"seq": 3, "request": "pause"})
+        assert [wire.receive()["seq"] for _ in range(3)] == [1, 2, 3]
+        assert time.monotonic() - asked >= 0.4
+    scripted.run("cancel")
+
+
+def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(scripted: Talk) -> None:
+    begin(scripted, "never-ends ignore-pause")
+    with scripted.connect() as wire:
+        wire.send({"seq": 1, "request": "pause"})
+        with pytest.raises(TimeoutError):
+            wire.receive(0.5)
+        wire.send({"seq": 2, "request": "pause"})
+        asked = time.monotonic()
+        for seq in (1, 2):
+            reply = wire.receive()
+            assert (reply["seq"], reply["error"]["code"]) == (seq, "not_silent")
+        assert time.monotonic() - asked >= 1.9
     scripted.run("resume")
     scripted.run("cancel")
 

@@ -19,8 +19,8 @@ class Handed:
     heard_at: float | None = None
     #: when the process was told to stop it
     stop_at: float | None = None
-    #: whether it is to be held: by the process that speaks it, else by the thread
-    paused: bool = False
+    #: the number of the pause that it is to be held for, by the process that speaks it, else by the thread
+    pause: int | None = None
     #: how it ended, once the process that spoke it is known to be gone
     verdict: Ended | None = None
     #: … and that process

@@ -73,6 +73,7 @@ class Pause:
 
     kind: ClassVar[str] = "pause"
     id: str
+    number: int  # of the pause in the goal, from 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +161,7 @@ class Paused:
 
     kind: ClassVar[str] = "paused"
     id: str
+    number: int  # of the pause that it answers
 
 
 @dataclass(frozen=True, slots=True)

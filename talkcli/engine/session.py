@@ -118,23 +118,23 @@ class Session:
             self._stop(command)
         elif isinstance(command, protocol.Pause | protocol.Resume):
             if goal is not None and goal.id == command.id and not goal.stop_asked:
-                self._hold_or_go_on(goal, isinstance(command, protocol.Pause))
+                self._hold_or_go_on(goal, command)
         else:
             self._leaving = self._leaving or isinstance(command, protocol.Quit)
             self._backlog.append(command)
 
-    def _hold_or_go_on(self, goal: InHand, held: bool) -> None:
-        if not held:
+    def _hold_or_go_on(self, goal: InHand, command: protocol.Pause | protocol.Resume) -> None:
+        if isinstance(command, protocol.Resume):
             self.hold.release()
             return
-        self.hold.ask()
+        self.hold.ask(command.number)
         if self._pump is not None and goal.spoken and not goal.interrupted:
             goal.interrupted = True
             self._engine.stop()
 
-    def _tell_paused(self) -> None:
+    def _tell_paused(self, number: int) -> None:
         if self._goal is not None and not self._goal.stop_asked:
-            self._channel.send(protocol.Paused(self._goal.id))
+            self._channel.send(protocol.Paused(self._goal.id, number))
 
     def _stop(self, command: protocol.Stop) -> None:
         if self._goal is not None and self._goal.id == command.id:

@@ -91,13 +91,13 @@ class EngineThread:
         """Make the goal end, silent."""
         self._inbox.call(lambda: self._begin_stop(goal_id))
 
-    def pause(self, goal_id: str) -> None:
+    def pause(self, goal_id: str, number: int) -> None:
         """Hold the goal where it is; `Paused` is posted when it is silent, and nothing once it is being stopped."""
-        self._inbox.call(lambda: self._hold(goal_id, paused=True))
+        self._inbox.call(lambda: self._hold(goal_id, number))
 
     def resume(self, goal_id: str) -> None:
         """Let the goal go on."""
-        self._inbox.call(lambda: self._hold(goal_id, paused=False))
+        self._inbox.call(lambda: self._hold(goal_id, None))
 
     def give_up(self, goal_id: str) -> None:
         """Let go of a goal that didn't end in time: its process is left behind, there will be no `Ended`."""
@@ -185,7 +185,7 @@ class EngineThread:
 
     def _hand_over(self) -> None:
         goal = self._goal
-        waits = goal and not (goal.spoken or goal.paused or goal.verdict)
+        waits = goal and not (goal.spoken or goal.pause or goal.verdict)
         if goal and waits and self._process and self._process.ready:
             goal.heard_at = time.monotonic()
             self._tell(goal.say)
@@ -194,15 +194,15 @@ class EngineThread:
         if self._process and not self._process.send(command):
             self._lose_process("the engine takes no commands", "engine_hung")
 
-    def _hold(self, goal_id: str, paused: bool) -> None:
+    def _hold(self, goal_id: str, pause: int | None) -> None:
         goal = self._goal
-        if goal is None or goal.id != goal_id or goal.ending or not (paused or goal.paused):
+        if goal is None or goal.id != goal_id or goal.ending or goal.pause is pause is None:
             return  # it ended, or is about to, while this was on its way
-        goal.paused = paused
+        goal.pause = pause
         if goal.spoken:
-            self._tell(protocol.Pause(goal_id) if paused else protocol.Resume(goal_id))
-        elif paused:
-            self._post(protocol.Paused(goal_id))  # it waits for a process, and now for `resume` as well
+            self._tell(protocol.Resume(goal_id) if pause is None else protocol.Pause(goal_id, pause))
+        elif pause is not None:
+            self._post(protocol.Paused(goal_id, pause))  # it waits for a process, and now for `resume` as well
         else:
             self._hand_over()
 
@@ -259,7 +259,9 @@ class EngineThread:
             goal.heard_at = time.monotonic()
             if isinstance(event, protocol.Ended):
                 self._finish(event)
-            elif isinstance(event, protocol.Word) or (isinstance(event, protocol.Paused) and goal.paused):
+            elif isinstance(event, protocol.Word) or (
+                isinstance(event, protocol.Paused) and event.number == goal.pause
+            ):
                 self._post(event)
             return
         if isinstance(event, protocol.Ready):

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from talkcli import __version__, wire
 from talkcli.admission import DEFAULT_VOICE, bad_setting
 from talkcli.errors import UnknownGoal
-from talkcli.messages import By
 from talkcli.requests import Cancel, Log, Pause, Request, Resume, Say, Set, Status, Voices, Wait, Watch
 from talkcli.server import log
+from talkcli.server.pauses import Pauses
 from talkcli.states import State
 
 if TYPE_CHECKING:
@@ -26,17 +26,6 @@ if TYPE_CHECKING:
 
 #: Ended goals that `status` lists.
 RECENT = 10
-#: Seconds after which a pause is answered though nobody knows that it is silent.
-PAUSE_LIMIT = 2.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _AwaitedPause:
-    """A pause that is answered when the goal that it holds is silent, or in doubt after a while."""
-
-    connection: Connection
-    seq: int | None
-    record: Record
 
 
 class Answers:
@@ -47,10 +36,7 @@ class Answers:
         self._scheduler = service.scheduler
         #: cancels that are answered when the goal they stopped is silent
         self._cancels: list[tuple[Connection, int | None, Cancelled]] = []
-        #: pauses that are answered when the goal that they hold is silent
-        self._pauses: list[_AwaitedPause] = []
-        #: the goal that is known to be held and silent
-        self._held: str | None = None
+        self.pauses = Pauses(service)
         self._by_kind: dict[type[Request], Callable[..., None]] = {
             Say: self._say,
             Wait: self._wait,
@@ -60,8 +46,8 @@ class Answers:
             Watch: self._watch,
             Log: self._log,
             Set: self._set,
-            Pause: self._pause,
-            Resume: self._resume,
+            Pause: self.pauses.pause,
+            Resume: self.pauses.resume,
         }
 
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
@@ -74,7 +60,7 @@ class Answers:
     def left(self, connection: Connection) -> None:
         """Owe a connection that is gone nothing more."""
         self._cancels = [each for each in self._cancels if each[0] is not connection]
-        self._pauses = [each for each in self._pauses if each.connection is not connection]
+        self.pauses.left(connection)
 
     def ended(self, record: Record) -> None:
         """Answer those who wait for this goal to be silent."""
@@ -84,16 +70,7 @@ class Answers:
         for connection, seq, done in due:
             self._report_cancel(connection, seq, done)
             connection.settle()
-        if record.id == self._held:
-            self._held = None
-        self._answer_pauses(record)
-
-    def held(self, goal_id: str) -> None:
-        """Answer those who wait for the active goal to be held and silent."""
-        active = self._scheduler.active
-        if active is not None and active.id == goal_id and active.paused:
-            self._held = goal_id
-            self._answer_pauses(active)
+        self.pauses.ended(record)
 
     # -- one method a request
 
@@ -218,35 +195,6 @@ class Answers:
             )
         )
 
-    def _pause(self, connection: Connection, seq: int | None, _: Pause) -> None:
-        self._service.now()
-        newly = not self._scheduler.paused
-        effects = self._scheduler.pause()
-        active = self._scheduler.active
-        if newly:
-            self._tell_paused(connection, active if active and active.paused else None)
-        self._service.apply(effects)
-        if active is None or active.id == self._held:
-            self._report_paused(connection, seq, active)
-            return
-        connection.owed += 1
-        pause = _AwaitedPause(connection, seq, active)
-        self._pauses.append(pause)
-        self._service.call_later(PAUSE_LIMIT, lambda: self._doubt(pause))
-
-    def _resume(self, connection: Connection, seq: int | None, _: Resume) -> None:
-        now = self._service.now()
-        newly, active = self._scheduler.paused, self._scheduler.active
-        held = active if active and active.paused else None
-        self._held = None
-        effects = self._scheduler.resume(now)
-        if newly:
-            self._tell_paused(connection, held)
-        self._service.apply(effects)
-        if held:
-            self._answer_pauses(held)  # they will not see it silent any more
-        self._report_paused(connection, seq, held)
-
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)
         if record is None:
@@ -321,30 +269,3 @@ class Answers:
         else:
             reply = wire.ok(seq, count=len(ended))
         connection.stream(items, reply)
-
-    def _tell_paused(self, connection: Connection, held: Record | None) -> None:
-        """Publish and log that speech is paused, or not any more."""
-        paused, by = self._scheduler.paused, By(client=connection.sender)
-        self._service.audience.paused(held.id if held else None, paused=paused, by=by, at=time.time())
-        log.line(f"{'paused' if paused else 'resumed'} by {log.who(connection.sender)}")
-
-    def _answer_pauses(self, record: Record) -> None:
-        """Answer the pauses that waited for this goal to be silent: it is held, or it has ended."""
-        due = [each for each in self._pauses if each.record is record]
-        self._pauses = [each for each in self._pauses if each.record is not record]
-        for each in due:
-            self._report_paused(each.connection, each.seq, record)
-            each.connection.settle()
-
-    def _doubt(self, pause: _AwaitedPause) -> None:
-        """Answer a pause whose goal was not known to be silent in time."""
-        if pause not in self._pauses:
-            return
-        self._pauses.remove(pause)
-        words = f"speech is paused, but {pause.record.id} was not known to be silent within {PAUSE_LIMIT:g} s"
-        pause.connection.reply(wire.failure(pause.seq, "not_silent", words))
-        pause.connection.settle()
-
-    def _report_paused(self, connection: Connection, seq: int | None, held: Record | None) -> None:
-        goal = None if held is None or held.state.terminal else held.snapshot().to_json()
-        connection.reply(wire.ok(seq, paused=self._scheduler.paused, goal=goal))

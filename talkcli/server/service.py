@@ -155,7 +155,7 @@ class Service:
         elif isinstance(effect, GiveUp):
             self.engine.give_up(effect.record.id)
         elif isinstance(effect, Hold):
-            self.engine.pause(effect.record.id)
+            self.engine.pause(effect.record.id, effect.record.holds)
         elif isinstance(effect, Resume):
             self.engine.resume(effect.record.id)
         else:
@@ -219,7 +219,7 @@ class Service:
         elif isinstance(report, protocol.Word):
             self._word(report)
         elif isinstance(report, protocol.Paused):
-            self._answers.held(report.id)
+            self._answers.pauses.silent(report.id, report.number)
         elif isinstance(report, protocol.Voices):
             self.voices = report.voices
             self.later.voices_known()

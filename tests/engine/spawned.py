@@ -43,6 +43,7 @@ class Spawned:
         """`limits` replaces constants of the playback, `before` is code that runs in the process first."""
         self.events: list[protocol.Event] = []
         self._rest = b""
+        self._pauses = 0
         self._socket, theirs = socket.socketpair()
         self._socket.settimeout(PATIENCE)
         self.liveness, inherited = os.pipe()
@@ -92,8 +93,9 @@ class Spawned:
     def pause(self, goal: str = "g1") -> float:
         """Hold the sentence and return the seconds until the process said that it is silent."""
         asked = time.monotonic()
-        self.send(protocol.Pause(goal))
-        assert self.until(protocol.Paused).id == goal
+        self._pauses += 1
+        self.send(protocol.Pause(goal, self._pauses))
+        assert self.until(protocol.Paused) == protocol.Paused(goal, self._pauses)
         return time.monotonic() - asked
 
     def resume(self, goal: str = "g1") -> None:

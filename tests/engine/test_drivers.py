@@ -207,7 +207,7 @@ def test_a_driver_that_has_not_said_a_word_says_all_of_it_after_a_pause() -> Non
 def test_a_driver_that_is_resumed_before_it_is_silent_goes_on_when_it_is() -> None:
     with _timed() as engine:
         engine.until(protocol.Word)
-        engine.send(protocol.Pause("g1"))
+        engine.send(protocol.Pause("g1", 1))
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
         assert len(engine.words()) == 5
@@ -221,7 +221,7 @@ def test_a_stop_ends_a_driver_that_is_paused(silent: bool) -> None:
         if silent:
             engine.pause()
         else:
-            engine.send(protocol.Pause("g1"))
+            engine.send(protocol.Pause("g1", 1))
         engine.send(protocol.Stop("g1"))
         assert engine.until(protocol.Ended) == protocol.Ended("g1", protocol.STOPPED)
         assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED

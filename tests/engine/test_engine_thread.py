@@ -72,7 +72,7 @@ def test_a_goal_is_held_and_goes_on_where_it_was(start: Callable[[], Thread]) ->
     began = time.monotonic()
     thread.say("length=0.6 two three four")
     thread.until(protocol.Word)
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 1)
     assert thread.until(protocol.Paused).id == "g1"
     assert thread.next(0.8) is None
     thread.engine.resume("g1")
@@ -85,7 +85,7 @@ def test_a_pause_may_last_longer_than_any_limit(start: Callable[[], Thread]) -> 
     thread = start()
     thread.say("length=0.3")
     thread.until(protocol.Word)
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 1)
     thread.until(protocol.Paused)
     assert thread.next(HANG_AFTER + 0.5) is None
     thread.engine.resume("g1")
@@ -97,11 +97,24 @@ def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(star
     thread.say("length=1.5 slow-pause=0.4")
     thread.until(protocol.Word)
     asked = time.monotonic()
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 1)
     thread.until(protocol.Paused)
     assert time.monotonic() - asked >= 0.4
     thread.engine.resume("g1")
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 2)
+    thread.engine.resume("g1")
+    thread.until(protocol.Ended)
+    assert sum(isinstance(each, protocol.Paused) for each in thread.seen) == 1
+
+
+def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Callable[[], Thread]) -> None:
+    thread = start()
+    thread.say("length=1 stale-pause slow-pause=0.3")
+    thread.until(protocol.Word)
+    thread.engine.pause("g1", 1)
+    thread.engine.resume("g1")
+    thread.engine.pause("g1", 2)
+    assert thread.until(protocol.Paused) == protocol.Paused("g1", 2)
     thread.engine.resume("g1")
     thread.until(protocol.Ended)
     assert sum(isinstance(each, protocol.Paused) for each in thread.seen) == 1
@@ -113,8 +126,8 @@ def test_a_goal_that_waits_for_a_process_is_held_by_the_thread(
     monkeypatch.setenv("SCRIPTED_START", "slow=0.5")
     thread = start()
     thread.say("two words")
-    thread.engine.pause("g1")
-    assert thread.next() == protocol.Paused("g1")
+    thread.engine.pause("g1", 1)
+    assert thread.next() == protocol.Paused("g1", 1)
     thread.until(protocol.Voices)
     assert thread.next(0.5) is None
     thread.engine.resume("g1")
@@ -128,9 +141,9 @@ def test_a_goal_that_is_held_by_the_thread_is_stopped_at_once(
     monkeypatch.setenv("SCRIPTED_START", "slow=0.5")
     thread = start()
     thread.say("two words")
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 1)
     thread.engine.stop("g1")
-    assert [thread.next(), thread.next()] == [protocol.Paused("g1"), protocol.Ended("g1", protocol.STOPPED)]
+    assert [thread.next(), thread.next()] == [protocol.Paused("g1", 1), protocol.Ended("g1", protocol.STOPPED)]
     thread.say("the next is not held", "g2")
     assert thread.until(protocol.Ended) == protocol.Ended("g2", protocol.COMPLETED, duration=0.1)
 
@@ -140,10 +153,10 @@ def test_a_paused_goal_is_stopped(start: Callable[[], Thread], word: str, outcom
     thread = start()
     thread.say(f"never-ends {word}")
     thread.until(protocol.Word)
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 1)
     thread.until(protocol.Paused)
     thread.engine.stop("g1")
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 1)
     assert thread.until(protocol.Ended).outcome == outcome
     assert sum(isinstance(each, protocol.Paused) for each in thread.seen) == 1
 
@@ -152,7 +165,7 @@ def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: Callable[[],
     thread = start()
     thread.say("length=0.2 at=0.9 crash slow-pause=5")
     thread.until(protocol.Word)
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 1)
     ended = thread.until(protocol.Ended)
     assert (ended.outcome, ended.reason) == (protocol.FAILED, "engine_crashed")
     thread.engine.resume("g1")
@@ -162,9 +175,9 @@ def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: Callable[[],
 
 def test_what_is_said_of_another_goal_changes_nothing(start: Callable[[], Thread]) -> None:
     thread = start()
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 1)
     thread.say("length=0.3")
-    thread.engine.pause("g0")
+    thread.engine.pause("g0", 1)
     thread.engine.resume("g1")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
     assert not any(isinstance(each, protocol.Paused) for each in thread.seen)
@@ -174,7 +187,7 @@ def test_an_engine_that_ignores_a_pause_confirms_none(start: Callable[[], Thread
     thread = start()
     thread.say("length=0.5 ignore-pause")
     thread.until(protocol.Word)
-    thread.engine.pause("g1")
+    thread.engine.pause("g1", 1)
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
     assert not any(isinstance(each, protocol.Paused) for each in thread.seen)
 

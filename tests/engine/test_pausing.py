@@ -213,7 +213,9 @@ def test_a_pause_before_the_first_sound_holds_all_of_it(sink: Sink, reference: S
     def attempt() -> None:
         with Spawned("aplay", environment=sink.env) as engine, sink.record() as recording:
             engine.until(protocol.Voices)
-            line = protocol.encode(protocol.Say("g1", TEXT, 200, 1.0, None, 50)) + protocol.encode(protocol.Pause("g1"))
+            line = protocol.encode(protocol.Say("g1", TEXT, 200, 1.0, None, 50)) + protocol.encode(
+                protocol.Pause("g1", 1)
+            )
             engine.send_raw(line)
             engine.until(protocol.Paused)
             assert children(engine.process.pid) == []

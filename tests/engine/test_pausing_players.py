@@ -92,16 +92,16 @@ def test_pausing_twice_and_resuming_for_nothing_is_harmless(player: Player) -> N
         engine.say(TEXT)
         engine.resume()
         engine.until(protocol.Word)
-        engine.send(protocol.Pause("g0"))
+        engine.send(protocol.Pause("g0", 1))
         engine.pause()
-        engine.send(protocol.Pause("g1"))
+        engine.send(protocol.Pause("g1", 1))
         engine.send(protocol.Resume("g0"))
         assert isinstance(engine.event(), protocol.Alive)
         engine.resume()
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
         assert sum(isinstance(event, protocol.Paused) for event in engine.events) == 1
-        engine.send(protocol.Pause("g1"))
+        engine.send(protocol.Pause("g1", 1))
         assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
 
 
@@ -112,7 +112,7 @@ def test_resuming_before_it_is_silent_loses_nothing(player: Player) -> None:
         engine.until(protocol.Word)
         for _ in range(3):
             engine.until(protocol.Word)
-            engine.send(protocol.Pause("g1"))
+            engine.send(protocol.Pause("g1", 1))
             engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     assert player.heard.read_bytes() == _bytes(TEXT)
@@ -203,7 +203,7 @@ def test_a_pause_when_only_the_end_is_left_lets_it_end(player: Player) -> None:
         engine.say(TEXT)
         while not mark.exists():
             time.sleep(0.002)  # what another process does is no event
-        engine.send(protocol.Pause("g1"))
+        engine.send(protocol.Pause("g1", 1))
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
         assert not any(isinstance(event, protocol.Paused) for event in engine.events)
 
@@ -215,7 +215,7 @@ def test_no_silence_is_written_to_a_file(tmp_path: Path, held: str) -> None:
     subprocess.run(["espeak-ng", "-s", "200", "-w", str(plain), text], check=True)
     with Spawned(f"file:{target}") as engine:
         engine.until(protocol.Voices)
-        pause = protocol.encode(protocol.Pause("g1"))
+        pause = protocol.encode(protocol.Pause("g1", 1))
         engine.send_raw(protocol.encode(protocol.Say("g1", text, 200, 1.0, None, 50)) + pause * (held == "before"))
         if held == "within":
             engine.until(protocol.Word)

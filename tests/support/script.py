@@ -19,6 +19,7 @@ sentences are spoken plainly:
 | `slow-stop=SECONDS` | ends that long after it was told to stop |
 | `on-stop=crash`, `=exit`, `=hang`, `=fail`, `=complete` | does that when it is told to stop |
 | `slow-pause=SECONDS` | goes on that long after it was told to pause, before it is silent |
+| `stale-pause` | answers each pause but the first at once, as if it were the one before, and then as it is |
 | `ignore-pause` | ignores pause and resume, and says nothing about it |
 | `linger=SECONDS` | leaves a process that holds the pipe of `TALK_LIVENESS_FD` open so long, whatever happens |
 
@@ -37,7 +38,9 @@ from dataclasses import dataclass
 
 #: No scripted process outlives this many seconds of hanging or lingering, whatever happens to the test.
 LONGEST = 30.0
-_FLAGS = frozenset({"silent-start", "crash", "exit", "hang", "never-ends", "ignore-stop", "ignore-pause"})
+_FLAGS = frozenset(
+    {"silent-start", "crash", "exit", "hang", "never-ends", "ignore-stop", "stale-pause", "ignore-pause"}
+)
 _VALUED = frozenset(
     {"length", "words", "at", "fail", "message", "exit", "slow-stop", "on-stop", "slow-pause", "linger"}
 )
@@ -60,6 +63,7 @@ class Script:
     slow_stop: float = 0.0
     on_stop: str | None = None
     slow_pause: float = 0.0
+    stale_pause: bool = False
     ignore_pause: bool = False
     linger: float = 0.0
     words: tuple[tuple[int, int], ...] = ()
@@ -94,6 +98,7 @@ def parse(text: str) -> Script:
         slow_stop=float(asked.get("slow-stop", "0")),
         on_stop=asked.get("on-stop"),
         slow_pause=float(asked.get("slow-pause", "0")),
+        stale_pause="stale-pause" in asked,
         ignore_pause="ignore-pause" in asked,
         linger=min(LONGEST, float(asked.get("linger", "0"))),
         words=tuple(spans[:count]) if "silent-start" not in asked else (),

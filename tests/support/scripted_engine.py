@@ -64,8 +64,8 @@ class Engine:
         self._goal: Goal | None = None
         self._last = time.monotonic()
         self._buffer = b""
-        #: whether `Paused` is still to be sent
-        self._pause_untold = False
+        #: the number of the pause that is still to be answered
+        self._untold: int | None = None
 
     def run(self) -> None:
         """Serve until the other side closes, or tells it to quit."""
@@ -79,7 +79,7 @@ class Engine:
         if self._goal is None:
             return None
         goal, due = self._goal, self._last + protocol.ALIVE_EVERY
-        if self._pause_untold and goal.silent_at is not None:
+        if self._untold and goal.silent_at is not None:
             due = min(due, goal.silent_at)
         if goal.plan and not goal.held(time.monotonic()):
             due = min(due, goal.plan[0][0])
@@ -145,7 +145,7 @@ class Engine:
         goal = self._goal
         if goal is None or goal.id != stop.id or goal.script.ignore_stop or goal.stopped:
             return
-        goal.stopped, goal.silent_at, self._pause_untold = True, None, False
+        goal.stopped, goal.silent_at, self._untold = True, None, None
         goal.plan.clear()
         act = goal.script.on_stop
         action = (lambda: self._act(act, goal.script.code)) if act else (lambda: self._end(protocol.STOPPED))
@@ -162,12 +162,14 @@ class Engine:
         ):
             return
         goal.silent_at = time.monotonic() + goal.script.slow_pause
-        self._pause_untold = True
+        self._untold = pause.number
+        if goal.script.stale_pause and pause.number > 1:
+            self._send(protocol.Paused(goal.id, pause.number - 1))
 
     def _resume(self, resume: protocol.Resume) -> None:
         if self._goal and self._goal.id == resume.id:
             self._goal.resume(time.monotonic())
-            self._pause_untold = False
+            self._untold = None
 
     def _quit(self) -> bool:
         if self._goal:
@@ -182,9 +184,9 @@ class Engine:
                 break
             _, action = goal.plan.pop(0)
             action()
-        if goal and self._pause_untold and goal.held(time.monotonic()):
-            self._pause_untold = False
-            self._send(protocol.Paused(goal.id))
+        if goal and self._untold and goal.held(time.monotonic()):
+            self._send(protocol.Paused(goal.id, self._untold))
+            self._untold = None
         if self._goal and time.monotonic() - self._last >= protocol.ALIVE_EVERY:
             self._send(protocol.Alive(self._goal.id))
 
@@ -205,7 +207,7 @@ class Engine:
             sys.exit(f"the script asks for {what!r}, which is not in its grammar")
 
     def _end(self, outcome: str) -> None:
-        goal, self._goal, self._pause_untold = self._goal, None, False
+        goal, self._goal, self._untold = self._goal, None, None
         assert goal
         failed = outcome == protocol.FAILED
         self._send(
