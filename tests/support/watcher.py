@@ -5,6 +5,7 @@ What it has collected must keep the promise, each goal one terminal state and no
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import Counter
@@ -15,6 +16,8 @@ from tests.support.connection import PATIENCE, Message, Wire
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
+#: Numbers of requests after this one are those of `hello`, with which the watcher catches up.
+_FIRST_SEQ = 1000
 TERMINAL = frozenset({"PREEMPTED", "SUCCEEDED", "ABORTED", "REJECTED", "RECALLED"})
 
 
@@ -27,6 +30,8 @@ class Watcher:
         self._events: list[Message] = []
         self._arrivals: dict[int, float] = {}  # by the identity of an event, which stays in `_events`
         self._ended: str | None = None
+        #: the last `hello` that was sent to catch up with the server, and the last that was answered
+        self._asked = self._answered = _FIRST_SEQ
         try:
             #: the reply that closed the snapshot, and the snapshot's lines
             self.reply = self._wire.request("watch")
@@ -41,7 +46,8 @@ class Watcher:
         self._thread.start()
 
     def events(self, goal_id: str | None = None) -> list[Message]:
-        """Return the events so far, of one goal or of all, `alive` left out."""
+        """Return all events that the server had sent when this was called, of one goal or of all, `alive` left out."""
+        self._catch_up()
         with self._changed:
             return [each for each in self._events if goal_id is None or each.get("id") == goal_id]
 
@@ -138,6 +144,16 @@ class Watcher:
         assert ends or may_be_unfinished, f"no terminal state: {told}"
         assert not ends or ends[0] == len(own) - 1, f"an event after the terminal state: {told}"
 
+    def _catch_up(self) -> None:
+        """Wait for all that the server has sent: its reply to a request comes after that; a frozen one says nothing."""
+        with self._changed:
+            if self._ended is not None:
+                return
+            self._asked = asked = self._asked + 1
+            with contextlib.suppress(OSError):  # it has closed: the thread reads to the end
+                self._wire.send({"seq": asked, "request": "hello"})
+            self._changed.wait_for(lambda: self._answered >= asked or self._ended is not None, PATIENCE)
+
     def _read(self) -> None:
         while True:
             try:
@@ -150,6 +166,10 @@ class Watcher:
             if message.get("event") == "alive":
                 continue
             with self._changed:
+                if message.get("seq", 0) > _FIRST_SEQ and "ok" in message:
+                    self._answered = message["seq"]
+                    self._changed.notify_all()
+                    continue
                 self._events.append(message)
                 self._arrivals[id(message)] = time.monotonic()
                 self._changed.notify_all()
