@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import pytest
 
+from tests.support.company import company
 from tests.support.processes import Talk
 from tests.support.sink import Sink
 
@@ -35,6 +36,18 @@ class MakeTalk(Protocol):
 def _interruptible() -> None:
     """Start clients with SIGINT as a terminal would: what runs the tests in its background may have it ignored."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def _place(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Run beside other tests; alone what listens, and what is marked so."""
+    listens = not {"sink", "private_sink"}.isdisjoint(request.fixturenames)
+    if listens or request.node.get_closest_marker("alone"):
+        company.stay_alone()
+    else:
+        company.join()
+    yield
+    company.leave()
 
 
 @pytest.fixture(scope="session")

@@ -174,6 +174,7 @@ def test_what_is_in_time_is_tried_once() -> None:
     assert attempt.late is None
 
 
+@pytest.mark.alone
 def test_what_is_late_beside_a_late_control_is_tried_again() -> None:
     times = iter([0.3, 0.1])
     first, second = retry_if_late(lambda: assert_within(next(times), 0.2, "it"), lambda: 9.0)
@@ -181,6 +182,7 @@ def test_what_is_late_beside_a_late_control_is_tried_again() -> None:
     assert second.late is None
 
 
+@pytest.mark.alone
 def test_what_is_late_beside_a_control_in_time_fails_at_once() -> None:
     times = iter([0.3, 0.1])
     with pytest.raises(AssertionError, match="the control was in time"):
@@ -188,6 +190,7 @@ def test_what_is_late_beside_a_control_in_time_fails_at_once() -> None:
     assert next(times) == 0.1
 
 
+@pytest.mark.alone
 def test_a_third_late_attempt_fails() -> None:
     times = iter([0.3, 0.3, 0.3, 0.1])
     with pytest.raises(AssertionError, match="the control was late too"):

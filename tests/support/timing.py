@@ -13,6 +13,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tests.support.company import company
 from tests.support.surroundings import clean_environment
 
 if TYPE_CHECKING:
@@ -59,7 +60,8 @@ def retry_if_late(
     """Run an attempt, at most three times, again only where it was late and so was the control before or after it.
 
     An attempt that raises `LateError` while the control was in time fails, as does any other failure at once, and the
-    third late one. Every attempt's times are in the message, and returned where one was in time at last.
+    third late one. Every attempt's times are in the message, and returned where one was in time at last. One that was
+    late beside other tests, where no control tells what those did meanwhile, does not count: the next are made alone.
     """
     attempts: list[Attempt] = []
     while True:
@@ -67,6 +69,9 @@ def retry_if_late(
         try:
             attempt()
         except LateError as error:
+            if not company.alone:
+                company.stay_alone()
+                continue
             after = control()
             attempts.append(Attempt(before, after, str(error)))
             in_time = max(before, after) <= control_limit
