@@ -1,0 +1,187 @@
+"""Clients by the hundred: turned away and taken later, frozen, killed; nobody else is harmed and nothing is left."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.rawsocket import Raw
+from tests.conformance.test_wire_slow_clients import others_served
+from tests.support import census
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+#: Seconds of `status` for somebody else, whatever these clients do.
+STATUS = 0.1
+#: So many words, less a few, go to those who follow a goal: as many as the longest text has.
+WORDS = "length=2 " + "a " * 4_990
+
+#: A process with many connections, each of which sends a line, says when all have been answered, and sleeps.
+_CROWD = """
+import socket, sys
+path, count, line = sys.argv[1], int(sys.argv[2]), sys.argv[3].encode()
+crowd = [socket.socket(socket.AF_UNIX) for _ in range(count)]
+for each in crowd:
+    each.connect(path)
+    each.sendall(line + b"\\n")
+for each in crowd:
+    received = b""
+    while received.count(b"\\n") < 2:
+        received += each.recv(4096)
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+@contextlib.contextmanager
+def crowd(talk: Talk, count: int, line: str) -> Iterator[subprocess.Popen[str]]:
+    """Give a process with so many connections, each of which has sent this line and had its reply."""
+    process = subprocess.Popen(
+        [sys.executable, "-S", "-c", _CROWD, talk.socket, str(count), line],
+        env=talk.env,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdin
+    assert process.stdout
+    try:
+        assert process.stdout.readline() == "ready\n"
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdin.close()
+        process.stdout.close()
+
+
+def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(scripted: Talk) -> None:
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(Raw(scripted.socket)) for _ in range(300)]
+        for each in clients:
+            each.send(b'{"seq": 1, "request": "hello"}\n')
+        lines = [each.receive_lines(1) for each in clients]
+        greeted = [client for client, said in zip(clients, lines, strict=True) if "error" not in said[0]]
+        busy = [said[0] for said in lines if "error" in said[0]]
+        # The watcher of this test is one of 256.
+        assert (len(greeted), len(busy)) == (255, 45)
+        assert all((each["talk"], each["error"]) == (1, "busy") for each in busy)
+        assert all(each.receive_lines(2)[1] == {"seq": 1, "ok": True} for each in greeted)
+        full = scripted.run("--json", "say", "--wait", "length=0")
+        assert (full.code, json.loads(full.err)["error"]["code"]) == (5, "busy")
+        assert scripted.run("status").code == 0  # places are kept for those who want to know, and to silence it
+        late = scripted.start("say", "--wait", "length=0")
+        greeted[0].socket.close()
+        assert scripted.finish(late).code == 0  # it tries again
+    assert scripted.run("say", "--wait", "length=0").code == 0
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("max_queue", [1000, 100])
+def test_500_say_processes_at_once(make_talk: MakeTalk, max_queue: int) -> None:
+    """With room for all none is lost; without, those that were accepted are spoken, and the others know."""
+    talk = make_talk("--max-queue", str(max_queue), scripted=True)
+    first = talk.run("say", "never-ends").id
+    clients = [talk.start("say", "--", f"length=0 number {number}") for number in range(500)]
+    done = [talk.finish(each, timeout=120) for each in clients]
+    accepted = [each.id for each in done if each.code == 0]
+    assert {each.code for each in done} == ({0} if max_queue == 1000 else {0, 5}), [each.err for each in done]
+    assert len(accepted) == min(500, max_queue)
+    assert len(set(accepted)) == len(accepted)
+    for client in done:
+        assert client.code == 0 or "100 goals are waiting already" in client.err
+    talk.run("cancel", first)
+    for each in accepted:
+        assert talk.watcher.wait_for_terminal(each, timeout=30) == "SUCCEEDED"
+    spoken = [each["id"] for each in talk.watcher.events() if each.get("state") == "SUCCEEDED"]
+    assert sorted(spoken) == sorted(accepted)
+
+
+def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True, watched=False)
+
+    def attempt() -> None:
+        line = json.dumps({"seq": 1, "request": "watch"})
+        with crowd(talk, 50, line) as frozen:
+            frozen.send_signal(signal.SIGSTOP)
+            with others_served(talk) as times:
+                speak_words(talk, 2)
+                before = census.count(talk.pid)
+                speak_words(talk, 2)
+                after = census.count(talk.pid)
+            # All words that 50 clients are owed at most are there after the first 10,000. Of the next 10,000, 85 MB for
+            # all, each gets what is never dropped: two goals of 10 kB, with their first state and with their last.
+            assert after.memory - before.memory < 4 * 1024, (before, after)
+            assert (after.descriptors, after.threads) == (before.descriptors, before.threads)
+            frozen.send_signal(signal.SIGCONT)
+        assert_within(max(times), STATUS, "status for another client")
+
+    retry_if_late(attempt)
+
+
+def speak_words(talk: Talk, count: int) -> None:
+    """Speak so many sentences of nearly 5,000 words each."""
+    with talk.connect() as wire:
+        for _ in range(count):
+            assert wire.request("say", text=WORDS, wait=True)["ok"]
+        for _ in range(count):
+            assert wire.receive_event("result", timeout=30)["goal"]["state"] == "SUCCEEDED"
+
+
+def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-clients", "600", scripted=True)
+    goal = talk.run("say", "never-ends").id
+    talk.watcher.wait_for_word(goal)
+    line = json.dumps({"seq": 1, "request": "wait", "ids": [goal], "feedback": True})
+
+    def killed() -> None:
+        with contextlib.ExitStack() as stack:
+            crowds = [stack.enter_context(crowd(talk, 50, line)) for _ in range(10)]
+            assert census.count(talk.pid).descriptors >= 500
+            for each in crowds:
+                os.kill(each.pid, signal.SIGKILL)
+
+    before = census.count(talk.pid)
+    killed()
+    once = census.assert_as_before(talk.pid, before, memory=8 * 1024)
+    killed()
+    census.assert_as_before(talk.pid, before, memory=once.memory - before.memory + 1024)
+    assert talk.goal(goal)["state"] == "ACTIVE"
+    began = time.monotonic()
+    assert talk.run("cancel", goal).code == 0
+    assert time.monotonic() - began < 5
+    assert talk.watcher.wait_for_terminal(goal) == "PREEMPTED"
+
+
+def test_server_that_takes_no_connection_at_all_holds_no_client(scripted: Talk) -> None:
+    """Frozen, with its backlog full: nobody accepts, and `connect` itself would wait."""
+    scripted.freeze()
+    try:
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    connected = stack.enter_context(socket.socket(socket.AF_UNIX))
+                    connected.setblocking(False)
+                    connected.connect(scripted.socket)
+            commands = [["status"], ["cancel"], ["say", "hello"], ["say", "--wait", "hello"]]
+            for client in [scripted.start(*words) for words in commands]:
+                done = scripted.finish(client, timeout=10)
+                assert (done.code, done.out) == (3, ""), done
+                assert "restart it if it hangs" in done.err
+    finally:
+        scripted.thaw()
+    assert scripted.run("say", "--wait", "length=0").code == 0

@@ -1,0 +1,92 @@
+"""What a server and all that it started take of the machine, counted from outside: from /proc, on Linux alone."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+from tests.support.surroundings import command_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+#: Seconds in which what ended has been cleared away.
+_SETTLED = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Census:
+    """One count of a server."""
+
+    processes: int  # the server and all below it
+    descriptors: int  # of the server
+    threads: int  # of the server
+    memory: int  # kB of all of them, shared pages divided by those who share them (Pss)
+
+    def __str__(self) -> str:
+        return ", ".join(f"{each.name} {getattr(self, each.name)}" for each in fields(self))
+
+
+def count(pid: int) -> Census:
+    """Count a server that runs."""
+    family = descendants(pid)
+    return Census(
+        processes=1 + len(family),
+        descriptors=len(os.listdir(f"/proc/{pid}/fd")),
+        threads=len(os.listdir(f"/proc/{pid}/task")),
+        memory=sum(_pss(each) for each in (pid, *family)),
+    )
+
+
+def settled(pid: int, wanted: Callable[[Census], bool]) -> Census:
+    """Return the first count that is as wanted, or the last one: what is closed goes in its own time."""
+    end = time.monotonic() + _SETTLED
+    while not wanted(found := count(pid)) and time.monotonic() < end:
+        time.sleep(0.05)  # that a process or a connection is gone is no event for others
+    return found
+
+
+def assert_as_before(pid: int, before: Census, memory: int) -> Census:
+    """Assert that a server has no more processes, descriptors and threads than before, and so many kB more at most."""
+    found = settled(pid, lambda now: _fits(now, before))
+    assert _fits(found, before), f"before: {before}; now: {found}; {_told(pid)}"
+    assert found.memory <= before.memory + memory, f"before: {before}; now: {found}"
+    return found
+
+
+def descendants(pid: int) -> list[int]:
+    """Return the ids of all processes below one."""
+    parents: dict[int, list[int]] = {}
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
+                # The name in brackets may hold anything, brackets too.
+                parents.setdefault(int(file.read().rpartition(b")")[2].split()[1]), []).append(int(name))
+    found, due = [], [pid]
+    while due:
+        below = parents.get(due.pop(), [])
+        found += below
+        due += below
+    return found
+
+
+def _fits(now: Census, before: Census) -> bool:
+    return now.processes <= before.processes and now.descriptors <= before.descriptors and now.threads <= before.threads
+
+
+def _pss(pid: int) -> int:
+    with contextlib.suppress(OSError), open(f"/proc/{pid}/smaps_rollup", encoding="utf-8") as file:
+        return next((int(each.split()[1]) for each in file if each.startswith("Pss:")), 0)
+    return 0  # it has ended
+
+
+def _told(pid: int) -> str:
+    """Return what a server has, for messages."""
+    targets = []
+    for each in os.listdir(f"/proc/{pid}/fd"):
+        with contextlib.suppress(OSError):
+            targets.append(f"{each} → {os.readlink(f'/proc/{pid}/fd/{each}')}")
+    return "; ".join([*(command_line(each) for each in descendants(pid)), *sorted(targets)])
