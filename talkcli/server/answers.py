@@ -107,7 +107,7 @@ class Answers:
             self._service.audience.await_result(record.id, connection, feedback=request.feedback)
         connection.reply(wire.ok(seq, goal=goal, **extra))
         if ended and (request.wait or request.feedback):
-            connection.publish({"event": "result", "goal": goal})
+            connection.publish(wire.encode({"event": "result", "goal": goal}))
         self._service.apply(submitted.effects)
 
     def _wait(self, connection: Connection, seq: int | None, request: Wait) -> None:
@@ -122,7 +122,7 @@ class Answers:
         connection.stream((wire.item(seq, goal=each) for each in goals), wire.ok(seq, count=len(goals)))
         for record, goal in zip(records, goals, strict=True):
             if record.state.terminal:
-                connection.publish({"event": "result", "goal": goal})
+                connection.publish(wire.encode({"event": "result", "goal": goal}))
 
     def _cancel(self, connection: Connection, seq: int | None, request: Cancel) -> None:
         self._service.later.voices_known()  # goals that wait for them came before it

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from talkcli import wire
 from talkcli.states import State
 
 if TYPE_CHECKING:
     import asyncio
+    from collections.abc import Iterable
 
     from talkcli.messages import By, JsonObject
     from talkcli.record import Record
@@ -78,8 +80,7 @@ class Audience:
         waiting = list(self._waiters.get(record.id, ()))
         if waiting or self._watchers:
             event: JsonObject = {"event": "state", "id": record.id, "state": state.name, "n": self._count, "at": at}
-            for connection in waiting:
-                connection.publish(event)
+            _publish(event, waiting)
             self._tell_watchers(record, state, event)
         if state.terminal and waiting:
             self._send_result(record, waiting)
@@ -91,8 +92,7 @@ class Audience:
         listening.update((each, None) for each, feedback in self._waiters.get(goal_id, {}).items() if feedback)
         if listening:
             event = {"event": "word", "id": goal_id, **word, "n": self._count, "at": at}
-            for connection in listening:
-                connection.publish(event, feedback=True)
+            _publish(event, listening, feedback=True)
 
     def paused(self, held: str | None, *, paused: bool, by: By, at: float) -> None:
         """Publish that speech is held, or goes on: `held` is the goal that was being spoken."""
@@ -101,21 +101,17 @@ class Audience:
         for waiting in self._waiters.values():
             listening.update((each, None) for each, feedback in waiting.items() if feedback)
         event: JsonObject = {"event": "paused", "paused": paused, "id": held, "by": by.to_json()}
-        for connection in listening:
-            connection.publish({**event, "n": self._count, "at": at})
+        _publish({**event, "n": self._count, "at": at}, listening)
 
     def _tell_watchers(self, record: Record, state: State, event: JsonObject) -> None:
         if not self._watchers:
             return
         if state is State.PENDING or state.terminal:
             event = {**event, "goal": record.snapshot(state).to_json()}  # its first state, and its last
-        for connection in list(self._watchers):
-            connection.publish(event)
+        _publish(event, list(self._watchers))
 
     def _send_result(self, record: Record, waiting: list[Connection]) -> None:
-        result: JsonObject = {"event": "result", "goal": record.snapshot().to_json()}
-        for connection in waiting:
-            connection.publish(result)
+        _publish({"event": "result", "goal": record.snapshot().to_json()}, waiting)
         del self._waiters[record.id]
         for connection in waiting:
             awaited = self._awaited[connection]
@@ -131,7 +127,12 @@ class Audience:
     def _say_alive(self) -> None:
         self._alive = None
         listening = dict.fromkeys([*self._awaited, *self._watchers, *self._kept])
-        for connection in listening:
-            connection.publish({"event": "alive"})
+        _publish({"event": "alive"}, listening)
         if listening:
             self._keep_alive()
+
+
+def _publish(event: JsonObject, connections: Iterable[Connection], *, feedback: bool = False) -> None:
+    line = wire.encode(event)
+    for connection in connections:
+        connection.publish(line, feedback=feedback)

@@ -73,8 +73,8 @@ class Connection(asyncio.Protocol):
         self._splitter = wire.LineSplitter()
         self._lines: deque[bytes] = deque()
         #: what has to be sent in its order while a list is on its way: lists, and what came after them
-        self._outbox: deque[Iterator[JsonObject]] = deque()
-        self._newest: JsonObject | None = None
+        self._outbox: deque[Iterator[JsonObject | bytes]] = deque()
+        self._newest: bytes | None = None
         self._congested = self._half_closed = self._turn_is_due = False
         self._bad_lines = 0
         self._first_limit: asyncio.TimerHandle | None = None
@@ -144,8 +144,8 @@ class Connection(asyncio.Protocol):
         self._outbox.append(chain(items, [reply]))
         self._ask_for_a_turn()
 
-    def publish(self, event: JsonObject, *, feedback: bool = False) -> None:
-        """Send an event. Feedback is dropped, all but the newest, while the client doesn't read."""
+    def publish(self, event: bytes, *, feedback: bool = False) -> None:
+        """Send an encoded event. Feedback is dropped, all but the newest, while the client doesn't read."""
         if feedback and self._congested:
             self._newest = event
             return
@@ -182,7 +182,7 @@ class Connection(asyncio.Protocol):
         """Whether more can be sent."""
         return self._transport is not None and not self._transport.is_closing()
 
-    def _send(self, message: JsonObject) -> None:
+    def _send(self, message: JsonObject | bytes) -> None:
         """Send a message after the lists that are on their way."""
         if not self._outbox:
             self._write(message)
@@ -212,10 +212,10 @@ class Connection(asyncio.Protocol):
             self._line_limit.cancel()
             self._line_limit = None
 
-    def _write(self, message: JsonObject) -> None:
+    def _write(self, message: JsonObject | bytes) -> None:
         if self._transport is None or self._transport.is_closing():
             return
-        self._transport.write(wire.encode(message))
+        self._transport.write(message if isinstance(message, bytes) else wire.encode(message))
         if self._transport.get_write_buffer_size() > HARD_OUTPUT:
             self.drop()
 

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 #: Seconds of `status` for somebody else, whatever these clients do.
 STATUS = 0.1
-#: So many words, less a few, go to those who follow a goal: as many as the longest text has.
-WORDS = "length=2 " + "a " * 4_990
+#: So many words, less a few, go to those who follow a goal: as many as the longest text has, a thousand a second.
+WORDS = "length=5 " + "a " * 4_990
 
 #: A process with many connections, each of which sends a line, says when all have been answered, and sleeps.
 _CROWD = """
@@ -111,6 +111,7 @@ def test_500_say_processes_at_once(make_talk: MakeTalk, max_queue: int) -> None:
     assert sorted(spoken) == sorted(accepted)
 
 
+@pytest.mark.alone
 def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
 
