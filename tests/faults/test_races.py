@@ -1,0 +1,54 @@
+"""Cancel against the natural end of a goal, ten thousand times: whoever wins, there is one end."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from tests.faults.soak_witness import Witness
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+
+GOALS = 10_000
+#: Goals on their way at once: fewer than the queue takes.
+AHEAD = 50
+
+
+def test_cancel_that_races_with_the_natural_end_10000_times(make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True, watched=False)
+    witness = Witness(talk.socket)
+    over = threading.Event()
+    canceled = Counter[bool]()
+
+    def cancel() -> None:
+        with talk.connect() as wire:
+            while not over.is_set():
+                reply = wire.request("cancel", current=True)
+                assert reply["ok"]
+                canceled[reply["count"] > 0] += 1
+
+    thread = threading.Thread(target=cancel)
+    thread.start()
+    results: Counter[str] = Counter()
+    try:
+        with talk.connect() as wire:
+            for number in range(GOALS + AHEAD):
+                if number < GOALS:
+                    # No word: the goal may be over before it is known to have begun.
+                    wire.send({"seq": number, "request": "say", "text": "length=0 words=0", "wait": True})
+                if number >= AHEAD:
+                    results[wire.receive_event("result")["goal"]["state"]] += 1
+    finally:
+        over.set()
+        thread.join()
+    assert witness.wait_for(GOALS, timeout=10)
+    talk.stop()
+    witness.close()
+    assert not witness.faults
+    assert sum(results.values()) == GOALS
+    assert results.keys() <= {"SUCCEEDED", "PREEMPTED"}
+    assert {state: count for (state, _), count in witness.ends.items()} == dict(results)
+    # Both must have won often, or it was no race.
+    assert min(results["SUCCEEDED"], results["PREEMPTED"]) > GOALS / 100, results
