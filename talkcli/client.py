@@ -212,7 +212,8 @@ class Client:
         """
         wanted = None if ids is None else [self._full_id(each) for each in ids]
         first, *others = [None] if wanted is None else batches(wanted) or [()]
-        requests = [Cancel(first, current, before and self._full_id(before), key), *map(Cancel, others)]
+        last = None if before is None else self._full_id(before)
+        requests = [Cancel(first, current, last, key), *map(Cancel, others)]
         check_key(key)
         items: list[JsonObject] = []
         unknown: list[str] = []

@@ -193,6 +193,15 @@ def test_cancel_by_key(client: Client) -> None:
             client.cancel(key=key)
 
 
+@pytest.mark.parametrize("selection", [{"ids": [""]}, {"before": ""}])
+def test_empty_id_is_an_error_and_selects_nothing(client: Client, selection: dict[str, Any]) -> None:
+    goal = client.say("never-ends")
+    with pytest.raises(UsageError, match="an id is empty"):
+        client.cancel(**selection)
+    assert not goal.state.terminal
+    goal.cancel()
+
+
 def test_more_ids_than_a_request_holds(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "5000", scripted=True, watched=False)
     ids = [f"{number:04}.".ljust(64, "x") for number in range(1_000)]
