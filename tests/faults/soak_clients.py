@@ -129,7 +129,7 @@ class Narrator:
     def _run(self) -> None:
         try:
             number = 0
-            while not self._over.wait(0.5):
+            while not self._over.wait(0.2):
                 self._narrate(_SENTENCES[number % len(_SENTENCES)])
                 number += 1
         except Exception as error:  # noqa: BLE001 - told by the soak, in its own thread
@@ -149,9 +149,8 @@ class Narrator:
         if abs(_sound(samples) - _sound(reference)) <= _EXTENT and found.correlation >= _ALIKE:
             self.heard_whole += 1
         else:
-            self.failures.append(
-                f"{goal_id} SUCCEEDED, but was not heard as it should: {found}, {_sound(samples):.2f} s of sound{_gaps(samples)}; after {self._last()}"
-            )
+            how = f"{found}, {_sound(samples):.2f} s of sound{_gaps(samples)}; after {self._last()}"
+            self.failures.append(f"{goal_id} SUCCEEDED, but was not heard as it should: {how}")
 
 
 def _follow(wire: Wire) -> tuple[dict[str, float], Message]:

@@ -1,0 +1,27 @@
+"""Mutated requests: a seed that never changes, and one of today; a minute in CI, a few seconds elsewhere."""
+
+from __future__ import annotations
+
+import datetime as dt
+import os
+
+import pytest
+
+from tests.faults.fuzz_lines import fuzz
+
+SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (60 if os.environ.get("CI") else 8))
+
+
+def test_20000_mutated_lines_have_one_reply_each() -> None:
+    report = fuzz(20, count=20_000)
+    assert not report.failures, str(report)
+    assert len(report.errors) > 8, f"hardly any errors: {report}"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(int(SECONDS) + 300)
+def test_mutated_lines_of_today_have_one_reply_each() -> None:
+    report = fuzz(dt.datetime.now(dt.timezone.utc).toordinal(), seconds=SECONDS)
+    print(report)
+    assert not report.failures, str(report)
+    assert report.lines > 200 * SECONDS
