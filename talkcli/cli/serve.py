@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import sys
 
 import click
+from click.core import ParameterSource
 
-from talkcli.cli import complete
-from talkcli.cli.common import common, common_options, filled, number, seconds
+from talkcli.cli import complete, units
+from talkcli.cli.common import common, common_options, filled, note, number, seconds, show
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE, Settings
 
 #: Milliseconds of silence before a sentence: no output needs longer to wake.
@@ -117,23 +119,60 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     help="Who may connect: the socket's file mode.",
 )
 @click.option("--greeting", metavar="TEXT", help="A sentence to speak at the start.")
+@click.option(
+    "--print-unit",
+    type=click.Choice(list(units.UNITS)),
+    help="Print a unit for systemd that serves with the options given here, and end; it says where it goes.",
+)
 @common_options
 @click.pass_context
-def command(context: click.Context, /, **options: object) -> int:
+def command(context: click.Context, /, print_unit: str | None, **options: object) -> int:
     """Run the server, in the foreground, until SIGTERM or Ctrl-C.
 
-    It queues sentences and speaks one at a time; its log is on standard error. Under systemd, run it as a service.
+    It queues sentences and speaks one at a time; its log is on standard error. For systemd it prints its own units.
 
     \b
       talk serve --rate 150
       talk serve --player null      no sound, same timing: for simulation and CI
+      talk serve --print-unit user  a service for systemd, with how to install it
 
     Exit codes: 0 ended by SIGTERM or SIGINT; 2 usage; 11 another server serves already, or the socket's directory is
     not safe.
     """
+    if options["device"] and str(options["player"] or "").startswith(("null", "file:")):
+        raise click.UsageError(f"--device means nothing to the player {options['player']}", context)
+    if print_unit:
+        _print_unit(context, print_unit)
+        return 0
     from talkcli import paths
     from talkcli.server.run import serve
 
-    if options["device"] and str(options["player"] or "").startswith(("null", "file:")):
-        raise click.UsageError(f"--device means nothing to the player {options['player']}", context)
     return serve(Settings(socket=paths.named_socket(common(context).socket), **options))  # type: ignore[arg-type]
+
+
+def _print_unit(context: click.Context, name: str) -> None:
+    given = {each.name: each for each in context.command.params if _is_given(context, each)}
+    mode = context.params["socket_mode"] if "socket_mode" in given else None
+    options = [_written(each, context.params[each.name or ""]) for each in given.values()]
+    wanted = units.wanted(sys.argv[0], options, common(context).socket, mode)
+    show(units.UNITS[name](wanted).rstrip("\n"))
+    hidden = units.hidden_from_others(wanted.files) if name == "system" else None
+    if hidden:
+        note(
+            f"this talk is in {hidden}, where the service's own user can't get: install it for all, as with "
+            "'sudo python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install talkcli', and print the unit with that"
+        )
+
+
+def _is_given(context: click.Context, parameter: click.Parameter) -> bool:
+    """Return whether an option of the server's stands on the command line."""
+    source = context.get_parameter_source(parameter.name or "")
+    return parameter.expose_value and parameter.name != "print_unit" and source is ParameterSource.COMMANDLINE
+
+
+def _written(parameter: click.Parameter, value: object) -> str:
+    """Return an option as it is written on a command line."""
+    option = parameter.opts[-1]
+    if value is True:
+        return option
+    return f"{option}={value:04o}" if parameter.name == "socket_mode" else f"{option}={value}"

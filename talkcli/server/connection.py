@@ -35,8 +35,11 @@ FIRST_REQUEST = 5.0
 LINE_LIMIT = 10.0
 #: Lines in a row that aren't JSON, after which the other end is taken for something that is no client.
 MAX_BAD_LINES = 10
-#: Lines taken from one client before the others have their turn.
-TURN = 64
+#: Lines taken from one client before the others have their turn: a hundred that send as fast as they can, each line a
+#: tenth of a millisecond or two, keep nobody waiting for longer than a tenth of a second.
+TURN = 8
+#: Lines taken from the socket and not yet answered, past which a client is not read from.
+READ_AHEAD = 64
 
 
 class Handler(Protocol):
@@ -195,7 +198,7 @@ class Connection(asyncio.Protocol):
         """Read from the client only while it takes its answers and its requests are kept up with."""
         if self._transport is None or self._transport.is_closing():
             return
-        reading = not self._congested and len(self._lines) <= TURN
+        reading = not self._congested and len(self._lines) <= READ_AHEAD
         if reading:
             self._transport.resume_reading()
         else:

@@ -1,7 +1,8 @@
 """The listening socket: who may serve at a path, and how its file comes and goes.
 
 A lock that is held for life decides who serves; only its holder removes a socket that an ended server left. The file
-of the lock stays: removing it would let two servers hold two locks of one name.
+of the lock stays: removing it would let two servers hold two locks of one name. Where somebody else has removed it, the
+server that comes first to lock a new one goes on, and the other ends.
 """
 
 from __future__ import annotations
@@ -22,61 +23,127 @@ from talkcli.requests import Hello
 BACKLOG = 1024
 #: Seconds in which the holder of the lock has written its process id.
 _LOCK_NAMES_HOLDER = 1.0
+#: The first descriptor that systemd passes (SD_LISTEN_FDS_START).
+_FIRST_PASSED = 3
+_RESTART_SOCKET = "restart the socket's unit (systemctl restart talk.socket)"
 
 
 class Listener:
     """A bound, listening socket. AddressInUse if it is served already, or its directory is not safe."""
 
-    def __init__(self, path: str, mode: int) -> None:
-        self.path = path
-        #: who may connect, as the mode of the socket's file
+    #: whether somebody else made the socket, so that its file is not ours
+    passed = False
+
+    def __init__(self, named: str | None, mode: int) -> None:
+        """`named`: the path that the user named; `mode`: who may connect, as the mode of the socket's file."""
+        self._named = named
         self.mode = mode
-        self._lock = _lock(path)
+        self.path = paths.server_socket(named)
+        _check_directory(os.path.dirname(self.path))
+        _refuse_second_server(named)
+        self._lock = _lock(self.path)
         try:
-            self.socket = _bind(path, mode)
+            self.socket = _bind(self.path, mode)
         except BaseException:
             os.close(self._lock)
             raise
-        self._identity = _identity(path)
+        self._identity = _identity(self.path)
+
+    def in_place(self) -> bool:
+        """Whether the files of socket and lock are the ones that were made."""
+        # Neither inode can be another's meanwhile: an open socket, and an open file, keep theirs.
+        return _identity(self.path) == self._identity and _is_named(self._lock, _lock_name(self.path))
+
+    def bind_again(self) -> socket.socket | None:
+        """Make anew what is not in place, by the rules of the start: directory, lock, socket.
+
+        Returns the former socket, to be closed by whoever listens to it; None if it is the same still. AddressInUse if
+        another server serves by now, or something else is in the way; then all is as before.
+        """
+        path = paths.server_socket(self._named)
+        _check_directory(os.path.dirname(path))
+        keeps_lock = _is_named(self._lock, _lock_name(path))
+        lock = self._lock if keeps_lock else _lock(path)
+        former = None
+        try:
+            if _identity(path) != self._identity:
+                _refuse_live_socket(path)
+                bound = _bind(path, self.mode)
+                former = self.socket
+                self.socket, self.path, self._identity = bound, path, _identity(path)
+        except BaseException:
+            if not keeps_lock:
+                os.close(lock)
+            raise
+        if not keeps_lock:
+            os.close(self._lock)
+            self._lock = lock
+        return former
 
     def close(self) -> None:
         """Remove the socket's file, if it is still this one, and let the lock go."""
-        self.socket.close()
         if self._identity is not None and _identity(self.path) == self._identity:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(self.path)
+        self.socket.close()
         os.close(self._lock)
 
 
 class InheritedListener:
     """The socket that systemd bound (LISTEN_FDS): its file is systemd's to remove."""
 
+    passed = True
+
     def __init__(self, fd: int) -> None:
+        os.set_inheritable(fd, False)
         self.socket = socket.socket(fileno=fd)
-        if self.socket.family != socket.AF_UNIX:
+        try:
+            _check_passed(self.socket)
+            self.path = self.socket.getsockname()
+            self._identity = _identity(self.path)
+            if self._identity is None:
+                raise AddressInUse(f"the passed socket's file {self.path} is gone: {_RESTART_SOCKET}")
+            self.mode = stat.S_IMODE(os.lstat(self.path).st_mode)
+        except BaseException:
             self.socket.close()
-            raise UsageError("the socket that was passed (LISTEN_FDS) is not a Unix socket: use ListenStream=/path")
+            raise
         self.socket.setblocking(False)
-        name = self.socket.getsockname()
-        self.path = name if isinstance(name, str) else os.fsdecode(name)
-        self.mode = stat.S_IMODE(os.stat(self.path).st_mode)
+
+    def in_place(self) -> bool:
+        """Whether the socket's file is the one that was there at the start."""
+        return _identity(self.path) == self._identity
+
+    def bind_again(self) -> socket.socket | None:
+        """Say what to do: whoever passed the socket would pass the old one again."""
+        raise AddressInUse(f"the file of the socket {self.path} was removed or replaced: {_RESTART_SOCKET}")
 
     def close(self) -> None:
         """Stop listening; the file stays."""
         self.socket.close()
 
 
+def _check_passed(passed: socket.socket) -> None:
+    """Refuse what isn't a listening Unix socket with a file: `talk serve` would fail at it in ways hard to read."""
+    if passed.family != socket.AF_UNIX:
+        raise UsageError("the socket that was passed (LISTEN_FDS) is not a Unix socket: use ListenStream=/path")
+    if passed.type != socket.SOCK_STREAM or not passed.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+        raise UsageError("the socket that was passed (LISTEN_FDS) doesn't listen: use ListenStream= and Accept=no")
+    name = passed.getsockname()
+    if not isinstance(name, str) or not os.path.isabs(name):
+        raise UsageError("the socket that was passed (LISTEN_FDS) has no file: use ListenStream=/path")
+
+
 def listen(named: str | None, mode: int) -> Listener | InheritedListener:
     """Return the socket to serve: the one passed by systemd, else at the path that was named, else at the usual one."""
     passed = os.environ.get("LISTEN_FDS")
-    if passed and os.environ.get("LISTEN_PID") == str(os.getpid()) and not named:
+    if passed and os.environ.get("LISTEN_PID") == str(os.getpid()):
         if passed != "1":
             raise UsageError(f"{passed} sockets were passed (LISTEN_FDS), talk serves one")
-        return InheritedListener(3)  # SD_LISTEN_FDS_START
-    path = paths.server_socket(named)
-    _check_directory(os.path.dirname(path))
-    _refuse_second_server(named)
-    return Listener(path, mode)
+        inherited = InheritedListener(_FIRST_PASSED)
+        if not named or os.path.abspath(named) == inherited.path:
+            return inherited
+        inherited.close()
+    return Listener(named, mode)
 
 
 def _refuse_second_server(named: str | None) -> None:
@@ -89,6 +156,19 @@ def _refuse_second_server(named: str | None) -> None:
         raise AddressInUse(f"a server is there already: {error}") from error
     found.socket.close()
     raise AddressInUse(f"a server (pid {found.pid}) serves {found.path} already")
+
+
+def _refuse_live_socket(path: str) -> None:
+    """Refuse where a program listens without the lock: to remove its socket would take it from its users."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(path)
+        except BlockingIOError:
+            pass  # its backlog is full
+        except OSError:
+            return
+    raise AddressInUse(f"another program listens at {path} now")
 
 
 def _check_directory(directory: str) -> None:
@@ -113,22 +193,37 @@ def _check_directory(directory: str) -> None:
         )
 
 
+def _lock_name(path: str) -> str:
+    return f"{path}.lock"
+
+
 def _lock(path: str) -> int:
     """Return the descriptor of the lock, held; AddressInUse, naming the holder, if another server holds it."""
-    name = f"{path}.lock"
-    try:
-        fd = os.open(name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    except OSError as error:
-        raise AddressInUse(f"the lock {name} can't be opened: {error.strerror}") from error
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        holder = _holder(fd)
-        os.close(fd)
-        raise AddressInUse(f"a server (pid {holder}) serves {path} already") from None
+    name = _lock_name(path)
+    while True:
+        try:
+            fd = os.open(name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            raise AddressInUse(f"the lock {name} can't be opened: {error.strerror}") from error
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            holder = _holder(fd)
+            os.close(fd)
+            raise AddressInUse(f"a server (pid {holder}) serves {path} already") from None
+        if _is_named(fd, name):
+            break
+        os.close(fd)  # it was removed between the two steps: who locks the next one serves
     os.ftruncate(fd, 0)
-    os.write(fd, f"{os.getpid()}\n".encode())
+    with contextlib.suppress(OSError):  # a full disk: the lock holds without the number, which is for people
+        os.write(fd, f"{os.getpid()}\n".encode())
     return fd
+
+
+def _is_named(fd: int, name: str) -> bool:
+    """Whether the open file is still the one of this name."""
+    status = os.fstat(fd)
+    return _identity(name) == (status.st_dev, status.st_ino)
 
 
 def _holder(fd: int) -> str:
@@ -155,14 +250,18 @@ def _bind(path: str, mode: int) -> socket.socket:
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listening.setblocking(False)
-        # Before bind, so that the file never has any other mode; bind takes the umask away from it.
-        if sys.platform.startswith("linux"):  # elsewhere a socket has no mode of its own, and the umask has to do
+        if sys.platform.startswith("linux"):
+            # Before bind, so that the file never has a wider mode; bind takes the umask away, which chmod gives back.
+            # The umask itself stays: it is the whole process's, and the engine may be starting in another thread.
             os.fchmod(listening.fileno(), mode)
-        umask = os.umask(0o777 & ~mode)
-        try:
             listening.bind(path)
-        finally:
-            os.umask(umask)
+            os.chmod(path, mode)
+        else:  # a socket has no mode of its own, and the umask has to do
+            umask = os.umask(0o777 & ~mode)
+            try:
+                listening.bind(path)
+            finally:
+                os.umask(umask)
         listening.listen(BACKLOG)
     except OSError as error:
         listening.close()
@@ -171,8 +270,9 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _identity(path: str) -> tuple[int, int] | None:
+    """Return what tells a file from another of its name; None if there is none, or it can't be seen."""
     try:
         status = os.lstat(path)
-    except FileNotFoundError:
+    except OSError:
         return None
     return status.st_dev, status.st_ino

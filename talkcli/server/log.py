@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import select
 import sys
+import time
 from typing import TYPE_CHECKING
 
 from talkcli.printable import printable
@@ -24,7 +25,12 @@ _MAX_TEXT = 200
 #: Characters of a program's name or command line in the log.
 _MAX_COMMAND = 80
 
+#: Seconds between two lines of the same kind, of what may happen many times a second.
+_SELDOM = 60.0
+
 _lost = 0
+#: by kind: when it may be said again, and how often it happened since it was said
+_seldom: dict[str, tuple[float, int]] = {}
 
 
 def line(words: str) -> None:
@@ -46,6 +52,17 @@ def line(words: str) -> None:
         _lost = 0
     except (OSError, ValueError):
         _lost += 1
+
+
+def seldom(kind: str, words: str) -> None:
+    """Write a line at most once a minute for each kind; the next one says how often it was not written."""
+    now = time.monotonic()
+    again_at, more = _seldom.get(kind, (0.0, 0))
+    if now < again_at:
+        _seldom[kind] = (again_at, more + 1)
+        return
+    _seldom[kind] = (now + _SELDOM, 0)
+    line(f"{words} ({more} more of these were not logged)" if more else words)
 
 
 def ended(record: Record, seconds: float | None) -> None:

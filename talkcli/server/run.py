@@ -12,15 +12,20 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.thread import EngineThread
-from talkcli.errors import EXIT_OK, EXIT_SIGNAL
+from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse
 from talkcli.messages import Sender
 from talkcli.requests import Say
 from talkcli.server import log
+from talkcli.server.accept import Acceptor, make_room
 from talkcli.server.connection import Connection
-from talkcli.server.listener import BACKLOG, InheritedListener, Listener, listen
-from talkcli.server.service import Service
+from talkcli.server.listener import InheritedListener, Listener, listen
+from talkcli.server.notify import Supervisor
+from talkcli.server.service import DOOR, Service
+from talkcli.server.upkeep import Upkeep
 
 if TYPE_CHECKING:
+    import socket
+
     from talkcli.server.settings import Settings
 
 #: Seconds in which clients take their last answers before they are let go.
@@ -52,12 +57,18 @@ class _Server:
         self._settings = settings
         self._listener = listener
         self._service: Service
-        self._signals = 0
+        self._supervisor: Supervisor
+        self._acceptor: Acceptor
 
     async def run(self) -> None:
         loop = asyncio.get_running_loop()
         settings = self._settings
+        make_room(settings.max_clients + DOOR)
         service = self._service = Service(_boot(), settings, self._listener.path, self._listener.mode)
+        supervisor = self._supervisor = Supervisor(loop, os.environ, service.words)
+        service.changed = supervisor.changed
+        acceptor = self._acceptor = Acceptor(loop, lambda: Connection(service, loop), service.failed)
+        upkeep = Upkeep(loop, self._listener, self._moved, self._lost)
         loop.set_exception_handler(self._on_bug)
         for number in (signal.SIGTERM, signal.SIGINT):
             # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
@@ -72,21 +83,37 @@ class _Server:
         )
         service.engine.start()
         try:
-            # Not create_unix_server: that would remove a socket's file, with whoever serves it now.
-            server = await loop.create_server(
-                lambda: Connection(service, loop), sock=self._listener.socket, backlog=BACKLOG
-            )
+            acceptor.open(self._listener.socket)
+            upkeep.begin()
+            supervisor.ready()
             log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
                 service.apply(service.scheduler.submit(Say(settings.greeting), _self(), service.now()).effects)
             await service.finished.wait()
-            server.close()
+            supervisor.stopping()
+            upkeep.end()
+            acceptor.close()
             await self._say_goodbye()
         finally:
             service.engine.close()
             await asyncio.to_thread(service.engine.join, _ENGINE_GOODBYE)
+            supervisor.close()
         if service.fatal:
             raise service.fatal
+
+    def _moved(self, former: socket.socket | None) -> None:
+        """Take up connections where the listener is now; those that there are live on."""
+        self._service.path = self._listener.path
+        self._acceptor.open(self._listener.socket)
+        if former:
+            former.close()
+
+    def _lost(self, error: AddressInUse) -> None:
+        """End: clients find another server, or none; a supervisor that starts this one again will hear why."""
+        log.line(log.shown(f"ending: {error}"))
+        self._service.fatal = error
+        self._supervisor.stopping()
+        self._service.shut_down()
 
     async def _say_goodbye(self) -> None:
         """Let every client take what was written for it, but wait for none that doesn't read."""
@@ -98,14 +125,19 @@ class _Server:
             connection.drop()
 
     def _on_signal(self, number: signal.Signals) -> None:
-        self._signals += 1
-        if self._signals > 1:
-            # Whoever asks twice wants no goodbye. The engine process dies with this one.
-            with contextlib.suppress(OSError):
-                self._listener.close()
-            os._exit(EXIT_SIGNAL + number)
         log.line(f"{signal.Signals(number).name}: ending")
+        for each in (signal.SIGTERM, signal.SIGINT):
+            if signal.getsignal(each) != signal.SIG_IGN:
+                # Not by the loop, which may have a long turn to finish: whoever asks twice wants no goodbye.
+                signal.signal(each, self._on_second_signal)
+        self._supervisor.stopping()
         self._service.shut_down()
+
+    def _on_second_signal(self, number: int, _: object) -> None:
+        """End at once; the engine process dies with this one."""
+        with contextlib.suppress(OSError):
+            self._listener.close()
+        os._exit(EXIT_SIGNAL + number)
 
     def _on_bug(self, _: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
         error = context.get("exception")

@@ -52,6 +52,8 @@ class Service:
         #: whether the socket's mode lets others in than its owner
         self._open_to_others = bool(mode & 0o066)
         self.engine: EngineThread
+        #: called, in the loop's thread, when `words` may have changed
+        self.changed: Callable[[], None] = lambda: None
         self.scheduler = Scheduler(
             boot,
             preempt=settings.preempt,
@@ -121,6 +123,19 @@ class Service:
         place = f" at {os.path.basename(frames[-1].filename)}:{frames[-1].lineno}" if frames else ""
         log.line(f"a bug in {what}{place}: {log.shown(f'{type(error).__name__}: {error}')}")
 
+    def words(self) -> str:
+        """Return what the server does and how the engine is, for people; no goal's text: any user may read it."""
+        scheduler, ready = self.scheduler, self.ready
+        if self.engine_words != "ready":
+            doing = f"engine: {self.engine_words}"
+        elif scheduler.paused:
+            doing = "paused"
+        else:
+            doing = f"speaking {scheduler.active.id}" if scheduler.active else "idle"
+        waiting = f", {scheduler.pending_count} waiting" if scheduler.pending_count else ""
+        voice = f"; {ready.version or ready.driver}, player {ready.player or 'its own'}" if ready else ""
+        return log.shown(doing + waiting + voice)
+
     # -- the scheduler's effects
 
     def now(self) -> Now:
@@ -144,6 +159,7 @@ class Service:
                 self.failed(type(effect).__name__, error)
         self._set_timer()
         self.later.look()
+        self.changed()
         if self._closing and self.scheduler.active is None:
             self.finished.set()
 
@@ -237,6 +253,7 @@ class Service:
             version = f", {log.shown(ready.version)}" if ready.version else ""
             log.line(f"engine ready: driver {ready.driver}{version}, player {ready.player or 'its own'}")
         self.ready, self.engine_words = ready, "ready"
+        self.changed()
 
     def _start_failed(self, failed: protocol.StartFailed) -> None:
         self._engine_fails(failed.message)
@@ -249,6 +266,7 @@ class Service:
             log.line(log.shown(words))
         self.engine_words = words
         self.later.voices_known()
+        self.changed()
 
     def _thread_died(self, words: str) -> None:
         """End: there is nothing left that could speak, and a supervisor will start another server."""

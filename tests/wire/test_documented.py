@@ -266,5 +266,5 @@ def test_readme_has_the_setup_commands_as_they_were() -> None:
     assert commands == [
         "python3 -m venv .venv && . .venv/bin/activate && pip install . && "
         '{ talk serve & sleep 3; talk say "battery low" --wait; }\n',
-        "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest\n",
+        "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest -n 3\n",
     ]

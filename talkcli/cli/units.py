@@ -1,0 +1,247 @@
+"""The units that `talk serve --print-unit` prints: how systemd runs the server. Text alone; nothing is installed here.
+
+A unit works as it stands, so whatever it says is shown by a test that starts a server with it. The system's unit keeps
+the server away from everything but sockets, the sound devices and what it needs to say who sent a goal.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import sys
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from talkcli import paths
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+#: Who may talk to the system's server: this group's members, who may use the sound card already.
+GROUP = "audio"
+
+_SERVICE = """\
+
+[Unit]
+Description=talk, speech for robots
+{order}# A robot has nobody who looks after it: what can't start now is tried again for as long as it takes.
+StartLimitIntervalSec=0
+
+[Service]
+Type=notify
+NotifyAccess=main
+ExecStart={command}
+# It gives signs of life as long as it answers its clients, whatever became of the loudspeaker.
+WatchdogSec=30
+Restart=on-failure
+RestartSec=2
+# Wrong options don't get better.
+RestartPreventExitStatus=2
+TimeoutStartSec=30
+TimeoutStopSec=10
+# The server ends its goals, and then its engine; what is left after that is killed.
+KillMode=mixed
+{hardening}
+[Install]
+WantedBy={target}
+"""
+
+_USER_HEAD = """\
+# ~/.config/systemd/user/talk.service: the voice of one user, through that user's PipeWire, PulseAudio or ALSA.
+#   mkdir -p ~/.config/systemd/user
+#   talk serve --print-unit user > ~/.config/systemd/user/talk.service
+#   systemctl --user daemon-reload && systemctl --user enable --now talk
+#   loginctl enable-linger        so that it runs from the start of the machine, without a login
+#   journalctl --user -u talk     is its log
+"""
+_USER_HARDENING = """
+# What works without privileges everywhere. Sound servers are reached through their sockets, or over the network.
+NoNewPrivileges=yes
+LockPersonality=yes
+RestrictRealtime=yes
+RestrictSUIDSGID=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6
+SystemCallArchitectures=native
+SystemCallFilter=@system-service
+SystemCallErrorNumber=EPERM
+"""
+
+_SYSTEM_HEAD = """\
+# /etc/systemd/system/talk.service: the voice of the machine, through ALSA; its socket is {socket}.
+#   talk serve --print-unit system | sudo tee /etc/systemd/system/talk.service
+#   sudo systemctl daemon-reload && sudo systemctl enable --now talk
+#   sudo usermod -aG {group} NAME    lets NAME talk, from the next login on
+#   journalctl -u talk             is its log
+# Where PipeWire or PulseAudio runs in a user's session, the sound devices are theirs: take the user's unit.
+"""
+_SYSTEM_HARDENING = """
+# It runs as a user of its own that exists as long as it runs. The group opens the sound devices, and is the socket's.
+User=talk
+DynamicUser=yes
+Group={group}
+# Without this line where there is a talk.socket: the directory would go with the service, and the socket with it.
+RuntimeDirectory=talk
+UMask=0077
+
+# It needs its program, the sound devices and Unix sockets, and nothing else of the machine.
+ProtectSystem=strict
+ProtectHome={home}
+PrivateTmp=yes
+DevicePolicy=closed
+DeviceAllow=char-alsa rw
+PrivateNetwork=yes
+IPAddressDeny=any
+RestrictAddressFamilies=AF_UNIX
+CapabilityBoundingSet=
+AmbientCapabilities=
+NoNewPrivileges=yes
+ProtectClock=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectKernelLogs=yes
+ProtectKernelModules=yes
+ProtectKernelTunables=yes
+LockPersonality=yes
+RestrictNamespaces=yes
+RestrictRealtime=yes
+RestrictSUIDSGID=yes
+SystemCallArchitectures=native
+SystemCallFilter=@system-service
+SystemCallFilter=~@privileged @resources
+SystemCallErrorNumber=EPERM
+# Left out on purpose: PrivateUsers= and ProtectProc= would hide who sent a goal, PrivateDevices= the sound card,
+# PrivateIPC= the programs that ALSA mixes with; and with MemoryDenyWriteExecute= an older libffi stops the engine.
+"""
+
+_SOCKET = """\
+
+[Unit]
+Description=The socket of talk, speech for robots
+
+[Socket]
+ListenStream={path}
+SocketMode={mode}
+{extra}RemoveOnStop=yes
+
+[Install]
+WantedBy=sockets.target
+"""
+_USER_SOCKET_HEAD = """\
+# ~/.config/systemd/user/talk.socket: clients can connect before talk.service runs, and while it starts again.
+# It comes beside that service ('--print-unit user'), which is started by the first client.
+#   talk serve --print-unit user-socket > ~/.config/systemd/user/talk.socket
+#   systemctl --user daemon-reload && systemctl --user stop talk && systemctl --user enable --now talk.socket
+"""
+_SYSTEM_SOCKET_HEAD = """\
+# /etc/systemd/system/talk.socket: clients can connect before talk.service runs, and while it starts again.
+# It comes beside that service ('--print-unit system'), which is started by the first client and must leave the
+# socket's directory alone.
+#   talk serve --print-unit system-socket | sudo tee /etc/systemd/system/talk.socket
+#   sudo sed -i /^RuntimeDirectory=/d /etc/systemd/system/talk.service
+#   sudo systemctl daemon-reload && sudo systemctl stop talk && sudo systemctl enable --now talk.socket
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What a unit is made from."""
+
+    #: the command that runs `talk`, its program an absolute path
+    program: tuple[str, ...]
+    #: what the program is made of: its script, its interpreter, its package
+    files: tuple[str, ...]
+    #: the options of `serve`, as they were given
+    options: tuple[str, ...]
+    #: the socket that the user named
+    socket: str | None
+    #: the mode of its file, if it was given
+    mode: int | None
+
+
+def _user(wanted: Wanted) -> str:
+    service = _SERVICE.format(
+        order="After=pipewire.service pipewire-pulse.service pulseaudio.service\n",
+        command=_command(wanted),
+        hardening=_USER_HARDENING,
+        target="default.target",
+    )
+    return f"{_USER_HEAD}{service}"
+
+
+def _system(wanted: Wanted) -> str:
+    if wanted.mode is None:
+        wanted = replace(wanted, options=("--socket-mode=0660", *wanted.options))
+    home = "read-only" if any(each.startswith(_HOMES) for each in wanted.files) else "yes"
+    service = _SERVICE.format(
+        order="After=sound.target\n",
+        command=_command(wanted),
+        hardening=_SYSTEM_HARDENING.format(group=GROUP, home=home),
+        target="multi-user.target",
+    )
+    return f"{_SYSTEM_HEAD.format(socket=wanted.socket or paths.SYSTEM_SOCKET, group=GROUP)}{service}"
+
+
+def _user_socket(wanted: Wanted) -> str:
+    path = _escaped(wanted.socket) if wanted.socket else f"%t/talk/{paths.SOCKET}"
+    mode = 0o600 if wanted.mode is None else wanted.mode
+    return _USER_SOCKET_HEAD + _SOCKET.format(path=path, mode=f"{mode:04o}", extra="DirectoryMode=0700\n")
+
+
+def _system_socket(wanted: Wanted) -> str:
+    path = _escaped(wanted.socket or paths.SYSTEM_SOCKET)
+    mode = 0o660 if wanted.mode is None else wanted.mode
+    return _SYSTEM_SOCKET_HEAD + _SOCKET.format(
+        path=path, mode=f"{mode:04o}", extra=f"SocketGroup={GROUP}\nDirectoryMode=0755\n"
+    )
+
+
+#: What ProtectHome= hides.
+_HOMES = ("/home/", "/root/", "/run/user/")
+#: What --print-unit prints, by its name.
+UNITS: dict[str, Callable[[Wanted], str]] = {
+    "user": _user,
+    "system": _system,
+    "user-socket": _user_socket,
+    "system-socket": _system_socket,
+}
+
+
+def wanted(started_as: str, options: Sequence[str], socket: str | None, mode: int | None) -> Wanted:
+    """Return what a unit is made from, for the `talk` that runs now: the installed script, else its module."""
+    beside = os.path.join(os.path.dirname(sys.executable), "talk")
+    found = shutil.which(started_as if os.path.basename(started_as) == "talk" else beside)
+    program = (os.path.abspath(found),) if found else (sys.executable, "-m", "talkcli")
+    files = (program[0], os.path.realpath(sys.executable), os.path.realpath(__file__))
+    path = os.path.abspath(socket) if socket else None
+    return Wanted(program, files, (*([f"--socket={path}"] if path else []), *options), path, mode)
+
+
+def hidden_from_others(files: Sequence[str]) -> str | None:
+    """Return the first directory on the way to these files that other users can't pass; None if there is none."""
+    for path in files:
+        steps = path.split(os.sep)
+        for count in range(2, len(steps)):
+            directory = os.sep.join(steps[:count])
+            if not os.stat(directory).st_mode & stat.S_IXOTH:
+                return directory
+    return None
+
+
+def _command(wanted: Wanted) -> str:
+    return " ".join(_quoted(each) for each in (*wanted.program, "serve", *wanted.options))
+
+
+def _quoted(word: str) -> str:
+    """Return a word of a command line as systemd reads it."""
+    word = _escaped(word).replace("$", "$$")
+    plain = all(each.isalnum() or each in "/._-+=:,@%{}" for each in word)
+    if word and plain:
+        return word
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t")
+    return f'"{escaped}"'
+
+
+def _escaped(word: str) -> str:
+    """Return a word without systemd's specifiers."""
+    return word.replace("%", "%%")

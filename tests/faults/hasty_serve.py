@@ -1,0 +1,15 @@
+"""Runs `talk serve` with the scripted engine, looking after its socket's file every 0.2 s; arguments as of `serve`."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
+
+from talkcli.server import upkeep
+from tests.support import scripted_serve
+
+if __name__ == "__main__":
+    upkeep.LOOK_EVERY = 0.2
+    scripted_serve.main()

@@ -1,0 +1,62 @@
+"""A supervisor for tests: the other end of sd_notify(3), which hears what a server tells."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+
+#: Seconds in which whatever is told must have come.
+PATIENCE = 10.0
+
+
+class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
+    """Listens at `address`: a path, or an abstract name that begins with '@'."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        #: all that was told so far, in its order: names with values, and when
+        self.told: list[tuple[str, str, float]] = []
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(f"\0{address[1:]}" if address.startswith("@") else address)
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+        if not self.address.startswith("@"):
+            os.unlink(self.address)
+
+    def wait_for(self, name: str, containing: str = "", since: float = 0.0) -> float:
+        """Return when it was told something of this name, after a time; fail if it is not."""
+        end = time.monotonic() + PATIENCE
+        while True:
+            for each, value, at in self.told:
+                if each == name and containing in value and at > since:
+                    return at
+            assert self.hear(end - time.monotonic()), f"{name} {containing!r} was never told: {self.told}"
+
+    def hear(self, timeout: float) -> bool:
+        """Take one datagram; False if none comes."""
+        self._socket.settimeout(max(0.001, timeout))
+        try:
+            data = self._socket.recv(65536)
+        except TimeoutError:
+            return False
+        now = time.monotonic()
+        for line in data.decode().splitlines():
+            name, _, value = line.partition("=")
+            self.told.append((name, value, now))
+        return True
+
+    def fill(self) -> None:
+        """Have it hold as much unread as it can, so that whoever tells it something more would wait."""
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
+            other.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    other.sendto(b"NOISE=1\n", self._socket.getsockname())
+
+    def drain(self) -> None:
+        """Take what has come already."""
+        while self.hear(0):
+            pass

@@ -1,0 +1,213 @@
+"""File descriptors used up: by clients, who can't have the engine's, and by whatever else there may be."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
+from tests.support import processes
+from tests.support.connection import Wire
+from tests.support.surroundings import short_directory
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+SCRIPTED = [SERVE[0], processes._SCRIPTED]
+CLIENTS = 60
+#: Seconds in which a server that was full is itself again.
+SOON = 5.0
+
+
+@pytest.fixture
+def home() -> Iterator[str]:
+    if not os.path.isdir("/proc/self/fd"):
+        pytest.skip("no /proc")
+    with short_directory() as path:
+        yield path
+
+
+def limited(files: int, command: list[str]) -> list[str]:
+    return ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command]
+
+
+def descriptors(pid: int) -> int:
+    return len(os.listdir(f"/proc/{pid}/fd"))
+
+
+def engine_of(pid: int) -> int | None:
+    """Return the process id of a server's engine, if it has one now."""
+    for task in os.listdir(f"/proc/{pid}/task"):
+        with open(f"/proc/{pid}/task/{task}/children", encoding="ascii") as file:
+            children = file.read().split()
+        if children:
+            return int(children[0])
+    return None
+
+
+def kill_engine(pid: int) -> None:
+    """Kill a server's engine, and wait until it has another one."""
+    engine = engine_of(pid)
+    assert engine
+    os.kill(engine, signal.SIGKILL)
+    end = time.monotonic() + SOON
+    while engine_of(pid) in {engine, None}:
+        assert time.monotonic() < end, "there is no new engine"
+        time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def crowd(path: str) -> Iterator[list[socket.socket]]:
+    """Connect 60 clients at once, each of which says hello and keeps its connection."""
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(CLIENTS)]
+        for each in clients:
+            each.settimeout(SOON)
+            each.connect(path)
+        yield clients
+
+
+def receive(client: socket.socket) -> dict[str, Any]:
+    """Return the next line's object, and take no more than that."""
+    data = bytearray()
+    while not data.endswith(b"\n"):
+        byte = client.recv(1)
+        assert byte, "the server closed the connection"
+        data += byte
+    message: dict[str, Any] = json.loads(data)
+    return message
+
+
+def greeted(clients: list[socket.socket]) -> list[socket.socket]:
+    """Return the clients that were let in; each has been told, the others that the server is busy."""
+    inside = []
+    for each in clients:
+        greeting = receive(each)
+        if "boot" in greeting:
+            each.sendall(b'{"request": "hello"}\n')
+            inside.append(each)
+        else:
+            assert greeting["error"] == "busy"
+    return inside
+
+
+def status_over(client: socket.socket) -> float:
+    """Return the seconds in which a client that is in gets the status."""
+    began = time.monotonic()
+    client.sendall(b'{"seq": 7, "request": "status"}\n')
+    while receive(client).get("seq") != 7:
+        pass
+    return time.monotonic() - began
+
+
+def wait_for_descriptors(pid: int, count: int) -> None:
+    end = time.monotonic() + SOON
+    while descriptors(pid) > count:
+        assert time.monotonic() < end, f"{descriptors(pid)} descriptors are open, {count} were"
+        time.sleep(0.01)
+
+
+def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) -> None:
+    path = f"{home}/s"
+    env = environment(home, TALK_SOCKET=path)
+    with serving(env, command=limited(40, SERVE)) as server:
+        pid = server.process.pid
+        assert run([*TALK, "say", "--wait", "hello"], env).code == 0
+        wait_for_descriptors(pid, 20)
+        before = descriptors(pid)
+        with crowd(path) as clients:
+            inside = greeted(clients)
+            assert 5 <= len(inside) < CLIENTS
+            retry_if_late(lambda: assert_within(status_over(inside[0]), 0.1, "status while it is full"))
+            # One that comes now tries again, as long as a client does, and gets in when others leave.
+            late = subprocess.Popen([*TALK, "say", "--wait", "late"], env=env, stdout=subprocess.DEVNULL)
+            time.sleep(1)
+            assert late.poll() is None
+            for each in inside[1:]:
+                each.close()
+            assert late.wait(SOON) == 0
+        wait_for_descriptors(pid, before)
+        with crowd(path) as clients:
+            inside = greeted(clients)
+            kill_engine(pid)  # so that a new one must find descriptors
+            inside[0].sendall(b'{"seq": 8, "request": "say", "text": "again", "wait": true}\n')
+            while (line := receive(inside[0])).get("event") != "result":
+                pass
+            assert line["goal"]["state"] == "SUCCEEDED", line
+        wait_for_descriptors(pid, before)
+        assert run([*TALK, "say", "--wait", "hello"], env).code == 0
+        lines = server.log.splitlines()
+        about = [each for each in lines if "files may be open" in each or "Traceback" in each or "bug" in each]
+        assert len(about) <= 2, server.log  # at the start, and once for all that were turned away
+        assert len(lines) < 12, server.log
+
+
+def test_descriptors_that_something_else_has_used_up(home: str) -> None:
+    path = f"{home}/s"
+    env = environment(home, TALK_SOCKET=path)
+    with serving(env, command=SCRIPTED) as server, Wire(path) as wire:
+        pid = server.process.pid
+        assert run([*TALK, "say", "--wait", "length=0"], env).code == 0
+        before = descriptors(pid)
+        most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, most))  # it has more: there is no new one to be had
+        began = server.log.count("\n")
+        with crowd(path) as clients:
+            engine = engine_of(pid)
+            assert engine
+            os.kill(engine, signal.SIGKILL)
+            time.sleep(2)  # twice as long as it waits to look again; and three starts of the engine
+            retry_if_late(lambda: assert_within(_status(wire), 0.1, "status without descriptors"))
+            goal = wire.request("say", text="length=0", wait=True)["goal"]
+            ended = wire.receive_event("result")
+            assert (goal["id"], ended["goal"]["reason"]) == (ended["goal"]["id"], "engine_failed")
+            assert server.log.count("\n") - began < 8, server.log
+            resource.prlimit(pid, resource.RLIMIT_NOFILE, (most, most))
+            assert len(greeted(clients)) == CLIENTS  # those that waited are let in, all of them
+            assert _spoken_within(wire, 15), server.log  # the longest pause before a start is 10 s
+        wait_for_descriptors(pid, before)
+        assert "Traceback" not in server.log
+        assert "bug" not in server.log
+
+
+def _status(wire: Wire) -> float:
+    began = time.monotonic()
+    assert wire.request("status")["ok"]
+    return time.monotonic() - began
+
+
+def _spoken_within(wire: Wire, seconds: float) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        wire.request("say", text="length=0", wait=True)
+        if wire.receive_event("result")["goal"]["state"] == "SUCCEEDED":
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def test_more_clients_than_a_process_usually_has_descriptors(home: str) -> None:
+    if resource.getrlimit(resource.RLIMIT_NOFILE)[1] < 1500:
+        pytest.skip("this user may not open 1,500 files")
+    path = f"{home}/s"
+    with serving(
+        environment(home, TALK_SOCKET=path),
+        "--max-clients",
+        "1200",
+        command=["sh", "-c", 'ulimit -S -n 256; exec "$@"', "sh", *SCRIPTED],
+    ) as server:
+        assert resource.prlimit(server.process.pid, resource.RLIMIT_NOFILE)[0] >= 1200
+        with contextlib.ExitStack() as stack:
+            for _ in range(400):
+                stack.enter_context(Wire(path))
+        assert "files may be open" not in server.log

@@ -1,0 +1,216 @@
+"""Signals and standard error: what ends a server, how fast, and what doesn't."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import time
+import uuid
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
+from tests.support import processes
+from tests.support.connection import Wire
+from tests.support.surroundings import MARK, assert_none_left, dying_with_parent, short_directory
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+SCRIPTED = [SERVE[0], processes._SCRIPTED]
+#: Characters of texts that make an answer long, and requests for it: more than a connection's buffers hold.
+LONG = "word " * 1900
+ASKED = 12
+
+
+@pytest.fixture
+def home() -> Iterator[str]:
+    with short_directory() as path:
+        yield path
+
+
+@contextlib.contextmanager
+def stalled(path: str, count: int = 100) -> Iterator[None]:
+    """Connect clients that want much, read nothing, and leave a line unfinished; the server has done what it can."""
+    with contextlib.ExitStack() as stack:
+        wire = stack.enter_context(Wire(path))
+        wire.request("pause")
+        for _ in range(10):
+            wire.request("say", text=LONG)
+        wire.request("cancel")
+        wire.request("resume")
+        for _ in range(count):
+            client = stack.enter_context(socket.socket(socket.AF_UNIX))
+            client.connect(path)
+            client.sendall(b'{"request": "watch"}\n' + b'{"request": "status"}\n' * ASKED + b'{"request": ')
+        end = time.monotonic() + 20
+        while (clients := wire.request("status", timeout=20)["server"]["clients"]) < count:
+            assert time.monotonic() < end, f"{clients} clients of {count} were let in"
+        yield
+
+
+def test_sigterm_with_100_stalled_clients_ends_it_within_3_seconds(home: str) -> None:
+    path = f"{home}/s"
+
+    def attempt() -> None:
+        mark = uuid.uuid4().hex
+        with serving(environment(home, TALK_SOCKET=path, **{MARK: mark})) as server, Wire(path) as wire, stalled(path):
+            wire.request("say", text="a sentence that is long enough to be in the middle of it", wait=True)
+            wire.receive_event("state", state="ACTIVE")
+            began = time.monotonic()
+            server.process.send_signal(signal.SIGTERM)
+            result = wire.receive_event("result")["goal"]
+            assert (result["state"], result["reason"]) == ("PREEMPTED", "shutdown")
+            assert server.end() == 0
+            assert_within(time.monotonic() - began, 3, "the end after SIGTERM")
+        assert not os.path.exists(path)
+        assert_none_left(mark, 0.5)
+
+    retry_if_late(attempt)
+
+
+def test_second_sigterm_with_100_stalled_clients_ends_it_at_once(home: str) -> None:
+    path = f"{home}/s"
+
+    def attempt() -> None:
+        mark = uuid.uuid4().hex
+        with serving(environment(home, TALK_SOCKET=path, **{MARK: mark}), command=SCRIPTED) as server:
+            with Wire(path) as wire, stalled(path):
+                wire.request("watch")
+                wire.request("say", text="never-ends ignore-stop words=1")  # what takes a while to end
+                wire.receive_event("word")
+                server.process.send_signal(signal.SIGTERM)
+                wire.receive_event("state", state="PREEMPTING")
+                began = time.monotonic()
+                assert server.end(signal.SIGTERM) == 143
+                assert_within(time.monotonic() - began, 0.1, "the end after a second SIGTERM")
+            assert not os.path.exists(path)
+        assert_none_left(mark, 0.5)
+
+    retry_if_late(attempt)
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGPIPE])
+def test_storm_of_signals_is_survived(home: str, number: signal.Signals) -> None:
+    path = f"{home}/s"
+    with serving(environment(home, TALK_SOCKET=path)) as server, Wire(path) as wire:
+        goal = wire.request("say", text="spoken to its end, whatever comes", wait=True)["goal"]
+        wire.receive_event("state", state="ACTIVE")
+
+        def storm_and_ask() -> None:
+            for _ in range(1000):
+                server.process.send_signal(number)
+            began = time.monotonic()
+            assert wire.request("status")["ok"]
+            assert_within(time.monotonic() - began, 0.1, "status in a storm of signals")
+
+        for _ in range(5):
+            retry_if_late(storm_and_ask)
+        assert wire.receive_event("result", timeout=10)["goal"]["id"] == goal["id"]
+        assert wire.request("status", id=goal["id"])["goal"]["state"] == "SUCCEEDED"
+
+
+@contextlib.contextmanager
+def serving_with(
+    home: str, redirection: str, stderr: int | None = None
+) -> Iterator[tuple[Wire, subprocess.Popen[bytes]]]:
+    """Run a server whose log nobody reads, and assert that SIGTERM ends it well."""
+    path = f"{home}/s"
+    command = dying_with_parent(["sh", "-c", f'exec "$@" {redirection}', "sh", *SERVE])
+    with subprocess.Popen(command, env=environment(home, TALK_SOCKET=path), stderr=stderr) as process:
+        try:
+            yield _greeted(path, process), process
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(5) == 0
+            assert not os.path.exists(path)
+        finally:
+            process.kill()
+
+
+def _greeted(path: str, process: subprocess.Popen[bytes]) -> Wire:
+    end = time.monotonic() + 10
+    while True:
+        with contextlib.suppress(OSError):
+            return Wire(path)
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.01)  # a socket's appearance is no event
+
+
+def speaks(wire: Wire, texts: Sequence[str] = ("battery low",)) -> None:
+    for text in texts:
+        wire.request("say", text=text, wait=True)
+        assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+
+
+@pytest.mark.parametrize("redirection", ["2>&-", "<&- >&- 2>&-", "2>/dev/full"])
+def test_speech_goes_on_with_standard_error_closed(home: str, redirection: str) -> None:
+    with serving_with(home, redirection) as (wire, process), wire:
+        speaks(wire, ["one", "two"])
+        wire.request("cancel")
+        wire.send_raw(b"nonsense\n")
+        assert process.poll() is None
+
+
+def test_speech_goes_on_while_nobody_reads_a_full_standard_error(home: str) -> None:
+    reading, writing = os.pipe()
+    try:
+        os.set_blocking(writing, False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(writing, b"." * 4096)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(writing, b".")
+        os.set_blocking(writing, True)
+        with serving_with(home, "", writing) as (wire, _), wire:
+            os.close(writing)
+            writing = -1
+            speaks(wire, ["one", "two", "three"])
+            os.set_blocking(reading, False)
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    os.read(reading, 65536)
+            os.set_blocking(reading, True)
+            speaks(wire, ["four"])
+            said = ""
+            while '"four"' not in said:
+                said += os.read(reading, 65536).decode()
+        # What was lost is told as soon as there is room.
+        assert "lines before this one could not be written)" in said.splitlines()[0]
+    finally:
+        os.close(reading)
+        if writing >= 0:
+            os.close(writing)
+
+
+def test_speech_goes_on_when_whoever_read_standard_error_is_gone(home: str) -> None:
+    reading, writing = os.pipe()
+    with serving_with(home, "", writing) as (wire, _), wire:
+        os.close(writing)
+        os.close(reading)
+        speaks(wire, ["one", "two"])
+
+
+def test_lines_of_the_log_are_whole_and_one_each(home: str) -> None:
+    path = f"{home}/s"
+    with serving(environment(home, TALK_SOCKET=path), command=SCRIPTED) as server, Wire(path) as wire:
+        wire.request("say", text=f"length=0 {'word ' * 1900}\ntalk: forged\n", wait=True)
+        wire.receive_event("result")
+        assert server.end(signal.SIGTERM) == 0
+    assert all(line.startswith("talk: ") and len(line) < 4096 for line in server.log.splitlines()), server.log
+    assert "talk: forged" not in server.log.splitlines()
+
+
+def test_sigint_that_a_shell_had_ignored_stays_so(home: str) -> None:
+    path = f"{home}/s"
+    command = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", *SCRIPTED]
+    with serving(environment(home, TALK_SOCKET=path), command=command) as server:
+        server.process.send_signal(signal.SIGINT)
+        assert run([*TALK, "say", "--wait", "length=0"], environment(home, TALK_SOCKET=path)).code == 0
+        assert server.process.poll() is None

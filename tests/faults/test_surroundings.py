@@ -1,0 +1,169 @@
+"""A machine that lacks what is taken for granted: room in TMPDIR, a home, a path, a language, a runtime directory."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
+
+    from tests.support.sink import Sink
+
+AUDIBLE = [*TALK, "serve"]
+VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR")
+
+
+@pytest.fixture
+def home() -> Iterator[str]:
+    with short_directory() as path:
+        yield path
+
+
+@contextlib.contextmanager
+def mounted(directory: str, options: str) -> Iterator[None]:
+    """Mount a small file system of its own; skip where this user may not."""
+    os.mkdir(directory, 0o700)
+    command = ["mount", "-t", "tmpfs", "-o", f"mode=700,{options}", "tmpfs", directory]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip(f"only root can mount a file system of its own: {done.stderr.splitlines()[0]}")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", directory], check=True)
+
+
+def fill(directory: str) -> None:
+    """Write until there is no room for a single byte."""
+    with open(f"{directory}/full", "wb", buffering=0) as file, contextlib.suppress(OSError):
+        while True:
+            file.write(b"." * 4096)
+    with pytest.raises(OSError, match="No space"), open(f"{directory}/more", "wb", buffering=0) as file:
+        file.write(b".")
+
+
+@contextlib.contextmanager
+def full(directory: str) -> Iterator[None]:
+    with mounted(directory, "size=64k"):
+        fill(directory)
+        yield
+
+
+@contextlib.contextmanager
+def read_only(directory: str) -> Iterator[None]:
+    with mounted(directory, "size=64k,ro"):
+        yield
+
+
+def speaks(env: dict[str, str]) -> None:
+    done = run([*TALK, "say", "--wait", "--", "battery low"], env)
+    assert (done.code, done.err) == (0, ""), done
+
+
+@pytest.mark.parametrize("fault", [full, read_only], ids=["full", "read-only"])
+def test_speech_goes_on_with_a_temporary_directory_that_takes_nothing(
+    home: str, sink: Sink, fault: Callable[[str], AbstractContextManager[None]]
+) -> None:
+    with fault(f"{home}/tmp"):
+        env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s", "TMPDIR": f"{home}/tmp"})
+        with serving(env, command=AUDIBLE) as server:
+            speaks(env)
+            os.kill(_engine(server), signal.SIGKILL)  # the next one, too, finds what it needs
+            speaks(env)
+
+
+def test_socket_in_a_full_directory_is_served_and_its_lock_holds(home: str) -> None:
+    with full(f"{home}/tmp"):
+        env = environment(home, TALK_SOCKET=f"{home}/tmp/s")
+        with serving(env):
+            speaks(env)
+            second = run(SERVE, env)
+            assert second.code == 11
+            assert "serves" in second.err
+        with serving(env):  # and again
+            speaks(env)
+
+
+def test_socket_in_a_directory_that_is_read_only_is_a_clear_error(home: str) -> None:
+    with read_only(f"{home}/tmp"):
+        done = run(SERVE, environment(home, TALK_SOCKET=f"{home}/tmp/s"))
+        assert done.code == 11
+        assert done.err == f"talk: the lock {home}/tmp/s.lock can't be opened: Read-only file system\n"
+
+
+def test_no_directory_at_all_for_the_socket_is_a_clear_error(home: str) -> None:
+    os.mkdir(f"{home}/file", 0o700)
+    with open(f"{home}/file/talk", "w", encoding="utf-8"):
+        pass
+    done = run(SERVE, environment(home, XDG_RUNTIME_DIR=f"{home}/file"))
+    assert done.code == 11, done
+    assert f"{home}/file/talk" in done.err
+    assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize("missing", [*[(each,) for each in VARIABLES], VARIABLES], ids="-".join)
+def test_speech_goes_on_without_a_variable(home: str, sink: Sink, missing: tuple[str, ...]) -> None:
+    env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s"})
+    assert "XDG_RUNTIME_DIR" not in env  # what it means that this one is missing: `test_servers_places`
+    for name in missing:
+        env.pop(name, None)
+    if "PATH" in missing and not any(os.access(f"/{place}/pacat", os.X_OK) for place in ("bin", "usr/bin")):
+        pytest.skip("the player is not where programs are looked for without PATH")
+    # Where there is no home, aplay's settings for this sink aren't found either.
+    with serving(env, *(["--player", "pacat"] if "HOME" in missing else []), command=AUDIBLE) as server:
+        speaks(env)
+        assert run([*TALK, "say", "--wait", "--", "größer 二"], env).code == 0
+        assert "engine ready" in server.log
+
+
+@pytest.mark.parametrize("path", ["", "/nowhere"])
+def test_path_without_players_is_a_clear_error_and_no_silence(home: str, path: str) -> None:
+    env = environment(home, TALK_SOCKET=f"{home}/s", PATH=path)
+    with serving(env, command=AUDIBLE):
+        began = time.monotonic()
+        done = run([*TALK, "say", "--wait", "--", "battery low"], env)
+        assert done.code == 4
+        assert "no player found: install alsa-utils (aplay)" in done.err
+        assert time.monotonic() - began < 5
+        assert run([*TALK, "status"], env).code == 0
+
+
+@pytest.mark.parametrize("place", ["/nonexistent", "/proc", ""])
+def test_speech_goes_on_with_a_home_that_is_not_there(home: str, sink: Sink, place: str) -> None:
+    env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s", "HOME": place})
+    with serving(env, "--player", "pacat", command=AUDIBLE):
+        speaks(env)
+
+
+def test_clients_in_an_empty_environment_reach_the_server(home: str) -> None:
+    env = environment(home, TALK_SOCKET=f"{home}/s")
+    with serving(env):
+        for words in (["status"], ["say", "--wait", "größer"], ["cancel"], ["log"]):
+            kept = {name: env[name] for name in ("PYTHONPATH",) if name in env}
+            done = run([*TALK, "--socket", f"{home}/s", *words], kept)
+            assert (done.code, done.err) == (0, ""), done
+
+
+def _engine(server: BareServe) -> int:
+    pid = server.process.pid
+    for task in os.listdir(f"/proc/{pid}/task"):
+        with open(f"/proc/{pid}/task/{task}/children", encoding="ascii") as file:
+            children = file.read().split()
+        if children:
+            return int(children[0])
+    pytest.fail("there is no engine")
+
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mounts and /proc as Linux has them")

@@ -1,0 +1,241 @@
+"""Several users of one machine: who gets in, what each of them may do, and what none of them can do to another."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import click
+import pytest
+
+import talkcli
+from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
+from tests.support import processes
+from tests.support.connection import Wire
+from tests.support.surroundings import needs, short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+SCRIPTED = [SERVE[0], processes._SCRIPTED]
+NOBODY = 65534
+#: A group that the server gets, and some of the strangers.
+GROUP = 4242
+HOSTILE = "\x1b]0;owned\x07\x1b[2Jred\u202egnp.exe\r\ntalk: forged"
+#: A client for users who may be able to read neither this checkout nor its interpreter. It sends lines, prints all
+#: that comes back, and calls itself something that would do harm on a terminal.
+STRANGER = r"""
+import socket, sys
+open("/proc/self/comm", "w").write("\x1b[31m\n\x07evil")
+s = socket.socket(socket.AF_UNIX)
+s.settimeout(5)
+try:
+    s.connect(sys.argv[1])
+except OSError as error:
+    sys.exit(type(error).__name__)
+try:
+    for line in sys.argv[2:]:
+        s.sendall(line.encode() + b"\n")
+    s.shutdown(socket.SHUT_WR)
+except OSError:
+    pass  # it was closed before that; why, it has said
+try:
+    while data := s.recv(65536):
+        sys.stdout.buffer.write(data)
+except ConnectionResetError:
+    pass  # it closed without reading what was sent
+"""
+#: Starts the stranger from a program whose command line would do harm, too.
+PARENT = r"""
+import subprocess, sys
+sys.exit(subprocess.call([sys.executable, *sys.argv[2:]]))
+"""
+#: A server of another user's, who says what ours would.
+IMPOSTOR = r"""
+import os, socket, sys
+s = socket.socket(socket.AF_UNIX)
+s.bind(sys.argv[1])
+os.chmod(sys.argv[1], 0o666)
+s.listen()
+print(flush=True)
+while True:
+    client, _ = s.accept()
+    try:
+        client.sendall(b'{"talk": 1, "version": "0", "pid": 1, "boot": "evil", "features": []}\n')
+        print(client.recv(65536), flush=True)
+    except (BrokenPipeError, ConnectionResetError):
+        print(b"", flush=True)
+    client.close()
+"""
+PYTHON = "/usr/bin/python3" if os.path.exists("/usr/bin/python3") else sys.executable
+
+pytestmark = [
+    pytest.mark.skipif(
+        os.getuid() != 0 or shutil.which("setpriv") is None, reason="only root can act as other users (and setpriv)"
+    ),
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="users, groups and sockets as Linux has them"),
+]
+
+
+@pytest.fixture
+def home() -> Iterator[str]:
+    with short_directory() as path:
+        os.chmod(path, 0o755)  # others can get at what is inside, as far as that lets them
+        yield path
+
+
+def as_user(uid: int, *groups: int) -> list[str]:
+    member = [f"--groups={','.join(map(str, groups))}"] if groups else ["--clear-groups"]
+    return ["setpriv", f"--reuid={uid}", f"--regid={uid}", *member]
+
+
+def stranger(path: str, *requests: dict[str, object], groups: Sequence[int] = ()) -> subprocess.CompletedProcess[str]:
+    words = [*as_user(NOBODY, *groups), PYTHON, "-c", PARENT, HOSTILE, "-c", STRANGER, path]
+    words += [json.dumps(each) for each in requests]
+    return subprocess.run(words, cwd="/", capture_output=True, text=True, timeout=20, check=False)
+
+
+def replies(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
+    assert not done.stderr, done
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def group_server() -> list[str]:
+    return ["setpriv", f"--regid={GROUP}", "--clear-groups", *SCRIPTED, "--socket-mode", "0660"]
+
+
+def test_members_of_the_group_are_let_in_by_the_socket_s_mode_and_others_are_not(home: str) -> None:
+    path = f"{home}/s"
+    with serving(environment(home, TALK_SOCKET=path), command=group_server()):
+        status = os.stat(path)
+        assert (status.st_uid, status.st_gid, stat.S_IMODE(status.st_mode)) == (0, GROUP, 0o660)
+        assert stranger(path).stderr.strip() == "PermissionError"
+        assert stranger(path, groups=[4343]).stderr.strip() == "PermissionError"
+        told = replies(stranger(path, {"seq": 1, "request": "say", "text": "length=0", "wait": True}, groups=[GROUP]))
+        assert told[-1]["goal"]["state"] == "SUCCEEDED"
+        assert told[-1]["goal"]["client"]["uid"] == NOBODY
+
+
+def test_whoever_may_connect_may_silence_everybody_and_the_log_says_who(home: str) -> None:
+    path = f"{home}/s"
+    with serving(environment(home, TALK_SOCKET=path), command=group_server()) as server, Wire(path) as wire:
+        goal = wire.request("say", text="never-ends", wait=True)["goal"]
+        pending = wire.request("say", text="waits")["goal"]
+        told = replies(stranger(path, {"seq": 1, "request": "cancel"}, groups=[GROUP]))
+        assert {each["canceled"]["id"] for each in told if "canceled" in each} == {goal["id"], pending["id"]}
+        ended = wire.receive_event("result")["goal"]
+        assert (ended["state"], ended["by"]["client"]["uid"]) == ("PREEMPTED", NOBODY)
+        for request in ({"request": "pause"}, {"request": "resume"}, {"request": "set", "rate": 150}):
+            assert replies(stranger(path, {"seq": 1, **request}, groups=[GROUP]))[-1]["ok"]
+        assert server.end(signal.SIGTERM) == 0
+    line = next(each for each in server.log.splitlines() if f"{goal['id']} PREEMPTED" in each)
+    assert f"(canceled by uid {NOBODY}, pid " in line
+
+
+def test_nothing_that_another_user_sends_reaches_a_terminal_raw(home: str) -> None:
+    path = f"{home}/s"
+    env = environment(home, TALK_SOCKET=path)
+    with serving(env, command=group_server()) as server, Wire(path) as wire:
+        watch = subprocess.Popen([*TALK, "watch"], env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        assert watch.stdout
+        snapshot = watch.stdout.readline()
+        say = {"request": "say", "text": f"length=0 {HOSTILE}", "key": HOSTILE, "wait": True}
+        told = replies(stranger(path, {"request": "hello", "name": HOSTILE}, say, groups=[GROUP]))
+        goal = told[-1]["goal"]
+        assert (goal["state"], goal["client"]["name"]) == ("SUCCEEDED", HOSTILE), told
+        assert "\x1b[31m" in goal["client"]["command"]
+        assert "\x1b]0;owned" in goal["client"]["parent"]  # a program gets it as it is
+        bad = replies(stranger(path, {"request": "say", "text": "x", "id": HOSTILE}, groups=[GROUP]))[-1]
+        assert not bad.get("ok") or bad["goal"]["state"] == "REJECTED"
+        # One that is being spoken, and one that waits.
+        wire.request("say", text=f"never-ends {HOSTILE}", key=HOSTILE)
+        wire.request("say", text=f"waits {HOSTILE}")
+        shown = [run([*TALK, *words], env).out for words in (["status"], ["status", goal["id"]], ["log"], ["set"])]
+        shown.append(run([*TALK, "cancel"], env).out)
+        assert "".join(shown).count("owned") >= 4  # it is shown
+        assert server.end(signal.SIGTERM) == 0
+        everything, _ = watch.communicate(timeout=10)
+        shown += [snapshot.decode() + everything.decode(), server.log]
+    for each in shown:
+        assert not re.search("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e]", each), each
+        assert "talk: forged" not in each.splitlines()
+
+
+def test_another_user_is_refused_before_a_request_is_read_whatever_the_file_says(home: str) -> None:
+    path = f"{home}/s"
+    with serving(environment(home, TALK_SOCKET=path), command=SCRIPTED) as server, Wire(path) as wire:
+        os.chmod(path, 0o666)  # somebody else's doing: the server was not told to let others in
+        (told,) = replies(stranger(path, {"request": "say", "text": "somebody else"}))
+        assert told["error"] == "permission_denied"
+        assert "--socket-mode" in told["message"]
+        wire.request("status")
+        assert wire.items == []
+    assert "somebody else" not in server.log
+
+
+def test_client_tells_nothing_to_a_server_of_another_user_except_where_it_was_named(home: str) -> None:
+    os.makedirs(f"{home}/run/talk")
+    os.chmod(f"{home}/run/talk", 0o777)
+    path = f"{home}/run/talk/talk.sock"
+    command = [*as_user(NOBODY), PYTHON, "-u", "-c", IMPOSTOR, path]
+    with subprocess.Popen(command, cwd="/", stdout=subprocess.PIPE) as theirs:
+        try:
+            assert theirs.stdout
+            assert theirs.stdout.readline()
+            env = environment(home, XDG_RUNTIME_DIR=f"{home}/run")
+            done = run([*TALK, "say", "a secret"], env)
+            assert done.code == 10, done
+            assert f"belongs to uid {NOBODY}" in done.err
+            assert theirs.stdout.readline() == b"b''\n"  # it hung up without a word
+            run([*TALK, "--socket", path, "status"], env)
+            assert b'"hello"' in theirs.stdout.readline()  # it is named: that is the user's own trust
+        finally:
+            theirs.kill()
+
+
+def test_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
+    """As the system's service: its user is neither root nor the client's."""
+    script = f"""
+        set -e
+        mount -t tmpfs tmpfs /run
+        mkdir /run/talk; chown {NOBODY} /run/talk
+        {" ".join(as_user(NOBODY))} {PYTHON} -u -c "$1" /run/talk/talk.sock > {home}/heard &
+        while ! [ -s {home}/heard ]; do sleep 0.01; done
+        shift
+        "$@" || true
+        kill $!
+    """
+    command = ["unshare", "--mount", "sh", "-c", script, "sh", IMPOSTOR, *TALK, "status"]
+    with open(f"{home}/heard", "w", encoding="utf-8"):
+        os.chown(f"{home}/heard", NOBODY, NOBODY)
+    done = run(command, environment(home))
+    if "unshare" in done.err or "mount" in done.err:
+        pytest.skip(f"this root may not mount: {done.err}")
+    with open(f"{home}/heard", encoding="utf-8") as file:
+        assert '"hello"' in file.read(), done
+
+
+def test_user_s_server_lets_root_in_and_no_third_user(home: str) -> None:
+    needs("/usr/bin/python3")  # theirs: they may be able to read neither this checkout nor its interpreter
+    for package in (talkcli, click):
+        folder = os.path.dirname(str(package.__file__))
+        shutil.copytree(folder, f"{home}/lib/{package.__name__}", ignore=shutil.ignore_patterns("__pycache__"))
+    subprocess.run(["chmod", "-R", "a+rX", f"{home}/lib"], check=True)
+    os.mkdir(f"{home}/theirs")
+    os.chown(f"{home}/theirs", 4141, 4141)
+    path = f"{home}/theirs/s"
+    theirs = environment(home, TALK_SOCKET=path, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
+    command = [*as_user(4141), "/usr/bin/python3", "-m", "talkcli", "serve", "--player", "null"]
+    with serving(theirs, command=command):
+        assert run([*TALK, "--socket", path, "status"], environment(home)).code == 0
+        os.chmod(path, 0o666)
+        (told,) = replies(stranger(path, {"request": "status"}))
+        assert told["error"] == "permission_denied"
+        assert "uid 4141's" in told["message"]
