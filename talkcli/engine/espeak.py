@@ -16,9 +16,11 @@ import time
 import types
 from typing import TYPE_CHECKING, Any
 
+from talkcli.engine import guard
 from talkcli.engine.playback import Playback
 from talkcli.engine.sink import SAMPLE, AudioFailed, Stopped
 from talkcli.engine.wordclock import TimedWord
+from talkcli.engine.words import letters
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,11 +39,6 @@ _DEFAULT_LANGUAGE = "en"
 
 #: An event that pyttsx3's binding does not name: the sample rate, before the first samples.
 _EVENT_SAMPLERATE = 8
-
-#: Control characters, each replaced by one blank so that offsets hold: 0x01 starts a command to the library, NUL ends
-#: its text. Tab, newline and return are blanks to it already.
-_BLANKED = {code: " " for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\t\n\r"}
-
 
 #: Seconds between two steps of pyttsx3's own loop, which `talk` does not use.
 _LOOP_STEP = 0.05
@@ -76,6 +73,7 @@ class EspeakDriver:
         self._wait = wait
         self._hold = hold
         self._text: str | None = None
+        self._spoken = ""
         self._playback: Playback | None = None
         self._caught: BaseException | None = None
         self._looping = False
@@ -173,7 +171,8 @@ class EspeakDriver:
     def _synthesise(self, text: str) -> None:
         espeak = self._espeak
         self._caught = None
-        encoded = text.translate(_BLANKED).encode("utf-8", "replace")
+        self._spoken = guard.guarded(text)
+        encoded = self._spoken.encode("utf-8", "replace")
         status = espeak.Synth(encoded, flags=espeak.CHARS_UTF8 | espeak.ENDPAUSE)
         caught, self._caught = self._caught, None
         if caught is not None:
@@ -198,8 +197,11 @@ class EspeakDriver:
             if event.type == _EVENT_SAMPLERATE:
                 self._rate = event.id.number
                 playback.begin(self._rate)
-            elif event.type == self._espeak.EVENT_WORD and event.length > 0:
-                playback.add_word(TimedWord(event.text_position - 1, event.length, event.sample / self._rate))
+            elif event.type == self._espeak.EVENT_WORD:
+                location = event.text_position - 1
+                length = event.length if event.length > 0 else letters(self._spoken, location)
+                if length:
+                    playback.add_word(TimedWord(location, length, event.sample / self._rate))
         if samples and count > 0:
             playback.write(ctypes.string_at(samples, count * SAMPLE))
 

@@ -32,7 +32,7 @@ class Feed:
         self.taken = 0
         #: bytes that were written to it
         self.written = 0
-        #: when it last took or was given anything
+        #: when it last took a whole piece, or was given one
         self.progress_at = time.monotonic()
         self._rate = rate
         self._zeros = bytes(self.piece)
@@ -71,7 +71,8 @@ class Feed:
             if self.taken == 0:  # it has opened its device: the clock starts here, not with what waited in the pipe
                 self._clock.start(now)
             self.taken = consumed
-            self.progress_at = now
+            if consumed >= self.written:  # one that nibbles would never be done
+                self.progress_at = now
         if self.sink.real_time and not (last and consumed >= self.written):
             self._clock.hold(now, max(0.0, self._seconds(consumed) - PLAYER_HOLDS))
 

@@ -21,6 +21,8 @@ class Handed:
     stop_at: float | None = None
     #: the number of the pause that it is to be held for, by the process that speaks it, else by the thread
     pause: int | None = None
+    #: when a process was told of it, until it is confirmed
+    pause_at: float | None = None
     #: how it ended, once the process that spoke it is known to be gone
     verdict: Ended | None = None
     #: … and that process

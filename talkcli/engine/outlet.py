@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 _FILE = "file:"
 
 #: Seconds after which a device that was let go of counts as idle, and gets the lead-in again: the power saving of sound
-#: cards (snd_hda_intel) begins after 1 s where it is on, sound servers suspend a device after 5 s.
+#: cards (snd_hda_intel) begins after 1 s where it is on, sound servers suspend a device after 5 s. Silence counts as
+#: idle: loudspeakers that switch themselves off do so by what they hear.
 IDLE_AFTER = 1.0
 
 
@@ -54,9 +55,9 @@ class Outlet:
         """Take note that a sentence was played whole by the player of this name."""
         self._worked = name
 
-    def let_go(self) -> None:
-        """Take note that a device that had been playing was closed."""
-        self._used_at = time.monotonic()
+    def let_go(self, silent_at: float | None = None) -> None:
+        """Take note that a device was closed; `silent_at`: since when it had played nothing but silence."""
+        self._used_at = time.monotonic() if silent_at is None else silent_at
 
     def lead_in(self) -> float:
         """Return the seconds of silence that a player which is started now begins with."""

@@ -96,7 +96,7 @@ class PlayerPipe:
     def ended(self) -> bool:
         """Return True when the player ended well after `close`; AudioFailed if it ended in any other way."""
         self._read_stderr()
-        status = self._process.poll()
+        status = self._status()
         if status is None:
             self._check_broken()
             return False
@@ -124,9 +124,7 @@ class PlayerPipe:
 
     def kill(self) -> None:
         """Kill the player and what it has started, and reap it if that takes no time."""
-        if self._process.returncode is None:  # not reaped yet, so its group can't be another's
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)
+        self._kill_group()
         self._close_stdin()
         if self._exit is not None and self._process.returncode is None:
             wait = select.poll()
@@ -136,7 +134,7 @@ class PlayerPipe:
 
     def gone(self) -> bool:
         """Return True once the player is reaped."""
-        if self._process.poll() is None:
+        if self._status() is None:
             return False
         self._close_stdin()
         self._close_stderr()
@@ -144,6 +142,17 @@ class PlayerPipe:
             os.close(self._exit)
             self._exit = None
         return True
+
+    def _status(self) -> int | None:
+        """Return the player's exit status, None while it runs; what it leaves behind must not go on without it."""
+        if self._process.returncode is None and _has_ended(self._process.pid):
+            self._kill_group()
+        return self._process.poll()
+
+    def _kill_group(self) -> None:
+        if self._process.returncode is None:  # not reaped yet, so its group can't be another's
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
 
     def _write(self, data: memoryview) -> int:
         if self._stdin is None or self._broken_at is not None:
@@ -223,6 +232,13 @@ def _exit_descriptor(pid: int) -> int | None:
         return os.pidfd_open(pid)
     except OSError:  # an old kernel, or a sandbox that forbids it
         return None
+
+
+def _has_ended(pid: int) -> bool:
+    """Return whether a child has ended and waits to be reaped; False where the system cannot tell without reaping."""
+    if not hasattr(os, "waitid"):
+        return False  # macOS before Python 3.13
+    return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
 
 
 def _unread(pipe: int) -> int:

@@ -10,7 +10,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.engine.feed import Feed
-from talkcli.engine.sink import PIECE, SAMPLE, AudioFailed, Stopped
+from talkcli.engine.sink import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
 from talkcli.engine.wordclock import WordClock
 
 if TYPE_CHECKING:
@@ -50,6 +50,9 @@ CLOCK_AHEAD = 0.01
 #: this, and nothing may be lost.
 SAID_AGAIN = 0.03
 
+#: Seconds within which a player that was killed must be gone: it takes 1 ms, unless it hangs in a device's driver.
+GONE_WITHIN = 1.0
+
 #: Seconds of a pause after which the player is let go of: long enough for a question in between, after which the next
 #: sample is heard at once; a longer one must leave the device to other programs, and let it sleep.
 RELEASE_AFTER = 10.0
@@ -75,6 +78,8 @@ class Playback:
         self._begin = 0  # bytes before the first that this player got
         self._sent = 0  # bytes that players have taken
         self._stopped = False
+        #: since when the player has been given nothing but silence, because the sentence is held
+        self._silent_at: float | None = None
 
     def begin(self, rate: int) -> None:
         """Set the samples per second; before the first samples."""
@@ -112,15 +117,18 @@ class Playback:
             self._feed.sink.kill()
 
     def silence(self) -> None:
-        """Return when nothing can be heard any more, however it ended."""
+        """Return when nothing can be heard any more, however it ended; CannotEnd where that can't be had."""
         if self._feed is None:
             return
         sink = self._feed.sink
         sink.kill()
-        while not sink.gone():  # hangs in the kernel: the server has a limit of its own
+        limit = time.monotonic() + GONE_WITHIN
+        while not sink.gone():
+            if time.monotonic() >= limit:
+                raise CannotEnd(f"{sink.name} could not be ended within {GONE_WITHIN:g} s")
             self._wait((), time.monotonic() + PIECE)
         if sink.real_time and sink.proven:
-            self._outlet.let_go()
+            self._outlet.let_go(self._silent_at)
 
     def _audible(self, samples: bytes) -> bool:
         return self._any_word or samples.count(0) != len(samples)
@@ -147,6 +155,7 @@ class Playback:
             self._candidates = self._outlet.candidates(self._rate)
         sink = self._candidates.pop(0)()
         self._sent = self._begin
+        self._silent_at = None
         return Feed(sink, self._rate, self._clock, self._seconds(self._begin), self._outlet.lead_in())
 
     def _next_player(self, error: AudioFailed) -> None:
@@ -276,7 +285,8 @@ class Playback:
 
     def _stay_open(self, feed: Feed) -> bool:
         """Keep the player that holds nothing but silence; False if it failed, or must be let go of, before the end."""
-        release_at = time.monotonic() + RELEASE_AFTER
+        self._silent_at = time.monotonic()
+        release_at = self._silent_at + RELEASE_AFTER
         while self._hold.asked:
             self._hold.confirm()
             try:
@@ -288,6 +298,7 @@ class Playback:
                 return False
             if not fed:
                 self._wait_for(feed, due)
+        self._silent_at = None
         return True
 
     def _feed_silence(self, feed: Feed) -> int:

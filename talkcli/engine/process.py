@@ -7,7 +7,9 @@ it at any moment; and it must be gone, with its player, when the server is.
 from __future__ import annotations
 
 import os
+import resource
 import signal
+import sys
 
 from talkcli.engine import protocol
 from talkcli.engine.channel import Channel
@@ -20,6 +22,7 @@ LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
 def main() -> None:
     """Run the engine process to its end."""
     die_with_parent()
+    _leave_no_core()
     # Ctrl-C in the server's terminal and the terminal's end are the server's business. A server or a player that stops
     # reading is seen by the write that fails.
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
@@ -30,6 +33,15 @@ def main() -> None:
     if configure is None or os.getppid() != configure.server:
         return
     _serve(channel, configure)
+
+
+def _leave_no_core() -> None:
+    """Have no core written when a text crashes the library: it takes longer than the next start, and wears SD cards.
+
+    One byte, not none: a limit of 0 would still be piped to a program that collects them.
+    """
+    _, hard = resource.getrlimit(resource.RLIMIT_CORE)
+    resource.setrlimit(resource.RLIMIT_CORE, (1 if hard else 0, hard))
 
 
 def _configuration(channel: Channel) -> protocol.Configure | None:
@@ -43,6 +55,7 @@ def _configuration(channel: Channel) -> protocol.Configure | None:
 def _serve(channel: Channel, configure: protocol.Configure) -> None:
     from talkcli.engine.outlet import Outlet
     from talkcli.engine.session import Session
+    from talkcli.engine.sink import CannotEnd
     from talkcli.engine.start import CannotStart, start
 
     outlet = Outlet(configure.player, configure.device, _inherited(), configure.lead_in / 1000)
@@ -57,6 +70,8 @@ def _serve(channel: Channel, configure: protocol.Configure) -> None:
     channel.send(protocol.Ready(started.driver, started.version, outlet.first() if own else None))
     try:
         session.run(configure.list_voices)
+    except CannotEnd as error:  # the server sees that something is left, and speaks on with another process
+        sys.stderr.write(f"{error}\n")
     finally:
         started.engine.endLoop()
 

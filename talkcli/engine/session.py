@@ -34,6 +34,12 @@ if TYPE_CHECKING:
 #: Seconds between two steps of a driver that is not ours while it has a goal in hand: it has no way to wake us.
 STEP = 0.05
 
+#: What such a driver may take from one word, or the beginning, to the end of the text: so many seconds, and for each
+#: character the time of so many words ("€" is one, an emoji is five, but there is never one alone). Nobody can see
+#: whether it speaks, only that it should have ended by then.
+PATIENCE = 10.0
+WORDS_A_CHARACTER = 3
+
 
 @dataclass(slots=True)
 class InHand:
@@ -44,6 +50,10 @@ class InHand:
     words: Words
     #: when it began, without the time for which it was held
     began: float
+    #: words per minute
+    rate: int
+    #: when the driver got it, or said a word of it
+    progress_at: float
     #: whether the driver has it; not while it is held, unless the driver is our own
     spoken: bool = False
     #: whether the driver was told to stop because it is to be held
@@ -56,6 +66,8 @@ class InHand:
     last_word: int = 0
     stop_asked: bool = False
     error: Exception | None = None
+    #: whether it was said that the driver won't come to its end
+    given_up: bool = False
 
 
 class Session:
@@ -165,7 +177,8 @@ class Session:
     def _say(self, say: protocol.Say) -> None:
         """Speak a goal to its end."""
         assert self._settings is not None
-        self._goal = goal = InHand(say.id, say.text, Words(say.text), time.monotonic())
+        now = time.monotonic()
+        self._goal = goal = InHand(say.id, say.text, Words(say.text), now, say.rate, now)
         self.hold.release()
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
@@ -196,6 +209,7 @@ class Session:
             goal.began += _since(goal.silent_at)
         goal.offset = goal.last_word
         goal.spoken, goal.interrupted, goal.silent_at = True, False, None
+        goal.progress_at = time.monotonic()
         if self._engine.say(goal.text[goal.offset :], goal.id) is not None:
             self._end(protocol.FAILED, "nothing_to_say", "nothing in the text can be spoken")
 
@@ -227,7 +241,7 @@ class Session:
             return
         found = goal.words.next(goal.offset + location if location >= 0 else location, length)
         if found is not None:
-            goal.last_word = found.start
+            goal.last_word, goal.progress_at = found.start, _since(0.0)
             seconds = _since(goal.began) if time is None else time
             self._channel.send(protocol.Word(goal.id, found.start, found.end, found.number, round(seconds, 3)))
 
@@ -260,7 +274,23 @@ class Session:
         self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration))
 
     def _alive_due(self) -> float | None:
-        return None if self._goal is None else self._channel.sent_at + protocol.ALIVE_EVERY
+        if self._goal is None or self._lost(self._goal):
+            return None
+        return self._channel.sent_at + protocol.ALIVE_EVERY
+
+    def _lost(self, goal: InHand) -> bool:
+        """Whether a driver that is not ours has had all the time it could need: no sign of life comes from here then.
+
+        The server ends the process for that, as there may be no other way to silence it.
+        """
+        if self._pump is None or not goal.spoken:
+            return False
+        rest = (len(goal.text) - goal.last_word) * WORDS_A_CHARACTER * 60 / goal.rate
+        lost = time.monotonic() > goal.progress_at + PATIENCE + rest
+        if lost and not goal.given_up:
+            goal.given_up = True
+            sys.stderr.write(f"the driver did not end what takes less than {PATIENCE + rest:.0f} s\n")
+        return lost
 
     def _tell_alive(self) -> None:
         due = self._alive_due()

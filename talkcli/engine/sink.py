@@ -31,6 +31,10 @@ class Stopped(Exception):
     """The sentence was stopped."""
 
 
+class CannotEnd(Exception):
+    """A player was killed and is not gone: nobody knows whether it is silent, and this process is of no more use."""
+
+
 class Sink(Protocol):
     """Where the samples of one sentence go."""
 

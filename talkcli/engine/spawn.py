@@ -19,7 +19,7 @@ from talkcli.engine import protocol
 from talkcli.wire import LineSplitter
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 #: The variable that tells the engine process which descriptor its player has to inherit.
 LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
@@ -45,12 +45,19 @@ class EngineProcess:
     OSError from the constructor if it cannot be started.
     """
 
-    def __init__(self, command: list[str], configure: protocol.Configure) -> None:
+    def __init__(
+        self,
+        command: list[str],
+        configure: protocol.Configure,
+        on_stderr: Callable[[bytes], None] = lambda _: None,
+    ) -> None:
+        """`on_stderr` is called with what is read of its standard error, empty at the end."""
         self.ready = False
         #: whether the process said itself why it cannot start
         self.explained = False
         self._lines = LineSplitter(limit=None)
         self._stderr_tail = b""
+        self._on_stderr = on_stderr
         environment = {name: value for name, value in os.environ.items() if name not in _NOT_INHERITED}
         with contextlib.ExitStack() as kept, contextlib.ExitStack() as handed_over:
             self.socket, theirs = socket.socketpair()
@@ -114,13 +121,20 @@ class EngineProcess:
         except BlockingIOError:
             return True
         self._stderr_tail = (self._stderr_tail + data)[-_STDERR_KEPT:]
+        self._on_stderr(data)
         return bool(data)
 
     def kill(self) -> None:
-        """Kill the process and its player. The process isn't reaped yet, so its group can't be anybody else's."""
+        """Kill the process, its player, and what that has started.
+
+        The process isn't reaped yet, so its group and its session can't be anybody else's.
+        """
         if self._process.returncode is None:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self._process.pid, signal.SIGKILL)
+            for pid in _session(self._process.pid):
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.kill(pid, signal.SIGKILL)
 
     def last_words(self) -> str:
         """Return how a process that closed its connection ended, for people; what it started is killed.
@@ -158,6 +172,21 @@ class EngineProcess:
         self.socket.close()
         os.close(self.liveness)
         os.close(self.stderr)
+
+
+def _session(leader: int) -> list[int]:
+    """Return the processes of a session, where there is a /proc to tell them.
+
+    A player leads a group of its own; it dies with the engine process, but a pipeline that it has started would not.
+    """
+    found = []
+    for name in os.listdir("/proc") if os.path.isdir("/proc/self") else []:
+        if name.isdigit():
+            with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
+                # The name in brackets may hold anything, brackets too; then state, parent, group, session.
+                if int(file.read().rpartition(b")")[2].split()[3]) == leader:
+                    found.append(int(name))
+    return found
 
 
 def _signal_name(number: int) -> str:

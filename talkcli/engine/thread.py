@@ -13,8 +13,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol, spawn
+from talkcli.engine.dying import Dying
 from talkcli.engine.handed import Handed
 from talkcli.engine.inbox import Inbox
+from talkcli.engine.murmur import Murmur
+from talkcli.engine.restarts import Restarts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,15 +30,21 @@ HANG_AFTER = 3.0
 STOP_LIMIT = 0.15
 #: Seconds after a kill in which process and player must be gone.
 SILENCE_LIMIT = 2.0
-#: Seconds before the next start, by the number of processes in a row that died before they were of use.
-BACK_OFF = (0.0, 0.1, 0.5, 2.0, 10.0)
-#: A ready process that dies sooner than this, with no goal in hand, was of no use.
-SHORT_LIFE = 1.0
+#: Seconds after which a pause that isn't confirmed becomes a kill, twice what a client waits for it: a driver that is
+#: not ours may finish its word first, or more.
+PAUSE_LIMIT = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class EngineDied:
     """The engine process ended, or had to be ended; for the log."""
+
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class EngineSaid:
+    """A line that the engine process wrote to standard error; for the log. It may hold what a goal's text says."""
 
     words: str
 
@@ -48,7 +57,7 @@ class ThreadDied:
 
 
 _OF_A_GOAL = protocol.Started | protocol.Alive | protocol.Word | protocol.Paused | protocol.Ended
-Report = protocol.Event | EngineDied | ThreadDied
+Report = protocol.Event | EngineDied | EngineSaid | ThreadDied
 
 
 class EngineThread:
@@ -64,13 +73,10 @@ class EngineThread:
         self._selector.register(self._inbox.descriptor, selectors.EVENT_READ)
         self._process: spawn.EngineProcess | None = None
         self._started_at = 0.0
-        self._start_at = 0.0
-        self._failures = 0
-        #: why no process becomes ready, while that is so
-        self._start_error: str | None = None
+        self._restarts = Restarts()
         self._goal: Handed | None = None
-        #: killed, not yet known to be gone, with the time by which they must be
-        self._dying: dict[spawn.EngineProcess, float] = {}
+        self._dying = Dying()
+        self._murmur = Murmur()
         self._closing = False
 
     # -- called from other threads
@@ -129,17 +135,18 @@ class EngineThread:
 
     def _deadlines(self) -> list[float | None]:
         if self._process is None:
-            first: list[float | None] = [self._start_at]
+            first: list[float | None] = [self._restarts.due_at]
         else:
             first = [None if self._process.ready else self._started_at + START_LIMIT]
         if goal := self._goal:
             first.append(None if goal.heard_at is None else goal.heard_at + HANG_AFTER)
             first.append(None if goal.stop_at is None else goal.stop_at + STOP_LIMIT)
-        return first + [limit for limit in self._dying.values() if limit != float("inf")]
+            first.append(None if goal.pause_at is None else goal.pause_at + PAUSE_LIMIT)
+        return first + self._dying.deadlines()
 
     def _keep_limits(self, now: float) -> None:
         goal = self._goal
-        if self._process is None and now >= self._start_at:
+        if self._process is None and now >= self._restarts.due_at:
             self._start()
         elif self._process and not self._process.ready and now >= self._started_at + START_LIMIT:
             self._lose_process(f"the engine was not ready after {START_LIMIT:g} s", "engine_failed")
@@ -147,12 +154,12 @@ class EngineThread:
             self._lose_process(f"the engine did not confirm a stop within {STOP_LIMIT * 1000:.0f} ms", "engine_hung")
         elif goal and goal.heard_at is not None and now >= goal.heard_at + HANG_AFTER:
             self._lose_process(f"the engine gave no sign of life for {HANG_AFTER:g} s", "engine_hung")
-        for process, limit in list(self._dying.items()):
-            if now >= limit:
-                self._dying[process] = float("inf")  # kept, to be reaped when it goes after all
-                if self._goal and self._goal.verdict_on is process:
-                    words = f"the player could not be ended within {SILENCE_LIMIT:g} s"
-                    self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "not_silent", words))
+        elif goal and goal.pause_at is not None and now >= goal.pause_at + PAUSE_LIMIT:
+            self._lose_process(f"the engine did not confirm a pause within {PAUSE_LIMIT:g} s", "engine_hung")
+        for process in self._dying.overdue(now):
+            if self._goal and self._goal.verdict_on is process:
+                words = f"the player could not be ended within {SILENCE_LIMIT:g} s"
+                self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "not_silent", words))
 
     def _handle(self, key: selectors.SelectorKey) -> None:
         if key.fd == self._inbox.descriptor:
@@ -178,8 +185,8 @@ class EngineThread:
 
     def _take(self, say: protocol.Say) -> None:
         self._goal = Handed(say)
-        if self._start_error is not None:
-            self._finish(protocol.Ended(say.id, protocol.FAILED, "engine_failed", self._start_error))
+        if self._restarts.error is not None:
+            self._finish(protocol.Ended(say.id, protocol.FAILED, "engine_failed", self._restarts.error))
         else:
             self._hand_over()
 
@@ -199,6 +206,7 @@ class EngineThread:
         if goal is None or goal.id != goal_id or goal.ending or goal.pause is pause is None:
             return  # it ended, or is about to, while this was on its way
         goal.pause = pause
+        goal.pause_at = time.monotonic() if goal.spoken and pause is not None else None
         if goal.spoken:
             self._tell(protocol.Resume(goal_id) if pause is None else protocol.Pause(goal_id, pause))
         elif pause is not None:
@@ -233,9 +241,9 @@ class EngineThread:
     def _start(self) -> None:
         self._started_at = time.monotonic()
         try:
-            process = spawn.EngineProcess(spawn.engine_command(), self._configure)
+            process = spawn.EngineProcess(spawn.engine_command(), self._configure, self._murmured)
         except OSError as error:
-            self._start_failed(f"the engine process cannot be started: {error}")
+            self._start_failed(f"the engine process cannot be started: {error}", explained=True)
             return
         self._process = process
         for fd in (process.socket.fileno(), process.liveness, process.stderr):
@@ -251,6 +259,10 @@ class EngineThread:
     def _crashed(self, process: spawn.EngineProcess) -> None:
         self._lose_process(f"the engine crashed: {process.last_words()}", "engine_crashed")
 
+    def _murmured(self, data: bytes) -> None:
+        for words in self._murmur.take(data, time.monotonic()):
+            self._post(EngineSaid(words))
+
     def _note(self, process: spawn.EngineProcess, event: protocol.Event) -> None:
         if isinstance(event, _OF_A_GOAL):
             goal = self._goal
@@ -259,16 +271,17 @@ class EngineThread:
             goal.heard_at = time.monotonic()
             if isinstance(event, protocol.Ended):
                 self._finish(event)
-            elif isinstance(event, protocol.Word) or (
-                isinstance(event, protocol.Paused) and event.number == goal.pause
-            ):
+            elif isinstance(event, protocol.Word):
+                self._post(event)
+            elif isinstance(event, protocol.Paused) and event.number == goal.pause:
+                goal.pause_at = None
                 self._post(event)
             return
         if isinstance(event, protocol.Ready):
             process.ready = True
-            self._start_error = None
+            self._restarts.error = None
         elif isinstance(event, protocol.StartFailed):
-            self._start_error = event.message
+            self._restarts.error = event.message
             process.explained = True
         elif isinstance(event, protocol.Voices):
             self._configure = replace(self._configure, list_voices=False)  # the next process need not
@@ -283,48 +296,38 @@ class EngineThread:
         self._process = None
         process.kill()
         self._selector.unregister(process.socket.fileno())
-        self._dying[process] = now + SILENCE_LIMIT
+        self._dying.add(process, now + SILENCE_LIMIT)
         goal = self._goal
         had_goal = goal is not None and goal.spoken
         if goal and had_goal:
             failed = protocol.Ended(goal.id, protocol.FAILED, reason, words)
             goal.verdict = failed if goal.stop_at is None else protocol.Ended(goal.id, protocol.STOPPED)
             goal.verdict_on = process
-            goal.heard_at = goal.stop_at = None
+            goal.heard_at = goal.stop_at = goal.pause_at = None
         if not (self._closing or process.explained):
             self._post(EngineDied(words))
-        if not process.ready:
-            self._start_failed(self._start_error if process.explained and self._start_error else words, process)
-        elif had_goal or now - self._started_at > SHORT_LIFE:
-            self._failures = 0
-            self._start_at = now
+        if process.ready:
+            self._restarts.died(now, age=now - self._started_at, had_goal=had_goal)
         else:
-            self._wait_longer(now)
+            explained = self._restarts.error if process.explained else None
+            self._start_failed(explained or words, explained=process.explained)
 
-    def _start_failed(self, words: str, process: spawn.EngineProcess | None = None) -> None:
-        """Plan another start; no goal waits for it, unless only one start has failed and nobody knows why."""
-        explained = process is None or process.explained
-        first = self._failures == 0
-        self._wait_longer(time.monotonic())
-        if first and not explained:
-            return
-        self._start_error = words
-        if self._goal and not self._goal.verdict:
-            self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "engine_failed", words))
-
-    def _wait_longer(self, now: float) -> None:
-        self._start_at = now + BACK_OFF[min(self._failures, len(BACK_OFF) - 1)]
-        self._failures += 1
+    def _start_failed(self, words: str, *, explained: bool) -> None:
+        """Plan another start; where goals need not wait for it, the one in hand doesn't either."""
+        self._restarts.failed(time.monotonic(), words, explained=explained)
+        if self._restarts.error is not None and self._goal and not self._goal.verdict:
+            self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "engine_failed", self._restarts.error))
 
     def _bury(self, process: spawn.EngineProcess) -> None:
         """Process and player are gone: what was being spoken is silent."""
         self._selector.unregister(process.liveness)
         if process.stderr in self._selector.get_map():
+            process.read_stderr()
             self._selector.unregister(process.stderr)
         process.close()
-        limit = self._dying.pop(process)
+        in_time = self._dying.remove(process)
         goal = self._goal
-        if goal and goal.verdict and goal.verdict_on is process and limit != float("inf"):
+        if goal and goal.verdict and goal.verdict_on is process and in_time:
             self._finish(goal.verdict)
 
     # -- the end
@@ -340,7 +343,7 @@ class EngineThread:
             for key, _ in self._selector.select(max(0.0, limit - time.monotonic())):
                 self._handle(key)
         self._inbox.refuse()
-        for process in list(self._dying):
+        for process in self._dying:
             process.close()
         self._selector.close()
         self._inbox.close()

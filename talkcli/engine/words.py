@@ -8,6 +8,7 @@ one ("in the") are reported by the first of them: nobody knows about the second 
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass
 
 #: What goes on behind a letter without a report of its own: "it's", "well-known", "U.S.A".
@@ -26,6 +27,18 @@ class FoundWord:
     start: int  # character offset
     end: int  # offset after its last character
     number: int  # in the sentence, from 1
+
+
+def letters(text: str, start: int) -> int:
+    """Return how many letters and digits, with their accents, stand there in a row.
+
+    It is the length of a word that a synthesiser reports with none: libespeak-ng does so before a sign that is no ASCII
+    ("hello" of "«hello»"), and also where there is no word at all.
+    """
+    end = start
+    while 0 <= end < len(text) and (text[end].isalnum() or unicodedata.category(text[end]).startswith("M")):
+        end += 1
+    return end - start
 
 
 class Words:

@@ -17,7 +17,7 @@ from talkcli import __version__, peers, wire
 from talkcli.admission import DEFAULT_VOICE
 from talkcli.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
 from talkcli.engine import protocol
-from talkcli.engine.thread import EngineDied, Report, ThreadDied
+from talkcli.engine.thread import EngineDied, EngineSaid, Report, ThreadDied
 from talkcli.engine.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.messages import Sender
@@ -245,6 +245,8 @@ class Service:
             self._start_failed(report)
         elif isinstance(report, EngineDied):
             self._engine_fails(report.words)
+        elif isinstance(report, EngineSaid):
+            log.line(f"engine: {log.shown(report.words)}")
         elif isinstance(report, ThreadDied):
             self._thread_died(report.words)
 

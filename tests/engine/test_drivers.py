@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import select
 import time
 
 import pytest
@@ -234,6 +236,36 @@ def test_a_driver_that_raises_fails_the_goal_and_not_the_next() -> None:
         ended = engine.spoken("raise")
         assert (ended.reason, ended.message) == ("engine_failed", "RuntimeError: no tongue")
         assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+
+
+def test_a_driver_that_never_ends_shows_no_sign_of_life_after_a_while() -> None:
+    patience = "from talkcli.engine import session\nsession.PATIENCE, session.WORDS_A_CHARACTER = 0.7, 0\n"
+    never = "Driver.stop = lambda self: None\nFOR_EVER = 1e9\n"
+    never += (
+        "say = Driver.say\ndef never(self, text):\n    say(self, text)\n    self.due += FOR_EVER\nDriver.say = never\n"
+    )
+    with Spawned(driver="slow", before=patience + SLOW_DRIVER + never) as engine:
+        engine.until(protocol.Voices)
+        engine.say("battery low")
+        while engine.until(protocol.Word).number < 2:
+            pass
+        began = time.monotonic()
+        alive = 0
+        while select.select([engine._socket], [], [], 2 * protocol.ALIVE_EVERY + 0.2)[0]:
+            assert isinstance(engine.event(), protocol.Alive)
+            assert time.monotonic() - began < 0.7 + protocol.ALIVE_EVERY + 0.2
+            alive += 1
+        assert alive == 1
+        assert _processor(engine.process.pid) < 0.5, "it spins"
+        engine.process.kill()
+        assert engine.errors() == "the driver did not end what takes less than 1 s\n"
+
+
+def _processor(pid: int) -> float:
+    """Return the seconds of processor time that a process has used."""
+    with open(f"/proc/{pid}/stat", encoding="ascii", errors="replace") as file:
+        fields = file.read().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def test_the_wheels_library_serves_where_the_system_has_none() -> None:

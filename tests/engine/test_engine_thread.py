@@ -1,4 +1,4 @@
-"""The engine thread holds a goal and lets it go on, with the scripted engine as its process."""
+"""The engine thread holds goals, watches its process and passes on what it says, with the scripted engine as that."""
 
 from __future__ import annotations
 
@@ -11,12 +11,16 @@ from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 
+import talkcli
 from talkcli.engine import protocol, spawn
-from talkcli.engine.thread import HANG_AFTER, EngineThread, Report
+from talkcli.engine import thread as engine_thread
+from talkcli.engine.murmur import LINES
+from talkcli.engine.thread import HANG_AFTER, EngineDied, EngineSaid, EngineThread, Report
 from tests.support import scripted_engine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
 _R = TypeVar("_R")
 
@@ -200,3 +204,119 @@ def test_the_voices_are_listed_by_the_first_process_alone(start: Callable[[], Th
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
     assert sum(isinstance(each, protocol.Ready) for each in thread.seen) == 2
     assert sum(isinstance(each, protocol.Voices) for each in thread.seen) == 1
+
+
+def test_a_pause_that_is_not_confirmed_ends_the_process(
+    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine_thread, "PAUSE_LIMIT", 0.3)
+    thread = start()
+    thread.say("never-ends ignore-pause")
+    thread.until(protocol.Word)
+    asked = time.monotonic()
+    thread.engine.pause("g1", 1)
+    ended = thread.until(protocol.Ended)
+    assert time.monotonic() - asked >= 0.3
+    assert (ended.reason, ended.message) == ("engine_hung", "the engine did not confirm a pause within 0.3 s")
+    thread.say("yes", "g2")
+    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+
+
+@pytest.mark.parametrize("words", ["slow-pause=0.1", "ignore-pause"], ids=["confirmed", "resumed before"])
+def test_a_pause_has_no_limit_once_it_is_confirmed_or_over(
+    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    monkeypatch.setattr(engine_thread, "PAUSE_LIMIT", 0.3)
+    thread = start()
+    thread.say(f"length=0.5 {words}")
+    thread.until(protocol.Word)
+    thread.engine.pause("g1", 1)
+    if words == "ignore-pause":
+        thread.engine.resume("g1")
+    else:
+        thread.until(protocol.Paused)
+        assert thread.next(0.6) is None
+        thread.engine.resume("g1")
+    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+
+
+def test_a_start_that_hangs_is_tried_again_and_then_fails_the_goals(
+    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    behaviour = tmp_path / "start"
+    behaviour.write_text("hang")
+    monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
+    monkeypatch.setattr(engine_thread, "START_LIMIT", 0.5)
+    thread = start()
+    began = time.monotonic()
+    thread.say("battery low")
+    failed = protocol.Ended("g1", protocol.FAILED, "engine_failed", "the engine was not ready after 0.5 s")
+    assert thread.until(protocol.Ended) == failed
+    assert time.monotonic() - began >= 2 * 0.5
+    asked = time.monotonic()
+    thread.say("coming home", "g2")
+    assert thread.until(protocol.Ended) == protocol.Ended("g2", *(failed.outcome, failed.reason, failed.message))
+    assert time.monotonic() - asked < 0.3, "it is not waited for any more"
+    behaviour.write_text("")
+    monkeypatch.setattr(engine_thread, "START_LIMIT", 10.0)
+    thread.until(protocol.Ready)
+    thread.say("yes", "g3")
+    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+
+
+#: An engine process that complains about each goal, and ends in its middle where it is told to.
+COMPLAINS = """
+import os, sys
+sys.path.insert(0, {root!r})
+from talkcli.engine import protocol
+for line in os.fdopen(0, "rb"):
+    command = protocol.decode_command(line)
+    if isinstance(command, protocol.Configure):
+        os.write(0, protocol.encode(protocol.Ready("complaining", None, None)))
+    elif isinstance(command, protocol.Say):
+        for word in command.text.split():
+            if word == "raise":
+                raise ValueError("no tongue")
+            sys.stderr.write(word + "\\n")
+        sys.stderr.write("half a line")
+        sys.stderr.flush()
+        os.write(0, protocol.encode(protocol.Ended(command.id, protocol.COMPLETED)))
+"""
+
+
+@pytest.fixture
+def complaining(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Thread]:
+    program = tmp_path / "engine.py"
+    program.write_text(COMPLAINS.format(root=os.path.dirname(os.path.dirname(talkcli.__file__))))
+    monkeypatch.setattr(spawn, "engine_command", lambda: [sys.executable, str(program)])
+    thread = Thread()
+    yield thread
+    thread.close()
+
+
+def _said(thread: Thread) -> list[str]:
+    return [each.words for each in thread.seen if isinstance(each, EngineSaid)]
+
+
+def test_what_a_living_process_writes_to_standard_error_is_posted(complaining: Thread) -> None:
+    complaining.say("one two")
+    while len(_said(complaining)) < 2:
+        assert complaining.next() is not None
+    assert _said(complaining) == ["one", "two"]
+
+
+def test_the_traceback_of_a_crash_is_posted_before_the_crash(complaining: Thread) -> None:
+    complaining.say("one raise")
+    died = complaining.until(EngineDied)
+    assert died.words == "the engine crashed: it exited with status 1 (ValueError: no tongue)"
+    said = _said(complaining)
+    assert said[:2] == ["one", "Traceback (most recent call last):"]
+    assert said[-1] == "ValueError: no tongue"
+
+
+def test_a_flood_of_complaints_is_cut_off(complaining: Thread) -> None:
+    complaining.say("x " * 5000)
+    complaining.until(protocol.Ended)
+    complaining.say("raise", "g2")
+    complaining.until(EngineDied)
+    assert _said(complaining) == ["x"] * LINES

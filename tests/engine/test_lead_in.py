@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import outlet, protocol
-from tests.engine.spawned import Spawned, late_if_it_differs
+from tests.engine.spawned import Spawned, children, late_if_it_differs
 from tests.engine.test_player_faults import Player, player
 from tests.support import compare
 from tests.support.reference import RATE, render
@@ -102,6 +102,36 @@ def test_a_player_after_a_long_pause_gets_it_again(player: Player) -> None:
     rest = heard[held + _LEAD :]
     assert sentence.endswith(rest)
     assert heard[_LEAD : len(sentence) - len(rest) + _LEAD] == sentence[: -len(rest)]
+
+
+def test_a_sentence_that_goes_on_as_soon_as_the_device_was_let_go_of_gets_it_again(player: Player) -> None:
+    with Spawned(player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": outlet.IDLE_AFTER}) as engine:
+        engine.until(protocol.Voices)
+        engine.say(TEXTS[0])
+        engine.until(protocol.Word)
+        engine.pause()
+        while children(engine.process.pid):
+            assert isinstance(engine.event(), protocol.Alive)
+        held = player.heard.stat().st_size
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+    heard = player.heard.read_bytes()
+    assert heard[held : held + _LEAD] == bytes(_LEAD)
+    assert _bytes()[0].endswith(heard[held + _LEAD :])
+
+
+def test_a_short_pause_in_which_the_device_was_let_go_of_gets_none(player: Player) -> None:
+    with Spawned(player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": 0.1}) as engine:
+        engine.until(protocol.Voices)
+        engine.say(TEXTS[0])
+        engine.until(protocol.Word)
+        engine.pause()
+        while children(engine.process.pid):
+            time.sleep(0.01)  # that it is gone is no event for others
+        held = player.heard.stat().st_size
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert _bytes()[0].endswith(player.heard.read_bytes()[held:])
 
 
 def test_a_pause_within_it_loses_nothing(player: Player) -> None:

@@ -112,8 +112,7 @@ def test_resuming_before_it_is_silent_loses_nothing(player: Player) -> None:
         engine.until(protocol.Word)
         for _ in range(3):
             engine.until(protocol.Word)
-            engine.send(protocol.Pause("g1", 1))
-            engine.resume()
+            engine.send_raw(protocol.encode(protocol.Pause("g1", 1)) + protocol.encode(protocol.Resume("g1")))
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     assert player.heard.read_bytes() == _bytes(TEXT)
 

@@ -292,6 +292,22 @@ def test_no_descriptor_is_left_over(player: Player) -> None:
         assert os.listdir(f"/proc/{engine.process.pid}/fd") == before
 
 
+@pytest.mark.parametrize("status", [0, 1])
+def test_what_a_player_leaves_behind_when_it_ends_is_ended(tmp_path: Path, status: int) -> None:
+    script = tmp_path / "pipeline.sh"
+    # Both ends of its input stay open: nobody but us would end what it has started.
+    script.write_text(f"sleep 60 <&0 & echo $! > {tmp_path}/child; exit {status}\n", "utf-8")
+    with Spawned(f"sh {script}") as engine:
+        engine.until(protocol.Ready)
+        ended = engine.spoken(TEXT)
+        assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_device" if status else "audio_lost")
+        child = int((tmp_path / "child").read_text("utf-8"))
+        end = time.monotonic() + 1
+        while os.path.exists(f"/proc/{child}/exe"):  # a dead one that waits to be reaped by others has none
+            assert time.monotonic() < end, "what the player had started goes on"
+            time.sleep(0.005)  # the end of somebody else's child is no event
+
+
 def test_what_a_player_has_started_is_silent_with_it(tmp_path: Path) -> None:
     script = tmp_path / "pipeline.sh"
     script.write_text(f"sleep 60 & echo $! > {tmp_path}/child; cat > /dev/null; wait\n", "utf-8")

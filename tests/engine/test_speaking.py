@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import resource
 import signal
 import subprocess
 import time
@@ -211,6 +212,13 @@ def test_quit_stops_the_sentence_and_ends_the_process() -> None:
         assert engine.event() is None
         assert engine.process.wait(5) == 0
         assert engine.errors() == ""
+
+
+def test_a_crash_leaves_no_core() -> None:
+    with Spawned() as engine:
+        engine.until(protocol.Ready)
+        soft, _ = resource.prlimit(engine.process.pid, resource.RLIMIT_CORE)
+        assert soft in (0, 1)  # bytes; 0 where it may not have more
 
 
 def test_an_idle_process_does_not_wake_up() -> None:

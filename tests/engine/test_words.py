@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.engine.words import Words
+from talkcli.engine.words import Words, letters
 from tests.support.reference import Sentence, render_with_words
 
 if TYPE_CHECKING:
@@ -27,7 +27,8 @@ def reported(text: str, places: Iterable[tuple[int, int]]) -> list[str]:
 def spoken(text: str, voice: str = "gmw/en") -> list[str]:
     """Return the words of what libespeak-ng itself tells."""
     (rendering,) = render_with_words([Sentence(text, voice=voice)])
-    return reported(text, [(start, end - start) for start, end, _ in rendering.words if end > start])
+    places = ((start, end - start or letters(text, start)) for start, end, _ in rendering.words)
+    return reported(text, [(start, length) for start, length in places if length > 0])
 
 
 @pytest.mark.parametrize(
@@ -44,6 +45,9 @@ def spoken(text: str, voice: str = "gmw/en") -> list[str]:
         ("foo_bar foo/bar fooBar v1.2", "foo _bar foo / bar foo Bar v 1.2"),
         ("привет мир", "привет мир"),
         ("one\ttwo\n three\n\nfour", "one two three four"),
+        ("say «hello» now", "say hello now"),
+        ("„Hallo“ and “the old man’s” sea", "Hallo and the old man’s sea"),
+        ("a «it's» or «U.S.A.» b — c x—y", "a it's or U.S.A b c x y"),
     ],
 )
 def test_the_words_of_a_sentence(text: str, words: str) -> None:
@@ -54,6 +58,13 @@ def test_the_words_of_other_languages() -> None:
     assert spoken("l'homme est là", "roa/fr") == ["l'homme", "est", "là"]
     assert spoken("dell'acqua c'è", "roa/it") == ["dell'acqua", "c'è"]
     assert spoken("世界、人", "sit/cmn") == ["世", "界", "人"]
+    assert spoken("「世界」人", "sit/cmn") == ["世", "界", "人"]
+    assert spoken("«привет мир» да", "zle/ru") == ["привет", "мир", "да"]
+    assert spoken("«मैं जा» रहा", "inc/hi") == ["मैं", "जा", "रहा"]
+
+
+def test_a_word_without_a_length_goes_as_far_as_its_letters() -> None:
+    assert [letters("«né» 日本e\u0301", place) for place in range(-1, 11)] == [0, 0, 2, 1, 0, 0, 4, 3, 2, 1, 0, 0]
 
 
 def test_what_is_repeated_behind_or_outside_is_none() -> None:

@@ -118,11 +118,15 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
             self._monitor.close()
             self._monitor = None
 
-    def reload(self) -> None:
-        """Bring the sink back after `unload()`, warm; a recording that is running goes on with it."""
+    def reload(self, *, warm: bool = True) -> None:
+        """Bring the sink back after `unload()`; a recording that is running goes on with it.
+
+        One that is not `warm` is there at once, as a robot would find it: its first sound comes 1 to 2 s late.
+        """
         self._module = self._pactl("load-module", *_NULL_SINK).strip()
         self._monitor = Monitor(self._child(), f"{_NAME}.monitor", self._taps, self._changed)
-        self._warm_up()
+        if warm:
+            self._warm_up()
 
     def freeze(self) -> None:
         """Stop the sound server as it is (SIGSTOP)."""
@@ -142,8 +146,8 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
             self._monitor.close()
             self._monitor = None
 
-    def start_server(self) -> None:
-        """Start the sound server and its sink, warm; again after `kill_server()`."""
+    def start_server(self, *, warm: bool = True) -> None:
+        """Start the sound server and its sink, as `reload()` does; again after `kill_server()`."""
         with contextlib.suppress(FileNotFoundError):
             os.unlink(self._socket)
         options = ["-n", "--daemonize=no", "--exit-idle-time=-1", "--use-pid-file=no", "--disable-shm=yes"]
@@ -157,7 +161,7 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
                 stderr=log,
             )
         self._await_socket()
-        self.reload()
+        self.reload(warm=warm)
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._server is None:

@@ -37,6 +37,9 @@ PURE = [
     "requests",
     "wire",
     "errors",
+    "engine.guard",
+    "engine.murmur",
+    "engine.restarts",
 ]
 IMPURE = {"asyncio", "threading", "socket", "time", "click", "pyttsx3", "os", "subprocess"}
 #: Who may name these, by the first part of a module's name.

@@ -1,0 +1,146 @@
+"""The guard before libespeak-ng: replaces the few characters of a text that are known to kill the library.
+
+Pure. One character takes the place of one, so that every offset stays what it was. Ordinary text must come out as it
+went in: a rule looks for a cause, says where its numbers come from, and touches nothing where that cause is not there.
+It makes crashes rare, no more; what is relied upon is that the library runs in a process of its own.
+
+The numbers are sizes of buffers into which libespeak-ng 1.51 writes without looking (N_WORD_BYTES, N_CLAUSE_WORDS and
+N_TR_SOURCE in its `translate.h`); 1.52 has mended some of them.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+#: Control characters: 0x01 starts a command to the library (another pitch, voice, punctuation), 0x02 behind a "["
+#: phonemes, NUL ends its text. Tab, newline and return are blanks to it already.
+_BLANKED = {code: " " for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\t\n\r"}
+
+#: Bytes for letters with dots, "U.S.A.", where they are looked up: each letter and a dot, then the word behind the last
+#: dot whole (N_WORD_BYTES, 160, less its end). 'a.' * 85 and 'a.' + 'b' * 170 are more.
+_LOOKED_UP = 156
+#: Bytes for the same letters where they are spelled: 80. No more than 50 of them are heard anyway.
+_SPELLED = 78
+#: Each of those letters marks up to two words behind it as spoken, in a table of 300 words a clause (N_CLAUSE_WORDS)
+#: without an end that is looked at. So behind this many words there must be none.
+_WORDS = 220
+#: Bytes after which the library ends a clause by itself, behind the next blank (N_TR_SOURCE, 800, less 75).
+_CLAUSE = 725
+#: Bytes of a word where its ending is taken off it: 160 (N_WORD_BYTES), less what is put in its place.
+_LONGEST_WORD = 150
+#: Apostrophes of a word: each "'s" is an ending of its own, whose sounds are collected in 200 bytes; 70 are too many.
+_ENDINGS = 30
+
+#: What the library takes for a part of a word: letters, digits, apostrophes, and nearly all that is not ASCII, accents
+#: that stand alone included.
+_WORD = (
+    r"(?:[A-Za-z0-9'’]|(?![\s\u0080-\u00a9\u00ab-\u00b4\u00b6-\u00b9\u00bb-\u00bf\u2000-\u200a\u2010-\u205f\u3000-\u303f"
+    r"\uff00-\uff0f])[^\x00-\x7f])"
+)
+_PIECE = re.compile(f"({_WORD}+)|((?:(?!{_WORD}).)+)", re.DOTALL)
+#: Signs that the library takes for letters: in circles, Braille.
+_SIGN_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2900))))
+#: What ends a clause: the first where a blank, a bracket or nothing follows, the second anywhere.
+_STOP = re.compile(r"[.,;:!?…](?:[\s()\[\]{}<>\"«»“”‘’„]|\Z)|[。、，！？：；︒؟،؛।॥։՝]|\n\s*\n")
+#: A hyphen behind a sign, before a letter.
+_HYPHEN = re.compile(r"(?<=[^\w\s]|_)-(?=[^\W\d_])")
+#: Scripts whose characters are words of their own, and the syllables that are taken apart into letters of three bytes.
+_IDEOGRAPHS, _HANGUL, _HANGUL_END = "\u2e80", "\uac00", "\ud7a3"
+
+
+def guarded(text: str) -> str:
+    """Return the text with what would kill libespeak-ng replaced; its length is the same."""
+    text = text.translate(_BLANKED)
+    if "." in text:
+        text = _without_long_initials(text)
+    if "-" in text:
+        text = _without_leading_hyphens(text)
+    return _without_endless_words(text)
+
+
+def _without_long_initials(text: str) -> str:
+    """Blank the dots between single letters where the library would collect more of them than it has room for."""
+    result = list(text)
+    looked_up = spelled = words = size = 0
+    dots: list[int] = []
+    for piece in _PIECE.finditer(text):
+        word, between = piece.groups()
+        size += len(piece.group().encode())
+        if between is not None:
+            words += len("".join(between.split()))
+            if size > _CLAUSE or _ends_clause(text, piece.start(), piece.end()):
+                words = size = 0
+            dots = [at for at in range(piece.start(), piece.end()) if text[at] == "."]
+            if not dots:
+                looked_up = spelled = 0
+            continue
+        room = sum(map(_room, word))
+        words += len(word) if word[0] >= _IDEOGRAPHS else 1
+        single = sum(map(_is_letter, word)) < 2
+        if looked_up and (looked_up + room > _LOOKED_UP or (single and spelled + room > _SPELLED) or words > _WORDS):
+            for at in dots:
+                result[at] = " "
+            looked_up = spelled = 0
+        looked_up, spelled = (looked_up + room + 1, spelled + room) if single else (0, 0)
+    return "".join(result)
+
+
+def _ends_clause(text: str, start: int, end: int) -> bool:
+    """Tell whether a clause ends among these signs; a dot before a small letter is an abbreviation's."""
+    behind = text[end : end + 1]
+    stops = _STOP.finditer(text, start, end + len(behind))
+    return any(text[each.start()] != "." or not behind.islower() for each in stops)
+
+
+def _is_letter(character: str) -> bool:
+    """Tell whether it makes a word longer: not the quotes, joiners and signs around a letter."""
+    return character.isalnum() or character in _SIGN_LETTERS or unicodedata.category(character).startswith("M")
+
+
+def _room(character: str) -> int:
+    """Return the bytes that a character may need: some voices put other letters in its place."""
+    if _HANGUL <= character <= _HANGUL_END:
+        return 9
+    return max(2, len(character.encode()), len(character.lower().encode()))
+
+
+def _without_leading_hyphens(text: str) -> str:
+    """Blank a hyphen that joins a word to a sign with which its clause begins, as in "'-o".
+
+    The library marks no beginning of that word, and looks for it before the first phoneme of its list: in Vietnamese,
+    Danish, Hindi and others what it finds there kills it. Nor does it report the word.
+    """
+    result: list[str] | None = None
+    for found in _HYPHEN.finditer(text):
+        at = start = found.start()
+        while start and not text[start - 1].isalnum():
+            start -= 1
+        if start == 0 or _ends_clause(text, start, at):
+            result = result or list(text)
+            result[at] = " "
+    return "".join(result) if result else text
+
+
+def _without_endless_words(text: str) -> str:
+    """Have a word that is too much for the library's buffers end earlier: at an apostrophe, or before a capital."""
+    return _PIECE.sub(_shortened, text) if len(text) > _ENDINGS else text
+
+
+def _shortened(piece: re.Match[str]) -> str:
+    word = piece.group(1)
+    if word is None or (len(word.encode()) <= _LONGEST_WORD and word.count("'") + word.count("’") <= _ENDINGS):
+        return piece.group()
+    result = list(word)
+    size = endings = 0
+    for at, character in enumerate(word):
+        size += len(character.encode())
+        endings += character in "'’"
+        before, here = result[at - 1].lower(), character.upper()
+        if endings > _ENDINGS:
+            result[at] = " "
+            size = endings = 0
+        elif size > _LONGEST_WORD and before.islower() and here.isupper() and len(before) == len(here) == 1:
+            result[at - 1], result[at] = before, here
+            size = len(here.encode())
+    return "".join(result)

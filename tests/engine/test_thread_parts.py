@@ -1,0 +1,92 @@
+"""The pure parts of the engine thread: when it tries again, what it passes on, what it waits for to be gone."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, cast
+
+import pytest
+
+from talkcli.engine.dying import Dying
+from talkcli.engine.murmur import LINES, LONGEST, WHILE, Murmur
+from talkcli.engine.restarts import BACK_OFF, SHORT_LIFE, Restarts
+
+if TYPE_CHECKING:
+    from talkcli.engine.spawn import EngineProcess
+
+
+def test_the_wait_grows_with_each_process_that_never_got_ready() -> None:
+    restarts, now = Restarts(), 100.0
+    for wait in (*BACK_OFF, BACK_OFF[-1], BACK_OFF[-1]):
+        restarts.failed(now, "no library", explained=True)
+        assert restarts.due_at == now + wait
+        now = restarts.due_at
+
+
+@pytest.mark.parametrize(("age", "had_goal"), [(SHORT_LIFE / 2, True), (SHORT_LIFE * 2, False)])
+def test_a_process_that_was_of_use_costs_no_wait_and_resets_it(age: float, had_goal: bool) -> None:
+    restarts = Restarts()
+    for _ in range(4):
+        restarts.failed(100.0, "no library", explained=True)
+    restarts.died(200.0, age=age, had_goal=had_goal)
+    assert restarts.due_at == 200.0
+    restarts.failed(200.0, "no library", explained=True)
+    assert restarts.due_at == 200.0 + BACK_OFF[0]
+
+
+def test_a_process_that_dies_as_soon_as_it_is_ready_is_waited_for_longer_and_longer() -> None:
+    restarts = Restarts()
+    for wait in BACK_OFF:
+        restarts.died(100.0, age=SHORT_LIFE / 2, had_goal=False)
+        assert restarts.due_at == 100.0 + wait
+
+
+def test_only_the_first_start_that_nobody_can_explain_is_no_error_yet() -> None:
+    restarts = Restarts()
+    restarts.failed(100.0, "it was killed", explained=False)
+    assert restarts.error is None
+    restarts.failed(100.0, "it was killed again", explained=False)
+    assert restarts.error == "it was killed again"
+    explained = Restarts()
+    explained.failed(100.0, "no library", explained=True)
+    assert explained.error == "no library"
+
+
+def test_lines_are_passed_on_when_they_are_whole() -> None:
+    murmur = Murmur()
+    assert murmur.take(b"one\ntw", 0.0) == ["one"]
+    assert murmur.take(b"o\n\n  \nthr\xffee", 0.0) == ["two"]
+    assert murmur.take(b"", 0.0) == ["thr\ufffdee"]
+    assert murmur.take(b"", 0.0) == []
+
+
+def test_a_line_that_never_ends_is_not_kept() -> None:
+    murmur = Murmur()
+    for _ in range(100):
+        assert murmur.take(b"x" * 65536, 0.0) == []
+    assert murmur.take(b"\n", 0.0) == ["x" * LONGEST]
+
+
+def test_what_is_too_much_is_counted_and_told_with_the_next_lines() -> None:
+    murmur = Murmur()
+    passed = list(itertools.chain.from_iterable(murmur.take(b"x\n" * 10, second) for second in range(10)))
+    assert passed == ["x"] * LINES
+    assert murmur.take(b"y\n", WHILE - 0.1) == []
+    assert murmur.take(b"z\n", WHILE) == [f"({100 + 1 - LINES} lines were left out)", "z"]
+    assert murmur.take(b"z\n", 2 * WHILE) == ["z"]
+
+
+def test_who_is_overdue_is_told_once_and_kept() -> None:
+    dying, process = Dying(), cast("EngineProcess", object())
+    assert not dying
+    dying.add(process, 102.0)
+    assert dying.deadlines() == [102.0]
+    assert dying.overdue(101.9) == []
+    assert dying.overdue(102.0) == [process]
+    assert dying.overdue(103.0) == []
+    assert dying.deadlines() == []
+    assert list(dying) == [process]
+    assert dying.remove(process) is False
+    dying.add(process, 102.0)
+    assert dying.remove(process) is True
+    assert not dying

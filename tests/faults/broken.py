@@ -1,0 +1,147 @@
+"""What the tests of broken engines, players and sound servers share: the server meanwhile, the next goal as heard."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+import talkcli
+from tests.conformance.hearing import HOME
+from tests.conformance.stopped import DROPPED
+from tests.support import census
+from tests.support.compare import assert_heard, compare, extent
+from tests.support.reference import RATE, render
+from tests.support.sink import Sink
+from tests.support.surroundings import clean_environment
+from tests.support.timing import assert_within
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from tests.conformance.hearing import Samples
+    from tests.support.processes import Talk
+    from tests.support.recording import Recording
+
+#: Seconds within which `status` is answered, whatever is broken.
+ANSWER = 0.1
+#: Seconds of `engine_start`, 0.05 on an idle machine, above which the machine counts as late.
+ENGINE_START_LIMIT = 0.12
+#: … and of `server_start`, 0.15.
+SERVER_START_LIMIT = 0.25
+#: Seconds by which a sentence may be longer or shorter than a fresh engine's.
+ALIKE = 0.15
+#: kB by which a server may have grown after a fault: what it keeps of one goal and its log is a few.
+GROWTH = 4096
+
+#: Keeps an engine process in its start for as long as a file is there; for `PYTHONPATH`, as the server's environment
+#: is the engine's. Its argument is the file.
+SLOW_START = """
+import os, sys, time
+while "talkcli.engine.process" in "".join(sys.orig_argv) and os.path.exists({flag!r}):
+    time.sleep(0.001)
+"""
+
+
+def assert_answers(talk: Talk) -> None:
+    """Assert that the server answers in time, whatever is broken; LateError where it is late."""
+    with talk.connect() as wire:
+        asked = time.monotonic()
+        assert wire.request("status")["ok"]
+        assert_within(time.monotonic() - asked, ANSWER, "`status`")
+
+
+def await_end(talk: Talk, goal_id: str, within: float) -> str:
+    """Return the state in which a goal ended; the server was asked for its status meanwhile, again and again."""
+    end = time.monotonic() + within
+    while True:
+        with contextlib.suppress(AssertionError):  # not yet
+            return talk.watcher.wait_for_terminal(goal_id, 0.25)
+        assert time.monotonic() < end, f"{goal_id} did not end within {within} s: {talk.watcher.states(goal_id)}"
+        assert_answers(talk)
+
+
+@pytest.fixture(scope="module")
+def sound() -> Iterator[Sink]:
+    """A sound server for tests that take seconds, mostly of waiting: unlike with `sink`, others run beside them.
+
+    So what they hear is not compared sample by sample: a player may run dry meanwhile.
+    """
+    with Sink() as result:
+        yield result
+
+
+def engine_start() -> float:
+    """Return the seconds in which a process has what an engine process needs: a control for what starts one."""
+    return _process_with("pyttsx3.drivers._espeak")
+
+
+def server_start() -> float:
+    """… and what a server needs, none of it talk's own."""
+    return _process_with("asyncio, click, json, platformdirs, selectors, subprocess")
+
+
+def _process_with(modules: str) -> float:
+    began = time.monotonic()
+    command = [sys.executable, "-c", f"import {modules}"]
+    subprocess.run(command, env=clean_environment(tempfile.gettempdir()), check=True)
+    return time.monotonic() - began
+
+
+@contextlib.contextmanager
+def nothing_left(talk: Talk) -> Iterator[None]:
+    """Assert that an idle server has no process, descriptor or thread more than before, once it is idle again."""
+    assert talk.run("voices").code == 0  # so that the engine is ready
+    before = census.count(talk.pid)
+    yield
+    census.assert_as_before(talk.pid, before, GROWTH)
+
+
+def began(recording: Recording, whole: Samples) -> float:
+    """Assert that a sentence was heard whole, and last; return when its sound began."""
+    samples = recording.samples
+    offset = compare(samples, whole).offset
+    assert_heard(samples[max(0, offset - DROPPED) :], [whole])
+    return recording.time_of(offset)
+
+
+def heard_again(talk: Talk, sink: Sink) -> float:
+    """Assert that a goal that is sent now is heard whole, and return when its sound began.
+
+    After a sentence that was stopped in its middle the library makes something else of the next, so only its length is
+    compared.
+    """
+    with sink.record() as recording:
+        recording.wait_until_quiet(0.2)  # what a frozen sound server had is heard when it goes on
+        start = len(recording)
+        assert talk.run("say", "--wait", "--", HOME).code == 0
+        recording.wait_until_quiet(0.2)
+    found, expected = extent(recording.samples[start:]), extent(render([HOME])[0])
+    assert found
+    assert expected
+    assert abs(found[1] - found[0] - expected[1] + expected[0]) / RATE < ALIKE, (found, expected)
+    return recording.time_of(start + found[0])
+
+
+def told(what: str, seconds: float) -> None:
+    """Leave a measured time where `pytest -s` shows it."""
+    print(f"measured: {what}: {seconds:.3f} s")
+
+
+def python_path(first: Path) -> dict[str, str]:
+    """Return a server's environment with a directory that is searched before all others, talk's own behind it."""
+    return {"PYTHONPATH": os.pathsep.join([str(first), os.path.dirname(os.path.dirname(talkcli.__file__))])}
+
+
+def write(path: Path, text: str, mode: int = 0o644) -> Path:
+    """Write a file and return its path."""
+    path.write_text(text, encoding="utf-8")
+    path.chmod(mode)
+    return path

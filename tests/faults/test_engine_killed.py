@@ -1,0 +1,208 @@
+"""The engine process is killed, crashes or is frozen, whatever it was doing: its goal ends truly, the next is heard."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine.thread import START_LIMIT
+from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, player_process, send
+from tests.faults.broken import (
+    ENGINE_START_LIMIT,
+    SLOW_START,
+    await_end,
+    began,
+    engine_start,
+    nothing_left,
+    python_path,
+    sound,
+    told,
+    write,
+)
+from tests.support import census
+from tests.support.compare import extent
+from tests.support.reference import render
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+    from tests.support.recording import Recording
+    from tests.support.sink import Sink
+
+__all__ = ["sound"]
+
+#: Seconds from the signal to the first sample of the next goal.
+CRASH, HANG = 0.5, 6.0
+SIGNALS = {
+    signal.SIGKILL: ("engine_crashed", "the engine crashed: it was killed by SIGKILL", CRASH),
+    signal.SIGSEGV: ("engine_crashed", "the engine crashed: it was killed by SIGSEGV", CRASH),
+    signal.SIGSTOP: ("engine_hung", "the engine gave no sign of life for 3 s", HANG),
+}
+#: A player that takes a sentence sooner than it plays it: the synthesis is over while it is heard, the pipes hold what
+#: is left. When the engine process dies, nobody but the server can end what the shell has started.
+DEEP = "sh -c 'cat | cat | cat | aplay -q -t raw -f S16_LE -c 1 -r {rate} --buffer-time=60000'"
+
+each_signal = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: signal.Signals(number).name)
+
+
+@each_signal
+def test_engine_process_signalled_while_idle(talk: Talk, sink: Sink, number: signal.Signals) -> None:
+    def attempt() -> None:
+        with nothing_left(talk), sink.record() as recording:
+            engine, hit = engine_process(talk), time.monotonic()
+            os.kill(engine, number)
+            if number is signal.SIGSTOP:
+                # Nobody can know of one that is frozen before it is given a goal, which is lost then.
+                lost = send(talk, LONG)
+            else:
+                lost = None
+                census.settled(talk.pid, lambda now: now.processes == 2 and engine_process(talk) != engine)
+            following = send(talk, LOW)
+            if lost:
+                _assert_lost(talk, lost, number)
+            assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
+        _assert_next(recording, hit, SIGNALS[number][2], f"{number.name} while idle")
+
+    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
+
+
+@each_signal
+def test_engine_process_signalled_in_synthesis(talk: Talk, sink: Sink, number: signal.Signals) -> None:
+    def attempt() -> None:
+        with nothing_left(talk), sink.record() as recording:
+            goal = begin(talk, LONG)
+            following = send(talk, LOW)
+            assert _feeding(talk, player_process(talk)), "the synthesis goes on until the sentence is nearly over"
+            hit = time.monotonic()
+            os.kill(engine_process(talk), number)
+            _assert_lost(talk, goal, number)
+            assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
+        _assert_next(recording, hit, SIGNALS[number][2], f"{number.name} in synthesis")
+
+    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
+
+
+@each_signal
+def test_engine_process_signalled_in_playback(make_talk: MakeTalk, sink: Sink, number: signal.Signals) -> None:
+    def attempt() -> None:
+        talk = make_talk("--player", DEEP, sink=sink)
+        with nothing_left(talk), sink.record() as recording:
+            goal = send(talk, LONG)
+            player = player_process(talk)
+            end = time.monotonic() + 2
+            while _feeding(talk, player):
+                assert time.monotonic() < end, "the player does not take the whole sentence"
+                time.sleep(0.005)  # that a descriptor is closed is no event for others
+            recording.wait_for_sound()
+            following = send(talk, LOW)
+            hit = time.monotonic()
+            os.kill(engine_process(talk), number)
+            _assert_lost(talk, goal, number)
+            assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
+        talk.stop()
+        _assert_next(recording, hit, SIGNALS[number][2], f"{number.name} in playback")
+
+    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
+
+
+@each_signal
+def test_engine_process_signalled_while_paused(talk: Talk, sink: Sink, number: signal.Signals) -> None:
+    def attempt() -> None:
+        with nothing_left(talk), sink.record() as recording:
+            goal = begin(talk, LONG)
+            assert talk.request("pause")["goal"]["id"] == goal
+            following = send(talk, LOW)
+            hit = time.monotonic()
+            os.kill(engine_process(talk), number)
+            _assert_lost(talk, goal, number)
+            assert talk.request("status")["server"]["paused"]
+            assert talk.goal(following)["state"] == "PENDING"
+            resumed = time.monotonic()
+            talk.request("resume")
+            assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
+        # While speech is held nothing may be heard: after a crash the limit begins with the end of that.
+        begins, limit = (hit, HANG) if number is signal.SIGSTOP else (resumed, CRASH)
+        _assert_next(recording, begins, limit, f"{number.name} while paused")
+
+    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV], ids=lambda number: number.name)
+def test_engine_process_signalled_in_its_start(
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path, number: signal.Signals
+) -> None:
+    def attempt() -> None:
+        talk = make_talk(sink=sink, env=_slow_start(tmp_path))
+        with nothing_left(talk), sink.record() as recording:
+            goal = begin(talk, LONG)
+            following, hit = _signal_the_next(talk, goal, tmp_path, number)
+            # It was not given to the one that never got ready, so nothing of it was lost.
+            assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
+        talk.stop()
+        _assert_next(recording, hit, CRASH, f"{number.name} in its start")
+
+    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
+
+
+def test_engine_process_frozen_in_its_start(make_talk: MakeTalk, sound: Sink, tmp_path: Path) -> None:
+    def attempt() -> None:
+        talk = make_talk(sink=sound, env=_slow_start(tmp_path))
+        with nothing_left(talk), sound.record() as recording:
+            goal = begin(talk, LONG)
+            following, hit = _signal_the_next(talk, goal, tmp_path, signal.SIGSTOP)
+            lost = len(recording)
+            assert await_end(talk, following, START_LIMIT + HANG) == "SUCCEEDED"
+            first = extent(recording.samples[lost:])
+        talk.stop()
+        assert first
+        seconds = recording.time_of(lost + first[0]) - hit
+        told("the next goal after SIGSTOP in its start", seconds)
+        assert_within(seconds, START_LIMIT + 2 * CRASH, "the next goal after SIGSTOP in its start")
+
+    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
+
+
+def _slow_start(folder: Path) -> dict[str, str]:
+    write(folder / "sitecustomize.py", SLOW_START.format(flag=str(folder / "starting")))
+    return python_path(folder)
+
+
+def _signal_the_next(talk: Talk, goal: str, folder: Path, number: signal.Signals) -> tuple[str, float]:
+    """Kill the engine and signal the next one while it starts; return the goal that waits for it, and when it was."""
+    flag = folder / "starting"
+    flag.touch()
+    os.kill(engine_process(talk), signal.SIGKILL)
+    assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
+    following = send(talk, LOW)
+    census.settled(talk.pid, lambda now: now.processes == 2)
+    (starting,) = census.descendants(talk.pid)
+    hit = time.monotonic()
+    os.kill(starting, number)
+    flag.unlink()
+    return following, hit
+
+
+def _feeding(talk: Talk, player: int) -> bool:
+    """Whether the engine still has samples for the player: it holds the other end of its standard input."""
+    pipe = os.readlink(f"/proc/{player}/fd/0")
+    engine = engine_process(talk)
+    return pipe in [os.readlink(f"/proc/{engine}/fd/{each}") for each in os.listdir(f"/proc/{engine}/fd")]
+
+
+def _assert_lost(talk: Talk, goal: str, number: signal.Signals) -> None:
+    reason, words, _ = SIGNALS[number]
+    assert await_end(talk, goal, HANG) == "ABORTED"
+    assert_aborted(talk.goal(goal), reason, words)
+
+
+def _assert_next(recording: Recording, hit: float, limit: float, what: str) -> None:
+    seconds = began(recording, render([LOW])[0]) - hit
+    told(f"the next goal after {what}", seconds)
+    assert_within(seconds, limit, f"the next goal after {what}")

@@ -1,0 +1,153 @@
+"""The engine cannot start, as pyttsx3 or libespeak-ng is not there: goals end at once, until it is installed.
+
+What is missing is shadowed in the environment of a real server: by a module that comes before the installed one, and by
+a library that the loader finds first.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from typing import TYPE_CHECKING
+
+import espeakng_loader
+import pytest
+
+from talkcli.engine.restarts import BACK_OFF
+from tests.conformance.hearing import LOW, assert_aborted, send
+from tests.faults.broken import (
+    ENGINE_START_LIMIT,
+    assert_answers,
+    engine_start,
+    heard_again,
+    python_path,
+    sound,
+    told,
+    write,
+)
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+__all__ = ["sound"]
+
+#: Seconds in which a goal is ABORTED that waits for nothing.
+AT_ONCE = 0.1
+#: Seconds that a start takes on a busy machine, above the wait before it.
+START = 1.0
+
+#: A module that is not there, for every process that would import it; each attempt leaves a line with its time.
+MISSING = """
+import time
+with open({attempts!r}, "a") as file:
+    file.write(f"{{time.monotonic()}}\\n")
+raise ModuleNotFoundError("No module named " + repr(__name__), name=__name__)
+"""
+#: The wheel without its data.
+EMPTY = """
+def get_library_path():
+    return {real!r} + "/libespeak-ng.so"
+def get_data_path():
+    return "{empty}"
+"""
+WHEEL = os.path.dirname(espeakng_loader.__file__)
+#: What the system lacks besides its library: the module in the place of the wheel, and what is to be installed.
+WITHOUT = {
+    "wheel": (MISSING, "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader ("),
+    "data": (EMPTY, "there is no espeak-ng data: install espeak-ng-data, or pip install espeakng-loader"),
+}
+
+
+def test_without_pyttsx3_goals_end_at_once_and_it_is_tried_again_at_longer_and_longer_intervals(
+    make_talk: MakeTalk, sound: Sink, tmp_path: Path
+) -> None:
+    attempts = tmp_path / "attempts"
+
+    def attempt() -> None:
+        attempts.write_text("")
+        shadow = write(tmp_path / "pyttsx3.py", MISSING.format(attempts=str(attempts)))
+        talk = make_talk(sink=sound, env=python_path(tmp_path))
+        _await_attempts(attempts, 2)
+        took = _assert_aborted_at_once(talk, "pyttsx3 is missing: pip install pyttsx3 (")
+        times = _await_attempts(attempts, len(BACK_OFF))
+        assert_answers(talk)
+        shadow.unlink()
+        back = time.monotonic()
+        _await_ready(talk)
+        told("ready again after pyttsx3 is there", time.monotonic() - back)
+        heard_again(talk, sound)
+        assert talk.log.count("pyttsx3 is missing") == 3, f"once for the engine, once for each goal: {talk.log}"
+        talk.stop()
+        assert len(_times(attempts)) == len(BACK_OFF), "it was tried more often than it should have been"
+        assert_within(took, AT_ONCE, "the end of a goal without an engine")
+        for (first, second), wait in zip(itertools.pairwise(times), BACK_OFF, strict=False):
+            assert second - first >= wait
+            assert_within(second - first, wait + START, f"the start after {wait} s")
+        assert_within(time.monotonic() - back, BACK_OFF[-1] + START + 2, "speaking again")
+
+    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
+
+
+@pytest.mark.parametrize("what", WITHOUT)
+def test_without_libespeak_ng_or_its_data_goals_end_at_once_until_it_is_installed(
+    make_talk: MakeTalk, sound: Sink, tmp_path: Path, what: str
+) -> None:
+    wheel, words = WITHOUT[what]
+    write(
+        tmp_path / "espeakng_loader.py", wheel.format(attempts=str(tmp_path / "attempts"), real=WHEEL, empty=tmp_path)
+    )
+    library = tmp_path / "libespeak-ng.so.1"
+
+    def attempt() -> None:
+        library.write_bytes(b"no library")
+        talk = make_talk(sink=sound, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
+        first = _assert_aborted_at_once(talk, words)
+        again = _assert_aborted_at_once(talk, words)
+        library.unlink()
+        _await_ready(talk)
+        heard_again(talk, sound)
+        talk.stop()
+        assert_within(max(first, again), AT_ONCE, "the end of a goal without an engine")
+
+    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
+
+
+def _assert_aborted_at_once(talk: Talk, words: str) -> float:
+    """Assert that goals are ABORTED, and say what to install; return after how many seconds one is."""
+    done = talk.run("say", "--wait", "--", LOW)
+    assert done.code == 4
+    assert words in done.err
+    asked = time.monotonic()
+    goal_id = send(talk, LOW)
+    ended = talk.watcher.arrived(talk.watcher.wait_for(goal_id, "ABORTED"))
+    for each in (done.id, goal_id):
+        goal = talk.goal(each)
+        assert_aborted(goal, "engine_failed", words)
+        assert goal["spoken"] == ""
+    return ended - asked
+
+
+def _await_attempts(path: Path, count: int) -> list[float]:
+    end = time.monotonic() + sum(BACK_OFF) + 5
+    while len(times := _times(path)) < count:
+        assert time.monotonic() < end, f"{len(times)} starts"
+        time.sleep(0.01)  # what another process writes is no event
+    return times
+
+
+def _times(path: Path) -> list[float]:
+    return [float(line) for line in path.read_text().splitlines()]
+
+
+def _await_ready(talk: Talk) -> None:
+    """Return when the engine is ready, as nobody but a client would find out."""
+    end = time.monotonic() + BACK_OFF[-1] + 5
+    while talk.request("status")["server"]["engine"] != "ready":
+        assert time.monotonic() < end, talk.log
+        time.sleep(0.05)  # it publishes nothing when it is ready

@@ -1,0 +1,164 @@
+"""Players that are missing, fail, hang or lie, under a real server: never SUCCEEDED unheard, never a hang, tried again.
+
+Each player is a shell script that misbehaves in its own way while a file is there, and plays with `aplay` after that.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine.playback import DRAIN_WITHIN, FIRST_WITHIN, STALLED_AFTER
+from tests.conformance.hearing import HOME, LONG, LOW, assert_aborted, begin, player_process, send
+from tests.faults.broken import await_end, heard_again, nothing_left, sound, write
+from tests.support.compare import assert_heard, assert_silent
+from tests.support.reference import render
+from tests.support.timing import assert_within, retry_if_late
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+__all__ = ["sound"]
+
+#: Seconds above a limit of the engine in which a goal's end is told.
+SLACK = 0.5
+#: … of LOW.
+LENGTH = 1.2
+
+PLAY = "aplay -q -t raw -f S16_LE -c 1 -r 22050 --buffer-time=60000"
+
+
+@dataclass(frozen=True, slots=True)
+class Player:
+    """What a player does, and how its goal ends: the reason, words of the message, the seconds it may take."""
+
+    does: str
+    reason: str
+    words: str
+    within: float
+
+
+BROKEN = {
+    "exits 1 at once": Player(
+        "echo 'player: main:831: audio open error: No such device' >&2; exit 1",
+        "audio_device",
+        "player: audio open error: No such device",
+        0,
+    ),
+    "exits 0 at once": Player("exit 0", "audio_lost", "player ended before the sound did", 0),
+    "exits 0 too early": Player("cat > /dev/null", "audio_lost", " s before the sound did", 0),
+    "leaves playing to a child": Player(f"{PLAY} <&0 & exit 0", "audio_lost", "player ended before the sound did", 0),
+    "never reads": Player("exec sleep 100", "audio_stalled", "player took no sound for 5 s", FIRST_WITHIN),
+    "reads a byte at a time": Player(
+        "while dd bs=1 count=1 of=/dev/null; do sleep 0.3; done 2> /dev/null",
+        "audio_stalled",
+        "player took no sound for 3 s",
+        STALLED_AFTER,
+    ),
+    "hangs in drain": Player(
+        f"{PLAY}; exec sleep 100", "audio_stalled", "player did not end 3 s after the sound", LENGTH + DRAIN_WITHIN
+    ),
+    "fails in drain": Player(
+        f"{PLAY}; echo 'drain failed: Broken pipe' >&2; exit 1", "audio_lost", "drain failed: Broken pipe", LENGTH
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_player_is_broken(make_talk: MakeTalk, sound: Sink, tmp_path: Path, what: str) -> None:
+    player, flag = BROKEN[what], tmp_path / "broken"
+    program = _script(tmp_path, player.does)
+
+    def attempt() -> None:
+        flag.touch()
+        talk = make_talk("--player", str(program), sink=sound)
+        with nothing_left(talk):
+            began = time.monotonic()
+            ended = _aborted(talk, send(talk, LOW), player.reason, player.words) - began
+            flag.unlink()
+            heard_again(talk, sound)
+        talk.stop()
+        assert_within(ended, player.within + SLACK, f"the end of a goal whose player {what}")
+
+    retry_if_late(attempt)
+
+
+@pytest.mark.parametrize(
+    ("number", "reason", "words", "within"),
+    [
+        (signal.SIGKILL, "audio_lost", "player was killed by SIGKILL", 0.0),
+        (signal.SIGSTOP, "audio_stalled", "player took no sound for 3 s", STALLED_AFTER),
+    ],
+    ids=["SIGKILL", "SIGSTOP"],
+)
+def test_player_is_signalled_in_mid_sentence(
+    make_talk: MakeTalk, sound: Sink, tmp_path: Path, number: signal.Signals, reason: str, words: str, within: float
+) -> None:
+    program = _script(tmp_path, "")
+
+    def attempt() -> None:
+        talk = make_talk("--player", str(program), sink=sound)
+        with nothing_left(talk):
+            goal = begin(talk, LONG)
+            hit = time.monotonic()
+            os.kill(player_process(talk), number)
+            ended = _aborted(talk, goal, reason, words) - hit
+            assert talk.goal(goal)["spoken"].startswith("two three")
+            heard_again(talk, sound)
+        talk.stop()
+        assert_within(ended, within + SLACK, f"the end of a goal whose player got {number.name}")
+
+    retry_if_late(attempt)
+
+
+def test_player_is_missing_until_it_is_installed(make_talk: MakeTalk, sound: Sink, tmp_path: Path) -> None:
+    program = tmp_path / "player"
+
+    def attempt() -> None:
+        program.unlink(missing_ok=True)
+        talk = make_talk("--player", str(program), sink=sound)
+        with nothing_left(talk):
+            asked = time.monotonic()
+            ended = _aborted(talk, send(talk, LOW), "no_player", f'player "{program}" not found') - asked
+            assert_silent(talk.recording)
+            _script(tmp_path, "")
+            heard_again(talk, sound)
+        talk.stop()
+        assert_within(ended, SLACK, "the end of a goal without a player")
+
+    retry_if_late(attempt)
+
+
+def test_player_that_writes_underrun_and_goes_on_is_no_error(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
+    complains = "while echo 'underrun!!! (at least 1.234 ms long)'; do sleep 0.02; done"
+    program = _script(tmp_path, f"({complains}) >&2 & sleep 100 & exec {PLAY}")
+    (tmp_path / "broken").touch()
+    talk = make_talk("--player", str(program), sink=sink)
+    with nothing_left(talk):
+        for text in (LOW, HOME):
+            assert talk.run("say", "--wait", "--", text).code == 0
+    talk.recording.wait_until_quiet(0.2)
+    assert_heard(talk.recording, render([LOW, HOME]))
+    talk.stop(gone_within=0.1)  # what the player had started went with it
+
+
+def _script(folder: Path, does: str) -> Path:
+    """Write a player that does something while the file "broken" is there, and plays otherwise."""
+    text = f"#!/bin/sh\nif [ -e {folder}/broken ]; then\n:\n{does}\nexit\nfi\nexec {PLAY}\n"
+    return write(folder / "player", text, 0o755)
+
+
+def _aborted(talk: Talk, goal_id: str, reason: str, words: str) -> float:
+    """Assert that a goal is ABORTED with a reason and the line that names the error; return when."""
+    assert await_end(talk, goal_id, 15) == "ABORTED"
+    assert_aborted(talk.goal(goal_id), reason, words)
+    return talk.watcher.arrived(talk.watcher.wait_for(goal_id, "ABORTED"))

@@ -1,0 +1,89 @@
+"""Runs a program that cannot be reaped for some seconds after it was killed, as one that hangs in a device's driver.
+
+`python trapped.py SECONDS PROGRAM ARGUMENT…`. It is really so: a tracer that asked for that is what the kernel waits
+for before it takes away what a killed process has. Nothing is changed for a program that ends by itself.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import signal
+import subprocess
+import sys
+import time
+
+_SEIZE, _CONTINUE, _EVENT_MESSAGE = 0x4206, 7, 0x4201
+_TRACE_EXIT, _EXIT_EVENT = 0x40, 6
+_SET_PTRACER, _ANY = 0x59616D61, 2**64 - 1
+_ALL_CHILDREN = 0x40000000
+#: Seconds after which a process that was killed is gone, unless it is held.
+_KILLED = 0.2
+
+
+@functools.cache
+def is_possible() -> bool:
+    """Whether this system lets a process be held like this: some sandboxes don't."""
+    program = ["sh", "-c", "echo ready; exec sleep 10"]
+    process = subprocess.Popen([sys.executable, "-S", __file__, "1", *program], stdout=subprocess.PIPE)
+    assert process.stdout
+    with process.stdout:
+        process.stdout.readline()
+    process.kill()
+    try:
+        process.wait(_KILLED)
+    except subprocess.TimeoutExpired:
+        process.wait()
+        return True
+    return False
+
+
+def main() -> None:
+    """Have this process traced, and become the program."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.ptrace.argtypes = [ctypes.c_ulong] * 4
+    libc.ptrace.restype = ctypes.c_long
+    libc.prctl(_SET_PTRACER, ctypes.c_ulong(_ANY), 0, 0, 0)
+    player = os.getpid()
+    traced, tell = os.pipe()
+    if os.fork() == 0:
+        _trace(libc, player, tell, float(sys.argv[1]))
+    os.close(tell)
+    os.read(traced, 1)
+    os.close(traced)
+    os.execvp(sys.argv[2], sys.argv[2:])
+
+
+def _trace(libc: ctypes.CDLL, player: int, tell: int, seconds: float) -> None:
+    """Hold the player in its end, where it was killed; it has nothing of the player's open itself."""
+    os.setsid()
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for descriptor in (0, 1, 2):
+        os.dup2(nothing, descriptor)
+    for name in os.listdir("/proc/self/fd"):
+        if int(name) > 2 and int(name) != tell:
+            try:
+                os.close(int(name))
+            except OSError:
+                continue  # what the list was read from
+    libc.ptrace(_SEIZE, player, 0, _TRACE_EXIT)
+    os.close(tell)
+    while True:
+        try:
+            _, status = os.waitpid(player, _ALL_CHILDREN)
+        except ChildProcessError:  # it may not be traced
+            os._exit(1)
+        if not os.WIFSTOPPED(status):
+            os._exit(0)
+        if status >> 16 == _EXIT_EVENT:
+            end = ctypes.c_ulong()
+            libc.ptrace(_EVENT_MESSAGE, player, 0, ctypes.addressof(end))
+            if os.WIFSIGNALED(end.value) and os.WTERMSIG(end.value) == signal.SIGKILL:
+                time.sleep(seconds)
+                os._exit(0)
+        libc.ptrace(_CONTINUE, player, 0, 0 if status >> 16 else os.WSTOPSIG(status))
+
+
+if __name__ == "__main__":
+    main()
