@@ -1,0 +1,60 @@
+"""The table of faults names tests that exist, and every test module of this folder."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent.parent
+#: A file, a function, or both: `test_a.py::test_b`; `::test_c` is of the file that was named before it.
+_NAMED = re.compile(r"`((?:tests/)?[\w/]*\.py)?(?:::(\w+))?`")
+
+
+def functions(path: Path) -> set[str]:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return {each.name for each in ast.walk(tree) if isinstance(each, ast.FunctionDef)}
+
+
+def rows() -> list[str]:
+    lines = (HERE / "README.md").read_text(encoding="utf-8").splitlines()
+    return [
+        each for each in lines if each.startswith("| ") and not re.match(r"\| (---|fault|it covers|line|text) \|", each)
+    ]
+
+
+def named(row: str) -> list[tuple[Path, str | None]]:
+    found: list[tuple[Path, str | None]] = []
+    path = None
+    for file, function in _NAMED.findall(row.split("|")[2]):
+        if file:
+            path = ROOT / file if file.startswith("tests/") else HERE / file
+        if path and (file or function):
+            found.append((path, function or None))
+    return found
+
+
+def test_every_row_names_tests_that_exist() -> None:
+    for row in rows():
+        tests = named(row)
+        assert tests, f"no test: {row}"
+        for path, function in tests:
+            assert path.is_file(), f"{path} does not exist: {row}"
+            assert function is None or function in functions(path), f"{path.name} has no {function}: {row}"
+            assert function is None or function.startswith("test_"), f"{function} is no test"
+
+
+def test_every_module_of_faults_is_named() -> None:
+    """Those of the service beside the faults (units, sd_notify) are no rows."""
+    shown = {path.name for row in rows() for path, _ in named(row)}
+    others = {
+        "test_table.py",
+        "test_engine_log.py",
+        "test_service_log.py",
+        "test_service_supervised.py",
+        "test_service_units.py",
+    }
+    assert {each.name for each in HERE.glob("test_*.py")} - others == {
+        each for each in shown if (HERE / each).is_file()
+    }
