@@ -1,0 +1,201 @@
+"""Section "Bad text": whatever a goal's text is, it is spoken as text or refused, and the server lives."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import unicodedata
+import wave
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine.render import render
+from talkcli.text import fault
+from tests.conformance.hearing import LOW, assert_same, send
+from tests.faults.fuzz_texts import speak_all
+from tests.faults.fuzz_texts_generator import SENTENCES, Case
+from tests.support.reference import Sentence
+from tests.support.reference import render as reference
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from tests.support.processes import Talk
+
+#: Characters of one text with many of them.
+_MANY = 1000
+#: All of them in CI, and where TALK_TEST_FUZZ asks for much; elsewhere one of so many.
+_WHOLE = bool(os.environ.get("CI") or os.environ.get("TALK_TEST_FUZZ"))
+_FEW, _FEWER = (1, 1) if _WHOLE else (20, 200)
+
+MARKUP = (
+    "<speak>hello</speak>",
+    "<audio src='file:///etc/passwd'/> hello",
+    '<voice name="de"><prosody rate="x-slow">hello</prosody></voice>',
+    "[[h@'loU]]",
+    "hello [[_^_de]] &lt; &#65; {{x}}",
+)
+#: The longest words of several languages, each with its voice.
+LONGEST_WORDS = {
+    "gmw/de": "Rindfleischetikettierungsüberwachungsaufgabenübertragungsgesetz",
+    "urj/fi": "lentokonesuihkuturbiinimoottoriapumekaanikkoaliupseerioppilas",
+    "gmq/sv": "nordvästersjökustartilleriflygspaningssimulatoranläggningsmaterielunderhållsuppföljningssystem",
+    "trk/tr": "muvaffakiyetsizleştiricileştiriveremeyebileceklerimizdenmişsinizcesine",
+    "gmw/en": "pneumonoultramicroscopicsilicovolcanoconiosis",
+    "urj/hu": "megszentségteleníthetetlenségeskedéseitekért",
+    "zle/ru": "превысокомногорассмотрительствующий",
+    "grk/el": "λοπαδοτεμαχοσελαχογαλεοκρανιολειψανοδριμυποτριμματοσιλφιοκαραβομελιτο",
+    "aav/vi": "nghiêng",
+    "roa/fr": "anticonstitutionnellement",
+}
+RIGHT_TO_LEFT = {
+    "sem/ar": "البطارية منخفضة، سأعود إلى القاعدة ٣ مرات (AB-12).",
+    "ira/fa": "باتری کم است\u200cها، برمی‌گردم.",
+    "sem/he": "הסוללה חלשה, אני חוזר לבסיס 12:30.",
+    "gmw/en": "low \u202eyrettab\u202c \u2067שלום\u2069 now",
+}
+#: What has no end, or too much of something; less of it where it takes minutes to be spoken.
+ENDLESS = {
+    "letters": "a" * 10_000,
+    "capitals": "WXYZ" * 500,
+    "digits": "7" * 2_000,
+    "signs": "%&$#" * 500,
+    "points": "." * 9_999 + "a",
+    "hyphens": "a-" * 5_000,
+    "letters with points": "e.g." * 500,
+    "accents": "e" + "\u0301" * 9_999,
+    "letters with accents": "e\u0301\u0327" * 3_333,
+    "vowel signs": "कि" + "ि" * 9_000,
+    "joiners": "a\u200d" * 5_000,
+    "ideographs": "電" * 1_000,
+    "syllables": "한" * 1_000,
+    "arabic": "ب" * 2_000,
+    "pictures": "👩\u200d🚀" * 500,
+    "directions": "\u202ea\u202c" * 3_000,
+    "blanks": " " * 9_999 + "a",
+    "lines": "\n" * 9_999 + "a",
+}
+
+
+def _samples(path: Path) -> bytes:
+    with wave.open(str(path)) as file:
+        data: bytes = file.readframes(file.getnframes())
+        return data
+
+
+@pytest.mark.parametrize("text", MARKUP)
+def test_markup_and_phonemes_are_spoken_as_text(text: str, tmp_path: Path) -> None:
+    render(text, str(tmp_path / "x.wav"))
+    (expected,) = reference([text])
+    assert _samples(tmp_path / "x.wav") == expected.tobytes()
+
+
+def test_commands_of_the_library_in_a_text_are_none(talk: Talk) -> None:
+    text = "\x01s \x01100A\x0180S battery \x01VDe\x02[\x02low"
+    goal = send(talk, text)
+    assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
+    talk.recording.wait_until_quiet()
+    assert_same(talk.recording.samples, reference([text.replace("\x01", " ").replace("\x02", " ")])[0])
+    assert talk.goal(goal)["spoken"] == text
+
+
+def test_ordinary_sentences_are_what_the_library_makes_of_them(tmp_path: Path) -> None:
+    voices = ["gmw/en", "gmw/en", "gmw/de", "roa/fr", "roa/es", "roa/it", "roa/pt-BR", "zlw/pl", "zlw/cs", "zle/ru"]
+    for voice, text in zip(voices, SENTENCES, strict=False):
+        render(text, str(tmp_path / "x.wav"), voice=voice)
+        (expected,) = reference([Sentence(text, voice=voice)])
+        assert _samples(tmp_path / "x.wav") == expected.tobytes(), (voice, text)
+
+
+def _every_character(common: bool) -> Iterator[str]:
+    """Return texts of all assigned characters: of the 32,000 common ones, or of the large sets of East Asia."""
+    large = (range(0x3400, 0xA000), range(0xAC00, 0xD7A4), range(0x17000, 0x19000), range(0x20000, 0xE0000))
+    found = [
+        chr(code)
+        for code in range(1, sys.maxunicode + 1)
+        if unicodedata.category(chr(code)) not in {"Cn", "Co", "Cs"} and common != any(code in each for each in large)
+    ]
+    found = found[:: _FEW if common else _FEWER]
+    texts = ("".join(found[at : at + _MANY]) for at in range(0, len(found), _MANY))
+    return (text for text in texts if fault(text) is None)  # one of controls alone says nothing
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("common", [True, False], ids=["all scripts", "East Asia"])
+def test_every_assigned_character_once(common: bool) -> None:
+    texts = list(_every_character(common))
+    tally = speak_all([Case("gmw/en", text) for text in texts], guarded=True)
+    print(tally)
+    assert tally.texts == len(texts) > 0
+    assert (tally.deaths, tally.faults) == ([], [])
+
+
+def test_the_longest_words_and_writing_from_right_to_left_are_spoken_whole(tmp_path: Path) -> None:
+    for voice, text in [*LONGEST_WORDS.items(), *RIGHT_TO_LEFT.items()]:
+        render(text, str(tmp_path / "x.wav"), voice=voice)
+        (expected,) = reference([Sentence(text, voice=voice)])
+        assert _samples(tmp_path / "x.wav") == expected.tobytes(), (voice, text)
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("text", ENDLESS.values(), ids=ENDLESS.keys())
+def test_thousands_of_characters_of_one_kind_end(text: str) -> None:
+    assert fault(text) is None
+    tally = speak_all([Case("gmw/en", text), Case("gmw/en", LOW)], guarded=True)
+    assert (tally.texts, tally.deaths, tally.faults) == (2, [], [])
+    assert set(tally.outcomes) <= {"completed", "nothing_to_say"}
+
+
+def test_a_server_survives_bad_texts_and_speaks_the_next_one(talk: Talk) -> None:
+    """Each is begun and cancelled, as nobody listens for minutes; in between `status` answers."""
+    for text in ENDLESS.values():
+        goal = send(talk, text)
+        talk.watcher.wait_for(goal, "ACTIVE")
+        assert talk.request("cancel", timeout=5)["ok"]
+        assert talk.watcher.wait_for_terminal(goal) in {"PREEMPTED", "ABORTED", "SUCCEEDED"}
+    for text in MARKUP[:1]:
+        assert talk.run("say", "--wait", "--", text).code == 0
+    assert talk.run("say", "--wait", "--", LOW).code == 0
+
+
+HOSTILE = "a\x1b[31mred\x07\x9b2J\u202egnp.exe\nfake line"
+#: A client that is nothing but a socket, so that it can be a program of any name.
+CLIENT = """
+import socket, sys
+with socket.socket(socket.AF_UNIX) as connection:
+    connection.connect(sys.argv[1])
+    connection.sendall(b'{"request": "say", "text": "length=0.1 named", "wait": true}\\n')
+    heard = b""
+    while b'"result"' not in heard:
+        heard += connection.recv(65536)
+"""
+
+
+def test_terminal_escapes_in_texts_ids_keys_and_names_are_shown_escaped(scripted: Talk) -> None:
+    hostile = HOSTILE
+    watch = scripted.start("watch")
+    goal = str(scripted.request("say", text=f"length=0.1 {hostile}", key=hostile)["goal"]["id"])
+    rejected = scripted.request("say", text="one", id="x\x1b[31m")
+    assert not rejected["ok"] or rejected["goal"]["state"] == "REJECTED"
+    scripted.watcher.wait_for_terminal(goal)
+    own = scripted.run("say", "--wait", "--as", hostile, "--key", hostile, "--", f"length=0.1 {hostile}")
+    assert own.code == 0, own
+    failed = scripted.run("say", "--wait", "--as", hostile, "--", f"fail=engine_failed {hostile}")
+    assert failed.code == 4
+    evil = f"{scripted.directory}/ev\x1b[31m\u202e"
+    os.symlink(sys.executable, evil)
+    subprocess.run([evil, "-c", CLIENT, scripted.socket], env=scripted.env, timeout=20, check=True)
+    shown = [scripted.run(*words) for words in (["status"], ["log"], ["status", goal], ["cancel", "\x1b[31m"])]
+    scripted.stop()
+    out, err = watch.communicate(timeout=10)
+    for text in [out, err, scripted.log, failed.err, own.err, *(each.out + each.err for each in shown)]:
+        assert not set(text) & {"\x1b", "\x07", "\x9b", "\u202e"}, ascii(text)
+        assert "\nfake line" not in text
+    assert r"\x1b[31mred\x07\x9b2J\u202egnp.exe\nfake line" in out
+    assert r"\x1b[31mred" in shown[0].out
+    assert r"\x1b[31mred" in shown[1].out
+    assert r"ev\x1b[31m" in out + scripted.log + shown[0].out + shown[1].out

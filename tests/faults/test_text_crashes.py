@@ -1,0 +1,132 @@
+"""Rows "text that crashes libespeak-ng in the middle of ten goals" and "crash loop: 100 such texts in a row"."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, send
+from tests.faults.fuzz_texts import list_voices, speak_all
+from tests.faults.fuzz_texts_generator import Case
+from tests.support import processes
+from tests.support.compare import assert_heard
+from tests.support.reference import render
+from tests.support.timing import assert_within, process_start, retry_if_late
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+#: Too much for every version of libespeak-ng that is known: it writes past the end of a table.
+CRASHING = "a." * 200
+UNGUARDED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "fuzz_texts_serve.py")
+#: Seconds from the first of a hundred crashing texts to the sound of the goal behind them.
+LOOP_LIMIT = 30.0
+#: Seconds that a bare engine process takes at most on a machine that has time for a hundred of them in 30.
+ENGINE_START = 0.15
+#: Seconds in which `status` is answered, whatever happens.
+ANSWERED = 0.1
+
+
+@pytest.fixture
+def unguarded(make_talk: MakeTalk, sink: Sink, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Talk]:
+    """Starts a server with the real engine, and without the guard before the library."""
+
+    def make(*options: str, heard: bool = True) -> Talk:
+        monkeypatch.setattr(processes, "_SCRIPTED", UNGUARDED)
+        return make_talk(*options, scripted=True, sink=sink if heard else None)
+
+    return make
+
+
+def test_a_scripted_crash_in_the_middle_of_ten_goals(scripted: Talk) -> None:
+    goals = [send(scripted, "crash length=0.2" if number == 5 else f"goal {number}") for number in range(10)]
+    assert_nine_spoken(scripted, goals)
+
+
+def test_a_crashing_text_in_the_middle_of_ten_goals(unguarded: Callable[..., Talk]) -> None:
+    talk = unguarded()
+    texts = [LOW, HOME, "battery two", "coming three", "battery four", CRASHING]
+    texts += ["coming six", "battery seven", "coming eight", "battery nine"]
+    goals = [send(talk, text) for text in texts]
+    assert_nine_spoken(talk, goals)
+    assert_aborted(talk.goal(goals[5]), "engine_crashed", "SIG")
+    talk.recording.wait_until_quiet()
+    # In two processes, of which the second begins anew: what was spoken before the crash, and after it.
+    assert_heard(talk.recording.samples, [*render(texts[:5]), *render(texts[6:])])
+
+
+def assert_nine_spoken(talk: Talk, goals: list[str]) -> None:
+    """Assert that the sixth is ABORTED, once, and the others are spoken in their order, while `status` answers."""
+    retry_if_late(lambda: assert_within(_answered(talk), ANSWERED, "status"), control=process_start)
+    states = [talk.watcher.wait_for_terminal(goal) for goal in goals]
+    assert states == ["SUCCEEDED"] * 5 + ["ABORTED"] + ["SUCCEEDED"] * 4
+    assert talk.watcher.states(goals[5]) == ["PENDING", "ACTIVE", "ABORTED"]  # never tried again
+    begun = [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"]
+    assert begun == goals
+
+
+def _answered(talk: Talk) -> float:
+    with talk.connect() as wire:
+        began = time.monotonic()
+        assert wire.request("status")["ok"]
+        return time.monotonic() - began
+
+
+def _engine_start() -> float:
+    """Return the seconds from the start of an engine process until it has told its voices, and is gone again."""
+    began = time.monotonic()
+    speak_all([], guarded=False)
+    return time.monotonic() - began
+
+
+def test_crash_loop_of_100_texts(unguarded: Callable[..., Talk], sink: Sink) -> None:
+    talk = unguarded("--max-queue", "200")
+
+    def attempt() -> None:
+        assert talk.run("voices").code == 0  # the engine is ready
+        with sink.record() as recording:
+            began = time.monotonic()
+            with talk.connect() as wire:
+                replies = [wire.request("say", text=CRASHING)["goal"]["id"] for _ in range(100)]
+            last = send(talk, LOW)
+            assert talk.watcher.wait_for_terminal(last, 4 * LOOP_LIMIT) == "SUCCEEDED"
+            assert_same(recording.samples, render([LOW])[0])
+            heard_at = recording.first_sound()
+        assert heard_at is not None
+        for goal in replies:
+            assert_aborted(talk.goal(goal), "engine_crashed", "SIG")
+        assert [talk.watcher.states(goal) for goal in replies] == [["PENDING", "ACTIVE", "ABORTED"]] * 100
+        print(f"100 crashing texts and a good one: {heard_at - began:.1f} s")
+        assert_within(heard_at - began, LOOP_LIMIT, "the goal behind 100 crashing texts")
+
+    retry_if_late(attempt, control=_engine_start, control_limit=ENGINE_START)
+    # A process for each, which was ready: so the next one needed no wait.
+    assert talk.log.count("talk: the engine crashed: it was killed by ") % 100 == 0
+    assert "engine_failed" not in talk.log
+
+
+@pytest.mark.parametrize("voice", ["gmw/en", "gmq/da", "zls/mk", "aav/vi"])
+def test_with_the_guard_known_crashing_texts_are_spoken(voice: str) -> None:
+    texts = [
+        *("a." * 85, "e.g. " * 60, "http://" + "x." * 100, CRASHING, "y.," * 220, "a." + "b" * 170, "I." + "'s" * 90),
+        *("A." * 20 + "\u200d" * 60, "a" * 163 + "ing", "é" * 85 + "s", "'-o", "xin! (-o", "№-o", ".-o", "०." * 90),
+    ]
+    cases = [Case(voice, text) for text in texts]
+    guarded = speak_all(cases, guarded=True)
+    assert (guarded.texts, guarded.deaths, guarded.faults) == (len(texts), [], [])
+    without = speak_all(cases, guarded=False)
+    assert (without.texts, without.faults) == (len(texts), [])
+    assert without.deaths, "this library needs no guard: look for what still kills it"
+
+
+def test_text_that_crashes_only_a_few_voices_is_spoken_by_all_of_them() -> None:
+    voices = [each for each in list_voices() if each.split("/")[0] in {"gmq", "aav", "inc", "dra"}]
+    tally = speak_all([Case(voice, text) for voice in voices for text in ("'-o", ".-す", "…-o x")], guarded=True)
+    assert (tally.deaths, tally.faults) == ([], [])

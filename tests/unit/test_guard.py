@@ -1,0 +1,122 @@
+"""What the guard replaces in a text, and that it replaces nothing else."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from talkcli.engine.guard import guarded
+
+#: As people write; each has something that looks like what a rule is about.
+ORDINARY = (
+    "It's 10:30 on 2024-05-01; the U.S.A. and e.g. Mr. Smith's well-known e-mail: a.b@example.org.",
+    "A. B. C. D. E. F. G. H. I. J. K. L. M. N. O. P. Q. R. S. T. U. V. W. X. Y. Z. 1. 2. 3. 4. 5. 6. 7. 8. 9. 10.",
+    "А. Б. В. Г. Д. Е. Ё. Ж. З. И. Й. К. Л. М. Н. О. П. Р. С. Т. У. Ф. Х. Ц. Ч. Ш. Щ. Ъ. Ы. Ь. Э. Ю. Я.",
+    "The address is https://www.example.org/a/b.c.d?e=f-g&h=1.2.3 or 192.168.1.10, version 1.2.3-rc.4.",
+    "Pre- and post-war; the '-ing' form; U.S.-based, z. B.-Regel; x (-er) words; minus -5 - yes -- no.",
+    "Donaudampfschifffahrtselektrizitätenhauptbetriebswerkbauunterbeamtengesellschaft",
+    "Taumatawhakatangihangakoauauotamateaturipukakapikimaungahoronukupokaiwhenuakitanatahu",
+    "L’homme « très bien » n'est-ce pas ? Dell'acqua c'è… ¿Qué? ¡Ay! “Old man’s” sea\tthen\nmore\r\n\r\nend",
+    "बैटरी कम है, मैं वापस जा रहा हूँ। البطارية منخفضة، הסוללה חלשה. 电池电量低。バッテリー残量、배터리가 부족합니다.",
+    "แบตเตอรี่อ่อน กำลังกลับฐาน e\u0301 n\u0303 👩‍🚀 🏳️‍🌈 ½ m² №5 50% €5 a_b foo/bar fooBar C++ #1 @x {y} [z] <w>",
+    "one " * 2000 + "U.S.A.",
+    "他说‘电池电量低正在返回充电站请您稍等一下我马上就回来了因为电池电量低正在返回充电站请您稍等一下我马上就回来’了",
+)
+
+
+@pytest.mark.parametrize("text", ORDINARY)
+def test_ordinary_text_stays_what_it_is(text: str) -> None:
+    assert guarded(text) == text
+
+
+@pytest.mark.parametrize("code", [*range(1, 9), 0x0B, 0x0C, *range(0x0E, 0x20), 0x7F, 0x80, 0x85, 0x9F])
+def test_a_control_character_becomes_a_blank(code: int) -> None:
+    assert guarded(f"a{chr(code)}5Sb") == "a 5Sb"
+
+
+def test_letters_with_dots_are_parted_before_they_are_too_many() -> None:
+    assert guarded("a." * 85) == "a." * 38 + "a " + "a." * 38 + "a " + "a." * 7
+    assert guarded("e.g. " * 60).count("e.g. ") < 60
+    assert guarded("http://" + "x." * 100).startswith("http://" + "x." * 38 + "x x.")
+    for text in (
+        "я. " * 60,
+        "A.,B.;" * 60,
+        "a..b.." * 60,
+        "'a'.'b'." * 60,
+        "\u0301.\u0302." * 60,
+        "०.१." * 60,
+        "a.՞b.°" * 60,
+        "Ⓐ.Ⓑ." * 60,
+    ):
+        changed = guarded(text)
+        assert changed != text
+        assert changed.replace(" ", "").replace(".", "") == text.replace(" ", "").replace(".", "")
+
+
+def test_a_long_word_behind_letters_with_dots_is_parted_from_them() -> None:
+    assert guarded("a.b." + "1" * 170) == "a.b " + "1" * 170
+    assert guarded("I." + "'s" * 90).startswith("I 's's")
+    assert guarded("a." + "한" * 20) == "a " + "한" * 20  # is taken apart into letters
+    assert guarded("a." + "b" * 70) == "a." + "b" * 70
+
+
+def test_letters_with_dots_behind_very_many_words_of_a_clause_are_parted() -> None:
+    assert guarded("a " * 225 + "U.S.A.") == "a " * 225 + "U S A."
+    assert guarded("a " * 225 + "b. u.s.a.") == "a " * 225 + "b  u s a."
+    assert guarded("a " * 225 + "b. U.S.A.") == "a " * 225 + "b. U.S.A."
+    assert guarded("a " * 225 + "b, U.S.A.") == "a " * 225 + "b, U.S.A."
+
+
+@pytest.mark.parametrize("sign", ["'", "(", ".", "…", "€", "№", "_", "--", "' '"])
+def test_a_hyphen_that_joins_a_word_to_the_sign_at_the_start_of_a_clause_becomes_a_blank(sign: str) -> None:
+    assert guarded(f"{sign}-o") == f"{sign} o"
+    assert guarded(f"yes, {sign}-o") == f"yes, {sign} o"
+    assert guarded(f"yes! {sign}-ს") == f"yes! {sign} ს"
+    assert guarded(f"yes {sign}-o") == f"yes {sign}-o"
+    assert guarded(f"yes {sign} -o") == f"yes {sign} -o"
+
+
+def test_an_endless_word_ends_earlier_and_loses_no_letter() -> None:
+    for text in ("a" * 163 + "ing", "A" * 400, "é" * 200, "я" * 300):
+        changed = guarded(text)
+        assert changed != text
+        assert changed.lower() == text.lower()
+        parts = [each for each in _words(changed) if each]
+        assert max(len(each.encode()) for each in parts) <= 160, parts
+    for text in (
+        "अ" * 100,
+        "中" * 100,
+        "1" * 400,
+    ):  # no capitals, or no word: nothing can be done, and nothing was seen
+        assert guarded(text) == text
+    assert guarded("x" + "'s" * 70) == "x" + "'s" * 30 + " s" + "'s" * 30 + " s" + "'s" * 8
+
+
+@given(st.text(st.characters(exclude_categories=["Cs"]) | st.sampled_from("a.- 'é\n"), max_size=300))
+def test_any_text_keeps_its_length_and_what_is_changed_once_is_not_changed_again(text: str) -> None:
+    changed = guarded(text)
+    assert len(changed) == len(text)
+    assert guarded(changed) == changed
+    changed.encode()
+
+
+@pytest.mark.parametrize("motif", ["a.", "a. ", "-'", "'-o", "... ", "a", "é", ".-", "한.", "\u0301", "\n"])
+def test_the_longest_text_takes_no_time(motif: str) -> None:
+    text = (motif * 10_000)[:10_000]
+    guarded(text)
+    began = time.thread_time()
+    guarded(text)
+    assert time.thread_time() - began < 0.5
+
+
+def _words(text: str) -> list[str]:
+    """Return the words into which the library parts one: before a capital behind a small letter."""
+    words = [""]
+    for before, here in zip(" " + text, text, strict=False):
+        if before.islower() and here.isupper():
+            words.append("")
+        words[-1] += here
+    return words
