@@ -7,6 +7,7 @@ import signal
 from typing import TYPE_CHECKING, Protocol
 
 import pytest
+from _pytest.runner import runtestprotocol
 
 from tests.support.company import company
 from tests.support.processes import Talk
@@ -14,6 +15,13 @@ from tests.support.sink import Sink
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
+
+
+#: Fixtures of tests that listen.
+_LISTENING = frozenset({"sink", "private_sink"})
+#: Set for a test that is tried again; and the same in its reports.
+_AGAIN = pytest.StashKey[bool]()
+_TRIED_AGAIN = "tried again"
 
 
 class MakeTalk(Protocol):
@@ -40,14 +48,47 @@ def _interruptible() -> None:
 
 @pytest.fixture(autouse=True)
 def _place(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Run beside other tests; alone what listens, and what is marked so."""
-    listens = not {"sink", "private_sink"}.isdisjoint(request.fixturenames)
-    if listens or request.node.get_closest_marker("alone"):
+    """Run beside other tests; alone what is marked so, and what is tried again."""
+    if request.node.get_closest_marker("alone") or request.node.stash.get(_AGAIN, False):
         company.stay_alone()
     else:
         company.join()
     yield
     company.leave()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """Try a test that listens again, alone, where it failed beside others: what they did, it may have heard."""
+    listens = not _LISTENING.isdisjoint(getattr(item, "fixturenames", ()))
+    if company.alone or not listens or item.get_closest_marker("alone"):
+        return None
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    reports = runtestprotocol(item, nextitem=nextitem, log=False)
+    failed = next((each for each in reports if each.failed), None)
+    if failed:
+        item.stash[_AGAIN] = True
+        reports = runtestprotocol(item, nextitem=nextitem, log=False)
+        for each in reports:
+            each.sections.append(("it failed beside other tests before", failed.longreprtext))
+            each.user_properties.append((_TRIED_AGAIN, failed.longreprtext.splitlines()[-1]))
+    for each in reports:
+        item.ihook.pytest_runtest_logreport(report=each)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Name what passed only when it was alone."""
+    again = [
+        (report.nodeid, dict(report.user_properties)[_TRIED_AGAIN])
+        for report in terminalreporter.getreports("passed")
+        if report.when == "call" and _TRIED_AGAIN in dict(report.user_properties)
+    ]
+    if again:
+        terminalreporter.write_sep("-", "failed beside other tests, passed alone")
+        for name, why in again:
+            terminalreporter.write_line(f"{name}: {why}")
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,8 @@
-"""Who runs beside whom where tests run several at a time (`pytest -n`): most in company, those that listen alone.
+"""Who runs beside whom where tests run several at a time (`pytest -n`): most in company, some alone.
 
 What is heard is compared sample by sample, and a limit is a promise of a machine that is not busy with other tests. So
-a test that listens has the machine for itself, and one that was late in company is tried again alone. Two locks do it,
-on files of this checkout; the kernel drops them with their holder.
+what was late in company, or heard something else, is tried again alone, and only that counts. Two locks do it, on files
+of this checkout; the kernel drops them with their holder.
 """
 
 from __future__ import annotations
