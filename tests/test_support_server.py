@@ -76,6 +76,7 @@ def test_a_good_server_is_started_watched_and_ended(make_talk: MakeTalk) -> None
     assert not talk.running
     talk.start_server()
     assert talk.running
+    talk.watcher.wait_for("a", "SUCCEEDED")
 
 
 @pytest.mark.usefixtures("program")

@@ -108,10 +108,16 @@ def _unfinished(status: ServerStatus) -> list[Goal]:
 
 
 def _ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Items:
-    """Return the ids; where digits were typed, the numbers that stand for this server's."""
+    """Return the ids; where digits were typed, the numbers that stand for this server's as well."""
     own = f"{status.server.get('boot')}-"
     digits = incomplete.isascii() and incomplete.isdecimal()
-    return _items(((each.id.removeprefix(own) if digits else each.id, _goal_help(each)) for each in goals), incomplete)
+    offered = []
+    for each in goals:
+        number = each.id.removeprefix(own)
+        offered += [
+            (name, _goal_help(each)) for name in ((number, each.id) if digits and number != each.id else (each.id,))
+        ]
+    return _items(offered, incomplete)
 
 
 def _keys(goals: Iterable[Goal], incomplete: str) -> Items:

@@ -175,12 +175,16 @@ class EngineProcess:
 
 
 def _session(leader: int) -> list[int]:
-    """Return the processes of a session, where there is a /proc to tell them.
+    """Return the processes of a session, where there is a /proc to tell them and a descriptor to read it with.
 
     A player leads a group of its own; it dies with the engine process, but a pipeline that it has started would not.
     """
-    found = []
-    for name in os.listdir("/proc") if os.path.isdir("/proc/self") else []:
+    found: list[int] = []
+    try:
+        names = os.listdir("/proc")
+    except OSError:
+        return found
+    for name in names:
         if name.isdigit():
             with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
                 # The name in brackets may hold anything, brackets too; then state, parent, group, session.

@@ -156,6 +156,7 @@ def test_descriptors_that_something_else_has_used_up(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
     with serving(env, command=SCRIPTED) as server, Wire(path) as wire:
+        assert wire.request("hello")["ok"]  # else the connection is closed after a while
         pid = server.process.pid
         assert run([*TALK, "say", "--wait", "length=0"], env).code == 0
         before = descriptors(pid)

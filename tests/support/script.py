@@ -82,27 +82,36 @@ def parse(text: str) -> Script:
         name, equals, value = text[start:end].partition("=")
         if name in (_VALUED if equals else _FLAGS):
             asked[name] = value
-    count = int(asked["words"]) if "words" in asked else len(spans)
+    count = int(_number(asked, "words", len(spans)))
     act = next((each for each in ("fail", "crash", "exit", "hang") if each in asked), None)
     return Script(
         text=text,
-        length=float(asked.get("length", "0.1")),
+        length=_number(asked, "length", 0.1),
         started="silent-start" not in asked,
-        at=float(asked.get("at", "0.5")),
+        at=_number(asked, "at", 0.5),
         act=act,
         reason=asked.get("fail") or "engine_failed",
         message=asked["message"].replace("_", " ") if asked.get("message") else None,
-        code=int(asked.get("exit") or 0),
+        code=int(_number(asked, "exit", 0)),
         never_ends="never-ends" in asked,
         ignore_stop="ignore-stop" in asked,
-        slow_stop=float(asked.get("slow-stop", "0")),
+        slow_stop=_number(asked, "slow-stop", 0),
         on_stop=asked.get("on-stop"),
-        slow_pause=float(asked.get("slow-pause", "0")),
+        slow_pause=_number(asked, "slow-pause", 0),
         stale_pause="stale-pause" in asked,
         ignore_pause="ignore-pause" in asked,
-        linger=min(LONGEST, float(asked.get("linger", "0"))),
+        linger=min(LONGEST, _number(asked, "linger", 0)),
         words=tuple(spans[:count]) if "silent-start" not in asked else (),
     )
+
+
+def _number(asked: dict[str, str], name: str, usual: float) -> float:
+    """Return a number that was asked for; the usual one where it is none, as in a text that was mutated."""
+    try:
+        found = float(asked.get(name) or usual)
+    except ValueError:
+        return usual
+    return found if 0 <= found < float("inf") else usual
 
 
 def start() -> tuple[str, str]:
