@@ -57,6 +57,11 @@ def _place(request: pytest.FixtureRequest) -> Iterator[None]:
     company.leave()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run what is alone first, beside short tests, and what takes long last: whoever wants to be alone waits for it."""
+    items.sort(key=lambda item: (item.get_closest_marker("alone") is None, item.get_closest_marker("slow") is not None))
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
     """Try a test that listens again, alone, where it failed beside others: what they did, it may have heard."""

@@ -248,6 +248,7 @@ def test_row_35_no_server_is_told_at_once(words: Sequence[str]) -> None:
         retry_if_late(attempt)
 
 
+@pytest.mark.slow
 def test_row_46_server_that_is_frozen_for_good(scripted: Talk) -> None:
     """Takes 16 s, the limit of silence: the clients wait together."""
     waiter, goal_id = speaking(scripted, "--wait")

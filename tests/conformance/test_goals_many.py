@@ -54,6 +54,7 @@ OPTIONS: list[dict[str, Any]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(int(SECONDS) + 90)
 def test_row_17_five_clients_that_send_wait_and_cancel_meet_no_deadlock(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "4", scripted=True)

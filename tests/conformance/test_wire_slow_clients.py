@@ -152,6 +152,7 @@ def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None
         assert states == ["PENDING", "ACTIVE", "SUCCEEDED"]
 
 
+@pytest.mark.slow
 def test_slow_clients_are_closed_by_the_limits(scripted: Talk) -> None:
     """Takes 12 s, the longest limit: all kinds of slow clients at once, so that it is paid once."""
     with contextlib.ExitStack() as stack:

@@ -64,6 +64,7 @@ WITHOUT = {
 }
 
 
+@pytest.mark.slow
 def test_without_pyttsx3_goals_end_at_once_and_it_is_tried_again_at_longer_and_longer_intervals(
     make_talk: MakeTalk, sound: Sink, tmp_path: Path
 ) -> None:

@@ -12,6 +12,7 @@ from tests.faults.fuzz_lines import fuzz
 SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (60 if os.environ.get("CI") else 8))
 
 
+@pytest.mark.slow
 def test_20000_mutated_lines_have_one_reply_each() -> None:
     report = fuzz(20, count=20_000)
     assert not report.failures, str(report)

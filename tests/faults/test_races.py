@@ -6,6 +6,8 @@ import threading
 from collections import Counter
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.faults.soak_witness import Witness
 
 if TYPE_CHECKING:
@@ -16,6 +18,7 @@ GOALS = 10_000
 AHEAD = 50
 
 
+@pytest.mark.slow
 def test_cancel_that_races_with_the_natural_end_10000_times(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
     witness = Witness(talk.socket)

@@ -32,6 +32,7 @@ def test_mutated_texts_have_one_end_each_and_none_overflows() -> None:
     assert len(os.listdir("/proc/self/fd")) == before
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_crashing_texts_of_today_are_spoken_with_the_guard() -> None:
     voices = list_voices()

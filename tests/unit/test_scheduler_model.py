@@ -241,7 +241,7 @@ class SchedulerMachine(RuleBasedStateMachine):
 
 
 #: Where it fails, it takes its time to find the shortest sequence.
-TestScheduler = pytest.mark.timeout(900)(SchedulerMachine.TestCase)
+TestScheduler = pytest.mark.slow(pytest.mark.timeout(900)(SchedulerMachine.TestCase))
 #: More than other tests have: what goes wrong only where three options meet is rare.
 TestScheduler.settings = settings(
     max_examples=3 * settings().max_examples,
