@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 #: Seconds of `status` for somebody else, whatever these clients do.
 STATUS = 0.1
-#: So many words, less a few, go to those who follow a goal: as many as the longest text has, a thousand a second.
-WORDS = "length=5 " + "a " * 4_990
+#: So many words, less a few, go to those who follow a goal: as many as the longest text has, some six hundred a second.
+WORDS = "length=8 " + "a " * 4_990
 
 #: A process with many connections, each of which sends a line, says when all have been answered, and sleeps.
 _CROWD = """
