@@ -120,8 +120,8 @@ def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(scripted: 
         wire.send({"seq": 1, "request": "pause"})
         with pytest.raises(TimeoutError):
             wire.receive(0.5)
-        wire.send({"seq": 2, "request": "pause"})
         asked = time.monotonic()
+        wire.send({"seq": 2, "request": "pause"})
         for seq in (1, 2):
             reply = wire.receive()
             assert (reply["seq"], reply["error"]["code"]) == (seq, "not_silent")
