@@ -56,8 +56,10 @@ wire.recv(65536)
 longest = 0.0
 while not select.select([sys.stdin], [], [], 0.005)[0]:
     began = time.monotonic()
-    wire.sendall(b'{"request": "status", "id": "1"}\\n')
-    wire.recv(65536)
+    wire.sendall(b'{"seq": 1, "request": "status"}\\n')
+    received = b""
+    while b'"ok": true' not in received:
+        received += wire.recv(65536)
     longest = max(longest, time.monotonic() - began)
 print(longest)
 """
@@ -121,16 +123,16 @@ def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(scripted
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize(("max_queue", "processes"), [(1000, 500), (100, 250)])
-def test_500_say_processes_at_once(make_talk: MakeTalk, max_queue: int, processes: int) -> None:
+@pytest.mark.parametrize("max_queue", [1000, 100])
+def test_500_say_processes_at_once(make_talk: MakeTalk, max_queue: int) -> None:
     """With room for all none is lost; without, those that were accepted are spoken, and the others know."""
     talk = make_talk("--max-queue", str(max_queue), scripted=True)
     first = talk.run("say", "never-ends").id
-    clients = [talk.start("say", "--", f"length=0 number {number}") for number in range(processes)]
+    clients = [talk.start("say", "--", f"length=0 number {number}") for number in range(500)]
     done = [talk.finish(each, timeout=120) for each in clients]
     accepted = [each.id for each in done if each.code == 0]
     assert {each.code for each in done} == ({0} if max_queue == 1000 else {0, 5}), [each.err for each in done]
-    assert len(accepted) == min(processes, max_queue)
+    assert len(accepted) == min(500, max_queue)
     assert len(set(accepted)) == len(accepted)
     for client in done:
         assert client.code == 0 or "100 goals are waiting already" in client.err
@@ -155,8 +157,8 @@ def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(make_t
                 before = census.settled(talk.pid, lambda now: now.descriptors <= idle.descriptors)
                 speak_words(talk)
                 # All words that 50 clients are owed at most are there after the first 5,000. Of the next 5,000, 42 MB
-                # for all, each gets what is never dropped: a goal of 10 kB, with its first state and with its last.
-                census.assert_as_before(talk.pid, before, memory=4 * 1024)
+                # for all, each gets what is never dropped: a goal's text three times, 30 kB; and buffers grow by eighths.
+                census.assert_as_before(talk.pid, before, memory=8 * 1024)
             frozen.send_signal(signal.SIGCONT)
         assert_within(longest[0], STATUS, "status for another client")
 
