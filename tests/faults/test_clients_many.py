@@ -157,7 +157,7 @@ def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(make_t
                 before = census.settled(talk.pid, lambda now: now.descriptors <= idle.descriptors)
                 speak_words(talk)
                 # All words that 50 clients are owed at most are there after the first 5,000. Of the next 5,000, 42 MB
-                # for all, each gets what is never dropped: a goal's text three times, 30 kB; and buffers grow by eighths.
+                # for all, each gets what is never dropped, a goal's text three times, 30 kB; buffers grow by eighths.
                 census.assert_as_before(talk.pid, before, memory=8 * 1024)
             frozen.send_signal(signal.SIGCONT)
         assert_within(longest[0], STATUS, "status for another client")
