@@ -6,8 +6,7 @@ asked for, because every start of the command pays for it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+TYPE_CHECKING = False  # `typing` takes as long to import as a server to answer
 if TYPE_CHECKING:
     from talkcli.client import Client as Client
     from talkcli.events import PausedChanged as PausedChanged

@@ -8,12 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from talkcli.values import frozen
+
 if TYPE_CHECKING:
     from talkcli.record import Record
     from talkcli.states import State
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Now:
     """One moment on both clocks, in seconds: monotonic, for limits, and since 1970 UTC, to be shown.
 
@@ -24,7 +26,7 @@ class Now:
     wall: float
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Changed:
     """A goal is in a new state; to be published."""
 
@@ -32,35 +34,35 @@ class Changed:
     state: State
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Start:
     """The engine shall speak this goal."""
 
     record: Record
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Stop:
     """The engine shall stop this goal; the answer is `ended`."""
 
     record: Record
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class GiveUp:
     """The engine didn't become silent in time: it must be replaced before it may be given another goal."""
 
     record: Record
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Hold:
     """The engine shall be silent and go on with this goal at `Resume`."""
 
     record: Record
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Resume:
     """The engine shall go on with the goal that it holds."""
 
@@ -70,7 +72,7 @@ class Resume:
 Effect = Changed | Start | Stop | GiveUp | Hold | Resume
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Submitted:
     """What became of a goal that was sent: its record, or that of the first goal of its id, to which it is attached."""
 

@@ -1,4 +1,4 @@
-"""What a client hears, as frozen dataclasses, and their form in JSON: events, results, and the snapshot of a watch.
+"""What a client hears, as frozen values, and their form in JSON: events, results, and the snapshot of a watch.
 
 Rules for this file: form only, no I/O. `to_json` gives what the wire and the commands print, so that a program reads
 both alike. A field may be added, never renamed or given another meaning; a reader ignores what it doesn't know.
@@ -6,12 +6,12 @@ both alike. A field may be added, never renamed or given another meaning; a read
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.messages import By, Goal
 from talkcli.replies import ServerStatus
 from talkcli.states import State
+from talkcli.values import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StateChanged:
     """A goal is in another state now."""
 
@@ -53,7 +53,7 @@ class StateChanged:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class WordHeard:
     """A word of a goal is being heard: it begins now."""
 
@@ -99,7 +99,7 @@ class WordHeard:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PausedChanged:
     """Speech is held, or goes on."""
 
@@ -129,7 +129,7 @@ class PausedChanged:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Result:
     """A goal has ended; this is how."""
 
@@ -144,7 +144,7 @@ class Result:
         return cls(Goal.from_json(message.get("goal")))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Snapshot:
     """How everything is as watching begins."""
 

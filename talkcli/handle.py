@@ -7,7 +7,6 @@ which handle. Whatever changes a handle does so under the connection's lock, and
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING
 from weakref import WeakSet
 
@@ -17,6 +16,7 @@ from talkcli.connection import SILENCE_LIMIT
 from talkcli.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.requests import Cancel
 from talkcli.states import State
+from talkcli.values import replace
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

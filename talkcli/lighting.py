@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import unicodedata
 from bisect import bisect_right
-from dataclasses import dataclass
 
 from talkcli.printable import printable
+from talkcli.values import frozen
 
 #: Stands for what is left out at either end.
 MORE = "…"
@@ -24,7 +24,7 @@ _AS_EMOJI = "\ufe0f"
 _FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class View:
     """A part of a sentence, fit to be shown: what was heard, the word being heard, what is still to come."""
 

@@ -1,4 +1,4 @@
-"""A goal and who sent it, as client and server tell each other of them: frozen dataclasses and their form in JSON.
+"""A goal and who sent it, as client and server tell each other of them: frozen values and their form in JSON.
 
 Rules for this file: form only. Whether a goal is admitted is the scheduler's business, how a line is cut from a stream
 is the wire's. A field may be added, never renamed or given another meaning. A reader ignores fields that it doesn't
@@ -7,10 +7,10 @@ know; requests, where that would drop what somebody asked for, are in `requests`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.states import State
+from talkcli.values import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,7 +19,7 @@ JsonObject = dict[str, object]
 _T = TypeVar("_T")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Sender:
     """Who is at the other end of a connection. None where the system doesn't tell."""
 
@@ -47,7 +47,7 @@ class Sender:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class By:
     """What ended a goal: another goal, or a client's request. Neither where it was the server itself."""
 
@@ -67,7 +67,7 @@ class By:
         return cls(_maybe(value, "goal", str), None if client is None else Sender.from_json(client))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Goal:
     """A goal as it is at one moment. In JSON it always has all its keys, null where unknown.
 

@@ -1,11 +1,11 @@
-"""What a server's replies and their lists say, as frozen dataclasses. Form only, no I/O."""
+"""What a server's replies and their lists say, as frozen values. Form only, no I/O."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from talkcli.messages import Goal
+from talkcli.values import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from talkcli.messages import JsonObject
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ServerStatus:
     """What a server says, will say and said. `server` is its own description, for people and programs."""
 
@@ -56,7 +56,7 @@ class ServerStatus:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Canceled:
     """What a cancel did: the goals that it ended, and those named that had ended before."""
 

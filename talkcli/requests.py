@@ -1,6 +1,6 @@
-"""The requests of a client, as frozen dataclasses, and how they are read from JSON.
+"""The requests of a client, as frozen values, and how they are read from JSON.
 
-Rules for this file: form only; whether a goal is admitted is the scheduler's business. A request is one dataclass and
+Rules for this file: form only; whether a goal is admitted is the scheduler's business. A request is one class and
 one table of its fields. A field may be added, never renamed or given another meaning. A field that is not in the table
 is an error: an option that this server doesn't know is refused, never dropped.
 """
@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, cast
 
 from talkcli.errors import BadRequest
+from talkcli.values import frozen
 
 if TYPE_CHECKING:
     from talkcli.messages import JsonObject
@@ -95,7 +95,7 @@ def _optional(check: Check) -> Check:
     return lambda value: None if value is None else check(value)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Hello:
     """The first request of a client: it says who it is, and that it is alive."""
 
@@ -106,7 +106,7 @@ class Hello:
     urgent: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Say:
     """A goal: speak this. Values out of their range make it REJECTED, bad_option; see `admission`."""
 
@@ -159,7 +159,7 @@ class Say:
     format: str = "text"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Wait:
     """Send the results of these goals; where `ids` is not given, of all that are active or pending now."""
 
@@ -170,7 +170,7 @@ class Wait:
     feedback: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Cancel:
     """End what these select; where no selector is given, everything. An empty list of ids selects nothing."""
 
@@ -194,7 +194,7 @@ class Cancel:
         return self.ids is None and not self.current and self.before is None and self.key is None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Status:
     """How the server is, what it says, what it will say, what it said; or one goal."""
 
@@ -203,7 +203,7 @@ class Status:
     id: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Voices:
     """The voices of the server's engine."""
 
@@ -211,7 +211,7 @@ class Voices:
     fields: ClassVar[Mapping[str, Check]] = {}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Watch:
     """All goals as they are now, and then everything that happens to any goal."""
 
@@ -219,7 +219,7 @@ class Watch:
     fields: ClassVar[Mapping[str, Check]] = {}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Log:
     """The last `count` goals that ended, REJECTED ones too, oldest first."""
 
@@ -228,7 +228,7 @@ class Log:
     count: int = 20
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Set:
     """Change the running server's settings; those not given stay. Answered with all of them."""
 
@@ -249,7 +249,7 @@ class Set:
     ttl: float | None = None  # seconds, 0 for no limit
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Pause:
     """Hold speech where it is; answered when it is silent."""
 
@@ -257,7 +257,7 @@ class Pause:
     fields: ClassVar[Mapping[str, Check]] = {}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Resume:
     """Go on where speech was held."""
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import select
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from talkcli.dial import Interrupted, ready
 from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.text import MAX_BYTES
+from talkcli.values import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,7 +26,7 @@ class InputLate(TalkError):
     exit_code = EXIT_TIMEOUT
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Line:
     """A line of standard input, without its end."""
 

@@ -10,10 +10,10 @@ import os
 import shutil
 import stat
 import sys
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from talkcli import paths
+from talkcli.values import frozen, replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -143,7 +143,7 @@ _SYSTEM_SOCKET_HEAD = """\
 """
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Wanted:
     """What a unit is made from."""
 

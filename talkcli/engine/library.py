@@ -7,8 +7,9 @@ Linux only; elsewhere pyttsx3's own drivers find their libraries themselves. It 
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
 from typing import Any
+
+from talkcli.values import frozen
 
 _LIBRARY = "libespeak-ng.so.1"
 
@@ -24,7 +25,7 @@ class LibraryMissing(Exception):
     """The library or its data is not there; the text names what to install."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Library:
     """libespeak-ng, loaded and initialised."""
 

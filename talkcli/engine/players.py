@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import os
 import struct
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from talkcli.engine.sink import PIECE, SAMPLE, AudioFailed
+from talkcli.values import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,7 +28,7 @@ BUFFER_MS = 60
 READ_AHEAD = 4096
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Command:
     """A player program, ready to be started."""
 

@@ -12,8 +12,9 @@ process ends. After that each `Say` gets one `Started`, any number of `Word`, `A
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
+
+from talkcli.values import fields, frozen
 
 #: Seconds between two messages of an engine process that has a goal in hand. Far below `thread.HANG_AFTER`, so that one
 #: late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
@@ -25,7 +26,7 @@ STOPPED = "stopped"  # ended by a `Stop`, and silent now
 FAILED = "failed"  # ended by an error: `reason` and `message` say which
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Configure:
     """What an engine process is told at its start."""
 
@@ -46,7 +47,7 @@ class Configure:
     list_voices: bool = True
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Say:
     """Speak `text`. Settings are absolute; None leaves the driver's default."""
 
@@ -59,7 +60,7 @@ class Say:
     pitch: int  # 0 to 100, 50 is the voice's own
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Stop:
     """Be silent now. A stop for a goal that is not being spoken is ignored: it ended before the stop arrived."""
 
@@ -67,7 +68,7 @@ class Stop:
     id: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Pause:
     """Hold the sentence where it is; `Paused` comes when it is silent. Ignored where the goal isn't being spoken."""
 
@@ -76,7 +77,7 @@ class Pause:
     number: int  # of the pause in the goal, from 1
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Resume:
     """Go on where the sentence was held. Ignored where it is not held."""
 
@@ -84,14 +85,14 @@ class Resume:
     id: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Quit:
     """End the process; the sentence being spoken, if any, is stopped first."""
 
     kind: ClassVar[str] = "quit"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Voice:
     """One voice of the driver's."""
 
@@ -100,7 +101,7 @@ class Voice:
     name: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Ready:
     """The engine is initialised and takes a `Say`."""
 
@@ -110,7 +111,7 @@ class Ready:
     player: str | None  # what will be tried first, for people
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StartFailed:
     """The engine cannot start; the process ends after this."""
 
@@ -119,7 +120,7 @@ class StartFailed:
     message: str  # names what is missing and what to install
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Voices:
     """All voices of the driver; sent once, right after `Ready`, where `Configure` asks for it."""
 
@@ -127,7 +128,7 @@ class Voices:
     voices: tuple[Voice, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Started:
     """The `Say` was taken in hand."""
 
@@ -135,7 +136,7 @@ class Started:
     id: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Alive:
     """A sign of life from a process that has a goal in hand, at most `ALIVE_EVERY` seconds after the last message."""
 
@@ -143,7 +144,7 @@ class Alive:
     id: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Word:
     """A word begins to be heard, now, by the playback clock."""
 
@@ -155,7 +156,7 @@ class Word:
     time: float  # seconds into the sentence's audio
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Paused:
     """The sentence is held and silent, until `Resume` or `Stop`."""
 
@@ -164,7 +165,7 @@ class Paused:
     number: int  # of the pause that it answers
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Ended:
     """The `Say` is over, and it is silent: the player is reaped, or its stream is closed."""
 
@@ -185,7 +186,7 @@ _EVENTS = {each.kind: each for each in (Ready, StartFailed, Started, Alive, Word
 
 def encode(message: Command | Event) -> bytes:
     """Return the message as a line."""
-    return json.dumps({"kind": message.kind, **asdict(message)}, ensure_ascii=True).encode() + b"\n"
+    return json.dumps({"kind": message.kind, **fields(message)}, ensure_ascii=True).encode() + b"\n"
 
 
 def decode_command(line: bytes) -> Command:

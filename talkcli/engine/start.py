@@ -6,10 +6,10 @@ It starts no goal. Everything heavy is imported inside, so that a missing part i
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from talkcli.engine.settings import SettingFailed, Settings
+from talkcli.values import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,7 +34,7 @@ class CannotStart(Exception):
         self.reason = reason
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class OpenEngine:
     """An engine that is ready."""
 

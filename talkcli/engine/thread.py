@@ -9,7 +9,6 @@ from __future__ import annotations
 import selectors
 import threading
 import time
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol, spawn
@@ -18,6 +17,7 @@ from talkcli.engine.handed import Handed
 from talkcli.engine.inbox import Inbox
 from talkcli.engine.murmur import Murmur
 from talkcli.engine.restarts import Restarts
+from talkcli.values import frozen, replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,21 +35,21 @@ SILENCE_LIMIT = 2.0
 PAUSE_LIMIT = 4.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class EngineDied:
     """The engine process ended, or had to be ended; for the log."""
 
     words: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class EngineSaid:
     """A line that the engine process wrote to standard error; for the log. It may hold what a goal's text says."""
 
     words: str
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ThreadDied:
     """A bug ended the engine thread: nothing will be spoken any more."""
 

@@ -8,10 +8,11 @@ the clock says, so that no word is reported before it is heard. Silence that is 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+
+from talkcli.values import frozen
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TimedWord:
     """A word of the text and where in the audio it begins."""
 

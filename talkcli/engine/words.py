@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from dataclasses import dataclass
+
+from talkcli.values import frozen
 
 #: What goes on behind a letter without a report of its own: "it's", "well-known", "U.S.A".
 _GOES_ON = re.compile(r"(?:['’-][^\W\d_]\w*|\.[^\W\d_](?!\w))+")
@@ -20,7 +21,7 @@ _NUMBER_GOES_ON = re.compile(r"\d+(?:[.,]\d+)*")
 _STOPS = ".,;:!?…"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FoundWord:
     """A word of the text."""
 

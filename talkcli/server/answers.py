@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from talkcli import __version__, wire
@@ -14,6 +13,7 @@ from talkcli.requests import Cancel, Log, Pause, Request, Resume, Say, Set, Stat
 from talkcli.server import log
 from talkcli.server.pauses import Pauses
 from talkcli.states import State
+from talkcli.values import replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

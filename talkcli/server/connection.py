@@ -10,13 +10,13 @@ import asyncio
 import contextlib
 import os
 from collections import deque
-from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, Protocol, cast
 
 from talkcli import wire
 from talkcli.errors import BadRequest, LineTooLong
 from talkcli.requests import Cancel, Hello, Request, Status, read_request
+from talkcli.values import replace
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

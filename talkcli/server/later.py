@@ -6,9 +6,10 @@ It decides nothing about them: it keeps them in their order, counts them as owed
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING
+
+from talkcli.values import frozen
 
 if TYPE_CHECKING:
     import asyncio
@@ -23,7 +24,7 @@ VOICES_LIMIT = 4.0
 MAX_WAITING = 64
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _Waiting:
     connection: Connection
     carry_out: Callable[[], None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from talkcli.values import frozen
 
 #: Clients at once. Each takes a descriptor of the 1,024 that a process usually has.
 MAX_CLIENTS = 256
@@ -10,7 +10,7 @@ MAX_CLIENTS = 256
 MAX_QUEUE = 100
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Settings:
     """Options of `serve`, with their defaults."""
 

@@ -37,6 +37,7 @@ PURE = [
     "requests",
     "wire",
     "errors",
+    "values",
     "engine.guard",
     "engine.murmur",
     "engine.restarts",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import unicodedata
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -18,6 +17,7 @@ from talkcli.replies import ServerStatus
 from talkcli.senders import who_forms, why_forms
 from talkcli.states import State
 from talkcli.transcript import Transcript, log_lines
+from talkcli.values import replace
 
 PATROL = Sender(812, 1000, "talk", "/bin/bash /home/robot/bin/patrol.sh --fast", "night watch")
 NOON = time.mktime((2024, 5, 17, 12, 0, 0, 0, 0, -1))

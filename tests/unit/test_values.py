@@ -1,0 +1,114 @@
+"""Values are what frozen, slotted dataclasses are, and cost nothing until one is made."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+from dataclasses import dataclass
+from typing import ClassVar
+
+import pytest
+
+from talkcli.values import fields, frozen, replace
+
+
+@frozen
+class Point:
+    """A place."""
+
+    kind: ClassVar[str] = "point"
+    x: int
+    y: int = 2
+    name: str | None = None
+
+    @property
+    def far(self) -> bool:
+        return self.x > 100
+
+    @classmethod
+    def at(cls, x: int) -> Point:
+        return cls(x)
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    x: int
+    y: int = 2
+    name: str | None = None
+
+
+@frozen
+class Nothing:
+    pass
+
+
+@frozen
+class Other:
+    x: int
+    y: int = 2
+    name: str | None = None
+
+
+@pytest.mark.parametrize("given", [(1,), (1, 3), (1, 3, "a"), (1, 2, None)])
+def test_it_is_made_as_a_dataclass_is(given: tuple[int, ...]) -> None:
+    model, point = Model(*given), Point(*given)  # type: ignore[arg-type]
+    assert (point.x, point.y, point.name) == (model.x, model.y, model.name)
+    assert fields(point) == {"x": model.x, "y": model.y, "name": model.name}
+    assert repr(point) == repr(model).replace("Model", "Point")
+    assert point == Point(x=model.x, y=model.y, name=model.name)
+
+
+@pytest.mark.parametrize(("given", "named"), [((), {}), ((1, 2, "a", 4), {}), ((1,), {"z": 2}), ((1,), {"x": 1})])
+def test_what_does_not_fit_is_refused_as_by_a_dataclass(given: tuple[int, ...], named: dict[str, int]) -> None:
+    for each in (Model, Point):
+        with pytest.raises(TypeError, match="__init__"):
+            each(*given, **named)  # type: ignore[arg-type]
+
+
+def test_it_keeps_its_class_s_own_and_has_nothing_else() -> None:
+    point = Point.at(200)
+    assert (Point.__doc__, Point.__name__, Point.__module__) == ("A place.", "Point", __name__)
+    assert (point.kind, point.far, isinstance(point, Point)) == ("point", True, True)
+    assert not hasattr(point, "__dict__")
+    match point:
+        case Point(x, y):
+            assert (x, y) == (200, 2)
+
+
+def test_it_is_frozen() -> None:
+    point = Point(1)
+    with pytest.raises(AttributeError, match="its x can't be changed"):
+        point.x = 2  # type: ignore[misc]
+    with pytest.raises(AttributeError):
+        point.z = 2  # type: ignore[attr-defined]
+    with pytest.raises(AttributeError):
+        del point.x
+    assert point.x == 1
+
+
+def test_equal_are_values_of_one_class_with_equal_fields() -> None:
+    assert Point(1) == Point(1) != Point(2)
+    assert {Point(1), Point(1), Point(2)} == {Point(2), Point(1)}
+    assert Point(1) != Other(1)  # type: ignore[comparison-overlap]
+    assert Nothing() == Nothing()
+    assert bool(Nothing())
+
+
+def test_replaced_is_another_one() -> None:
+    point = Point(1, name="a")
+    assert replace(point, x=5) == Point(5, 2, "a")
+    assert point == Point(1, 2, "a")
+    with pytest.raises(TypeError, match="z"):
+        replace(point, z=1)
+
+
+def test_a_copy_is_equal() -> None:
+    assert copy.copy(Point(1)) == Point(1)
+    assert copy.deepcopy(Point(1)) == Point(1)
+
+
+def test_it_imports_nothing() -> None:
+    command = "import sys; before = set(sys.modules); import talkcli.values; print(sorted(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-S", "-c", command], capture_output=True, text=True, check=True, cwd=".")
+    assert done.stdout.strip() == "['__future__', 'talkcli', 'talkcli.values']"
