@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import re
 import sys
-from typing import TYPE_CHECKING
 
 from talkcli.requests import MAX_ID
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.requests import Say, Set

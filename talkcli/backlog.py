@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
 
 from talkcli.events import PausedChanged, StateChanged, WordHeard
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.events import Event

@@ -13,7 +13,6 @@ It imports neither click nor asyncio nor pyttsx3, starts no thread, and may be u
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
 
 from talkcli import __version__
 from talkcli.backlog import MAX_STATES, Backlog
@@ -41,6 +40,7 @@ from talkcli.requests import (
     Watch,
 )
 from talkcli.states import State
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
     from talkcli.events import Event
     from talkcli.messages import JsonObject
+    from talkcli.opening import Opened
 
 __all__ = ["Canceled", "Client", "GoalHandle", "ServerStatus"]
 
@@ -63,13 +64,15 @@ class Client:
         interrupt: int | None = None,
         patience: float = ANSWER_LIMIT,
         urgent: bool = False,
+        opened: Opened | None = None,
     ) -> None:
         """Connect.
 
         `socket`: path of the server's socket, default TALK_SOCKET, then the usual places; `name`: what this sender
         calls itself in `talk status` and the log, default TALK_NAME; `interrupt`: a descriptor that ends any waiting
         with talkcli.dial.Interrupted as soon as it is readable; `patience`: seconds in which the server must
-        greet; `urgent`: for status and cancel alone, for which a full server keeps some places.
+        greet; `urgent`: for status and cancel alone, for which a full server keeps some places; `opened`: a connection
+        that talkcli.opening has begun, with the first request that this client will send.
 
         UsageError for a name that is too long; ServerUnavailable, AccessDenied, Busy or ProtocolMismatch where there is
         no server to be had: nothing was sent then.
@@ -82,7 +85,7 @@ class Client:
             raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
         hello = Hello(name, urgent)
         self._connection = Connection(
-            paths.named_socket(socket), hello, __version__, self._followed.hear, interrupt, patience
+            paths.named_socket(socket), hello, __version__, self._followed.hear, interrupt, patience, opened
         )
 
     @property

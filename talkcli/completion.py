@@ -9,7 +9,7 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from talkcli.cli import talk
+from talkcli.cli.commands import talk
 from talkcli.cli.shells import Bash, Fish, Zsh
 
 if TYPE_CHECKING:

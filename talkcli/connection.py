@@ -7,24 +7,24 @@ whose `done` looks at several things sees them together.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import select
 import threading
 import time
+from _socket import SHUT_RDWR, SHUT_WR  # see `peers`
 from collections import deque
 from collections.abc import Callable
-from socket import SHUT_RDWR, SHUT_WR
-from typing import TYPE_CHECKING
 
 from talkcli import wire
 from talkcli.dial import ANSWER_LIMIT, Interrupted, dial, ready
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
 from talkcli.printable import printable
 from talkcli.requests import Say, write_request
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.messages import JsonObject
+    from talkcli.opening import Opened
     from talkcli.requests import Hello, Request
 
 #: Seconds of silence from a server that somebody waits for; it says that it is alive every 5.
@@ -65,8 +65,11 @@ class Connection:
         on_event: Callable[[JsonObject], None],
         interrupt: int | None = None,
         patience: float = ANSWER_LIMIT,
+        opened: Opened | None = None,
     ) -> None:
-        self.line = dial(socket, hello, version, patience, interrupt)
+        self.line = dial(socket, hello, version, patience, interrupt, opened)
+        # The beginning of the first line to be sent, if that was sent before there was this connection.
+        self._sent_early = opened.sent if opened else b""
         self._patience = patience
         self._on_event = on_event
         self._interrupt = interrupt
@@ -90,8 +93,7 @@ class Connection:
         with self.changed:
             self.ended = self.ended or "the connection was closed"
             self._closing = True
-            with contextlib.suppress(OSError):
-                self.line.socket.shutdown(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
+            self._shut(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
             if not self._reading:  # else it would poll a descriptor that may be another file's by now
                 self.line.socket.close()
             self.changed.notify_all()
@@ -236,6 +238,12 @@ class Connection:
             exchange.on_reply(message, exchange.items)
         exchange.reply = message  # now: what can't be understood is no reply
 
+    def _shut(self, direction: int) -> None:
+        try:
+            self.line.socket.shutdown(direction)
+        except OSError:
+            pass  # the server has hung up
+
     def _send(self, data: bytes) -> None:
         """Send a line. What fails here ends nothing that is waited for: the reader still hears what was said before."""
         end = time.monotonic() + ANSWER_LIMIT
@@ -243,7 +251,10 @@ class Connection:
             why = self.ended or self._mute
             if why:
                 raise ServerUnavailable(f"nothing was sent to the server at {self.line.path}: {why}")
-            rest = memoryview(data)
+            if not data.startswith(self._sent_early):
+                raise AssertionError(f"{self._sent_early!r} was sent early instead of {data!r}")
+            rest = memoryview(data)[len(self._sent_early) :]
+            self._sent_early = b""
             while rest:
                 try:
                     rest = rest[self.line.socket.send(rest) :]
@@ -251,8 +262,7 @@ class Connection:
                     if not ready({self.line.socket.fileno(): select.POLLOUT}, end - time.monotonic()):
                         # Half a line may be out: nothing that follows could be understood.
                         self._mute = f"it took nothing for {ANSWER_LIMIT:g} s"
-                        with contextlib.suppress(OSError):
-                            self.line.socket.shutdown(SHUT_WR)
+                        self._shut(SHUT_WR)
                         raise ServerUnavailable(f"the server at {self.line.path} does not answer") from None
                 except OSError as error:
                     self._mute = "the server went away"

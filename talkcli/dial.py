@@ -5,20 +5,21 @@ It sends nothing but `hello`, so whatever fails here is safe to try again.
 
 from __future__ import annotations
 
-import contextlib
+import _socket  # see `peers`
 import errno
 import math
 import os
-import random
 import select
-import socket
 import time
-from dataclasses import dataclass
 
 from talkcli import paths, peers, wire
 from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
 from talkcli.printable import printable
 from talkcli.requests import Hello, write_request
+from talkcli.values import TYPE_CHECKING, frozen
+
+if TYPE_CHECKING:
+    from talkcli.opening import Opened
 
 #: Seconds in which a server greets, and answers each request.
 ANSWER_LIMIT = 5.0
@@ -28,11 +29,11 @@ BUSY_LIMIT = 5.0
 _BUSY_PAUSE = (0.02, 0.2)
 
 
-@dataclass(slots=True)
+@frozen
 class Line:
     """A connection to a server that has greeted, and what was read of it beyond the greeting."""
 
-    socket: socket.socket
+    socket: _socket.socket
     path: str
     #: the server's boot id: the first half of its goals' ids
     boot: str
@@ -53,22 +54,39 @@ class _BacklogFull(ServerUnavailable):
 
 
 def dial(
-    named: str | None, hello: Hello, version: str, patience: float = ANSWER_LIMIT, interrupt: int | None = None
+    named: str | None,
+    hello: Hello,
+    version: str,
+    patience: float = ANSWER_LIMIT,
+    interrupt: int | None = None,
+    opened: Opened | None = None,
 ) -> Line:
     """Return a connection to the first server that answers.
 
     `named`: the only socket to try, or None for the list; `hello`: what is said to it; `version`: the client's own;
-    `patience`: seconds in which the server must greet; `interrupt`: a descriptor that ends it with Interrupted.
+    `patience`: seconds in which the server must greet; `interrupt`: a descriptor that ends it with Interrupted;
+    `opened`: a connection on which `hello` was sent already.
 
     ServerUnavailable, AccessDenied, ProtocolMismatch or Busy where there is none.
     """
     end = time.monotonic() + min(BUSY_LIMIT, patience)
+    if opened:
+        connected = _socket.socket(fileno=opened.descriptor)
+        try:
+            return _greet(connected, opened.path, None, version, patience, interrupt, opened.received)
+        except (Busy, AccessDenied):
+            connected.close()  # nothing but `hello` was sent to such a server: begin again
+        except BaseException:
+            connected.close()
+            raise
     while True:
         try:
             return _try_all(named, hello, version, patience, interrupt)
         except (Busy, _BacklogFull):
             if time.monotonic() >= end:
                 raise
+            import random
+
             _await(None, random.uniform(*_BUSY_PAUSE), interrupt)
 
 
@@ -82,7 +100,7 @@ def ready(watched: dict[int, int], timeout: float | None) -> set[int]:
     return {fd for fd, _ in poll.poll(milliseconds)}
 
 
-def _await(connected: socket.socket | None, timeout: float, interrupt: int | None) -> bool:
+def _await(connected: _socket.socket | None, timeout: float, interrupt: int | None) -> bool:
     """Wait until the server has said something; False after `timeout` seconds."""
     watched = {fd: select.POLLIN for fd in (connected.fileno() if connected else None, interrupt) if fd is not None}
     found = ready(watched, timeout)
@@ -114,8 +132,8 @@ def _try_all(named: str | None, hello: Hello, version: str, patience: float, int
     raise _nobody(failures, denied)
 
 
-def _connect(path: str) -> socket.socket:
-    connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+def _connect(path: str) -> _socket.socket:
+    connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
     try:
         # Not blocking: a server that is stopped and whose backlog is full would hold the client for ever.
         connected.setblocking(False)
@@ -139,7 +157,7 @@ def _why(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _check_owner(connected: socket.socket, path: str, named: bool) -> None:
+def _check_owner(connected: _socket.socket, path: str, named: bool) -> None:
     """Refuse a server that somebody else has put where ours would be: it would hear every sentence."""
     _, uid = peers.credentials(connected)
     if uid not in {os.getuid(), 0} and not named and path != paths.SYSTEM_SOCKET:
@@ -147,13 +165,23 @@ def _check_owner(connected: socket.socket, path: str, named: bool) -> None:
 
 
 def _greet(
-    connected: socket.socket, path: str, hello: Hello, version: str, patience: float, interrupt: int | None
+    connected: _socket.socket,
+    path: str,
+    hello: Hello | None,
+    version: str,
+    patience: float,
+    interrupt: int | None,
+    received: bytes = b"",
 ) -> Line:
+    """Greet, unless that has been done, and be greeted; `received`: what has been read of that."""
     splitter = wire.LineSplitter(limit=None)
-    lines: list[bytes] = []
+    lines = splitter.feed(received)
     try:
-        with contextlib.suppress(BrokenPipeError):  # it has hung up already, but it may have said why
-            connected.send(wire.encode(write_request(hello)))
+        try:
+            if hello:
+                connected.send(wire.encode(write_request(hello)))
+        except BrokenPipeError:
+            pass  # it has hung up already, but it may have said why
         end = time.monotonic() + patience
         while not lines:
             if not _await(connected, end - time.monotonic(), interrupt):
@@ -185,7 +213,7 @@ def _greet(
     )
 
 
-def _next_step(connected: socket.socket) -> str:
+def _next_step(connected: _socket.socket) -> str:
     pid, _ = peers.credentials(connected)
     return f"look at process {pid}, and restart it if it hangs"
 

@@ -12,6 +12,8 @@ EXIT_ERROR = 1
 EXIT_USAGE = 2
 EXIT_TIMEOUT = 124  # as timeout(1)
 EXIT_SIGNAL = 128  # plus the signal's number, as a shell reports it
+EXIT_SIGINT = EXIT_SIGNAL + 2
+EXIT_SIGPIPE = EXIT_SIGNAL + 13  # standard output was closed
 
 
 class TalkError(Exception):

@@ -6,19 +6,18 @@ both alike. A field may be added, never renamed or given another meaning; a read
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
-
 from talkcli.messages import By, Goal
 from talkcli.replies import ServerStatus
 from talkcli.states import State
-from talkcli.values import frozen
+from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from typing import TypeVar
 
     from talkcli.messages import JsonObject
 
-_T = TypeVar("_T")
+    _T = TypeVar("_T")
 
 
 @frozen

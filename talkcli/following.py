@@ -6,10 +6,10 @@ It waits, as a handle does, on the client's connection; it prints nothing and ca
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 from talkcli.connection import SILENCE_LIMIT
 from talkcli.events import PausedChanged, Result, StateChanged, WordHeard
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

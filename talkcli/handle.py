@@ -7,8 +7,6 @@ which handle. Whatever changes a handle does so under the connection's lock, and
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
-from weakref import WeakSet
 
 from talkcli import events
 from talkcli.backlog import Backlog
@@ -16,10 +14,11 @@ from talkcli.connection import SILENCE_LIMIT
 from talkcli.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.requests import Cancel
 from talkcli.states import State
-from talkcli.values import replace
+from talkcli.values import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from weakref import WeakSet
 
     from talkcli.client import Client
     from talkcli.events import Event
@@ -173,8 +172,7 @@ class Followed:
 
     def __init__(self) -> None:
         self._handles: dict[str, list[GoalHandle]] = {}
-        # A watch ends when nobody holds its iterator any more.
-        self._watches: WeakSet[Backlog] = WeakSet()
+        self._watches: WeakSet[Backlog] | None = None
 
     def add(self, handle: GoalHandle, *, feedback: bool) -> None:
         """Tell a handle of its goal from now on."""
@@ -185,6 +183,10 @@ class Followed:
 
     def watch(self, backlog: Backlog) -> None:
         """Put everything that happens into this backlog, as long as somebody holds it."""
+        from weakref import WeakSet  # few watch, and all would wait for the import
+
+        # A watch ends when nobody holds its iterator any more.
+        self._watches = WeakSet() if self._watches is None else self._watches
         self._watches.add(backlog)
 
     def hear(self, message: JsonObject) -> None:
@@ -197,7 +199,7 @@ class Followed:
             self._tell_handles(event)
             # Of the goals that are waited for the states come twice: with the whole goal to those who watch.
             if not isinstance(event, StateChanged) or event.goal or not _tells_all(event.state):
-                for backlog in self._watches:
+                for backlog in self._watches or ():
                     backlog.add(event)
 
     def _tell_handles(self, event: StateChanged | WordHeard | PausedChanged) -> None:

@@ -7,16 +7,16 @@ know; requests, where that would drop what somebody asked for, are in `requests`
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
-
 from talkcli.states import State
-from talkcli.values import frozen
+from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from typing import TypeVar
+
+    _T = TypeVar("_T")
 
 JsonObject = dict[str, object]
-_T = TypeVar("_T")
 
 
 @frozen

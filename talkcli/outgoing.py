@@ -5,14 +5,13 @@ Pure: it sends nothing. What it refuses was never sent.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from talkcli import wire
 from talkcli.admission import MAX_KEY, bad_option, bad_setting
 from talkcli.errors import UnknownGoal, UsageError
 from talkcli.messages import Goal
 from talkcli.requests import MAX_ID, MAX_IDS, Say, write_request
 from talkcli.states import State
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -7,13 +7,13 @@ Text from others always goes through `printable`. What happens as it happens is 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 from talkcli import columns
 from talkcli.columns import GAP, Screen
 from talkcli.printable import printable
 from talkcli.senders import by_whom, who, who_forms, why_forms
 from talkcli.states import State
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from talkcli.messages import Goal
-from talkcli.values import frozen
+from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

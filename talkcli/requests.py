@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, ClassVar, cast
 
 from talkcli.errors import BadRequest
-from talkcli.values import frozen
+from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
+    from typing import ClassVar
+
     from talkcli.messages import JsonObject
 
 #: An id is at most this long; a longer one names no goal that could exist.
@@ -83,12 +84,11 @@ def _name(value: object) -> str:
 
 def _data(value: object) -> JsonObject:
     try:
-        fits = isinstance(value, dict) and len(json.dumps(value)) <= MAX_DATA
+        if isinstance(value, dict) and len(json.dumps(value)) <= MAX_DATA:
+            return value
     except RecursionError:
-        fits = False
-    if not fits:
-        raise ValueError(f"must be an object of at most {MAX_DATA} bytes")
-    return cast("JsonObject", value)
+        pass
+    raise ValueError(f"must be an object of at most {MAX_DATA} bytes")
 
 
 def _optional(check: Check) -> Check:

@@ -6,10 +6,10 @@ Pure. Everything here comes from others, so all of it goes through `printable`.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
 
 from talkcli.printable import printable
 from talkcli.states import State
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.messages import By, Goal, Sender

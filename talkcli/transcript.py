@@ -7,7 +7,6 @@ same order: time, state, id, text, who sent it, why it ended.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 from talkcli import columns
 from talkcli.columns import GAP, Screen, pad
@@ -15,6 +14,7 @@ from talkcli.events import PausedChanged, Result, Snapshot, StateChanged, WordHe
 from talkcli.printable import printable
 from talkcli.senders import who_forms, why_forms
 from talkcli.states import State
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

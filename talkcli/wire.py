@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import math
-from typing import TYPE_CHECKING
 
 from talkcli.errors import BadRequest, Busy, LineTooLong, ProtocolMismatch
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.messages import JsonObject

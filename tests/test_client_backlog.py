@@ -80,7 +80,9 @@ def test_watch_ends_with_its_iterator() -> None:
             break
         client.events()  # not even begun
         client.status()
-        assert len(client._followed._watches) == 0
+        watches = client._followed._watches
+        assert watches is not None
+        assert len(watches) == 0
 
 
 # The same thing twice, and things in parts

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import __version__
-from talkcli.cli import COMMANDS
+from talkcli.cli.commands import COMMANDS
 from tests.conformance.bareserve import TALK, environment, run
 from tests.conformance.rawsocket import GREETING, FakeServer
 from tests.support.surroundings import clean_environment, short_directory

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import completion
-from talkcli.cli import COMMANDS
+from talkcli.cli.commands import COMMANDS
 from tests.conformance.bareserve import TALK, environment, run
 from tests.conformance.rawsocket import GREETING, FakeServer
 from tests.support.connection import PATIENCE

@@ -91,8 +91,7 @@ def begin(talk: Talk, text: str) -> str:
 def test_a_pause_that_is_called_off_before_it_is_silent_is_answered_by_the_resume(scripted: Talk) -> None:
     goal = begin(scripted, "never-ends slow-pause=1")
     with scripted.connect() as wire:
-        wire.send({"seq": 1, "request": "pause"})
-        wire.send({"seq": 2, "request": "resume"})
+        wire.send_raw(b'{"seq": 1, "request": "pause"}\n{"seq": 2, "request": "resume"}\n')
         first, second = wire.receive(), wire.receive()
         assert [(each["seq"], each["ok"], each["paused"]) for each in (first, second)] == [
             (1, True, False),
@@ -105,8 +104,7 @@ def test_a_pause_that_is_called_off_before_it_is_silent_is_answered_by_the_resum
 def test_silence_of_an_earlier_pause_answers_no_later_one(scripted: Talk) -> None:
     begin(scripted, "never-ends stale-pause slow-pause=0.4")
     with scripted.connect() as wire:
-        wire.send({"seq": 1, "request": "pause"})
-        wire.send({"seq": 2, "request": "resume"})
+        wire.send_raw(b'{"seq": 1, "request": "pause"}\n{"seq": 2, "request": "resume"}\n')
         asked = time.monotonic()
         wire.send({"seq": 3, "request": "pause"})
         assert [wire.receive()["seq"] for _ in range(3)] == [1, 2, 3]

@@ -1,170 +1,56 @@
 """The command line. Only this package and `completion` know click, and only here is anything printed or exited.
 
-A command's module is imported when the command is run, so that no command pays for another.
+Scripts call `say`, `wait`, `cancel` and `status` all the time, and importing click takes longer than a server takes to
+answer. So a plain command line of these is read, its request sent, and the rest of the program imported only then; any
+other line, every error in one and all help are click's.
 """
 
 from __future__ import annotations
 
-import errno
-import importlib
 import os
-import signal
 import sys
-from typing import Any, NoReturn
 
-import click
+from talkcli.values import TYPE_CHECKING
 
-from talkcli import __version__
-from talkcli.cli.common import Common, common_options, note, show_error
-from talkcli.errors import EXIT_ERROR, EXIT_SIGNAL, TalkError, UsageError
-from talkcli.printable import printable
-
-#: The commands, in the order in which help lists them: what a newcomer needs first comes first.
-COMMANDS = {
-    "serve": "Run the server, in the foreground.",
-    "say": "Speak a sentence.",
-    "wait": "Wait until goals have ended.",
-    "cancel": "Stop speaking: everything, or what is named.",
-    "status": "What is being said, what will be, what was.",
-    "watch": "Follow all goals as they happen.",
-    "log": "What was said: when, by whom, how it ended.",
-    "pause": "Hold speech where it is.",
-    "resume": "Go on where speech was held.",
-    "set": "Change the running server's settings, or print them.",
-    "voices": "List the voices.",
-}
-
-
-#: What writing says where there is no room, or the terminal is gone.
-_OUTPUT_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-
-
-class _OutputClosed(Exception):
-    """Standard output is closed. Under its own name, because click ends the process with 1 for a broken pipe."""
-
-
-class _Commands(click.Group):
-    """Loads the module of a command when it is needed; lists them all without."""
-
-    def make_context(self, *arguments: Any, **extra: Any) -> click.Context:
-        try:
-            return super().make_context(*arguments, **extra)
-        except BrokenPipeError as error:
-            raise _OutputClosed from error
-
-    def invoke(self, ctx: click.Context) -> object:
-        try:
-            return super().invoke(ctx)
-        except BrokenPipeError as error:
-            raise _OutputClosed from error
-
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
-        if cmd_name not in COMMANDS:
-            return None
-        command: click.Command = importlib.import_module(f"talkcli.cli.{cmd_name}").command
-        return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        name = args[0] if args else ""
-        if ctx.resilient_parsing:  # a shell asks for completion: nothing may be said
-            return super().resolve_command(ctx, args)
-        if name and not name.startswith("-") and name not in COMMANDS:
-            import difflib
-
-            near = difflib.get_close_matches(name, COMMANDS, n=1)
-            hint = f"Did you mean {near[0]!r}?" if near else f'To speak it, write: talk say "{" ".join(args)}"'
-            raise click.UsageError(f"No such command '{name}'. {hint}", ctx)
-        return super().resolve_command(ctx, args)
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
-
-
-@click.group(
-    cls=_Commands,
-    invoke_without_command=True,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="'talk COMMAND --help' says more. Exit codes: 0 succeeded, 3 no server, 4 aborted, 5 rejected, 6 recalled, "
-    "7 preempted, 124 timed out; all of them are in the README.",
-)
-@common_options
-@click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
-@click.pass_context
-def talk(context: click.Context) -> None:
-    """Speech for robots: sentences as goals that can be awaited, cancelled and preempted.
-
-    \b
-      talk serve &                      one server on the robot
-      talk say --wait -- "battery low"  the exit code tells whether it was heard
-      talk cancel                       silence, now
-      talk status                       what it says, will say, has said
-    """
-    context.ensure_object(Common)
-    if context.invoked_subcommand is None:
-        click.echo(context.get_help())
+if TYPE_CHECKING:
+    from typing import NoReturn
 
 
 def main() -> NoReturn:
     """Run the command line, and exit."""
-    sys.exit(run(sys.argv[1:]))
+    code = _run_plain(sys.argv[1:])
+    if code is None:
+        sys.exit(_run_by_click(sys.argv[1:]))
+    # All is written. To tidy up what ends with it anyway would take the interpreter an eighth of the command's life.
+    os._exit(code)
 
 
 def run(arguments: list[str]) -> int:
     """Run a command line, and return its exit code."""
-    options = Common()
+    code = _run_plain(arguments)
+    return _run_by_click(arguments) if code is None else code
+
+
+def _run_plain(arguments: list[str]) -> int | None:
+    """Run a plain command line, and return its exit code; None where it isn't one."""
     _prepare_streams()
     if "_TALK_COMPLETE" in os.environ:
-        return _complete(options)
-    try:
-        code = talk.main(arguments, prog_name="talk", standalone_mode=False, obj=options)
-        if sys.stdout:
-            sys.stdout.flush()
-    except click.ClickException as error:
-        # The options may not have been read as far as --json when the error was found.
-        _show_click_error(error, json=options.json or "--json" in arguments)
-        return error.exit_code
-    except TalkError as error:
-        show_error(error, json=options.json)
-        return error.exit_code
-    except (click.Abort, KeyboardInterrupt):
-        return EXIT_SIGNAL + signal.SIGINT
-    except (_OutputClosed, BrokenPipeError):
-        _give_up_output()
-        return EXIT_SIGNAL + signal.SIGPIPE
-    except Exception as error:
-        if isinstance(error, OSError) and error.errno in _OUTPUT_FULL:
-            _give_up_output()
-            note(f"standard output can't be written: {error.strerror}")
-            return EXIT_ERROR
-        if os.environ.get("TALK_DEBUG"):
-            raise
-        note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
-        return EXIT_ERROR
-    return code if isinstance(code, int) else 0
+        return None
+    from talkcli.cli.plain import read
+
+    plain = read(arguments, os.environ)
+    if plain is None:
+        return None
+    from talkcli.cli.early import carry_out
+
+    return carry_out(plain, arguments)
 
 
-def _give_up_output() -> None:
-    """Write nothing more to standard output, which takes nothing; not even at the interpreter's end."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+def _run_by_click(arguments: list[str]) -> int:
+    from talkcli.cli.commands import run as run_by_click
+    from talkcli.cli.show import Common
 
-
-def _complete(options: Common) -> int:
-    """Answer a shell that asks for completion: what there is to offer, and never a word besides."""
-    from talkcli.cli import shells
-
-    shells.register()
-    try:
-        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # ends by itself
-    except Exception:
-        if os.environ.get("TALK_DEBUG"):
-            raise
-    return EXIT_ERROR
+    return run_by_click(arguments, Common())
 
 
 def _prepare_streams() -> None:
@@ -180,15 +66,3 @@ def _prepare_streams() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-
-
-def _show_click_error(error: click.ClickException, *, json: bool) -> None:
-    """Show a usage error. What was typed may be text of somebody else's, so its controls are escaped."""
-    words = printable(error.format_message())
-    if json:
-        show_error(UsageError(words), json=True)
-    else:
-        context = getattr(error, "ctx", None)
-        if context is not None:
-            click.echo(f"{context.get_usage()}\nTry '{context.command_path} --help' for help.\n", err=True)
-        click.echo(f"Error: {words}", err=True)

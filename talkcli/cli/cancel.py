@@ -5,9 +5,8 @@ from __future__ import annotations
 import click
 
 from talkcli.cli import complete
-from talkcli.cli.common import Common, common, common_options, filled, note, show, show_json
-from talkcli.client import Canceled
-from talkcli.errors import EXIT_OK, UnknownGoal
+from talkcli.cli.asking import cancel
+from talkcli.cli.common import common, common_options, filled
 
 
 @click.command("cancel")
@@ -42,22 +41,4 @@ def command(context: click.Context, ids: tuple[str, ...], current: bool, before:
 
     Exit codes: 0 done; 3 no server; 8 an ID is unknown (the others are cancelled all the same).
     """
-    options = common(context)
-    with options.connect(urgent=True) as client:
-        try:
-            _show(client.cancel(ids or None, current=current, before=before, key=key), options)
-        except UnknownGoal as error:
-            _show(Canceled.from_items(error.items), options)
-            raise
-    return EXIT_OK
-
-
-def _show(done: Canceled, options: Common) -> None:
-    for goal in done.canceled:
-        if options.json:
-            show_json(goal.to_json())
-        elif not options.quiet:
-            show(goal.id)
-    for goal in done.ended:
-        if not options.quiet:
-            note(f"{goal.id} had ended already: {goal.state.name}")
+    return cancel(common(context), ids, current, before, key)

@@ -11,21 +11,22 @@ import select
 import signal
 import sys
 import threading
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from talkcli.cli.common import colourful, note, show, show_json
+from talkcli.cli.show import colourful, note, show, show_json
 from talkcli.columns import Screen
 from talkcli.dial import ready
 from talkcli.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.lighting import Sentence
 from talkcli.printable import printable
 from talkcli.states import State
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from types import FrameType
 
-    from talkcli.cli.common import Common
+    from talkcli.cli.show import Common
     from talkcli.events import Event
     from talkcli.messages import Goal
 

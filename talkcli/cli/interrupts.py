@@ -5,14 +5,14 @@ All of them become a descriptor that is readable then, so that they never cut a 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
-from typing import TYPE_CHECKING
 
 from talkcli.errors import EXIT_SIGNAL, EXIT_TIMEOUT
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from types import FrameType, TracebackType
 
 _CAUGHT = (signal.SIGINT, signal.SIGTERM)
@@ -23,11 +23,15 @@ _LONGEST = 1e8
 class Interrupts:
     """Catches SIGINT and SIGTERM: `descriptor` becomes readable, `number` is the signal. A second one ends at once."""
 
-    def __init__(self, timeout: float | None = None) -> None:
-        """`timeout`: seconds after which it becomes readable by itself, and `late` true; counted from the `with`."""
+    def __init__(self, timeout: float | None = None, held: Iterable[int] = ()) -> None:
+        """`timeout`: seconds after which it becomes readable by itself, and `late` true; counted from the `with`.
+
+        `held`: signals that were blocked until somebody should catch them.
+        """
         self.number: int | None = None
         self.late = False
         self._timeout = timeout
+        self._held = held
 
     @property
     def exit_code(self) -> int:
@@ -44,6 +48,8 @@ class Interrupts:
         if self._timeout is not None:
             self._before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._expired)
             signal.setitimer(signal.ITIMER_REAL, max(1e-6, min(self._timeout, _LONGEST)))  # 0 would be for never
+        if self._held:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, self._held)
         return self
 
     def __exit__(
@@ -59,13 +65,17 @@ class Interrupts:
     def clear(self) -> None:
         """Make the descriptor wait for another signal; there is none, a second one ends the process."""
         os.set_blocking(self.descriptor, False)
-        with contextlib.suppress(BlockingIOError):
+        try:
             os.read(self.descriptor, 16)
+        except BlockingIOError:
+            pass
 
     def wake(self) -> None:
         """Make the descriptor readable, from any thread: there is something else to see to."""
-        with contextlib.suppress(BlockingIOError):  # it is readable, many times over
+        try:
             os.write(self._write, b"\0")
+        except BlockingIOError:
+            pass  # it is readable, many times over
 
     def _caught(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         if self.number is not None:

@@ -12,9 +12,9 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from talkcli import output
-from talkcli.cli.common import note, show, show_error, show_json
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import SILENCE, SPEECH_IS_PAUSED, exit_code, report, until_ended
+from talkcli.cli.show import note, show, show_error, show_json
 from talkcli.cli.stdin import LineReader
 from talkcli.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
@@ -24,8 +24,8 @@ from talkcli.states import State
 from talkcli.text import MAX_BYTES
 
 if TYPE_CHECKING:
-    from talkcli.cli.common import Common
     from talkcli.cli.feedback import Feedback
+    from talkcli.cli.show import Common
     from talkcli.cli.stdin import Line
     from talkcli.client import Client, GoalHandle
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
-from talkcli.cli.common import common, common_options, screen, show, show_json
-from talkcli.errors import EXIT_OK
+from talkcli.cli.asking import log
+from talkcli.cli.common import common, common_options
 from talkcli.requests import MAX_LOG
 
 
@@ -34,15 +34,4 @@ def command(context: click.Context, count: int) -> int:
 
     Exit codes: 0 listed; 3 no server.
     """
-    from talkcli.transcript import log_lines
-
-    options = common(context)
-    with options.connect() as client:
-        goals = client.log(count)
-    if options.json:
-        for goal in goals:
-            show_json(goal.to_json())
-    else:
-        for line in log_lines(goals, screen()):
-            show(line)
-    return EXIT_OK
+    return log(common(context), count)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
-from talkcli.cli.common import note, show_json
+from talkcli.cli.show import note, show_json
 from talkcli.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.states import EXIT_CODES, State
+from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from talkcli.cli.common import Common
     from talkcli.cli.feedback import Feedback
     from talkcli.cli.interrupts import Interrupts
+    from talkcli.cli.show import Common
     from talkcli.client import GoalHandle
     from talkcli.messages import Goal
 

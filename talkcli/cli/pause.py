@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import click
 
-from talkcli.cli.common import Common, common, common_options, note, show_json
-from talkcli.errors import EXIT_OK
-from talkcli.printable import printable
-
-if TYPE_CHECKING:
-    from talkcli.messages import Goal
-
-#: Characters of what was heard last that are shown.
-_MAX_SPOKEN = 40
+from talkcli.cli.asking import pause
+from talkcli.cli.common import common, common_options
 
 
 @click.command("pause")
@@ -30,23 +21,4 @@ def command(context: click.Context) -> int:
 
     Exit codes: 0 speech is held; 3 no server.
     """
-    options = common(context)
-    with options.connect() as client:
-        held = client.pause()
-    heard = held.spoken[-_MAX_SPOKEN:] if held and held.spoken else ""
-    where = f', after "{printable(heard)}"' if heard else ""
-    tell(
-        options,
-        held,
-        paused=True,
-        words=f"{printable(held.id)} is held{where}" if held else "nothing is being spoken, and nothing will be",
-    )
-    return EXIT_OK
-
-
-def tell(options: Common, goal: Goal | None, *, paused: bool, words: str) -> None:
-    """Tell what became of speech, and of the goal that was held."""
-    if options.json:
-        show_json({"paused": paused, "goal": None if goal is None else goal.to_json()})
-    elif not options.quiet:
-        note(f"{words}; 'talk resume' goes on" if paused else words)
+    return pause(common(context))

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from talkcli.cli.common import note, show_json
 from talkcli.cli.interrupts import Interrupts
+from talkcli.cli.show import note, show_json
 from talkcli.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
 
 if TYPE_CHECKING:
-    from talkcli.cli.common import Common
+    from talkcli.cli.show import Common
     from talkcli.messages import JsonObject
 
 #: Settings, and the variables that hold for them where nothing is spoken: a server has its own.

@@ -3,39 +3,18 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 from click.core import ParameterSource
 
 from talkcli.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
 from talkcli.cli import complete
-from talkcli.cli.common import (
-    Common,
-    common,
-    common_options,
-    filled,
-    note,
-    number,
-    seconds,
-    show,
-    show_error,
-    show_json,
-    timeout_option,
-)
-from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.outcome import SPEECH_IS_PAUSED, give_up, report, rest, until_ended
-from talkcli.dial import ANSWER_LIMIT, Interrupted
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost
+from talkcli.cli.common import common, common_options, filled, number, seconds, timeout_option
+from talkcli.cli.outcome import rest
+from talkcli.cli.saying import GOAL_OPTIONS, say
 from talkcli.requests import Say
-from talkcli.states import State
 
-if TYPE_CHECKING:
-    from talkcli.cli.feedback import Feedback
-    from talkcli.client import GoalHandle
-
-#: Options of a goal, by the names that `Client.say` has for them.
-_GOAL = ("preempt", "flush", "priority", "ttl", "key", "throttle", "id", "rate", "volume", "voice", "pitch")
 #: Options that mean something to a server alone.
 _SERVER_ONLY = ("wait", "feedback", "lines", "preempt", "flush", "priority", "ttl", "key", "throttle", "id", "name")
 
@@ -144,7 +123,7 @@ def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> i
     _check(context, text, given)
     timeout, options = given["timeout"], common(context)
     end = None if timeout is None else began + timeout
-    goal_options = {name: given[name] for name in _GOAL}
+    goal_options = {name: given[name] for name in GOAL_OPTIONS}
     fault = bad_option(Say("", **goal_options))
     if fault is not None:
         raise click.UsageError(fault, context)
@@ -161,24 +140,7 @@ def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> i
         from talkcli.cli.rendering import render_to, settings
 
         return render_to(given["output"], sentence, settings(context, given), rest(end), options)
-    with Interrupts() as interrupts:
-        try:
-            patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
-            with options.connect(name=given["name"], interrupt=interrupts.descriptor, patience=patience) as client:
-                if interrupts.number is not None:
-                    raise Interrupted
-                goal = client.say(sentence, follow=given["wait"], feedback=given["feedback"], **goal_options)
-                shown = _feedback(options) if given["feedback"] else None
-                if not given["wait"] or goal.state is State.REJECTED:
-                    return _tell(goal, options, shown)
-                return _wait(goal, interrupts, end, options, shown)
-        except Interrupted:
-            return interrupts.exit_code
-        except Lost as error:
-            if interrupts.number is None and (end is None or time.monotonic() < end):
-                raise
-            show_error(error, json=options.json)
-            return interrupts.exit_code
+    return say(options, sentence, given, end)
 
 
 def _check(context: click.Context, text: tuple[str, ...], given: dict[str, Any]) -> None:
@@ -211,65 +173,3 @@ def _spelt(context: click.Context, name: str, value: object) -> str:
     """Return an option as it was typed, in its long form."""
     parameter = next(each for each in context.command.params if each.name == name)
     return (parameter.secondary_opts if value is False and parameter.secondary_opts else parameter.opts)[-1]
-
-
-def _feedback(options: Common) -> Feedback:
-    from talkcli.cli.feedback import feedback
-
-    return feedback(options)
-
-
-def _tell(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
-    """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
-    if goal.state is State.REJECTED:
-        if shown and options.json:
-            until_ended(goal, None, shown)
-        return report(goal.goal, options, shown)
-    _introduce(goal, options, shown)
-    if goal.state.terminal:
-        return report(goal.goal, options)
-    if options.json:
-        show_json(goal.goal.to_json())
-    return EXIT_OK
-
-
-def _introduce(goal: GoalHandle, options: Common, shown: Feedback | None) -> None:
-    """Print the id of a goal that was accepted, and why it may take long."""
-    if options.quiet:
-        return
-    if not options.json and shown is None:
-        show(goal.id)
-    if goal.speech_paused and not goal.state.terminal:
-        note(SPEECH_IS_PAUSED)
-
-
-def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common, shown: Feedback | None) -> int:
-    """Wait for a goal. It is this command's own: where it can't wait any longer, the goal ends too; unless another
-    `say` had sent it before, with the same id.
-    """
-    _introduce(goal, options, shown)
-    try:
-        if shown:
-            shown.begin([goal.goal])
-        until_ended(goal, rest(end), shown)
-    except (Interrupted, TimeoutError):
-        timed_out = interrupts.number is None
-        if goal.attached:
-            return _leave(goal, interrupts, shown)
-        give_up(goal, interrupts, shown)
-        code = report(goal.goal, options, shown)
-        if interrupts.number is not None and not timed_out:
-            return interrupts.exit_code
-        return code if goal.state is State.SUCCEEDED else EXIT_TIMEOUT
-    finally:
-        if shown:
-            shown.close()
-    return report(goal.goal, options, shown)
-
-
-def _leave(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> int:
-    """Stop watching a goal that is another's, which goes on."""
-    if interrupts.number is None:
-        tell = shown.aside if shown else note
-        tell(f"{goal.id} has not ended within the time, and goes on: it was sent before")
-    return interrupts.exit_code

@@ -9,7 +9,8 @@ import click
 from click.core import ParameterSource
 
 from talkcli.cli import complete, units
-from talkcli.cli.common import common, common_options, filled, note, number, seconds, show
+from talkcli.cli.common import common, common_options, filled, number, seconds
+from talkcli.cli.show import note, show
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE, Settings
 
 #: Milliseconds of silence before a sentence: no output needs longer to wake.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
-from talkcli import output
 from talkcli.admission import PITCHES, RATES, VOLUMES
 from talkcli.cli import complete
-from talkcli.cli.common import common, common_options, filled, number, seconds, show, show_json
-from talkcli.errors import EXIT_OK
+from talkcli.cli.asking import change
+from talkcli.cli.common import common, common_options, filled, number, seconds
 
 
 @click.command("set")
@@ -35,7 +36,7 @@ from talkcli.errors import EXIT_OK
 )
 @common_options
 @click.pass_context
-def command(context: click.Context, /, **changes: object) -> int:
+def command(context: click.Context, /, **changes: Any) -> int:
     """Change settings of the running server; without an option, print them.
 
     They hold for each goal that doesn't bring its own, from the next one that begins; --preempt and --ttl from the
@@ -48,13 +49,4 @@ def command(context: click.Context, /, **changes: object) -> int:
 
     Exit codes: 0 done; 2 a value out of its range, or an unknown voice: nothing was changed; 3 no server.
     """
-    options = common(context)
-    asked = {name: value for name, value in changes.items() if value is not None}
-    with options.connect() as client:
-        settings = client.set(**asked) if asked else client.settings()  # type: ignore[arg-type]
-    if options.json:
-        show_json(settings)
-    elif not asked:
-        for line in output.setting_lines(settings):
-            show(line)
-    return EXIT_OK
+    return change(common(context), **changes)

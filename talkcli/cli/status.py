@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import click
 
-from talkcli import output
 from talkcli.cli import complete
-from talkcli.cli.common import common, common_options, screen, show, show_json
-from talkcli.errors import EXIT_OK
+from talkcli.cli.asking import status
+from talkcli.cli.common import common, common_options
 
 
 @click.command("status")
@@ -24,23 +23,4 @@ def command(context: click.Context, goal_id: str | None) -> int:
 
     Exit codes: 0 the server runs; 3 no server; 8 unknown goal.
     """
-    options = common(context)
-    with options.connect(urgent=True) as client:
-        if goal_id is not None:
-            goal = client.goal(goal_id)
-            if options.json:
-                show_json(goal.to_json())
-            else:
-                _show_lines(output.goal_lines(goal, screen()))
-            return EXIT_OK
-        status = client.status()
-    if options.json:
-        show_json(status.to_json())
-    else:
-        _show_lines(output.status_lines(status, screen()))
-    return EXIT_OK
-
-
-def _show_lines(lines: list[str]) -> None:
-    for line in lines:
-        show(line)
+    return status(common(context), goal_id)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import click
 
-from talkcli import output
-from talkcli.cli.common import common, common_options, note, show, show_json
-from talkcli.errors import EXIT_OK
+from talkcli.cli.asking import voices
+from talkcli.cli.common import common, common_options
 
 
 @click.command("voices")
@@ -25,22 +24,4 @@ def command(context: click.Context, language: str | None) -> int:
 
     Exit codes: 0 listed; 3 no server; 1 the engine can't list them.
     """
-    options = common(context)
-    with options.connect() as client:
-        voices = client.voices()
-    if language:
-        wanted = language.lower()
-        voices = [each for each in voices if _language(each) == wanted or _language(each).startswith(f"{wanted}-")]
-        if not voices and not options.quiet:
-            note(f"no voice speaks {language!r}: 'talk voices' lists all")
-    if options.json:
-        for voice in voices:
-            show_json(voice)
-    else:
-        for line in output.voice_lines(voices):
-            show(line)
-    return EXIT_OK
-
-
-def _language(voice: dict[str, object]) -> str:
-    return str(voice.get("language") or "").lower()
+    return voices(common(context), language)

@@ -11,8 +11,9 @@ import threading
 
 import click
 
-from talkcli.cli.common import Common, common, common_options, screen, show, show_json
+from talkcli.cli.common import common, common_options
 from talkcli.cli.interrupts import Interrupts
+from talkcli.cli.show import Common, screen, show, show_json
 from talkcli.dial import Interrupted
 from talkcli.errors import EXIT_SIGNAL
 from talkcli.transcript import Transcript

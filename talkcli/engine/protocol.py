@@ -186,7 +186,7 @@ _EVENTS = {each.kind: each for each in (Ready, StartFailed, Started, Alive, Word
 
 def encode(message: Command | Event) -> bytes:
     """Return the message as a line."""
-    return json.dumps({"kind": message.kind, **fields(message)}, ensure_ascii=True).encode() + b"\n"
+    return json.dumps({"kind": message.kind, **fields(message)}, ensure_ascii=True, default=fields).encode() + b"\n"
 
 
 def decode_command(line: bytes) -> Command:

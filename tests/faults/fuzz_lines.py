@@ -90,7 +90,10 @@ def fuzz(seed: int, *, count: int | None = None, seconds: float | None = None) -
     end = None if seconds is None else time.monotonic() + seconds
     talk = Talk(scripted=True, watched=False)
     try:
-        before = census.count(talk.pid)
+        with talk.connect() as wire:
+            assert wire.request("say", text="length=0", wait=True)["ok"]
+            assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+        before = census.count(talk.pid)  # the engine runs
         while (count is None or report.lines < count) and (end is None or time.monotonic() < end):
             _send_batch(talk, list(islice(lines, ON_ONE)), report)
         with talk.connect() as wire:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import click
 import pytest
 
-from talkcli import admission, cli, errors, states, text, wire
+from talkcli import admission, errors, states, text, wire
+from talkcli.cli import commands
 from talkcli.history import MAX_ENDED, MAX_REJECTED
 from talkcli.messages import Goal
 from talkcli.requests import KINDS, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
@@ -227,14 +228,14 @@ def test_exit_codes_are_in_the_table() -> None:
 
 
 def command(name: str) -> click.Command:
-    found = cli.talk.get_command(click.Context(cli.talk), name)
+    found = commands.talk.get_command(click.Context(commands.talk), name)
     assert found, name
     return found
 
 
 def options(name: str) -> set[str]:
     """Return the options of a command that it doesn't share with all others."""
-    shared = {each.name for each in cli.talk.params}
+    shared = {each.name for each in commands.talk.params}
     own = [each for each in command(name).params if isinstance(each, click.Option) and each.name not in shared]
     return {form for each in own for form in (*each.opts, *each.secondary_opts)}
 
@@ -243,7 +244,7 @@ def test_commands_and_their_options_are_in_the_table() -> None:
     rows: dict[str, str] = {}
     for row in tables(section("Commands"))[0][1:]:
         rows |= {each.split()[0]: row[2] for each in words(row[0])}
-    assert sorted(rows) == sorted(cli.COMMANDS)
+    assert sorted(rows) == sorted(commands.COMMANDS)
     for name, documented in rows.items():
         assert {form for each in words(documented) for form in each.split("/")} == options(name), name
 
@@ -252,18 +253,18 @@ def test_every_command_in_the_examples_can_be_read() -> None:
     """Its options are the command's own; what stands around it is the shell's business."""
     seen = set()
     for name, rest in re.findall(r"\btalk (?:--json )?([a-z]+)\b([^|#;&\n]*)", "".join(examples("sh"))):
-        if name not in cli.COMMANDS:
+        if name not in commands.COMMANDS:
             continue
         seen.add(name)
-        shared = {form for each in cli.talk.params for form in each.opts}
+        shared = {form for each in commands.talk.params for form in each.opts}
         for option in re.findall(r"(?<!\S)(--?[a-z][a-z-]*)", rest.split(" -- ")[0]):
             assert option in options(name) | shared, f"talk {name}{rest}"
-    assert seen == set(cli.COMMANDS)
+    assert seen == set(commands.COMMANDS)
 
 
 def test_readme_has_the_setup_commands_as_they_were() -> None:
-    commands = [each for each in examples("sh") if "venv" in each]
-    assert commands == [
+    setup = [each for each in examples("sh") if "venv" in each]
+    assert setup == [
         "python3 -m venv .venv && . .venv/bin/activate && pip install . && "
         '{ talk serve & sleep 3; talk say "battery low" --wait; }\n',
         "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest -n 3\n",

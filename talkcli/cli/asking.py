@@ -1,0 +1,167 @@
+"""The commands that ask the server for one thing and show what it says, once their command line has been read.
+
+They know no click: plain command lines come here without it.
+"""
+
+from __future__ import annotations
+
+from talkcli.cli.show import note, screen, show, show_json
+from talkcli.errors import EXIT_OK, UnknownGoal
+from talkcli.values import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from typing import Any
+
+    from talkcli.cli.show import Common
+    from talkcli.messages import Goal, JsonObject
+    from talkcli.opening import Opened
+    from talkcli.replies import Canceled
+
+#: Characters of what was heard last that are shown of a goal that is held.
+_MAX_SPOKEN = 40
+
+
+def cancel(
+    options: Common,
+    ids: tuple[str, ...],
+    current: bool,
+    before: str | None,
+    key: str | None,
+    opened: Opened | None = None,
+) -> int:
+    """Cancel what these select, or everything, and return the exit code. `opened`: the connection, if it has been."""
+    with options.connect(urgent=True, opened=opened) as client:
+        try:
+            _show_canceled(client.cancel(ids or None, current=current, before=before, key=key), options)
+        except UnknownGoal as error:
+            from talkcli.replies import Canceled
+
+            _show_canceled(Canceled.from_items(error.items), options)
+            raise
+    return EXIT_OK
+
+
+def status(options: Common, goal_id: str | None, opened: Opened | None = None) -> int:
+    """Show how the server stands, or one goal, and return the exit code."""
+    from talkcli import output
+
+    with options.connect(urgent=True, opened=opened) as client:
+        found = client.status() if goal_id is None else None
+        goal = None if goal_id is None else client.goal(goal_id)
+    if options.json:
+        show_json((found or goal).to_json())  # type: ignore[union-attr]
+    else:
+        _show_lines(output.status_lines(found, screen()) if found else output.goal_lines(goal, screen()))  # type: ignore[arg-type]
+    return EXIT_OK
+
+
+def log(options: Common, count: int, opened: Opened | None = None) -> int:
+    """Show the goals that ended last, and return the exit code."""
+    from talkcli.transcript import log_lines
+
+    with options.connect(opened=opened) as client:
+        goals = client.log(count)
+    if options.json:
+        for goal in goals:
+            show_json(goal.to_json())
+    else:
+        _show_lines(log_lines(goals, screen()))
+    return EXIT_OK
+
+
+def voices(options: Common, language: str | None, opened: Opened | None = None) -> int:
+    """Show the engine's voices, or those of a language with its variants, and return the exit code."""
+    from talkcli import output
+
+    with options.connect(opened=opened) as client:
+        found = client.voices()
+    if language:
+        wanted = language.lower()
+        found = [each for each in found if _language(each) == wanted or _language(each).startswith(f"{wanted}-")]
+        if not found and not options.quiet:
+            note(f"no voice speaks {language!r}: 'talk voices' lists all")
+    if options.json:
+        for voice in found:
+            show_json(voice)
+    else:
+        _show_lines(output.voice_lines(found))
+    return EXIT_OK
+
+
+def change(options: Common, opened: Opened | None = None, **settings: Any) -> int:
+    """Change those settings of the server that aren't None, or show them all, and return the exit code."""
+    from talkcli import output
+
+    asked = {name: value for name, value in settings.items() if value is not None}
+    with options.connect(opened=opened) as client:
+        found = client.set(**asked) if asked else client.settings()
+    if options.json:
+        show_json(found)
+    elif not asked:
+        _show_lines(output.setting_lines(found))
+    return EXIT_OK
+
+
+def pause(options: Common, opened: Opened | None = None) -> int:
+    """Hold speech, and return the exit code."""
+    with options.connect(opened=opened) as client:
+        held = client.pause()
+    from talkcli.printable import printable
+
+    heard = held.spoken[-_MAX_SPOKEN:] if held and held.spoken else ""
+    where = f', after "{printable(heard)}"' if heard else ""
+    words = f"{printable(held.id)} is held{where}" if held else "nothing is being spoken, and nothing will be"
+    _tell(options, held, paused=True, words=f"{words}; 'talk resume' goes on")
+    return EXIT_OK
+
+
+def resume(options: Common, opened: Opened | None = None) -> int:
+    """Go on where speech is held, and return the exit code."""
+    with options.connect(opened=opened) as client:
+        goal = client.resume()
+    from talkcli.printable import printable
+
+    words = f"speech goes on with {printable(goal.id)}" if goal else "speech goes on"
+    _tell(options, goal, paused=False, words=words)
+    return EXIT_OK
+
+
+#: Each of them by its command's name; called with the options that click or `plain` has read, by their names.
+COMMANDS: dict[str, Callable[..., int]] = {
+    "cancel": cancel,
+    "status": status,
+    "log": log,
+    "voices": voices,
+    "set": change,
+    "pause": pause,
+    "resume": resume,
+}
+
+
+def _show_canceled(done: Canceled, options: Common) -> None:
+    for goal in done.canceled:
+        if options.json:
+            show_json(goal.to_json())
+        elif not options.quiet:
+            show(goal.id)
+    for goal in done.ended:
+        if not options.quiet:
+            note(f"{goal.id} had ended already: {goal.state.name}")
+
+
+def _show_lines(lines: Iterable[str]) -> None:
+    for line in lines:
+        show(line)
+
+
+def _language(voice: JsonObject) -> str:
+    return str(voice.get("language") or "").lower()
+
+
+def _tell(options: Common, goal: Goal | None, *, paused: bool, words: str) -> None:
+    """Tell what became of speech, and of the goal that was held."""
+    if options.json:
+        show_json({"paused": paused, "goal": None if goal is None else goal.to_json()})
+    elif not options.quiet:
+        note(words)

@@ -1,0 +1,55 @@
+"""How a command ends: whatever it raises becomes words on standard error and an exit code."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+
+from talkcli import __version__
+from talkcli.cli.show import note, show_error
+from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, TalkError
+from talkcli.values import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from talkcli.cli.show import Common
+
+#: What writing says where there is no room, or the terminal is gone.
+_OUTPUT_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+
+
+class OutputClosed(Exception):
+    """Standard output is closed. Under its own name, because click ends the process with 1 for a broken pipe."""
+
+
+def ended(command: Callable[[], object], options: Common) -> int:
+    """Run a command, and return its exit code: what it returns, if that is a number, else 0; or that of its error."""
+    try:
+        code = command()
+        if sys.stdout:
+            sys.stdout.flush()
+    except TalkError as error:
+        show_error(error, json=options.json)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return EXIT_SIGINT
+    except (OutputClosed, BrokenPipeError):
+        _give_up_output()
+        return EXIT_SIGPIPE
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in _OUTPUT_FULL:
+            _give_up_output()
+            note(f"standard output can't be written: {error.strerror}")
+            return EXIT_ERROR
+        if os.environ.get("TALK_DEBUG"):
+            raise
+        note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
+        return EXIT_ERROR
+    return code if isinstance(code, int) else 0
+
+
+def _give_up_output() -> None:
+    """Write nothing more to standard output, which takes nothing; not even at the interpreter's end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -1,0 +1,130 @@
+"""`talk say` of one sentence, once its command line has been read: send it, wait for it, tell how it ended.
+
+It knows no click: plain command lines come here without it.
+"""
+
+from __future__ import annotations
+
+import time
+
+from talkcli.cli.interrupts import Interrupts
+from talkcli.cli.outcome import SPEECH_IS_PAUSED, give_up, report, rest, until_ended
+from talkcli.cli.show import note, show, show_error, show_json
+from talkcli.dial import ANSWER_LIMIT, Interrupted
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost
+from talkcli.states import State
+from talkcli.values import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from typing import Any
+
+    from talkcli.cli.feedback import Feedback
+    from talkcli.cli.show import Common
+    from talkcli.client import GoalHandle
+    from talkcli.opening import Opened
+
+#: Options of a goal, by the names that `Client.say` has for them.
+GOAL_OPTIONS = ("preempt", "flush", "priority", "ttl", "key", "throttle", "id", "rate", "volume", "voice", "pitch")
+
+
+def say(
+    options: Common,
+    text: str,
+    given: dict[str, Any],
+    end: float | None,
+    opened: Opened | None = None,
+    held: Iterable[int] = (),
+) -> int:
+    """Speak a text, and return the exit code.
+
+    `given`: the options, by their names, GOAL_OPTIONS and `wait`, `feedback`, `name`, `timeout`; `end`: when it is
+    given up, by the monotonic clock; `opened`: the connection, where it has been begun; `held`: signals that wait.
+    """
+    with Interrupts(held=held) as interrupts:
+        try:
+            patience = min(ANSWER_LIMIT, given["timeout"] or ANSWER_LIMIT)
+            with options.connect(
+                name=given["name"], interrupt=interrupts.descriptor, patience=patience, opened=opened
+            ) as client:
+                if interrupts.number is not None:
+                    raise Interrupted
+                goal = client.say(
+                    text,
+                    follow=given["wait"],
+                    feedback=given["feedback"],
+                    **{name: given[name] for name in GOAL_OPTIONS},
+                )
+                shown = _feedback(options) if given["feedback"] else None
+                if not given["wait"] or goal.state is State.REJECTED:
+                    return _tell(goal, options, shown)
+                return _wait(goal, interrupts, end, options, shown)
+        except Interrupted:
+            return interrupts.exit_code
+        except Lost as error:
+            if interrupts.number is None and (end is None or time.monotonic() < end):
+                raise
+            show_error(error, json=options.json)
+            return interrupts.exit_code
+
+
+def _feedback(options: Common) -> Feedback:
+    from talkcli.cli.feedback import feedback
+
+    return feedback(options)
+
+
+def _tell(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
+    """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
+    if goal.state is State.REJECTED:
+        if shown and options.json:
+            until_ended(goal, None, shown)
+        return report(goal.goal, options, shown)
+    _introduce(goal, options, shown)
+    if goal.state.terminal:
+        return report(goal.goal, options)
+    if options.json:
+        show_json(goal.goal.to_json())
+    return EXIT_OK
+
+
+def _introduce(goal: GoalHandle, options: Common, shown: Feedback | None) -> None:
+    """Print the id of a goal that was accepted, and why it may take long."""
+    if options.quiet:
+        return
+    if not options.json and shown is None:
+        show(goal.id)
+    if goal.speech_paused and not goal.state.terminal:
+        note(SPEECH_IS_PAUSED)
+
+
+def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common, shown: Feedback | None) -> int:
+    """Wait for a goal. It is this command's own: where it can't wait any longer, the goal ends too; unless another
+    `say` had sent it before, with the same id.
+    """
+    _introduce(goal, options, shown)
+    try:
+        if shown:
+            shown.begin([goal.goal])
+        until_ended(goal, rest(end), shown)
+    except (Interrupted, TimeoutError):
+        timed_out = interrupts.number is None
+        if goal.attached:
+            return _leave(goal, interrupts, shown)
+        give_up(goal, interrupts, shown)
+        code = report(goal.goal, options, shown)
+        if interrupts.number is not None and not timed_out:
+            return interrupts.exit_code
+        return code if goal.state is State.SUCCEEDED else EXIT_TIMEOUT
+    finally:
+        if shown:
+            shown.close()
+    return report(goal.goal, options, shown)
+
+
+def _leave(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> int:
+    """Stop watching a goal that is another's, which goes on."""
+    if interrupts.number is None:
+        tell = shown.aside if shown else note
+        tell(f"{goal.id} has not ended within the time, and goes on: it was sent before")
+    return interrupts.exit_code

@@ -1,0 +1,94 @@
+"""What all commands share in showing: the options that say how, lines on standard output, notes on standard error."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from talkcli import wire
+from talkcli.values import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from talkcli.client import Client
+    from talkcli.columns import Screen
+    from talkcli.errors import TalkError
+    from talkcli.messages import JsonObject
+
+#: Columns of a terminal that doesn't say how many it has.
+_USUAL_WIDTH = 80
+
+
+class Common:
+    """The options that every command has."""
+
+    __slots__ = ("json", "quiet", "socket")
+
+    def __init__(self, socket: str | None = None, *, json: bool = False, quiet: bool = False) -> None:
+        self.socket = socket
+        self.json = json
+        self.quiet = quiet
+
+    def connect(self, **options: Any) -> Client:
+        """Return a client connected to the server; see `Client` for the options."""
+        from talkcli.client import Client
+
+        return Client(self.socket, **options)
+
+
+def show(line: str) -> None:
+    """Write a line of data to standard output, at once; BrokenPipeError where that is closed."""
+    if sys.stdout is None:
+        raise BrokenPipeError("standard output is closed")
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def show_json(message: JsonObject) -> None:
+    """Write an object as a line of JSON, in UTF-8 whatever the locale is; BrokenPipeError as `show`."""
+    if sys.stdout is None:
+        raise BrokenPipeError("standard output is closed")
+    sys.stdout.flush()
+    sys.stdout.buffer.write(wire.encode(message))
+    sys.stdout.buffer.flush()
+
+
+def note(words: str) -> None:
+    """Write something for people to standard error."""
+    if sys.stderr is not None:
+        sys.stderr.write(f"talk: {words}\n")
+        sys.stderr.flush()
+
+
+def show_error(error: TalkError, *, json: bool) -> None:
+    """Write an error to standard error."""
+    if not json:
+        note(error.message)
+    elif sys.stderr is not None:
+        fields: JsonObject = {"code": error.code, "exit": error.exit_code, "message": error.message}
+        sys.stderr.flush()
+        sys.stderr.buffer.write(wire.encode({"error": fields}))
+        sys.stderr.buffer.flush()
+
+
+def colourful() -> bool:
+    """Whether standard output takes colour."""
+    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def screen() -> Screen:
+    """Return what standard output is at this moment: how wide, if it is a terminal, and whether it takes colour."""
+    from talkcli.columns import Screen
+
+    if sys.stdout is None or not sys.stdout.isatty():
+        return Screen()
+    # The terminal first: a COLUMNS that a shell once exported knows nothing of a window that was resized.
+    try:
+        width = os.get_terminal_size(sys.stdout.fileno()).columns
+    except OSError:
+        width = 0
+    if not width:
+        told = os.environ.get("COLUMNS", "")
+        width = int(told) if told.isascii() and told.isdecimal() else 0
+    return Screen(width or _USUAL_WIDTH, colourful())

@@ -1,0 +1,80 @@
+"""Opens a connection, and sends a request on it, before the rest of the client is imported: the server works meanwhile.
+
+It imports next to nothing itself, not even `socket` and `json`, which together take as long as the interpreter's start.
+So it knows only the plain case, a server of this protocol that answers at once. In any other it gives up, having sent
+nothing that could have an effect, and `dial` tries again and says what is wrong.
+"""
+
+from __future__ import annotations
+
+import _socket
+import os
+import select
+import sys
+
+from talkcli import paths
+from talkcli.values import TYPE_CHECKING, frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+#: How a server of this protocol begins its greeting, as `wire.encode` writes it; a test compares the two.
+GREETING = b'{"talk": 1, "version": '
+#: Seconds in which a server greets that is up and has time; whoever waits longer wants to be able to interrupt it.
+AT_ONCE = 0.2
+
+
+@frozen
+class Opened:
+    """A connection to a server that has been begun."""
+
+    descriptor: int
+    path: str
+    #: what the server has said: its greeting, or less
+    received: bytes
+    #: what was sent after `hello`: the request, if the greeting was as it should be
+    sent: bytes
+
+
+def open_early(named: str | None, hello: bytes, request: bytes, before: Callable[[], None]) -> Opened | None:
+    """Return a connection to the first server that answers, with these lines sent; None where there is no plain case.
+
+    `named`: the only socket to try, or None for the list; `before`: called before the request is sent.
+    """
+    if not hasattr(_socket, "SO_PEERCRED"):  # as on macOS, where `peers` knows another way
+        return None
+    for path in paths.client_sockets(named):
+        connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
+        try:
+            connected.setblocking(False)
+            connected.connect(path)
+        except OSError:
+            connected.close()
+            continue
+        try:
+            return _begin(connected, path, named is not None, hello, request, before)
+        except OSError:
+            connected.close()
+            return None
+    return None
+
+
+def _begin(
+    connected: _socket.socket, path: str, named: bool, hello: bytes, request: bytes, before: Callable[[], None]
+) -> Opened | None:
+    # The owner's uid, the second of three C ints, as `peers` reads it; whom to trust is `dial`'s rule.
+    owner = connected.getsockopt(_socket.SOL_SOCKET, _socket.SO_PEERCRED, 12)[4:8]
+    if int.from_bytes(owner, sys.byteorder) not in {os.getuid(), 0} and not named and path != paths.SYSTEM_SOCKET:
+        connected.close()
+        return None
+    if connected.send(hello) != len(hello):
+        raise BlockingIOError
+    received = sent = b""
+    poll = select.poll()
+    poll.register(connected, select.POLLIN)
+    if poll.poll(AT_ONCE * 1000):
+        received = connected.recv(65536)
+        if received.startswith(GREETING) and received.endswith(b"\n") and received.count(b"\n") == 1:
+            before()
+            sent = request[: connected.send(request)]
+    return Opened(connected.detach(), path, received, sent)

@@ -1,0 +1,233 @@
+"""Plain command lines, read without click: alike, whatever is typed; and sent before the rest is imported."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import click
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from talkcli import wire
+from talkcli.cli import early, plain, tabulate
+from talkcli.cli.commands import talk
+from talkcli.cli.plain_table import COMMANDS, COMMON
+from talkcli.cli.saying import GOAL_OPTIONS
+from talkcli.cli.show import Common
+from talkcli.opening import GREETING
+from talkcli.requests import Cancel, Hello, Pause, Resume, Say, Status, write_request
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from talkcli.requests import Request
+
+TABLES = [COMMON, *(each["options"] for each in COMMANDS.values())]
+OPTIONS = sorted({name for each in TABLES for name in each})
+VALUES = [
+    "0",
+    "1",
+    "7",
+    "0.5",
+    "1.0",
+    "80",
+    "451",
+    "-3",
+    "+5",
+    "1_0",
+    " 5",
+    "1e3",
+    ".5",
+    "5.",
+    "nan",
+    "inf",
+    "",
+    "٣",
+    "9" * 30,
+]
+WORDS = [
+    *OPTIONS,
+    *OPTIONS,
+    *COMMANDS,
+    *(f"{option}={value}" for option in OPTIONS for value in ("", "5", "a b", "-x")),
+    *VALUES,
+    *("-wq", "-wf", "-t5", "-qt", "--", "-", "--wai", "--help", "-h", "--version", "--lines", "-o", "x.wav", "serve"),
+    *(
+        "battery low",
+        "k3fz-12",
+        "12",
+        "Grüße",
+        'a "quoted" word',
+        "back\\slash",
+        "two\nlines",
+        "-x",
+        "\udc80",
+        "\x1b[1m",
+    ),
+]
+FLAGS = [name for name in OPTIONS if all(name not in each or each[name][1] in (True, False) for each in TABLES)]
+#: Mostly what is plain: a flag, an option with a value that fits most, words; and now and then anything.
+PIECES = st.one_of(
+    st.sampled_from(FLAGS).map(lambda each: [each]),
+    st.tuples(st.sampled_from(OPTIONS), st.sampled_from(["1", "0.5", "90", "k"])).map(list),
+    st.tuples(st.sampled_from(OPTIONS), st.sampled_from(["1", "0.5", "90", "k"]))
+    .map("=".join)
+    .map(lambda each: [each]),
+    st.sampled_from([["battery low"], ["12"], ["k3fz-12"], ["Grüße"], ["--", "-3 degrees"]]),
+    st.sampled_from(WORDS).map(lambda each: [each]),
+)
+LINES = st.builds(
+    lambda before, command, after: [*before, *command, *(word for piece in after for word in piece)],
+    st.sampled_from([[], [], ["--json"], ["-q", "--socket", "/run/x"], ["--socket=/run/y"], ["--version"]]),
+    st.sampled_from([[each] for each in COMMANDS] * 4 + [[], ["watch"], ["sya"]]),
+    st.lists(PIECES, max_size=4),
+)
+ENVIRONMENTS = st.sampled_from([{}, {"TALK_NAME": "patrol"}, {"TALK_NAME": ""}])
+
+
+def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], Common]:
+    """Return what click reads: the command, its options and arguments, and the common ones; UsageError."""
+    options = Common()
+    with talk.make_context("talk", list(arguments), obj=options) as group:
+        name, command, rest = talk.resolve_command(group, [*group._protected_args, *group.args])
+        assert name
+        assert command
+        with command.make_context(name, rest, parent=group) as context:
+            return name, context.params, options
+
+
+@settings(max_examples=2000, deadline=None)
+@given(LINES, ENVIRONMENTS)
+def test_both_read_any_line_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("TALK_NAME", raising=False)
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        found = plain.read(arguments, os.environ)
+        if not found:
+            return
+        command, params, options = by_click(arguments)
+    if command == "say":
+        params["wait"] = params["wait"] or params["feedback"]
+    assert (found.command, found.given) == (command, params)
+    assert found.common.get("socket") == options.socket
+    assert (found.common.get("json", False), found.common.get("quiet", False)) == (options.json, options.quiet)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        ["say", "battery low"],
+        ["say", "battery", "low", "--wait"],
+        ["--json", "say", "-w", "-t", "2.5", "--preempt", "--", "-3 degrees"],
+        ["say", "--queue", "--priority", "-1", "--key=battery", "--throttle", "60", "--rate", "150", "x"],
+        ["say", "--id", "a-1", "--voice", "de", "--volume", "0.5", "--pitch", "99", "--as", "me", "Grüße"],
+        ["cancel"],
+        ["cancel", "--current", "12", "13"],
+        ["status", "-q"],
+        ["--socket", "/run/x", "status", "12", "--json"],
+        ["wait", "12", "-t", "10", "-f"],
+    ],
+)
+def test_what_scripts_say_is_plain(line: list[str]) -> None:
+    assert plain.read(line, {})
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *([], ["serve"], ["sya", "hello"], ["--version"], ["say", "-h"], ["say"], ["say", "-"], ["say", "--lines"]),
+        *(
+            ["say", "--wiat", "x"],
+            ["say", "-x"],
+            ["say", "x", "--rate", "79"],
+            ["say", "x", "--rate"],
+            ["say", "-w5", "x"],
+        ),
+        *(["say", "x", "--flush", "--queue"], ["say", "x", "-t", "5"], ["say", "-wt", "0", "x"], ["status", "1", "2"]),
+        *(
+            ["say", "x", "--ttl", "nan"],
+            ["say", "x", "--key", ""],
+            ["say", "x", "--wait=1"],
+            ["say", "-o", "x.wav", "x"],
+        ),
+    ],
+)
+def test_anything_else_is_click_s(line: list[str]) -> None:
+    assert plain.read(line, {}) is None
+
+
+def test_the_table_is_what_click_s_commands_say() -> None:
+    """`python -m talkcli.cli.tabulate` writes it."""
+    assert tabulate.TABLE.read_text("utf-8") == tabulate.table()
+
+
+def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
+    """Return what the client library says for a command, with no way of its own around `requests`."""
+    name = found.given.get("name") or os.environ.get("TALK_NAME") or None
+    hello = Hello(name, urgent=found.command in {"cancel", "status"})
+    if found.command == "say":
+        text, options = " ".join(found.given["text"]), {each: found.given[each] for each in GOAL_OPTIONS}
+        return hello, Say(text, wait=found.given["wait"], feedback=found.given["feedback"], **options)
+    if found.command == "cancel":
+        return hello, Cancel(None, found.given["current"], found.given["before"], found.given["key"])
+    return hello, {"status": Status(), "pause": Pause(), "resume": Resume()}[found.command]
+
+
+@settings(max_examples=2000, deadline=None)
+@given(LINES, ENVIRONMENTS)
+def test_what_is_sent_early_is_what_the_library_sends(arguments: list[str], environment: Mapping[str, str]) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("TALK_NAME", raising=False)
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        found = plain.read(arguments, os.environ)
+        sent = found and early.lines(found)
+        if not found or not sent:
+            return
+        hello, request = library_sends(found)
+    assert sent == (wire.encode(write_request(hello)), wire.encode({"seq": 1, **write_request(request)}))
+
+
+@given(st.text(max_size=40))
+def test_a_text_goes_early_as_it_is_or_not_at_all(text: str) -> None:
+    found = plain.read(["say", "--", text], {})
+    sent = found and early.lines(found)
+    if sent:
+        assert sent[1] == wire.encode({"seq": 1, "request": "say", "text": text})
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(
+            ["say", "x" * 10_001],
+            ["say", "x", "--key", "k" * 65],
+            ["say", "x", "--id", "a"],
+            ["say", "x", "--as", "n" * 65],
+        ),
+        *(
+            ["say", "x", "--priority", "1000001"],
+            ["say", 'a "quoted" word'],
+            ["cancel", "12"],
+            ["cancel", "--before", "x"],
+        ),
+        *(["status", "12"], ["wait"], ["cancel", "--key", "k" * 65]),
+    ],
+)
+def test_what_may_be_refused_is_not_sent_early(line: list[str]) -> None:
+    found = plain.read(line, {})
+    assert found
+    assert early.lines(found) is None
+
+
+def test_the_greeting_that_is_looked_for_is_the_server_s() -> None:
+    assert wire.encode(wire.greeting("0.1.0", 1, "k3fz")).startswith(GREETING)
+    assert not wire.encode(wire.busy_greeting()).startswith(GREETING)
+
+
+def test_click_is_what_is_compared_with() -> None:
+    with pytest.raises(click.UsageError):
+        by_click(["say", "--wiat", "x"])
