@@ -74,11 +74,10 @@ def dial(
         connected = _socket.socket(fileno=opened.descriptor)
         try:
             return _greet(connected, opened.path, None, version, patience, interrupt, opened.received)
-        except (Busy, AccessDenied):
-            connected.close()  # nothing but `hello` was sent to such a server: begin again
-        except BaseException:
+        except BaseException as error:
             connected.close()
-            raise
+            if opened.sent or not isinstance(error, Busy | AccessDenied):
+                raise
     while True:
         try:
             return _try_all(named, hello, version, patience, interrupt)

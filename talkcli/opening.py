@@ -30,7 +30,7 @@ class Opened:
 
     descriptor: int
     path: str
-    #: what the server has said: its greeting, or less
+    #: what the server has said: less than its greeting, or more
     received: bytes
     #: what was sent after `hello`: the request, if the greeting was as it should be
     sent: bytes
@@ -74,7 +74,7 @@ def _begin(
     poll.register(connected, select.POLLIN)
     if poll.poll(AT_ONCE * 1000):
         received = connected.recv(65536)
-        if received.startswith(GREETING) and received.endswith(b"\n") and received.count(b"\n") == 1:
+        if received.startswith(GREETING) and b"\n" in received:
             before()
             sent = request[: connected.send(request)]
     return Opened(connected.detach(), path, received, sent)

@@ -47,8 +47,8 @@ def say(
             with options.connect(
                 name=given["name"], interrupt=interrupts.descriptor, patience=patience, opened=opened
             ) as client:
-                if interrupts.number is not None:
-                    raise Interrupted
+                if interrupts.number is not None and not (opened and opened.sent):
+                    raise Interrupted  # what has been sent is cancelled, once its id is known
                 goal = client.say(
                     text,
                     follow=given["wait"],

@@ -1,0 +1,109 @@
+"""A request that is sent before the rest of the client is imported: once, and owned from its first moment."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.conformance.bareserve import TALK, clean_environment, run
+from tests.support.connection import PATIENCE
+from tests.support.scripted_peer import GREETING, Peer, goal, result, serving
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from tests.support.processes import Talk
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_the_client_is_whole_cancels_the_goal_that_was_sent(number: signal.Signals) -> None:
+    def play(peer: Peer) -> None:
+        asked = peer.receive("say")
+        # At this moment the client has its request out, and most of its modules before it.
+        client.send_signal(number)
+        peer.send({"seq": asked["seq"], "ok": True, "goal": goal("PENDING")})
+        peer.reply("cancel")
+        peer.send(result("RECALLED"))
+
+    with serving(play) as path:
+        client = subprocess.Popen(
+            [*TALK, "say", "--wait", "hello"],
+            env=clean_environment(os.path.dirname(path), {"TALK_SOCKET": path}),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        out, err = client.communicate(timeout=PATIENCE)
+    assert (client.returncode, out) == (128 + number, "g\n"), err
+
+
+@pytest.mark.parametrize(
+    "greeting",
+    [
+        [GREETING],
+        [GREETING[:10], GREETING[10:]],
+        [b"", GREETING],
+        [GREETING.replace(b'{"talk": 1,', b'{ "talk":1,')],
+        [GREETING[:-1] + b"\n" + b'{"event": "alive"}\n'],
+    ],
+    ids=["at once", "in parts", "late", "written otherwise", "with more"],
+)
+def test_it_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> None:
+    said: list[dict[str, Any]] = []
+
+    def serve() -> None:
+        connected, _ = listening.accept()
+        with connected, connected.makefile("rb") as file:
+            for part in greeting:
+                connected.sendall(part)
+                time.sleep(0.3 if part is not greeting[-1] else 0)  # more than a client waits before it is whole
+            said.extend(json.loads(file.readline()) for _ in range(2))
+            connected.sendall(json.dumps({"seq": said[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
+            said.extend(json.loads(each) for each in file)
+
+    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(f"{directory}/s")
+        listening.listen()
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        done = run([*TALK, "say", "hello"], clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}))
+        thread.join(PATIENCE)
+    assert (done.code, done.out, done.err) == (0, "g\n", "")
+    assert said == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
+
+
+def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
+    """What it costs whoever waits for the first word: none of what follows is there when the request is out."""
+    code = (
+        "import sys\n"
+        "from talkcli import opening\n"
+        "opened = opening.open_early\n"
+        "def spy(*arguments):\n"
+        "    found = opened(*arguments)\n"
+        "    assert found and found.sent\n"
+        "    heavy = {{'click', 'json', 're', 'enum', 'socket', 'typing', 'talkcli.client'}}\n"
+        "    print(sorted(heavy & {{*sys.modules}}))\n"
+        "    return found\n"
+        "opening.open_early = spy\n"
+        "from talkcli.cli import run\n"
+        "assert run({}) == 0\n"
+        "print('click' in sys.modules)\n"
+    )
+    for words in (["say", "--wait", "length=0"], ["say", "length=0"], ["status"], ["cancel"], ["pause"], ["resume"]):
+        done = run([sys.executable, "-c", code.format(words)], scripted.env)
+        assert [done.out.splitlines()[each] for each in (0, -1) if done.out] == ["[]", "False"], done
+
+
+def test_commands_that_send_one_request_need_no_click(scripted: Talk) -> None:
+    code = "import sys; from talkcli.cli import run; assert run({}) == 0; print('click' in sys.modules)"
+    for words in (["wait"], ["log"], ["voices"], ["set"], ["set", "--rate", "150"], ["status", "-q"]):
+        done = run([sys.executable, "-c", code.format(words)], scripted.env)
+        assert done.out.splitlines()[-1] == "False", done
