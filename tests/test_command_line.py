@@ -9,11 +9,12 @@ import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli import __version__
+from talkcli import __version__, cli
 from talkcli.cli.commands import COMMANDS
 from tests.conformance.bareserve import TALK, environment, run
 from tests.conformance.rawsocket import GREETING, FakeServer
@@ -235,6 +236,19 @@ def test_timeout_may_be_as_long_as_one_likes(scripted: Talk) -> None:
 
 
 # What a client costs, and whom it talks to
+
+
+def test_the_installed_script_is_this_one_and_imports_nothing_itself() -> None:
+    """What pip makes of an entry point imports `re` first; the wheel brings its own script."""
+    script = Path(cli.__file__).with_name("talk")
+    assert os.access(script, os.X_OK)
+    lines = script.read_text("utf-8").splitlines()
+    assert (lines[0], [each for each in lines if "import" in each.split()]) == (
+        "#!python",
+        ["from talkcli.cli import main"],
+    )
+    done = run([sys.executable, str(script), "--version"], {**os.environ, "PYTHONPATH": str(script.parents[2])})
+    assert (done.code, done.out) == (0, f"talk {__version__}\n")
 
 
 def test_client_imports_nothing_heavy(scripted: Talk) -> None:

@@ -204,19 +204,22 @@ def test_only_the_cli_prints_and_exits() -> None:
 
 
 HEAVY = ["asyncio", "pyttsx3", "click", "platformdirs", "espeakng_loader", "talkcli.server", "talkcli.scheduler"]
+#: What every start of a client would pay for: each takes as long to import as a server takes to answer, or longer.
+COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", "logging", "subprocess", "tempfile"]
 
 
 @pytest.mark.parametrize(
     ("statement", "without"),
     [
-        ("import talkcli", [*HEAVY, "talkcli.client", "socket"]),
-        ("import talkcli.client", HEAVY),
-        ("from talkcli import Client", HEAVY),
-        ("import talkcli.cli", [each for each in HEAVY if each != "click"]),
+        ("import talkcli", [*HEAVY, *COSTLY, "talkcli.client"]),
+        ("import talkcli.client", [*HEAVY, *COSTLY]),
+        ("from talkcli import Client", [*HEAVY, *COSTLY]),
+        ("import talkcli.cli, talkcli.cli.early", [*HEAVY, *COSTLY, "json", "re", "enum", "signal"]),
+        ("import talkcli.cli.asking, talkcli.cli.saying, talkcli.cli.waiting", [*HEAVY, *COSTLY]),
     ],
 )
 def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> None:
-    code = f"{statement}\nimport sys\nprint(*[each for each in {without!r} if each in sys.modules])"
+    code = f"import sys\nbefore = {{*sys.modules}}\n{statement}\nprint(*({{*{without!r}}} & {{*sys.modules}} - before))"
     done = subprocess.run(  # as a program of its own: this one has loaded everything already
         [sys.executable, "-c", code], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=60, check=False
     )
