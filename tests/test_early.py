@@ -107,3 +107,24 @@ def test_commands_that_send_one_request_need_no_click(scripted: Talk) -> None:
     for words in (["wait"], ["log"], ["voices"], ["set"], ["set", "--rate", "150"], ["status", "-q"]):
         done = run([sys.executable, "-c", code.format(words)], scripted.env)
         assert done.out.splitlines()[-1] == "False", done
+
+
+def test_ctrl_c_before_anything_was_sent_is_no_traceback() -> None:
+    """The server has taken up the connection, and does not greet."""
+    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(f"{directory}/s")
+        listening.listen()
+        client = subprocess.Popen(
+            [*TALK, "say", "--wait", "hello"],
+            env=clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        connected, _ = listening.accept()
+        with connected:
+            assert connected.recv(65536) == b'{"request": "hello"}\n'
+            client.send_signal(signal.SIGINT)
+            out, err = client.communicate(timeout=PATIENCE)
+            assert (client.returncode, out, err) == (130, "", "")
+            assert connected.recv(65536) == b""

@@ -11,6 +11,7 @@ import _signal
 import os
 import time
 
+from talkcli.errors import EXIT_SIGINT
 from talkcli.opening import open_early
 from talkcli.values import TYPE_CHECKING
 
@@ -86,7 +87,10 @@ def carry_out(plain: Plain, arguments: list[str]) -> int:
         held.update(asked - _signal.pthread_sigmask(_signal.SIG_BLOCK, asked))
 
     named = plain.common.get("socket") or os.environ.get("TALK_SOCKET") or None
-    opened = open_early(named, *said, hold) if said else None
+    try:
+        opened = open_early(named, *said, hold) if said else None
+    except KeyboardInterrupt:
+        return EXIT_SIGINT  # nothing was sent
     from talkcli.cli.ends import ended
     from talkcli.cli.show import Common
 
