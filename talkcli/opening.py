@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import _socket
 import os
-import select
 import sys
 
 from talkcli import paths
@@ -45,9 +44,12 @@ def open_early(named: str | None, hello: bytes, request: bytes, before: Callable
         return None
     for path in paths.client_sockets(named):
         connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
+        connected.settimeout(AT_ONCE)
         try:
-            connected.setblocking(False)
             connected.connect(path)
+        except BlockingIOError:  # a server that takes up no connection at this moment: it is that one, not the next
+            connected.close()
+            return None
         except OSError:
             connected.close()
             continue
@@ -67,14 +69,14 @@ def _begin(
     if int.from_bytes(owner, sys.byteorder) not in {os.getuid(), 0} and not named and path != paths.SYSTEM_SOCKET:
         connected.close()
         return None
-    if connected.send(hello) != len(hello):
-        raise BlockingIOError
+    connected.sendall(hello)
     received = sent = b""
-    poll = select.poll()
-    poll.register(connected, select.POLLIN)
-    if poll.poll(AT_ONCE * 1000):
+    try:
         received = connected.recv(65536)
-        if received.startswith(GREETING) and b"\n" in received:
-            before()
-            sent = request[: connected.send(request)]
+    except TimeoutError:
+        pass  # it may have more to do than to greet
+    if received.startswith(GREETING) and b"\n" in received:
+        before()
+        sent = request[: connected.send(request)]
+    connected.setblocking(False)
     return Opened(connected.detach(), path, received, sent)

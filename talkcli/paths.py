@@ -10,8 +10,6 @@ from __future__ import annotations
 import os
 import sys
 
-from talkcli.errors import AddressInUse
-
 #: The name of the socket in its directory.
 SOCKET = "talk.sock"
 #: The directory of a server for the whole machine: what systemd makes for `RuntimeDirectory=talk`.
@@ -70,4 +68,6 @@ def server_socket(named: str | None) -> str:
         try:
             return str(platformdirs.PlatformDirs("talk", appauthor=False).place_runtime_file(SOCKET))
         except OSError as error:
+            from talkcli.errors import AddressInUse
+
             raise AddressInUse(f"no directory for the socket: {error}; name a socket with --socket PATH") from error

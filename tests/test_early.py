@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -14,10 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.conformance.bareserve import TALK, clean_environment, run
+from talkcli.opening import open_early
+from talkcli.paths import client_sockets
+from tests.conformance.bareserve import TALK, run
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import GREETING, Peer, goal, result, serving
-from tests.support.surroundings import short_directory
+from tests.support.surroundings import clean_environment, short_directory
 
 if TYPE_CHECKING:
     from tests.support.processes import Talk
@@ -128,3 +131,27 @@ def test_ctrl_c_before_anything_was_sent_is_no_traceback() -> None:
             out, err = client.communicate(timeout=PATIENCE)
             assert (client.returncode, out, err) == (130, "", "")
             assert connected.recv(65536) == b""
+
+
+def test_a_server_whose_backlog_is_full_is_not_passed_over_for_the_next_place() -> None:
+    with short_directory() as directory, contextlib.ExitStack() as stack:
+        first, second = f"{directory}/runtime/talk/talk.sock", f"{directory}/runtime-{os.getuid()}/talk/talk.sock"
+        for each in (first, second):
+            os.makedirs(os.path.dirname(each))
+            listening = stack.enter_context(socket.socket(socket.AF_UNIX))
+            listening.bind(each)
+            listening.listen(0 if each == first else 8)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                waiting = stack.enter_context(socket.socket(socket.AF_UNIX))
+                waiting.setblocking(False)
+                waiting.connect(first)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("XDG_RUNTIME_DIR", f"{directory}/runtime")
+            patch.setenv("TMPDIR", directory)
+            assert first in client_sockets(None)
+            assert second in client_sockets(None)
+            assert open_early(None, b"hello\n", b"request\n", lambda: None) is None
+        listening.setblocking(False)
+        with pytest.raises(BlockingIOError):  # nobody came to the second
+            listening.accept()

@@ -173,7 +173,8 @@ def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
         return hello, Say(text, wait=found.given["wait"], feedback=found.given["feedback"], **options)
     if found.command == "cancel":
         return hello, Cancel(None, found.given["current"], found.given["before"], found.given["key"])
-    return hello, {"status": Status(), "pause": Pause(), "resume": Resume()}[found.command]
+    others: dict[str, Request] = {"status": Status(), "pause": Pause(), "resume": Resume()}
+    return hello, others[found.command]
 
 
 @settings(max_examples=2000, deadline=None)

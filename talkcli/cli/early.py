@@ -11,7 +11,6 @@ import _signal
 import os
 import time
 
-from talkcli.errors import EXIT_SIGINT
 from talkcli.opening import open_early
 from talkcli.values import TYPE_CHECKING
 
@@ -90,7 +89,7 @@ def carry_out(plain: Plain, arguments: list[str]) -> int:
     try:
         opened = open_early(named, *said, hold) if said else None
     except KeyboardInterrupt:
-        return EXIT_SIGINT  # nothing was sent
+        return 128 + int(_signal.SIGINT)  # nothing was sent
     from talkcli.cli.ends import ended
     from talkcli.cli.show import Common
 
