@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import sys
 
-from talkcli import wire
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from typing import Any
+    from typing import Any, TextIO
 
     from talkcli.client import Client
     from talkcli.columns import Screen
@@ -49,9 +48,15 @@ def show_json(message: JsonObject) -> None:
     """Write an object as a line of JSON, in UTF-8 whatever the locale is; BrokenPipeError as `show`."""
     if sys.stdout is None:
         raise BrokenPipeError("standard output is closed")
-    sys.stdout.flush()
-    sys.stdout.buffer.write(wire.encode(message))
-    sys.stdout.buffer.flush()
+    _write_json(sys.stdout, message)
+
+
+def _write_json(stream: TextIO, message: JsonObject) -> None:
+    from talkcli import wire  # help and completion have nothing to do with JSON
+
+    stream.flush()
+    stream.buffer.write(wire.encode(message))
+    stream.buffer.flush()
 
 
 def note(words: str) -> None:
@@ -67,9 +72,7 @@ def show_error(error: TalkError, *, json: bool) -> None:
         note(error.message)
     elif sys.stderr is not None:
         fields: JsonObject = {"code": error.code, "exit": error.exit_code, "message": error.message}
-        sys.stderr.flush()
-        sys.stderr.buffer.write(wire.encode({"error": fields}))
-        sys.stderr.buffer.flush()
+        _write_json(sys.stderr, {"error": fields})
 
 
 def colourful() -> bool:
