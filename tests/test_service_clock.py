@@ -31,6 +31,9 @@ class _BusyEngine:
     def say(self, goal: protocol.Say) -> None:
         self.said.append(goal.text)
 
+    def follow(self, goal_id: str, followed: bool) -> None:
+        """Take note of what makes no difference here."""
+
 
 class _Clock:
     def __init__(self) -> None:

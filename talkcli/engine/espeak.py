@@ -14,7 +14,6 @@ import ctypes
 import sys
 import time
 import types
-from typing import TYPE_CHECKING, Any
 
 from talkcli.engine import guard
 from talkcli.engine.playback import Playback
@@ -22,8 +21,10 @@ from talkcli.engine.sink import SAMPLE, AudioFailed, Stopped
 from talkcli.engine.wordclock import TimedWord
 from talkcli.engine.words import letters
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from typing import Any
 
     from talkcli.engine.hold import Hold
     from talkcli.engine.library import Library
@@ -156,6 +157,7 @@ class EspeakDriver:
         failure: Exception | None = None
         duration = None
         try:
+            playback.prepare()
             self._synthesise(text)
             duration = playback.finish()
         except Stopped:

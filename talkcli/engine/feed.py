@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import select
 import time
-from typing import TYPE_CHECKING
 
 from talkcli.engine.sink import PIECE, SAMPLE
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from talkcli.engine.sink import Interest, Sink
     from talkcli.engine.wordclock import WordClock
@@ -87,6 +87,14 @@ class Feed:
     def missing(self, now: float) -> float:
         """Return by how many seconds it would be too early for the stream to be over."""
         return self._first_write + self._seconds(self.written) - now
+
+    def began_at(self, now: float) -> float:
+        """Return when its stream began to be heard, or would have if the clock were exact."""
+        return now - self._clock.elapsed(now)
+
+    def over_at(self, now: float) -> float:
+        """Return when all that was written is heard, or was."""
+        return now + self.unheard(self.written, now)
 
     def interests(self, full: bool) -> list[Interest]:
         """Return what to poll for; where nothing is to be written, not for room to write."""

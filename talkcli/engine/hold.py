@@ -1,14 +1,29 @@
 """Whether the sentence in hand is to be held: the session asks for it, the playback obeys and says when it is silent.
 
-It holds no sample and knows no player. pyttsx3 has no word for a pause, so this goes past it, to our own driver alone.
+It holds no sample and knows no player; how long things may take in a pause is here, too. pyttsx3 has no word for a
+pause, so this goes past it, to our own driver alone.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+#: Seconds within which a sentence that is to be held must be silent. A player has 42 to 98 ms of it to play; one that
+#: has more, or stands still, is ended instead and the sentence goes on with another.
+SILENT_WITHIN = 0.15
+
+#: Seconds by which the word clock may be ahead of what is heard: 4 to 8 ms were measured.
+CLOCK_AHEAD = 0.01
+
+#: Seconds that are said again where a player had to be ended before all it held was heard: the clock is no better than
+#: this, and nothing may be lost.
+SAID_AGAIN = 0.03
+
+#: Seconds of a pause after which the player is let go of: long enough for a question in between, after which the next
+#: sample is heard at once; a longer one must leave the device to other programs, and let it sleep.
+RELEASE_AFTER = 10.0
 
 
 class Hold:

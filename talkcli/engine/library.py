@@ -7,9 +7,12 @@ Linux only; elsewhere pyttsx3's own drivers find their libraries themselves. It 
 from __future__ import annotations
 
 import ctypes
-from typing import Any
 
 from talkcli.values import frozen
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
 
 _LIBRARY = "libespeak-ng.so.1"
 

@@ -6,10 +6,10 @@ For robots in simulation and for CI, where scripts must keep their timing. It op
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 from talkcli.engine.sink import SAMPLE
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 

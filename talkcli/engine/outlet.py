@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import time
 from functools import partial
-from typing import TYPE_CHECKING
 
+from talkcli.engine.changeover import Changeover
 from talkcli.engine.nullsink import NullSink
 from talkcli.engine.pipe import PlayerPipe
 from talkcli.engine.players import commands, on_path
 from talkcli.engine.sink import AudioFailed
 from talkcli.engine.wavefile import WavFile
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from talkcli.engine.sink import Sink
 
+_NULL = "null"
 _FILE = "file:"
 
 #: Seconds after which a device that was let go of counts as idle, and gets the lead-in again: the power saving of sound
@@ -39,12 +41,19 @@ class Outlet:
         self._device = device
         self._inherited = inherited
         self._lead_in = lead_in
+        #: what lies between two sentences
+        self.changeover = Changeover()
         self._worked: str | None = None
         self._used_at: float | None = None
 
+    @property
+    def is_program(self) -> bool:
+        """Whether what plays is a program, which takes a while to start."""
+        return self._player != _NULL and not (self._player or "").startswith(_FILE)
+
     def candidates(self, rate: int) -> list[Callable[[], Sink]]:
         """Return what opens the sinks to try for a sentence, best first; AudioFailed if there is none."""
-        if self._player == "null":
+        if self._player == _NULL:
             return [partial(NullSink, rate)]
         if self._player is not None and self._player.startswith(_FILE):
             return [partial(WavFile, self._player[len(_FILE) :], rate)]

@@ -7,12 +7,14 @@ nothing of processes: a sink says what it takes, this says what that means.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 from talkcli.engine.feed import Feed
+from talkcli.engine.hold import CLOCK_AHEAD, RELEASE_AFTER, SAID_AGAIN, SILENT_WITHIN
+from talkcli.engine.samples import Samples
 from talkcli.engine.sink import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
 from talkcli.engine.wordclock import WordClock
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -39,23 +41,8 @@ DRAIN_WITHIN = 3.0
 #: silence. The pause at a sentence's end is longer than this, so that nothing audible can be missing.
 EARLY_END = 0.25
 
-#: Seconds within which a sentence that is to be held must be silent. A player has 42 to 98 ms of it to play; one that
-#: has more, or stands still, is ended instead and the sentence goes on with another.
-SILENT_WITHIN = 0.15
-
-#: Seconds by which the word clock may be ahead of what is heard: 4 to 8 ms were measured.
-CLOCK_AHEAD = 0.01
-
-#: Seconds that are said again where a player had to be ended before all it held was heard: the clock is no better than
-#: this, and nothing may be lost.
-SAID_AGAIN = 0.03
-
 #: Seconds within which a player that was killed must be gone: it takes 1 ms, unless it hangs in a device's driver.
 GONE_WITHIN = 1.0
-
-#: Seconds of a pause after which the player is let go of: long enough for a question in between, after which the next
-#: sample is heard at once; a longer one must leave the device to other programs, and let it sleep.
-RELEASE_AFTER = 10.0
 
 
 class Playback:
@@ -71,44 +58,55 @@ class Playback:
         self._feed: Feed | None = None
         self._first_error: AudioFailed | None = None
         self._clock = WordClock()
-        self._any_word = False
-        #: samples that may still be needed: all of them until the player is proven, then those that were not heard yet
-        self._samples = bytearray()
-        self._dropped = 0  # bytes before those
+        #: all of them until the player is proven, then those that were not heard yet
+        self._samples = Samples()
+        self._complete = False  # whether no more are to come
         self._begin = 0  # bytes before the first that this player got
         self._sent = 0  # bytes that players have taken
+        self._began = False  # whether any are known to be heard
         self._stopped = False
         #: since when the player has been given nothing but silence, because the sentence is held
         self._silent_at: float | None = None
 
     def begin(self, rate: int) -> None:
         """Set the samples per second; before the first samples."""
+        if self._feed is not None and rate != self._rate:
+            self._let_go(0)  # it was started for another
         self._rate = rate
+
+    def prepare(self) -> None:
+        """Start a player program now: it needs 5 to 15 ms, the synthesis 2. What goes wrong is told by `write`."""
+        if self._outlet.is_program and not self._hold.asked:
+            try:
+                self._try(lambda _: True)
+            except AudioFailed:
+                self._candidates, self._first_error = [], None
 
     def add_word(self, word: TimedWord) -> None:
         """Report this word when it is heard. It comes before its samples do."""
-        self._any_word = True
+        self._samples.speaks = True
         self._clock.add(word)
 
     def write(self, samples: bytes) -> None:
         """Play the samples; returns when the player has taken them, or at once if nothing audible has come yet."""
-        self._samples += samples
+        self._samples.add(samples)
         self._wait((), 0.0)  # a file is never waited for, and it must be possible to stop that too
         self._check_stopped()
-        if self._sent == 0 and self._feed is None and not self._audible(samples):
-            return
-        self._try(self._feed_all)
+        if self._samples.speaks:
+            self._try(self._feed_all)
 
     def finish(self) -> float:
         """Play to the end and return the length in seconds. Returns only if all of it was heard."""
-        if self._sent == 0 and self._feed is None and not self._any_word:
+        if not self._samples.speaks:
             raise AudioFailed("nothing_to_say", "nothing in the text can be spoken")
+        self._complete = True
         self._try(self._drain)
         for word in self._clock.rest():
             self._on_word(word)
         if self._feed is not None:
             self._outlet.worked(self._feed.sink.name)
-        return self._seconds(self._end())
+            self._outlet.changeover.ended(self._feed.sink.name, self._feed.over_at(time.monotonic()))
+        return self._seconds(self._sent)
 
     def stop(self) -> None:
         """Be silent now; what waits ends with Stopped."""
@@ -130,9 +128,6 @@ class Playback:
         if sink.real_time and sink.proven:
             self._outlet.let_go(self._silent_at)
 
-    def _audible(self, samples: bytes) -> bool:
-        return self._any_word or samples.count(0) != len(samples)
-
     # -- players
 
     def _try(self, step: Callable[[Feed], bool]) -> None:
@@ -142,7 +137,7 @@ class Playback:
             try:
                 if self._feed is None:
                     self._await_resume()
-                    if 0 < self._begin == self._end():  # held at its very end
+                    if 0 < self._begin == self._samples.end:  # held at its very end
                         return
                     self._feed = self._open()
                 if step(self._feed):
@@ -194,10 +189,12 @@ class Playback:
 
     def _feed_all(self, feed: Feed) -> bool:
         """Hand all samples there are to the player; False if it was let go of before."""
+        if feed.written == 0:
+            feed.progress_at = time.monotonic()  # what it was not given it could not take
         while True:
             if self._hold.asked and not self._stay_silent(feed):
                 return False
-            if self._sent == self._end():
+            if self._sent == self._until(feed):
                 return True
             taken = self._offer(feed)
             self._tick(feed)
@@ -226,29 +223,36 @@ class Playback:
                 raise AudioFailed("audio_stalled", f"{sink.name} did not end {DRAIN_WITHIN:g} s after the sound")
             self._wait_for(feed, limit)
         missing = feed.missing(time.monotonic())
-        if sink.real_time and missing > EARLY_END:
+        if sink.real_time and missing > EARLY_END - self._seconds(self._samples.end - self._sent):
             raise AudioFailed("audio_lost", f"{sink.name} ended {missing:.1f} s before the sound did")
         return True
 
     def _offer(self, feed: Feed) -> int:
         if feed.leading_in:
             return feed.lead_in()
-        begin = self._sent - self._dropped
-        with memoryview(self._samples) as view, view[begin : begin + feed.piece] as part:
+        with self._samples.part(self._sent, min(self._until(feed), self._sent + feed.piece)) as part:
             taken = feed.offer(part)
         self._sent += taken
         return taken
 
+    def _until(self, feed: Feed) -> int:
+        """Return the end of what is to be played: less silence where a goal waits, and for as long as one may come."""
+        if not feed.sink.real_time or (self._complete and not self._outlet.changeover.followed):
+            return self._samples.end
+        most = int(self._outlet.changeover.allowance(feed.sink.name) * self._rate) * SAMPLE
+        return max(self._sent, self._samples.end - self._samples.quiet_end(most))
+
     def _tick(self, feed: Feed) -> None:
         """Bring the clock up to date, report the words that are heard, forget the samples that were heard."""
         now = time.monotonic()
-        feed.tick(now, last=self._sent == self._end() and not self._hold.asked)
+        feed.tick(now, last=self._sent == self._until(feed) and not self._hold.asked)
         sink = feed.sink
         if not sink.proven:
             return
-        needed = self._unheard() if sink.real_time else self._sent
-        del self._samples[: needed - self._dropped]
-        self._dropped = needed
+        if feed.taken and not self._began:
+            self._began = True
+            self._outlet.changeover.began(sink.name, feed.began_at(now))
+        self._samples.forget(self._unheard() if sink.real_time else self._sent)
         for word in self._clock.due(now) if sink.real_time else self._clock.rest():
             self._on_word(word)
 
@@ -338,10 +342,7 @@ class Playback:
     def _unheard(self) -> int:
         """Return the bytes before those that may not have been heard yet, of those that this player got."""
         heard = int(max(0.0, self._clock.heard(time.monotonic()) - SAID_AGAIN) * self._rate) * SAMPLE
-        return min(self._sent, max(self._begin, self._dropped, heard))
-
-    def _end(self) -> int:
-        return self._dropped + len(self._samples)
+        return min(self._sent, max(self._begin, self._samples.begin, heard))
 
     def _seconds(self, length: int) -> float:
         return length / (self._rate * SAMPLE)

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import os
 import struct
-from typing import TYPE_CHECKING
 
 from talkcli.engine.sink import PIECE, SAMPLE, AudioFailed
 from talkcli.values import frozen
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -22,6 +22,10 @@ PACKAGES = {"aplay": "alsa-utils", "pacat": "pulseaudio-utils", "pw-cat": "pipew
 #: Milliseconds of sound that a player may hold. What it holds is heard late and is lost in a stall; with less than
 #: three periods of 20 ms a busy machine makes gaps.
 BUFFER_MS = 60
+
+#: Milliseconds of sound that wait for aplay while it starts. It begins to play when its buffer is full, and reads whole
+#: periods of 15 ms; with one piece of 20 ms after the other, each asked for, it would begin 2 ms later on a PC.
+START_MS = 80
 
 #: Bytes that a player may take before it has opened its device: a block as programs read it. Only what is taken beyond
 #: proves that the sound goes somewhere. Where more is known about a player, it is said there.
@@ -38,6 +42,8 @@ class Command:
     read_ahead: int = READ_AHEAD
     #: what goes in front of the samples.
     preamble: bytes = b""
+    #: bytes of samples that may wait for it while it starts, if they are more than one piece.
+    at_start: int = 0
 
 
 def commands(
@@ -75,7 +81,8 @@ def _known(name: str, device: str | None, rate: int) -> Command:
         argv = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "1", "-r", str(rate)]
         argv += [f"--buffer-time={BUFFER_MS * 1000}"]
         argv += ["-D", device] if device else []
-        return Command(name, tuple(argv), read_ahead=0)  # it opens the device before it reads
+        # It opens the device before it reads.
+        return Command(name, tuple(argv), read_ahead=0, at_start=START_MS * rate // 1000 * SAMPLE)
     if name == "pacat":
         argv = ["pacat", "--playback", "--raw", "--format=s16le", "--channels=1", f"--rate={rate}"]
         argv += [f"--latency-msec={BUFFER_MS}", "--process-time-msec=20", "--client-name=talk", "--stream-name=talk"]

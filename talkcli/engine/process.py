@@ -27,6 +27,8 @@ def main() -> None:
     # reading is seen by the write that fails.
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(number, signal.SIG_IGN)
+    # Who started the server may ignore it, and every player would seem to have ended well then: nothing to reap.
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     channel = Channel()
     configure = _configuration(channel)
     # The server may have died before the kernel was asked to tell.
@@ -59,7 +61,7 @@ def _serve(channel: Channel, configure: protocol.Configure) -> None:
     from talkcli.engine.start import CannotStart, start
 
     outlet = Outlet(configure.player, configure.device, _inherited(), configure.lead_in / 1000)
-    session = Session(channel)
+    session = Session(channel, outlet.changeover)
     try:
         started = start(configure.driver, configure.voice, outlet, session.wait, session.hold)
     except CannotStart as error:

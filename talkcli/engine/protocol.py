@@ -12,9 +12,12 @@ process ends. After that each `Say` gets one `Started`, any number of `Word`, `A
 from __future__ import annotations
 
 import json
-from typing import Any, ClassVar
 
 from talkcli.values import fields, frozen
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any, ClassVar
 
 #: Seconds between two messages of an engine process that has a goal in hand. Far below `thread.HANG_AFTER`, so that one
 #: late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
@@ -58,6 +61,7 @@ class Say:
     volume: float  # 0.0 to 1.0
     voice: str | None  # id, name or language
     pitch: int  # 0 to 100, 50 is the voice's own
+    followed: bool = False  # whether another goal waits behind it
 
 
 @frozen
@@ -83,6 +87,15 @@ class Resume:
 
     kind: ClassVar[str] = "resume"
     id: str
+
+
+@frozen
+class Followed:
+    """Another goal waits behind the one that is being spoken, or no longer does."""
+
+    kind: ClassVar[str] = "followed"
+    id: str
+    followed: bool
 
 
 @frozen
@@ -177,10 +190,10 @@ class Ended:
     duration: float | None = None  # seconds of audio, where all of it was synthesised
 
 
-Command = Configure | Say | Stop | Pause | Resume | Quit
+Command = Configure | Say | Stop | Pause | Resume | Followed | Quit
 Event = Ready | StartFailed | Voices | Started | Alive | Word | Paused | Ended
 
-_COMMANDS = {each.kind: each for each in (Configure, Say, Stop, Pause, Resume, Quit)}
+_COMMANDS = {each.kind: each for each in (Configure, Say, Stop, Pause, Resume, Followed, Quit)}
 _EVENTS = {each.kind: each for each in (Ready, StartFailed, Started, Alive, Word, Paused, Ended)}
 
 

@@ -13,8 +13,6 @@ import sys
 import time
 import traceback
 from collections import deque
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 from talkcli.engine import protocol
 from talkcli.engine.hold import Hold
@@ -23,9 +21,12 @@ from talkcli.engine.sink import AudioFailed
 from talkcli.engine.voices import list_voices
 from talkcli.engine.words import Words
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from typing import Any
 
+    from talkcli.engine.changeover import Changeover
     from talkcli.engine.channel import Channel
     from talkcli.engine.protocol import Command
     from talkcli.engine.settings import Settings
@@ -41,40 +42,41 @@ PATIENCE = 10.0
 WORDS_A_CHARACTER = 3
 
 
-@dataclass(slots=True)
 class InHand:
     """The goal that is being spoken."""
 
-    id: str
-    text: str
-    words: Words
-    #: when it began, without the time for which it was held
-    began: float
-    #: words per minute
-    rate: int
-    #: when the driver got it, or said a word of it
-    progress_at: float
-    #: whether the driver has it; not while it is held, unless the driver is our own
-    spoken: bool = False
-    #: whether the driver was told to stop because it is to be held
-    interrupted: bool = False
-    #: when it became silent after that
-    silent_at: float | None = None
-    #: where in the text begins what the driver was given
-    offset: int = 0
-    #: where in the text the last word that was heard begins
-    last_word: int = 0
-    stop_asked: bool = False
-    error: Exception | None = None
-    #: whether it was said that the driver won't come to its end
-    given_up: bool = False
+    def __init__(self, say: protocol.Say, now: float) -> None:
+        self.id = say.id
+        self.text = say.text
+        self.words = Words(say.text)
+        #: words per minute
+        self.rate = say.rate
+        #: when it began, without the time for which it was held
+        self.began = now
+        #: when the driver got it, or said a word of it
+        self.progress_at = now
+        #: whether the driver has it; not while it is held, unless the driver is our own
+        self.spoken = False
+        #: whether the driver was told to stop because it is to be held
+        self.interrupted = False
+        #: when it became silent after that
+        self.silent_at: float | None = None
+        #: where in the text begins what the driver was given
+        self.offset = 0
+        #: where in the text the last word that was heard begins
+        self.last_word = 0
+        self.stop_asked = False
+        self.error: Exception | None = None
+        #: whether it was said that the driver won't come to its end
+        self.given_up = False
 
 
 class Session:
     """The loop. `open` gives it its engine, `run` runs it."""
 
-    def __init__(self, channel: Channel) -> None:
+    def __init__(self, channel: Channel, changeover: Changeover) -> None:
         self._channel = channel
+        self._changeover = changeover
         self._backlog: deque[Command] = deque()
         self._leaving = False
         self._goal: InHand | None = None
@@ -128,6 +130,9 @@ class Session:
         goal = self._goal
         if isinstance(command, protocol.Stop):
             self._stop(command)
+        elif isinstance(command, protocol.Followed):
+            if goal is not None and goal.id == command.id:
+                self._changeover.followed = command.followed
         elif isinstance(command, protocol.Pause | protocol.Resume):
             if goal is not None and goal.id == command.id and not goal.stop_asked:
                 self._hold_or_go_on(goal, command)
@@ -177,9 +182,9 @@ class Session:
     def _say(self, say: protocol.Say) -> None:
         """Speak a goal to its end."""
         assert self._settings is not None
-        now = time.monotonic()
-        self._goal = goal = InHand(say.id, say.text, Words(say.text), now, say.rate, now)
+        self._goal = goal = InHand(say, time.monotonic())
         self.hold.release()
+        self._changeover.followed = say.followed
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
         waiting, self._backlog = self._backlog, deque()

@@ -7,12 +7,13 @@ by an id that the driver itself lists.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 from talkcli.engine.espeak import UnknownVoice
 from talkcli.engine.voices import find_voice, list_voices, unknown_voice
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from talkcli.engine.protocol import Say, Voice
 
 #: What libespeak-ng starts with, and what pyttsx3's drivers set themselves.

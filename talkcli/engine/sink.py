@@ -7,7 +7,12 @@ says what it can take, and what to wait for. Nothing here opens or starts anythi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Protocol
+else:
+    Protocol = object
 
 #: bytes of one sample: 16 bit, one channel.
 SAMPLE = 2

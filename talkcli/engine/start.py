@@ -6,13 +6,14 @@ It starts no goal. Everything heavy is imported inside, so that a missing part i
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
 
 from talkcli.engine.settings import SettingFailed, Settings
 from talkcli.values import frozen
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from typing import Any
 
     from talkcli.engine.hold import Hold
     from talkcli.engine.outlet import Outlet

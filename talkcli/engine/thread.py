@@ -16,11 +16,14 @@ from talkcli.engine.dying import Dying
 from talkcli.engine.handed import Handed
 from talkcli.engine.inbox import Inbox
 from talkcli.engine.murmur import Murmur
+from talkcli.engine.reports import EngineDied, EngineSaid, ThreadDied
 from talkcli.engine.restarts import Restarts
-from talkcli.values import frozen, replace
+from talkcli.values import replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from talkcli.engine.reports import Report
 
 #: Seconds until a process that was started must be ready: a cold start from an SD card takes two or three.
 START_LIMIT = 10.0
@@ -35,29 +38,7 @@ SILENCE_LIMIT = 2.0
 PAUSE_LIMIT = 4.0
 
 
-@frozen
-class EngineDied:
-    """The engine process ended, or had to be ended; for the log."""
-
-    words: str
-
-
-@frozen
-class EngineSaid:
-    """A line that the engine process wrote to standard error; for the log. It may hold what a goal's text says."""
-
-    words: str
-
-
-@frozen
-class ThreadDied:
-    """A bug ended the engine thread: nothing will be spoken any more."""
-
-    words: str
-
-
 _OF_A_GOAL = protocol.Started | protocol.Alive | protocol.Word | protocol.Paused | protocol.Ended
-Report = protocol.Event | EngineDied | EngineSaid | ThreadDied
 
 
 class EngineThread:
@@ -104,6 +85,10 @@ class EngineThread:
     def resume(self, goal_id: str) -> None:
         """Let the goal go on."""
         self._inbox.call(lambda: self._hold(goal_id, None))
+
+    def follow(self, goal_id: str, followed: bool) -> None:
+        """Tell whether another goal waits behind this one: the silence between them may be made shorter then."""
+        self._inbox.call(lambda: self._tell_followed(goal_id, followed))
 
     def give_up(self, goal_id: str) -> None:
         """Let go of a goal that didn't end in time: its process is left behind, there will be no `Ended`."""
@@ -200,6 +185,10 @@ class EngineThread:
     def _tell(self, command: protocol.Command) -> None:
         if self._process and not self._process.send(command):
             self._lose_process("the engine takes no commands", "engine_hung")
+
+    def _tell_followed(self, goal_id: str, followed: bool) -> None:
+        if self._goal and self._goal.id == goal_id and self._goal.spoken:
+            self._tell(protocol.Followed(goal_id, followed))
 
     def _hold(self, goal_id: str, pause: int | None) -> None:
         goal = self._goal

@@ -8,12 +8,13 @@ its own lists, found here. This module asks the driver and sets nothing.
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
 
 from talkcli.engine.protocol import Voice
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from typing import Any
 
 #: A variant changes how any of espeak's voices sounds. It is listed by what is written behind the voice's name, and
 #: alone it goes with the driver's default, which is English.

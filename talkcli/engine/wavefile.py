@@ -11,10 +11,10 @@ import contextlib
 import os
 import stat
 import struct
-from typing import TYPE_CHECKING
 
 from talkcli.engine.sink import SAMPLE, AudioFailed
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from talkcli.engine.sink import Interest
 

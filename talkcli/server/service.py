@@ -7,7 +7,6 @@ passes between them and never waits for any of them.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import time
 import traceback
@@ -17,7 +16,7 @@ from talkcli import __version__, peers, wire
 from talkcli.admission import DEFAULT_VOICE
 from talkcli.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
 from talkcli.engine import protocol
-from talkcli.engine.thread import EngineDied, EngineSaid, Report, ThreadDied
+from talkcli.engine.reports import EngineDied, EngineSaid, Report, ThreadDied
 from talkcli.engine.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.messages import Sender
@@ -27,6 +26,8 @@ from talkcli.server.answers import Answers
 from talkcli.server.audience import Audience
 from talkcli.server.clock import LOOK_EVERY, elapsed
 from talkcli.server.later import Later
+from talkcli.server.mailbox import Mailbox
+from talkcli.server.stream import Turn
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from talkcli.requests import Request
     from talkcli.server.connection import Connection
     from talkcli.server.settings import Settings
+    from talkcli.server.stream import Stream
 
 #: Places at the door of a full server, for clients that want to know its status or to silence it.
 DOOR = 16
@@ -80,21 +82,26 @@ class Service:
         self._answers = Answers(self)
         self._closing = False
         self._timer: asyncio.TimerHandle | None = None
-        self._started: tuple[str, float] = ("", 0.0)
+        #: when the goals that were handed to the engine began, until their end is told: one, or for a moment two
+        self._started: dict[str, float] = {}
+        self._mailbox = Mailbox(self._loop, self._note, self.failed)
+        self.turn = Turn(self._loop)
+        #: whether the engine was told that a goal waits behind the one it has in hand
+        self._followed = False
 
     # -- the handler of the connections
 
-    def joined(self, connection: Connection, transport: asyncio.Transport) -> None:
+    def joined(self, connection: Connection, stream: Stream) -> None:
         """Admit a client, let it wait at the door of a full server, or turn it away."""
-        pid, uid = peers.credentials(transport.get_extra_info("socket"))
+        pid, uid = peers.credentials(stream.socket)
         if uid not in {os.getuid(), 0} and not self._open_to_others:
             words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
-            transport.write(wire.encode({"talk": wire.PROTOCOL, "error": "permission_denied", "message": words}))
-            transport.close()
+            stream.write(wire.encode({"talk": wire.PROTOCOL, "error": "permission_denied", "message": words}))
+            stream.close()
             return
         if len(self.connections) >= self.settings.max_clients + DOOR:
-            transport.write(wire.encode(wire.busy_greeting()))
-            transport.close()
+            stream.write(wire.encode(wire.busy_greeting()))
+            stream.close()
             return
         connection.sender = Sender(pid or None, uid, peers.command_of(pid), peers.parent_command_of(pid))
         connection.admitted = len(self.connections) < self.settings.max_clients
@@ -109,6 +116,10 @@ class Service:
         self.connections.discard(connection)
         if not self.connections:
             self.deserted.set()
+        if len(self.connections) >= self.settings.max_clients:  # then somebody may wait at the door for this place
+            waiting = [each for each in self.connections if not each.admitted]
+            if waiting and len(self.connections) - len(waiting) < self.settings.max_clients:
+                waiting[0].admit()
         self.audience.left(connection)
         self.later.left(connection)
         self._answers.left(connection)
@@ -151,12 +162,17 @@ class Service:
         return Now(elapsed(), time.time())
 
     def apply(self, effects: list[Effect]) -> None:
-        """Carry out what the scheduler decided, in its order."""
-        for effect in effects:
+        """Carry out what the scheduler decided, in its order, but what is for the engine before what clients are told.
+
+        So it works, or stops, while they are. What it says to that is taken in another turn of the loop: they hear of
+        everything in the scheduler's order.
+        """
+        for effect in sorted(effects, key=_is_told):
             try:
                 self._carry_out(effect)
             except Exception as error:  # noqa: BLE001 - the effects after it must not be lost: the engine would wait
                 self.failed(type(effect).__name__, error)
+        self._tell_followed()
         self._set_timer()
         self.later.look()
         self.changed()
@@ -181,12 +197,13 @@ class Service:
         record = change.record
         self.audience.changed(record, change.state, time.time())
         if change.state.terminal:
-            goal_id, since = self._started
-            log.ended(record, time.monotonic() - since if goal_id == record.id else None)
+            began = self._started.pop(record.id, None)
+            log.ended(record, None if began is None else time.monotonic() - began)
             self._answers.ended(record)
 
     def _start(self, record: Record) -> None:
-        self._started = (record.id, time.monotonic())
+        self._started[record.id] = time.monotonic()
+        self._followed = self.scheduler.pending_count > 0
         own, general = record, self.settings
         voice = general.voice if own.voice is None else own.voice
         self.engine.say(
@@ -197,8 +214,16 @@ class Service:
                 volume=general.volume if own.volume is None else own.volume,
                 voice=None if voice == DEFAULT_VOICE else voice,
                 pitch=general.pitch if own.pitch is None else own.pitch,
+                followed=self._followed,
             )
         )
+
+    def _tell_followed(self) -> None:
+        """Have the engine know that a goal waits behind the one it speaks: it makes good what the change will take."""
+        active, followed = self.scheduler.active, self.scheduler.pending_count > 0
+        if active and followed is not self._followed:
+            self._followed = followed
+            self.engine.follow(active.id, followed)
 
     def call_later(self, seconds: float, action: Callable[[], None]) -> asyncio.TimerHandle:
         """Do something after a while; what is returned can be cancelled."""
@@ -226,8 +251,7 @@ class Service:
 
     def report(self, report: Report) -> None:
         """Take what the engine thread says; called in any thread."""
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left who would want to know
-            self._loop.call_soon_threadsafe(self._note, report)
+        self._mailbox.post(report)
 
     def _note(self, report: Report) -> None:
         if isinstance(report, protocol.Ended):
@@ -316,3 +340,8 @@ class Service:
         self._closing = True
         self.apply(self.scheduler.shutdown(self._now()))
         self.later.voices_known()
+
+
+def _is_told(effect: Effect) -> bool:
+    """Whether an effect is news for clients; the others are for the engine."""
+    return isinstance(effect, Changed)

@@ -61,7 +61,7 @@ def does(word, said):
     elif name == "stop?":
         assert isinstance(next(arriving), protocol.Stop)
 
-arriving = commands()
+arriving = (each for each in commands() if not isinstance(each, protocol.Followed))
 for command in arriving:
     if isinstance(command, protocol.Configure):
         send(protocol.Ready("scripted", None, None))

@@ -15,7 +15,8 @@ import talkcli
 from talkcli.engine import protocol, spawn
 from talkcli.engine import thread as engine_thread
 from talkcli.engine.murmur import LINES
-from talkcli.engine.thread import HANG_AFTER, EngineDied, EngineSaid, EngineThread, Report
+from talkcli.engine.reports import EngineDied, EngineSaid, Report
+from talkcli.engine.thread import HANG_AFTER, EngineThread
 from tests.support import scripted_engine
 
 if TYPE_CHECKING:

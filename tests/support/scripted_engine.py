@@ -103,6 +103,8 @@ class Engine:
             self._pause(command)
         elif isinstance(command, protocol.Resume):
             self._resume(command)
+        elif isinstance(command, protocol.Followed):
+            pass  # it makes no sound that it could shorten
         else:
             return not self._quit()
         return True

@@ -38,6 +38,7 @@ PURE = [
     "wire",
     "errors",
     "values",
+    "engine.changeover",
     "engine.guard",
     "engine.murmur",
     "engine.restarts",

@@ -1,0 +1,184 @@
+"""A player's process: how it is started, when, and that nothing of it is left."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine import protocol
+from talkcli.engine.child import Child
+from talkcli.engine.pipe import PlayerPipe
+from talkcli.engine.players import Command
+from tests.engine.spawned import Spawned, children
+from tests.engine.test_player_faults import Player
+from tests.support.reference import render
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+#: What happens when: a line for each player that is started, each text that is looked at, each fork.
+_WATCHED = """
+from talkcli.engine import guard
+tell = lambda what: sys.stderr.write(what + "\\n")
+sys.addaudithook(lambda name, _: name in ("os.posix_spawn", "os.fork", "subprocess.Popen") and tell(name))
+guarded = guard.guarded
+guard.guarded = lambda text: (tell("text"), guarded(text))[1]
+"""
+
+
+@pytest.fixture
+def player(tmp_path: Path) -> Player:
+    return Player(tmp_path)
+
+
+def _status(child: Child, seconds: float = 10.0) -> int:
+    """Wait for a child's end, and return its status."""
+    end = time.monotonic() + seconds
+    while (status := child.status()) is None:
+        assert time.monotonic() < end, "it has not ended"
+        child.await_end(0.1)
+    child.release()
+    return status
+
+
+def _run(script: str, *inherited: int) -> Child:
+    return Child(("/bin/sh", "-c", script), inherited)
+
+
+def _descriptors(pid: int) -> dict[int, str]:
+    """Return what a process has open."""
+    folder = f"/proc/{pid}/fd"
+    links = {}
+    for name in os.listdir(folder):
+        with contextlib.suppress(FileNotFoundError):  # the one that lists them
+            links[int(name)] = os.readlink(f"{folder}/{name}")
+    return links
+
+
+# -- a child
+
+
+def test_its_status_is_that_of_its_end() -> None:
+    assert _status(_run("exit 0")) == 0
+    assert _status(_run("exit 7")) == 7
+    assert _status(_run("kill -TERM $$")) == -signal.SIGTERM
+
+
+def test_what_cannot_be_started_is_an_error_and_leaves_nothing_open(tmp_path: Path) -> None:
+    plain = tmp_path / "plain"
+    plain.write_text("no program")
+    before = os.listdir("/proc/self/fd")
+    with pytest.raises(FileNotFoundError):
+        Child(("no-such-program",))
+    with pytest.raises(PermissionError):
+        Child((str(plain),))
+    assert os.listdir("/proc/self/fd") == before
+
+
+def test_it_has_three_streams_what_it_inherits_and_its_leash() -> None:
+    reading, writing = os.pipe()
+    before = _descriptors(os.getpid())
+    child = Child(("sleep", "100"), (writing,))
+    its = _descriptors(child.pid)
+    assert its.pop(1) == os.devnull
+    assert its.pop(writing) == os.readlink(f"/proc/self/fd/{writing}")
+    ours = {os.readlink(f"/proc/self/fd/{each}") for each in (child.stdin, child.stderr, child._leash)}
+    assert ours <= set(its.values())
+    assert set(its.values()) - ours <= set(before.values()), "nothing else was opened for it"
+    assert not os.get_inheritable(writing)
+    child.kill()
+    _status(child)
+    assert _descriptors(os.getpid()) == before
+    os.close(reading)
+    os.close(writing)
+
+
+def test_it_may_be_ended_by_a_pipe_that_nobody_reads() -> None:
+    """Python ignores that signal; a player that went on ignoring it would never end."""
+    child = _run("kill -PIPE $$; exit 3")
+    assert _status(child) == -signal.SIGPIPE
+
+
+def test_it_is_killed_with_all_that_it_has_started() -> None:
+    reading, writing = os.pipe()
+    child = _run("sleep 100 & echo . >&2; wait", writing)
+    os.close(writing)
+    assert child.stderr is not None
+    os.set_blocking(child.stderr, True)
+    os.read(child.stderr, 1)
+    child.kill()
+    assert _status(child) == -signal.SIGKILL
+    assert os.read(reading, 1) == b"", "both have let go of it"
+    os.close(reading)
+
+
+# -- in an engine process
+
+
+def test_no_memory_is_copied_for_it_and_it_starts_before_the_text_is_read(player: Player) -> None:
+    """A fork takes 3 ms, the synthesis 2, and the player itself 5 to 15: together, not one after the other."""
+    with Spawned(player.plays(), before=_WATCHED) as engine:
+        engine.until(protocol.Ready)
+        assert engine.spoken("battery low").outcome == protocol.COMPLETED
+        engine.send(protocol.Quit())
+        assert engine.errors().split() == ["os.posix_spawn", "text"]
+
+
+def test_a_text_without_a_sound_is_no_fault_of_the_player(tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    broken.write_text("#!/no/such/interpreter")
+    broken.chmod(0o755)
+    with Spawned(str(broken)) as engine:
+        engine.until(protocol.Ready)
+        silent, spoken = engine.spoken("...", "g1"), engine.spoken("battery low", "g2")
+        assert (silent.reason, spoken.reason) == ("nothing_to_say", "no_player")
+        assert children(engine.process.pid) == []
+
+
+def test_a_player_for_another_rate_is_replaced_before_the_first_sample(player: Player) -> None:
+    before = """
+from talkcli.engine import library
+from talkcli.values import replace
+load = library.load
+library.load = lambda: replace(load(), rate=16_000)
+"""
+    rates = player.heard.with_name("rates")
+    program = player.plays(f"open({str(rates)!r}, 'a').write(sys.argv[2] + ' ')")
+    with Spawned(f"{program} {{rate}}", before=before) as engine:
+        engine.until(protocol.Voices)
+        assert engine.spoken("battery low").outcome == protocol.COMPLETED
+    assert set(rates.read_text().split()) == {"22050"}
+    assert player.heard.read_bytes() == render(["battery low"])[0].tobytes()
+
+
+def test_all_that_a_player_has_started_dies_with_a_killed_process(tmp_path: Path) -> None:
+    """What a shell starts behind itself, too: it would go on with what it holds."""
+    begun, script = tmp_path / "begun", tmp_path / "pipeline"
+    os.mkfifo(begun)
+    script.write_text(f"#!/bin/sh\nsleep 100 &\necho > {begun}\nwait\n")
+    script.chmod(0o755)
+    with Spawned(str(script)) as engine:
+        engine.until(protocol.Ready)
+        engine.say("one two three")
+        begun.read_text()
+        os.kill(engine.process.pid, signal.SIGKILL)
+        assert engine.all_gone()
+
+
+@pytest.mark.parametrize(("at_start", "pieces"), [(0, 1), (3528, 4), (2000, 3)])
+def test_a_player_that_starts_finds_what_it_needs_to_begin_and_later_a_piece_at_a_time(
+    at_start: int, pieces: int
+) -> None:
+    player = PlayerPipe(Command("sleep", ("sleep", "100"), read_ahead=0, at_start=at_start))
+    taken = []
+    while size := player.offer(memoryview(bytes(882))):
+        taken.append(size)
+    assert (len(taken), sum(taken)) == (pieces, max(882, at_start))
+    assert (player.consumed(), player.proven) == (0, False)
+    player.kill()
+    assert player.gone()

@@ -1,0 +1,39 @@
+"""What an engine process imports before it has spoken: after a crash somebody waits for it."""
+
+from __future__ import annotations
+
+import pytest
+
+from talkcli.engine import protocol
+from tests.engine.spawned import Spawned
+from tests.engine.test_player_faults import Player, player
+
+__all__ = ["player"]
+
+#: Each takes milliseconds of the start, on a Raspberry Pi ten times as many, and nothing in the process needs it.
+_NOT_NEEDED = (
+    "typing",
+    "dataclasses",
+    "inspect",
+    "subprocess",
+    "threading",
+    "selectors",
+    "asyncio",
+    "socket",
+    "logging",
+)
+_TELL = """
+import atexit
+atexit.register(lambda: sys.stderr.write(" ".join(sys.modules)))
+"""
+
+
+@pytest.mark.parametrize("text", ["battery low. Please come home", "..."])
+def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: str) -> None:
+    with Spawned(player.plays(), before=_TELL) as engine:
+        engine.until(protocol.Ready)
+        engine.spoken(text)
+        engine.send(protocol.Quit())
+        imported = set(engine.errors().split())
+    assert "talkcli.engine.playback" in imported
+    assert imported.isdisjoint(_NOT_NEEDED), imported.intersection(_NOT_NEEDED)
