@@ -1,6 +1,7 @@
 """What the scheduler says shall be done, and what it answers: plain objects, to be carried out by the server.
 
-Rules for this file: no decision, no I/O. Effects are to be carried out in the order in which they come.
+Rules for this file: no decision, no I/O. Effects are to be carried out in the order in which they come: those for the
+engine in theirs, and the news for clients, `Changed`, in theirs.
 """
 
 from __future__ import annotations

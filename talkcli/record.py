@@ -19,7 +19,9 @@ class Record:
     """One goal, from its acceptance to its end."""
 
     __slots__ = (
+        "ahead",
         "began",
+        "behind",
         "by",
         "data",
         "duration",
@@ -30,10 +32,11 @@ class Record:
         "id",
         "key",
         "message",
+        "newer",
         "number",
+        "older",
         "paused",
         "pitch",
-        "place",
         "preempt",
         "priority",
         "queued_at",
@@ -50,6 +53,7 @@ class Record:
         "ttl",
         "voice",
         "volume",
+        "waits",
     )
 
     def __init__(self, goal_id: str, number: int, text: str, sender: Sender, queued_at: float) -> None:
@@ -75,8 +79,12 @@ class Record:
         self.volume: float | None = None
         self.voice: str | None = None
         self.pitch: int | None = None
-        #: where it stands among its priority in the queue
-        self.place = 0
+        #: whether it is in the queue, and its neighbours there, by turn and by acceptance; the queue's business alone
+        self.waits = False
+        self.ahead: Record | None = None
+        self.behind: Record | None = None
+        self.older: Record | None = None
+        self.newer: Record | None = None
         self.format = "text"
         self.data: JsonObject | None = None
         self.reason: str | None = None

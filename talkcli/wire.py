@@ -29,21 +29,15 @@ MAX_DIGITS = 20
 def encode(message: JsonObject) -> bytes:
     """Return the object as a line. Text goes as UTF-8; only what UTF-8 cannot hold (a lone surrogate) is escaped."""
     try:
-        return json.dumps(message, ensure_ascii=False, allow_nan=False).encode() + b"\n"
+        return _ENCODER.encode(message).encode() + b"\n"
     except UnicodeEncodeError:
-        return json.dumps(message, allow_nan=False).encode() + b"\n"
+        return _ASCII_ENCODER.encode(message).encode() + b"\n"
 
 
 def decode(line: bytes) -> JsonObject:
     """Return the object in a line; BadRequest, whose code says why, where there is none."""
     try:
-        value = json.loads(
-            line.decode(),
-            object_pairs_hook=_no_duplicates,
-            parse_constant=_no_constant,
-            parse_int=_short_integer,
-            parse_float=_finite,
-        )
+        value = _DECODER.decode(line.decode())
     except UnicodeDecodeError as error:
         raise BadRequest(f"a line is UTF-8, but byte {error.start} of this one is not", "bad_encoding") from None
     except RecursionError:
@@ -77,6 +71,15 @@ def _finite(digits: str) -> float:
     if not math.isfinite(number):
         raise ValueError("a number past every float")
     return number
+
+
+# Made once: `json.dumps` and `json.loads` make a new one for each line that isn't written or read in their own way,
+# which takes half as long as an event's line itself.
+_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
+_ASCII_ENCODER = json.JSONEncoder(allow_nan=False)
+_DECODER = json.JSONDecoder(
+    object_pairs_hook=_no_duplicates, parse_constant=_no_constant, parse_int=_short_integer, parse_float=_finite
+)
 
 
 class LineSplitter:

@@ -84,7 +84,7 @@ def test_what_was_heard_last_is_shown_escaped(scripted: Talk) -> None:
 
 def begin(talk: Talk, text: str) -> str:
     goal_id = talk.run("say", text).id
-    talk.watcher.wait_for(goal_id, "ACTIVE")
+    talk.watcher.wait_for_word(goal_id)  # ACTIVE is earlier: the engine may still be starting
     return goal_id
 
 

@@ -1,6 +1,6 @@
 """Takes up connections, and leaves the engine the descriptors that it needs.
 
-It looks at no client: it makes the connections, and who is served is their handler's business.
+It looks at no client: it hands the connections on, and who is served is their handler's business.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-#: Connections taken up before those that are there have their turn.
-AT_ONCE = 32
+#: Connections taken up before those that are there have their turn: each is greeted, and may have a turn of requests.
+AT_ONCE = 8
 #: Descriptors that clients can't have: a restart of the engine takes nine besides those of the process that ends, a new
 #: socket and its lock two, a look at a client's process one.
 RESERVE = 16
@@ -52,21 +52,20 @@ def make_room(clients: int) -> None:
 
 
 class Acceptor:
-    """Takes up the connections of a listening socket; `make` returns the protocol for each."""
+    """Takes up the connections of a listening socket; `serve` is given each, and has to close it."""
 
     def __init__(
         self,
         loop: asyncio.AbstractEventLoop,
-        make: Callable[[], asyncio.Protocol],
+        serve: Callable[[socket.socket], None],
         failed: Callable[[str, Exception], None],
     ) -> None:
         """`failed` is told of a connection that was not made for a reason of the server's own."""
         self._loop = loop
-        self._make = make
+        self._serve = serve
         self._failed = failed
         self._listening: socket.socket | None = None
         self._retry: asyncio.TimerHandle | None = None
-        self._making: set[asyncio.Task[object]] = set()
         self._limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         if self._limit == resource.RLIM_INFINITY:
             self._limit = 2**31
@@ -104,13 +103,11 @@ class Acceptor:
             if connected.fileno() >= self._limit - RESERVE:
                 self._turn_away(connected)
             else:
-                making = self._loop.create_task(self._connect(connected))
-                self._making.add(making)
-                making.add_done_callback(self._making.discard)
+                self._connect(connected)
 
-    async def _connect(self, connected: socket.socket) -> None:
+    def _connect(self, connected: socket.socket) -> None:
         try:
-            await self._loop.connect_accepted_socket(self._make, connected)
+            self._serve(connected)
         except Exception as error:  # noqa: BLE001 - one connection must not take the others'
             self._failed("making a connection", error)
             connected.close()

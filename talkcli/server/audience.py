@@ -77,13 +77,15 @@ class Audience:
     def changed(self, record: Record, state: State, at: float) -> None:
         """Publish a goal's new state; with its last one, its result."""
         self._count += 1
-        waiting = list(self._waiters.get(record.id, ()))
-        if waiting or self._watchers:
-            event: JsonObject = {"event": "state", "id": record.id, "state": state.name, "n": self._count, "at": at}
-            _publish(event, waiting)
-            self._tell_watchers(record, state, event)
+        waiting = self._waiters.get(record.id, ())
+        if not (waiting or self._watchers):
+            return
+        event: JsonObject = {"event": "state", "id": record.id, "state": state.name, "n": self._count, "at": at}
+        self._tell_watchers(record, state, event)
         if state.terminal and waiting:
-            self._send_result(record, waiting)
+            self._send_result(record, wire.encode(event))
+        elif waiting:
+            _publish(event, waiting)
 
     def heard(self, goal_id: str, word: JsonObject, at: float) -> None:
         """Publish that a word of a goal is being heard."""
@@ -108,12 +110,13 @@ class Audience:
             return
         if state is State.PENDING or state.terminal:
             event = {**event, "goal": record.snapshot(state).to_json()}  # its first state, and its last
-        _publish(event, list(self._watchers))
+        _publish(event, self._watchers)
 
-    def _send_result(self, record: Record, waiting: list[Connection]) -> None:
-        _publish({"event": "result", "goal": record.snapshot().to_json()}, waiting)
-        del self._waiters[record.id]
-        for connection in waiting:
+    def _send_result(self, record: Record, last: bytes) -> None:
+        """Send a goal's last state and its result, in one piece: a thousand may wait for it."""
+        piece = last + wire.encode({"event": "result", "goal": record.snapshot().to_json()})
+        for connection in self._waiters.pop(record.id):
+            connection.publish(piece)
             awaited = self._awaited[connection]
             awaited.discard(record.id)
             if not awaited:
@@ -134,5 +137,5 @@ class Audience:
 
 def _publish(event: JsonObject, connections: Iterable[Connection], *, feedback: bool = False) -> None:
     line = wire.encode(event)
-    for connection in connections:
+    for connection in list(connections):
         connection.publish(line, feedback=feedback)

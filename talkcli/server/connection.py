@@ -6,22 +6,24 @@ not read from either; feedback for it is dropped, and at last the client itself.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
-import os
 from collections import deque
 from itertools import chain
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Protocol
 
 from talkcli import wire
 from talkcli.errors import BadRequest, LineTooLong
 from talkcli.requests import Cancel, Hello, Request, Status, read_request
+from talkcli.server.stream import Stream
 from talkcli.values import replace
 
 if TYPE_CHECKING:
+    import asyncio
+    import socket
     from collections.abc import Iterable, Iterator
 
     from talkcli.messages import JsonObject, Sender
+    from talkcli.server.stream import Turn
 
 #: Bytes that may wait for a client before feedback for it is dropped, and before its requests are left unread.
 SOFT_OUTPUT = 256 * 1024
@@ -45,10 +47,13 @@ READ_AHEAD = 64
 class Handler(Protocol):
     """What a connection needs of the server."""
 
+    #: shared by all its connections
+    turn: Turn
+
     def greeting(self) -> JsonObject:
         """Return the first line for a client that is let in."""
 
-    def joined(self, connection: Connection, transport: asyncio.Transport) -> None:
+    def joined(self, connection: Connection, stream: Stream) -> None:
         """Look who it is: admit a client, let it wait at the door, or close."""
 
     def left(self, connection: Connection) -> None:
@@ -61,10 +66,11 @@ class Handler(Protocol):
         """Note a request whose handling failed for a reason of the server's own."""
 
 
-class Connection(asyncio.Protocol):
+class Connection:
     """A client. One that is not `admitted` waits at the door of a full server until it says that it is urgent."""
 
-    def __init__(self, handler: Handler, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, handler: Handler, loop: asyncio.AbstractEventLoop, connected: socket.socket) -> None:
+        """`connected`: the client's socket, which doesn't block; it is closed with the connection."""
         #: set by the handler when the client joins
         self.sender: Sender
         self.admitted = True
@@ -72,7 +78,7 @@ class Connection(asyncio.Protocol):
         self.owed = 0
         self._handler = handler
         self._loop = loop
-        self._transport: asyncio.Transport | None = None
+        self._stream = Stream(loop, handler.turn, connected, self, SOFT_OUTPUT)
         self._splitter = wire.LineSplitter()
         self._lines: deque[bytes] = deque()
         #: what has to be sent in its order while a list is on its way: lists, and what came after them
@@ -83,27 +89,34 @@ class Connection(asyncio.Protocol):
         self._first_limit: asyncio.TimerHandle | None = None
         self._line_limit: asyncio.TimerHandle | None = None
 
-    # -- what asyncio calls
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = transport = cast("asyncio.Transport", transport)
-        transport.set_write_buffer_limits(high=SOFT_OUTPUT)
-        self._handler.joined(self, transport)
-        if transport.is_closing():
+    def begin(self) -> None:
+        """Greet the client, if it is let in, and take its requests from now on."""
+        self._handler.joined(self, self._stream)
+        if not self._open:
             return
         self._first_limit = self._loop.call_later(
             FIRST_REQUEST, self.refuse, "too_slow", f"no request came within {FIRST_REQUEST:g} s"
         )
         if self.admitted:
             self._write(self._handler.greeting())
+            self._stream.begin()
+        else:
+            # Not at once: the end of another client may have come before, and be seen only later in this turn.
+            self._loop.call_soon(self._stream.resume_reading)
 
-    def connection_lost(self, exc: Exception | None) -> None:
+    def admit(self) -> None:
+        """Let a client in that has waited at the door."""
+        self.admitted = True
+        self._write(self._handler.greeting())
+
+    # -- what the stream calls
+
+    def connection_lost(self, error: OSError | None) -> None:
         for limit in (self._first_limit, self._line_limit):
             if limit:
                 limit.cancel()
-        if isinstance(exc, OSError) and self.admitted:
+        if error is not None and self.admitted:
             self._hear_last_requests()
-        self._transport = None
         self._lines.clear()
         self._outbox.clear()
         self._handler.left(self)
@@ -157,11 +170,17 @@ class Connection(asyncio.Protocol):
             self._send(newest)
         self._send(event)
 
+    def has_hung_up(self) -> bool:
+        """Return whether the client can't be told anything more, as far as can be known by telling it what there is."""
+        self._stream.flush()
+        return not self._open
+
     def settle(self) -> None:
         """Note that an answer that was owed has been given."""
         self.owed -= 1
-        # Not at once: whoever gives the answer may be in the middle of other things, and another request must wait.
-        self._ask_for_a_turn()
+        if self._half_closed:
+            # Not at once: whoever gives the answer may be in the middle of other things, and another request must wait.
+            self._ask_for_a_turn()
 
     def refuse(self, code: str, words: str) -> None:
         """Say why, and close."""
@@ -170,20 +189,18 @@ class Connection(asyncio.Protocol):
 
     def close(self) -> None:
         """Close once what was written is sent."""
-        if self._transport:
-            self._transport.close()
+        self._stream.close()
 
     def drop(self) -> None:
         """Close at once."""
-        if self._transport:
-            self._transport.abort()
+        self._stream.abort()
 
     # -- inside
 
     @property
     def _open(self) -> bool:
         """Whether more can be sent."""
-        return self._transport is not None and not self._transport.is_closing()
+        return not self._stream.closing
 
     def _send(self, message: JsonObject | bytes) -> None:
         """Send a message after the lists that are on their way."""
@@ -196,13 +213,13 @@ class Connection(asyncio.Protocol):
 
     def _set_reading(self) -> None:
         """Read from the client only while it takes its answers and its requests are kept up with."""
-        if self._transport is None or self._transport.is_closing():
+        if not self._open:
             return
         reading = not self._congested and len(self._lines) <= READ_AHEAD
         if reading:
-            self._transport.resume_reading()
+            self._stream.resume_reading()
         else:
-            self._transport.pause_reading()
+            self._stream.pause_reading()
         if not reading or not self._splitter.unfinished:
             self._stop_line_limit()
         elif self._line_limit is None:
@@ -216,19 +233,15 @@ class Connection(asyncio.Protocol):
             self._line_limit = None
 
     def _write(self, message: JsonObject | bytes) -> None:
-        if self._transport is None or self._transport.is_closing():
-            return
-        self._transport.write(message if isinstance(message, bytes) else wire.encode(message))
-        if self._transport.get_write_buffer_size() > HARD_OUTPUT:
+        self._stream.write(message if isinstance(message, bytes) else wire.encode(message))
+        if self._stream.size > HARD_OUTPUT:
             self.drop()
 
     def _hear_last_requests(self) -> None:
         """Take what a client sent that closed without reading: the error hid it, but it is still in the socket."""
-        assert self._transport is not None
-        descriptor = self._transport.get_extra_info("socket").fileno()
         try:
             with contextlib.suppress(OSError):
-                while data := os.read(descriptor, SOFT_OUTPUT):
+                while data := self._stream.socket.recv(SOFT_OUTPUT):
                     self._lines.extend(self._splitter.feed(data))
         except LineTooLong as error:
             self._lines.extend(error.before)
@@ -300,8 +313,7 @@ class Connection(asyncio.Protocol):
     def _let_in(self, request: Request) -> bool:
         """Let a client in whose business is urgent; send the others away from a full server."""
         if isinstance(request, Status | Cancel) or (isinstance(request, Hello) and request.urgent):
-            self.admitted = True
-            self._write(self._handler.greeting())
+            self.admit()
             return True
         self._write(wire.busy_greeting())
         self.close()

@@ -97,7 +97,8 @@ class Later:
         waiting, self._for_room = self._for_room, deque()
         stay = []
         for each in waiting:
-            if each.may_go():
+            # Who has hung up has taken its request back, and is about to be forgotten.
+            if not each.connection.has_hung_up() and each.may_go():
                 self._audience.answered(each.connection)
                 self._go(each)
             else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import os
 import random
 import signal
@@ -39,6 +40,7 @@ def serve(settings: Settings) -> int:
 
     AddressInUse if another server serves, or the socket's directory isn't safe; UsageError if the voice isn't known.
     """
+    gc.freeze()  # what is imported stays: a full collection that looks at all of it keeps clients waiting for 10 ms
     listener = listen(settings.socket, settings.socket_mode)
     try:
         asyncio.run(_Server(settings, listener).run())
@@ -67,7 +69,7 @@ class _Server:
         service = self._service = Service(_boot(), settings, self._listener.path, self._listener.mode)
         supervisor = self._supervisor = Supervisor(loop, os.environ, service.words)
         service.changed = supervisor.changed
-        acceptor = self._acceptor = Acceptor(loop, lambda: Connection(service, loop), service.failed)
+        acceptor = self._acceptor = Acceptor(loop, lambda each: Connection(service, loop, each).begin(), service.failed)
         upkeep = Upkeep(loop, self._listener, self._moved, self._lost)
         loop.set_exception_handler(self._on_bug)
         for number in (signal.SIGTERM, signal.SIGINT):

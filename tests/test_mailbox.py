@@ -1,0 +1,108 @@
+"""What the engine says on its way to the clients: in its order, a few at a time, and what is for the engine first."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import TYPE_CHECKING
+
+from talkcli.engine import protocol
+from talkcli.messages import Sender
+from talkcli.requests import Say
+from talkcli.server.mailbox import AT_ONCE, Mailbox
+from talkcli.server.service import Service
+from talkcli.server.settings import Settings
+
+if TYPE_CHECKING:
+    from talkcli.record import Record
+    from talkcli.states import State
+
+COUNT = 5 * AT_ONCE + 1
+
+
+class _Written:
+    """An engine that writes down what it is told, where others write down what clients are told."""
+
+    def __init__(self, written: list[str]) -> None:
+        self.written = written
+
+    def say(self, goal: protocol.Say) -> None:
+        self.written.append(f"say {goal.text}")
+
+    def stop(self, _: str) -> None:
+        self.written.append("stop")
+
+    def follow(self, _: str, followed: bool) -> None:
+        """Take note of what is no news for this test."""
+
+
+def test_words_that_come_all_at_once_leave_the_clients_their_turns() -> None:
+    async def play() -> None:
+        loop = asyncio.get_running_loop()
+        taken: list[object] = []
+        wakes = []
+        mailbox = Mailbox(loop, taken.append, lambda *_: None)
+        call = loop.call_soon_threadsafe
+        loop.call_soon_threadsafe = lambda *values: wakes.append(call(*values))  # type: ignore[assignment, method-assign]
+        words = [protocol.Word("k3fz-1", 0, 1, number, 0.0) for number in range(COUNT)]
+
+        def post_all() -> None:
+            for each in words:
+                mailbox.post(each)
+
+        thread = threading.Thread(target=post_all)
+        thread.start()
+        thread.join()
+        assert len(wakes) == 1  # one for all of them
+        turns = 0
+        while len(taken) < COUNT:
+            await asyncio.sleep(0)
+            turns += 1
+            assert len(taken) <= turns * AT_ONCE
+        assert taken == words
+        mailbox.post(words[0])
+        assert len(wakes) == 2
+
+    asyncio.run(play())
+
+
+def test_report_that_meets_a_bug_takes_no_other_with_it() -> None:
+    async def play() -> None:
+        taken, failed = [], []
+
+        def take(report: protocol.Event) -> None:
+            taken.append(report)
+            if len(taken) == 1:
+                raise ZeroDivisionError("a bug")
+
+        mailbox = Mailbox(asyncio.get_running_loop(), take, lambda what, error: failed.append((what, type(error))))  # type: ignore[arg-type]
+        for number in range(3):
+            mailbox.post(protocol.Alive(f"k3fz-{number}"))
+        await asyncio.sleep(0)
+        assert len(taken) == 3
+        assert failed == [("a report of the engine", ZeroDivisionError)]
+
+    asyncio.run(play())
+
+
+def test_the_engine_gets_to_work_before_clients_are_told() -> None:
+    async def play() -> None:
+        written: list[str] = []
+        served = Service("k3fz", Settings(), "unused", 0o600)
+        served.engine = _Written(written)  # type: ignore[assignment]
+
+        def changed(record: Record, state: State, _: float) -> None:
+            written.append(f"{state.name} {record.text}")
+
+        served.audience.changed = changed  # type: ignore[assignment, method-assign]
+        for text, preempt in (("first", False), ("second", True)):
+            served.apply(served.scheduler.submit(Say(text, preempt=preempt), Sender(), served.now()).effects)
+        served.report(protocol.Ended("k3fz-1", protocol.STOPPED))
+        await asyncio.sleep(0)
+        assert written == [
+            *("say first", "PENDING first", "ACTIVE first"),
+            *("stop", "PENDING second", "PREEMPTING first"),
+            *("say second", "PREEMPTED first", "ACTIVE second"),
+        ]
+
+    asyncio.run(play())

@@ -1,0 +1,287 @@
+"""A client's socket as the server uses it: at once in, in one piece out, and the end told once.
+
+Turns of the event loop are counted, and calls of the system, not time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.server.stream import Stream, Turn
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+HIGH = 100_000
+
+
+class Counted(socket.socket):
+    """A socket that counts what is sent with it."""
+
+    sent = 0
+
+    def send(self, data: bytes, flags: int = 0, /) -> int:  # type: ignore[override]
+        self.sent += 1
+        return super().send(data, flags)
+
+
+class Told:
+    """Notes all that a stream tells."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.ends = 0
+        self.congested: list[bool] = []
+        self.lost: list[OSError | None] = []
+        self.stays_open = True
+        self.fault: Exception | None = None
+
+    def data_received(self, data: bytes) -> None:
+        self.data += data
+        if self.fault:
+            raise self.fault
+
+    def eof_received(self) -> bool:
+        self.ends += 1
+        return self.stays_open
+
+    def pause_writing(self) -> None:
+        self.congested.append(True)
+
+    def resume_writing(self) -> None:
+        self.congested.append(False)
+
+    def connection_lost(self, error: OSError | None) -> None:
+        self.lost.append(error)
+
+
+class Pair:
+    """A stream, what it tells, and the client's end of its socket."""
+
+    def __init__(self) -> None:
+        ours, self.client = socket.socketpair()
+        self.socket = Counted(fileno=ours.detach())
+        for each in (self.socket, self.client):
+            each.setblocking(False)
+        self.told = Told()
+        loop = asyncio.get_running_loop()
+        self.stream = Stream(loop, Turn(loop), self.socket, self.told, HIGH)
+
+    def receive(self) -> bytes:
+        """Return what has come at the client's end by now."""
+        received = b""
+        with contextlib.suppress(BlockingIOError, ConnectionResetError):
+            while data := self.client.recv(1 << 20):
+                received += data
+        return received
+
+
+@contextlib.asynccontextmanager
+async def paired() -> AsyncIterator[Pair]:
+    pair = Pair()
+    try:
+        yield pair
+    finally:
+        pair.client.close()
+        pair.stream.abort()
+        await turn()
+
+
+async def turn() -> None:
+    """Let the loop do what is due, and what follows from that at once."""
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+
+
+async def until_lost(pair: Pair) -> None:
+    for _ in range(100):
+        if pair.told.lost:
+            return
+        await asyncio.sleep(0.01)
+    pytest.fail("the end was not told")
+
+
+def test_what_is_there_already_is_read_and_what_was_written_is_sent_before_anything_else_happens() -> None:
+    async def play() -> None:
+        async with paired() as pair:
+            pair.client.send(b"hello\n")
+            pair.stream.write(b"greeting\n")
+            pair.stream.begin()
+            assert (pair.told.data, pair.receive()) == (b"hello\n", b"greeting\n")
+
+    asyncio.run(play())
+
+
+def test_what_is_written_in_one_turn_goes_out_in_one_piece() -> None:
+    async def play() -> None:
+        async with paired() as pair:
+            pair.stream.begin()
+            for number in range(5):
+                pair.stream.write(b"%d\n" % number)
+            assert (pair.receive(), pair.socket.sent) == (b"", 0)
+            await turn()
+            assert (pair.receive(), pair.socket.sent) == (b"0\n1\n2\n3\n4\n", 1)
+            await turn()
+            assert pair.socket.sent == 1
+
+    asyncio.run(play())
+
+
+def test_a_lot_is_sent_before_the_turn_ends() -> None:
+    async def play() -> None:
+        async with paired() as pair:
+            pair.stream.begin()
+            pair.stream.write(b"x" * 65_536)
+            assert len(pair.receive()) == 65_536
+
+    asyncio.run(play())
+
+
+def test_client_that_does_not_read_is_told_of_once_and_gets_all_in_the_end() -> None:
+    async def play() -> None:
+        async with paired() as pair:
+            pair.stream.begin()
+            written = b""
+            while not pair.told.congested:
+                written += b"%08d" % len(written) * 1_000
+                pair.stream.write(written[-8_000:])
+            assert pair.stream.size > HIGH
+            written += b"the rest"
+            pair.stream.write(b"the rest")
+            received = b""
+            while len(received) < len(written):
+                received += pair.receive()
+                await turn()
+            assert received == written
+            assert (pair.told.congested, pair.stream.size) == ([True, False], 0)
+
+    asyncio.run(play())
+
+
+def test_reading_stops_and_goes_on() -> None:
+    async def play() -> None:
+        async with paired() as pair:
+            pair.stream.begin()
+            pair.stream.pause_reading()
+            pair.client.send(b"hello\n")
+            await turn()
+            assert pair.told.data == b""
+            for _ in range(2):
+                pair.stream.resume_reading()
+            await turn()
+            assert pair.told.data == b"hello\n"
+
+    asyncio.run(play())
+
+
+def test_end_of_the_input_is_told_once_and_the_answers_still_go_out() -> None:
+    async def play() -> None:
+        async with paired() as pair:
+            pair.stream.begin()
+            pair.client.shutdown(socket.SHUT_WR)
+            await turn()
+            pair.stream.pause_reading()
+            pair.stream.resume_reading()
+            await turn()
+            assert (pair.told.ends, pair.told.lost, pair.stream.closing) == (1, [], False)
+            pair.stream.write(b"answer\n")
+            pair.stream.close()
+            await until_lost(pair)
+            assert (pair.receive(), pair.told.lost) == (b"answer\n", [None])
+
+    asyncio.run(play())
+
+
+def test_end_of_the_input_closes_where_the_receiver_says_so() -> None:
+    async def play() -> None:
+        async with paired() as pair:
+            pair.told.stays_open = False
+            pair.stream.begin()
+            pair.client.close()
+            await until_lost(pair)
+            assert (pair.told.ends, pair.told.lost, pair.socket.fileno()) == (1, [None], -1)
+
+    asyncio.run(play())
+
+
+def test_close_sends_what_the_client_has_not_taken_yet_and_abort_does_not() -> None:
+    async def play(*, abort: bool) -> int:
+        async with paired() as pair:
+            pair.stream.begin()
+            pair.stream.write(b"x" * 1_000_000)
+            pair.stream.close()
+            if abort:
+                pair.stream.abort()
+            pair.stream.write(b"not any more")
+            received = 0
+            while not pair.told.lost:
+                received += len(pair.receive())
+                await turn()
+            pair.stream.close()
+            pair.stream.abort()
+            await turn()
+            assert pair.told.lost == [None]
+            return received + len(pair.receive())
+
+    assert asyncio.run(play(abort=False)) == 1_000_000
+    assert asyncio.run(play(abort=True)) < 1_000_000
+
+
+def test_client_that_is_gone_is_seen_by_what_is_written_and_what_it_sent_can_still_be_read() -> None:
+    async def play() -> None:
+        async with paired() as pair:
+            pair.stream.begin()
+            pair.stream.pause_reading()
+            pair.client.send(b"a last request\n")
+            pair.client.close()
+            pair.stream.write(b"answer\n")
+            last = []
+            pair.told.connection_lost = lambda error: last.append((error, pair.socket.recv(100)))  # type: ignore[method-assign]
+            await turn()
+            ((error, received),) = last
+            assert isinstance(error, BrokenPipeError)
+            assert received == b"a last request\n"
+            assert pair.socket.fileno() == -1
+
+    asyncio.run(play())
+
+
+def test_receiver_that_meets_a_bug_loses_the_connection() -> None:
+    async def play() -> None:
+        said = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: said.append(context["exception"]))
+        async with paired() as pair:
+            pair.told.fault = ZeroDivisionError("a bug")
+            pair.stream.begin()
+            pair.client.send(b"hello\n")
+            await until_lost(pair)
+        assert [type(each) for each in said] == [ZeroDivisionError]
+
+    asyncio.run(play())
+
+
+def test_one_callback_sends_what_all_streams_were_given_in_a_turn() -> None:
+    async def play() -> None:
+        loop = asyncio.get_running_loop()
+        calls = []
+        turn_of_all = Turn(loop)
+        call = loop.call_soon
+        async with paired() as first, paired() as second:
+            pairs = [first, second]
+            for pair in pairs:
+                pair.stream = Stream(loop, turn_of_all, pair.socket, pair.told, HIGH)
+            loop.call_soon = lambda *values, **named: calls.append(call(*values, **named))  # type: ignore[assignment, method-assign]
+            for _ in range(3):
+                for pair in pairs:
+                    pair.stream.write(b"word\n")
+            loop.call_soon = call  # type: ignore[method-assign]
+            assert len(calls) == 1
+            await turn()
+            assert [pair.receive() for pair in pairs] == [b"word\n" * 3] * 2
+
+    asyncio.run(play())
