@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 def main() -> NoReturn:
     """Run the command line, and exit."""
-    code = _run_plain(sys.argv[1:])
+    try:
+        code = _run_plain(sys.argv[1:])
+    except KeyboardInterrupt:  # before there was anything to interrupt
+        code = 128 + 2
     if code is None:
         sys.exit(_run_by_click(sys.argv[1:]))
     # All is written. To tidy up what ends with it anyway would take the interpreter an eighth of the command's life.

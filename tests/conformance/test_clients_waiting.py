@@ -182,6 +182,7 @@ def test_row_33_signal_ends_what_the_client_owns(
     client, goal_id = speaking(scripted, "--wait") if command == "say" else speaking(scripted)
     if command == "wait":
         assert scripted.finish(client).id == goal_id
+        _until_watched(scripted, 2)
         client = scripted.start("wait", goal_id)
     _until_watched(scripted, 3)
     client.send_signal(number)

@@ -1,0 +1,119 @@
+"""What rows are measured with, each started when the first row needs it: sink, installed talk, speech-dispatcher."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import shutil
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tests.bench.dispatcher import dispatcher
+from tests.bench.ear import fine_blocks
+from tests.bench.installed import Installed, serve
+from tests.support.sink import PROGRAMS, Sink
+from tests.support.surroundings import clean_environment, short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from tests.bench.installed import Server
+
+#: What to install for a program that is missing.
+PACKAGES = {
+    "pulseaudio": "pulseaudio",
+    "pactl": "pulseaudio-utils",
+    "parec": "pulseaudio-utils",
+    "pacat": "pulseaudio-utils",
+    "aplay": "alsa-utils libasound2-plugins",
+    "espeak-ng": "espeak-ng",
+    "spd-say": "speech-dispatcher",
+    "speech-dispatcher": "speech-dispatcher speech-dispatcher-espeak-ng",
+}
+_SCRIPTED = str(Path(__file__).resolve().parents[1] / "support" / "scripted_serve.py")
+PEERS = ("espeak-ng", "spd-say", "speech-dispatcher")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How much is measured, and with what."""
+
+    rounds: int = 15
+    idle: float = 60.0  # seconds
+    peers: bool = True
+    venv: str | None = None
+    refresh: bool = True
+    #: what the rows of `onset` say
+    text: str = "battery low"
+
+
+def missing(*, peers: bool) -> dict[str, str]:
+    """Return the programs that are not there, and the Debian packages that have them."""
+    wanted = (*PROGRAMS, *(PEERS if peers else ()))
+    return {each: PACKAGES[each] for each in wanted if shutil.which(each) is None}
+
+
+class Stage(contextlib.AbstractContextManager["Stage"]):
+    """Gives what a row needs; `close` or `with` ends all of it."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self._chance = random.Random(5)
+        self._stack = contextlib.ExitStack()
+
+    def __exit__(self, *_error: object) -> None:
+        self._stack.close()
+
+    @cached_property
+    def sink(self) -> Sink:
+        """A sound server with one null sink, listened to from its start."""
+        found = self._stack.enter_context(Sink())
+        self._stack.enter_context(fine_blocks(found))
+        return found
+
+    @cached_property
+    def plain(self) -> dict[str, str]:
+        """The environment of a program that plays into the sink by itself."""
+        env = clean_environment(self.sink.directory, self.sink.env)
+        env.pop("PYTHONPATH", None)
+        return env
+
+    @cached_property
+    def installed(self) -> Installed:
+        """The environment that has talk."""
+        directory = self.options.venv or f"{self._stack.enter_context(short_directory('bench-'))}/venv"
+        found = Installed(os.path.abspath(directory))
+        found.make(refresh=self.options.refresh)
+        return found
+
+    @cached_property
+    def spd(self) -> dict[str, str]:
+        """The environment in which `spd-say` finds a speech-dispatcher of ours."""
+        return self._stack.enter_context(dispatcher(self.sink))
+
+    @cached_property
+    def speaking(self) -> Server:
+        """A server with the real engine that plays into the sink."""
+        return self._stack.enter_context(self.server("--player", "aplay"))
+
+    @contextlib.contextmanager
+    def server(self, *options: str, heard: bool = True) -> Iterator[Server]:
+        """Run a server of the installed talk with these options; one that is not `heard` needs no sink."""
+        sound = self.sink.env if heard else {}
+        with serve([self.installed.talk, "serve", *options], sound) as found:
+            yield found
+
+    def scripted(self, *options: str) -> list[str]:
+        """Return the command of a server of the installed talk whose engine is scripted."""
+        return [self.installed.python, _SCRIPTED, *options]
+
+    def jitter(self, most: float = 0.02) -> float:
+        """Return some seconds: two blocks of the sink, so that no row is measured at always the same moment of one."""
+        return self._chance.random() * most
+
+    def shuffled(self, names: Sequence[str]) -> list[str]:
+        """Return the names in another order each time, and in the same ones each run."""
+        return self._chance.sample(names, len(names))

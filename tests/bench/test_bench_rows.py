@@ -1,0 +1,63 @@
+"""Each row of the benchmark measures something: a short run of all of them, with no peers, whatever the figures are."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.bench import crowd, queueing, throughput
+from tests.bench.failure import FailedError
+from tests.bench.groups import GROUPS, measure
+from tests.bench.stage import Options, Stage
+from tests.support.surroundings import needs
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.bench.table import Row
+
+#: How many rows a group has.
+ROWS = {"onset": 6, "commands": 13, "idle": 3, "throughput": 2, "queue": 4}
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    if not os.path.exists(f"{sys.prefix}/bin/talk"):
+        reason = f"needs talk installed in {sys.prefix}"
+        pytest.fail(reason, pytrace=False) if os.environ.get("CI") else pytest.skip(reason)
+    needs("pulseaudio", "pactl", "parec", "pacat", "aplay")
+    with Stage(Options(rounds=1, idle=1, peers=False, venv=sys.prefix, refresh=False)) as found:
+        yield found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_row_measures_something(stage: Stage, group: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, name, less in (
+        (throughput, "GOALS", 200),
+        (throughput, "_FIRST", 50),
+        (queueing, "FEW", 50),
+        (queueing, "MANY", 200),
+        (queueing, "PENDING", 300),
+        (crowd, "CLIENTS", 20),
+    ):
+        monkeypatch.setattr(module, name, less)
+    rows = measure(group, stage)
+    assert [each.failure for each in rows if each.failure] == []
+    assert len(rows) == ROWS.get(group, 1)
+    for row in rows:
+        assert row.values
+        assert row.cells()[2].endswith(row.unit)
+
+
+def test_a_group_that_fails_has_a_reason_in_the_place_of_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: Stage) -> list[Row]:
+        raise FailedError("it was not heard")
+
+    monkeypatch.setitem(GROUPS, "onset", fail)
+    (row,) = measure("onset", Stage(Options()))
+    assert row.failure == "FailedError: it was not heard"
+    assert row.cells()[2].startswith("FAILED")
