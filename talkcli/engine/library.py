@@ -6,12 +6,15 @@ Linux only; elsewhere pyttsx3's own drivers find their libraries themselves. It 
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import os
 
 from talkcli.values import frozen
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from typing import Any
 
 _LIBRARY = "libespeak-ng.so.1"
@@ -45,11 +48,30 @@ def load() -> Library:
     origin, data = _preload()
     from pyttsx3.drivers import _espeak
 
-    rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _BUFFER_MS, data, _DONT_EXIT)
+    with _no_sound_server():
+        rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _BUFFER_MS, data, _DONT_EXIT)
     if rate <= 0:
         raise LibraryMissing("there is no espeak-ng data: install espeak-ng-data, or pip install espeakng-loader")
     version = (_espeak.Info(None) or b"").decode("utf-8", "replace").split(" ")[0]
     return Library(_espeak, f"eSpeak NG {version} ({origin})", rate)
+
+
+@contextlib.contextmanager
+def _no_sound_server() -> Iterator[None]:
+    """Let no PulseAudio be found meanwhile.
+
+    The library connects to one whenever it is initialised, though it is never to play: 7 ms where one answers, and 30 s
+    where one hangs, in which the engine would be given up.
+    """
+    before = os.environ.get("PULSE_SERVER")
+    os.environ["PULSE_SERVER"] = "unix:/dev/null"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PULSE_SERVER"]
+        else:
+            os.environ["PULSE_SERVER"] = before
 
 
 def _preload() -> tuple[str, bytes | None]:

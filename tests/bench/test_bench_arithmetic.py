@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 def sound(*parts: tuple[int, int]) -> Samples:
     """Return samples: each part is so many of an amplitude, with changing sign."""
     pieces = [amplitude * np.resize([1, -1], length) for length, amplitude in parts]
-    return np.concatenate(pieces).astype(np.int16)
+    samples: Samples = np.concatenate(pieces).astype(np.int16)
+    return samples
 
 
 @pytest.mark.parametrize(

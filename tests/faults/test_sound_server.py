@@ -107,3 +107,15 @@ def _ends(talk: Talk, goal_id: str, reason: str, since: float) -> float:
     assert_aborted(goal, reason)
     assert goal["message"] != "Talk aborted: "
     return talk.watcher.arrived(event) - since
+
+
+def test_sound_server_that_hangs_while_the_engine_starts(make_talk: MakeTalk) -> None:
+    """libespeak-ng looks for PulseAudio when it is initialised, and would wait half a minute for one that hangs."""
+    with Sink() as sink:
+        sink.freeze()
+        try:
+            talk = make_talk("--player", "null", sink=sink)
+            done = talk.run("say", "--wait", "--timeout", "8", LOW)
+            assert (done.code, done.err) == (0, "")
+        finally:
+            sink.thaw()
