@@ -31,6 +31,7 @@ COMMANDS = {
     "resume": "Go on where speech was held.",
     "set": "Change the running server's settings, or print them.",
     "voices": "List the voices.",
+    "doctor": "Check everything between a sentence and a loudspeaker.",
 }
 
 

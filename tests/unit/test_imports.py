@@ -225,3 +225,28 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
         [sys.executable, "-c", code], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, [], "")
+
+
+#: The doctor's modules that judge facts; they read a clock's format at most, and gather nothing.
+JUDGING = ["findings", "session", "voice", "sound", "level", "places", "sentence", "serving", "report"]
+#: What those may import of the package besides each other.
+FOR_JUDGING = {"", "columns", "messages", "printable", "states", "values"}
+
+
+def test_the_doctor_judges_without_looking() -> None:
+    judging = {f"doctor.{each}" for each in JUDGING}
+    assert judging <= sources().keys()
+    for module in judging:
+        assert not outside(module) & (IMPURE - {"time"}), module
+        assert {name for name, each in inside(module) if not each.typing} <= judging | FOR_JUDGING, module
+
+
+def test_the_doctor_is_imported_by_its_command_alone_and_the_engine_where_it_needs_one() -> None:
+    for module in sources():
+        for name, each in inside(module):
+            if part(module) == "doctor" and not each.typing:
+                assert part(name) not in {"cli", "server", "output"}, f"talkcli.{module} imports {name}"
+                assert part(name) != "engine" or each.function, f"talkcli.{module}:{each.line}"
+            if part(name) == "doctor" and part(module) != "doctor":
+                assert module == "cli.doctor", f"talkcli.{module} imports {name}"
+                assert each.function, "the other commands don't pay for it"

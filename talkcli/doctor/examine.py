@@ -1,0 +1,137 @@
+"""All checks, in the order of the way that a sentence takes; what each needs is gathered just before it is judged.
+
+It must never hang: whatever is asked has a limit of time. And it changes nothing: its own goal is all that it sends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from talkcli.doctor import ask, findings, level, look, places, probe, reach, sentence, serving, session, sound, voice
+from talkcli.doctor.probe import Setting
+from talkcli.doctor.sentence import Played
+from talkcli.errors import TalkError
+from talkcli.states import State
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from talkcli.client import Client
+    from talkcli.doctor.findings import Finding
+    from talkcli.doctor.places import Places
+    from talkcli.doctor.voice import Engine
+    from talkcli.messages import Goal, JsonObject
+
+#: Seconds that the sentence may take, its time in the queue included: long enough for one that is being spoken.
+LIMIT = 20.0
+#: Goals of the log that are looked at for failures.
+_LOG = 100
+#: Seconds in which an engine should be ready, and between two looks whether it is.
+_STARTING, _PAUSE = 1.0, 0.05
+#: The driver that plays through programs; any other has a way of its own.
+_OWN_DRIVER = "espeak"
+
+
+class Examination:
+    """One run of the doctor."""
+
+    def __init__(self, socket: str | None, *, silent: bool, interrupt: int | None = None) -> None:
+        """`socket`: --socket; `silent`: play the sentence without sound; `interrupt`: a descriptor that ends it."""
+        self._option = socket
+        self._silent = silent
+        self._interrupt = interrupt
+        self._server: JsonObject = {}
+        self._log: list[Goal] = []
+        self._found: list[Finding] = []
+        #: why a server that was there said nothing of itself
+        self._gone: str | None = None
+        #: whether the sound server hangs: whoever asks it again waits again
+        self._hangs = False
+
+    def findings(self) -> Iterator[Finding]:
+        """Give each finding as soon as it is known; Interrupted."""
+        client, found = reach.connect(self._option, self._interrupt)
+        with contextlib.ExitStack() as stack:
+            if client is not None:
+                stack.enter_context(client)
+                client = self._asked(client)
+            for each in self._all(client, found):
+                self._found.append(each)
+                yield each
+
+    def _asked(self, client: Client) -> Client | None:
+        """Return the client once the server has described itself; None where it went away."""
+        try:
+            end = time.monotonic() + _STARTING
+            self._server, self._log = client.status().server, client.log(_LOG)
+            # A server that has just been started doesn't know its player yet, and tells nobody when it does.
+            while self._server.get("engine") == "starting" and time.monotonic() < end:
+                time.sleep(_PAUSE)
+                self._server = client.status().server
+        except TalkError as error:
+            self._gone = error.message
+            return None
+        return client
+
+    def _all(self, client: Client | None, found: Places) -> Iterator[Finding]:
+        named = None if client else os.environ.get("TALK_VOICE") or None
+        engine = probe.look(Setting(voice=named, interrupt=self._interrupt))
+        yield from voice.judge(look.python(), engine, server=client is not None)
+        process = reach.process_here(client) if client else None
+        here, env = look.surroundings(process)
+        if client is not None and process is None:
+            yield session.elsewhere()
+            yield from sound.judge_setting(*self._player())
+        elif sys.platform.startswith("linux"):
+            yield from session.judge(here)
+            yield from self._sound(here, env, running=client is not None)
+        yield places.judge(found)
+        if self._gone is not None:
+            yield serving.gone(self._gone)
+        if client is not None:
+            yield from serving.judge(self._server, self._log, time.time())
+        yield self._sentence(client, engine, env)
+
+    def _player(self) -> tuple[str | None, str | None]:
+        """Return the player that is set, and by whom."""
+        if self._server:
+            player = self._server.get("player")
+            return (str(player), "the server's") if player else (None, None)
+        player = os.environ.get("TALK_PLAYER") or None
+        return (player, "TALK_PLAYER") if player else (None, None)
+
+    def _sound(self, here: session.Session, env: Mapping[str, str], *, running: bool) -> Iterator[Finding]:
+        if self._server.get("driver") not in {None, _OWN_DRIVER}:
+            return
+        wanted, by = self._player()
+        device = self._server.get("device")
+        players = ask.players(env, wanted, by)
+        used = wanted or next(iter(players.found), None)
+        devices = ask.devices(env, used, None if device is None else str(device))
+        cards, server = look.cards(here), ask.sound_server(env, here)
+        self._hangs = server.hangs
+        yield from sound.judge(players, devices, cards, server, here, running=running)
+        if not sound.is_silent(wanted):
+            default = device is None and used in players.packages
+            yield from level.judge(ask.levels(env, server, cards), default=default)
+
+    def _sentence(self, client: Client | None, engine: Engine, env: Mapping[str, str]) -> Finding:
+        wanted, _ = self._player()
+        if client is not None:
+            played = reach.speak(client, sentence.TEXT, 0.0 if self._silent else None, LIMIT)
+            played = reach.with_player(played, self._server.get("player"))
+        elif engine.reason is not None:
+            played = Played(State.ABORTED, engine.reason, engine.words)
+        else:
+            setting = Setting(wanted, None, os.environ.get("TALK_VOICE") or None, self._interrupt)
+            played = probe.speak(sentence.TEXT, setting, 0.0 if self._silent else 1.0, LIMIT)
+        asleep = ask.suspended(env) if played.reason == "audio_stalled" and not self._hangs else ()
+        quiet = self._silent or sound.is_silent(wanted)
+        step = findings.behind(self._found)
+        return sentence.judge(
+            played, silent=quiet, server=client is not None, suspended=asleep, behind=step, hangs=self._hangs
+        )

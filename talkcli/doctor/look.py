@@ -1,0 +1,206 @@
+"""Facts that files tell: who runs this process or the server's, in what surroundings, and the kernel's sound cards.
+
+It judges nothing, starts nothing and opens no device: that would wake it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import grp
+import os
+import platform
+import pwd
+import re
+import stat
+import struct
+import sys
+from typing import TYPE_CHECKING
+
+from talkcli import peers
+from talkcli.doctor.session import Session
+from talkcli.doctor.sound import Cards
+from talkcli.doctor.voice import Python
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+#: The group that Debian's cards belong to.
+_AUDIO = "audio"
+#: Files that container runtimes leave in theirs.
+_CONTAINER = ("/.dockerenv", "/run/.containerenv", "/run/systemd/container")
+#: Parents that are looked at: a shell in a script in cron is three below it.
+_GENERATIONS = 8
+_CRON = frozenset({"cron", "crond", "cronie", "anacron"})
+_SSH = frozenset({"ssh", "sshd"})
+#: An entry of an access control list for one user, or for one group; and the bits for reading and writing.
+_ACL_USER, _ACL_GROUP, _READ_WRITE = 2, 8, 6
+
+
+def python() -> Python:
+    """Return what interpreter this is; pyttsx3 is not imported, as it may be broken."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found: str | None = None
+    with contextlib.suppress(PackageNotFoundError):
+        found = version("pyttsx3")
+    return Python(platform.python_version(), sys.executable, found)
+
+
+def surroundings(server: int | None) -> tuple[Session, Mapping[str, str]]:
+    """Return who runs the server, and its environment; of this process where there is none, or it is not to be read.
+
+    The server's player is what plays, so where it can be seen, all that has to do with sound is looked at from there.
+    """
+    if server is not None:
+        environment = _environment(server)
+        if environment is not None:
+            return _session(environment, server), environment
+    return _session(os.environ, None), dict(os.environ)
+
+
+def _environment(pid: int) -> dict[str, str] | None:
+    """Return the environment of a process of the same user; None for another's, whose sound server shuts us out."""
+    try:
+        with open(f"/proc/{pid}/environ", "rb") as file:
+            data = file.read()
+        if os.stat(f"/proc/{pid}").st_uid != os.getuid():
+            return None
+    except OSError:
+        return None
+    pairs = (each.partition("=") for each in os.fsdecode(data).split("\0") if "=" in each)
+    return {name: value for name, _, value in pairs}
+
+
+def _session(environment: Mapping[str, str], server: int | None) -> Session:
+    uid = os.getuid()
+    gids = _groups(server)
+    caller = environment.get("SUDO_UID", "")
+    runtime = environment.get("XDG_RUNTIME_DIR") or None
+    usual = f"/run/user/{uid}"
+    owner = None
+    if runtime is not None:
+        with contextlib.suppress(OSError):
+            owner = os.stat(runtime).st_uid
+    return Session(
+        uid=uid,
+        user=_user(uid),
+        server=server,
+        groups=tuple(map(_group, gids)),
+        gids=gids,
+        sudo_uid=int(caller) if uid == 0 and caller.isdecimal() else None,
+        kinds=tuple(_kinds(environment, server)),
+        runtime=runtime,
+        runtime_owner=owner,
+        usual_runtime=usual if os.path.isdir(usual) else None,
+    )
+
+
+def _user(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+def _group(gid: int) -> str:
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return str(gid)
+
+
+def _groups(pid: int | None) -> tuple[int, ...]:
+    if pid is not None:
+        found = re.search(r"^Groups:(.*)$", _text(f"/proc/{pid}/status"), re.MULTILINE)
+        mine = re.search(r"^Gid:\s+\d+\s+(\d+)", _text(f"/proc/{pid}/status"), re.MULTILINE)
+        if found and mine:
+            return tuple(sorted({int(mine[1]), *map(int, found[1].split())}))
+    return tuple(sorted({os.getegid(), *os.getgroups()}))
+
+
+def _kinds(environment: Mapping[str, str], server: int | None) -> Iterable[str]:
+    """Give what started it, that which says most first."""
+    pid = os.getpid() if server is None else server
+    if environment.get("container") or any(map(os.path.exists, _CONTAINER)):
+        yield "a container"
+    unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _text(f"/proc/{pid}/cgroup"))
+    service = unit[1] if unit else ""
+    if service in _CRON or any(each.lower() in _CRON for each in _parents(pid)):
+        yield "a cron job"
+    elif service and service not in _SSH and environment.get("INVOCATION_ID"):
+        yield "a system service"
+    if environment.get("SSH_CONNECTION"):
+        yield "an ssh session"
+
+
+def _parents(pid: int) -> Iterable[str]:
+    for _ in range(_GENERATIONS):
+        found = re.search(r"^PPid:\s+(\d+)", _text(f"/proc/{pid}/status"), re.MULTILINE)
+        pid = int(found[1]) if found else 0
+        if pid == 0:
+            return
+        yield peers.command_of(pid) or ""
+
+
+def cards(session: Session, kernel: str = "/proc/asound", nodes: str = "/dev/snd") -> Cards:
+    """Return the kernel's sound cards, and which of them this user may open."""
+    # " 0 [Device         ]: USB-Audio - USB Audio Device", and a second line with its place
+    names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _text(f"{kernel}/cards"), re.MULTILINE)
+    playing = sorted(glob.glob(f"{glob.escape(nodes)}/pcmC*D*p"))
+    group = _AUDIO
+    forbidden = []
+    for each in playing:
+        with contextlib.suppress(OSError):
+            found = os.stat(each)
+            group = _group(found.st_gid) if found.st_gid else group
+            if not _may_open(found, _access_list(each), session):
+                forbidden.append(each)
+    return Cards(
+        kernel=os.path.isdir(kernel),
+        names=tuple(each.strip() for each in names),
+        nodes=tuple(playing),
+        forbidden=tuple(forbidden),
+        group=group,
+        from_next_login=session.user in _members(group),
+    )
+
+
+def _members(group: str) -> list[str]:
+    try:
+        return grp.getgrnam(group).gr_mem
+    except KeyError:
+        return []
+
+
+def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], session: Session) -> bool:
+    """Tell whether a user may read and write a file, by its mode or its access control list, as logind makes one."""
+    mode = stat.S_IMODE(found.st_mode)
+    if session.uid == 0:
+        return True
+    if session.uid == found.st_uid:
+        return mode >> 6 & _READ_WRITE == _READ_WRITE
+    for tag, permitted, holder in entries:
+        named = (tag == _ACL_USER and holder == session.uid) or (tag == _ACL_GROUP and holder in session.gids)
+        if named and permitted & _READ_WRITE == _READ_WRITE:
+            return True
+    bits = mode >> 3 if found.st_gid in session.gids else mode
+    return bits & _READ_WRITE == _READ_WRITE
+
+
+def _access_list(path: str) -> list[tuple[int, int, int]]:
+    """Return the entries of a file's access control list: kind, permissions, whose."""
+    try:
+        data = os.getxattr(path, "system.posix_acl_access")
+    except OSError:
+        return []
+    return list(struct.iter_unpack("<HHI", data[4 : 4 + (len(data) - 4) // 8 * 8]))
+
+
+def _text(path: str) -> str:
+    """Return a file under /proc; "" where it isn't there, or is another user's."""
+    try:
+        with open(path, encoding="utf-8", errors="replace") as file:
+            return file.read()
+    except OSError:
+        return ""

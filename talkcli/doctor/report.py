@@ -1,0 +1,60 @@
+"""Findings as lines for people. Pure: the screen comes from the caller."""
+
+from __future__ import annotations
+
+import textwrap
+
+from talkcli.columns import GAP, Screen, pad
+from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding, heard, next_step
+from talkcli.states import State
+from talkcli.values import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+#: Columns of the state, and of the check's name: of the longest of each.
+_STATE, _CHECK = 7, 12
+_INDENT = " " * (_STATE + _CHECK + 2 * len(GAP))
+_ARROW = "-> "
+#: Before the next step, at the end.
+_STEP = "  "
+#: Which state of a goal has a finding's colour.
+_COLOURS = {DONE: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILED: State.ABORTED}
+
+
+def lines(finding: Finding, screen: Screen) -> list[str]:
+    """Return a finding as it is shown: in a pipe one line, on a terminal the next step has lines of its own."""
+    state = screen.painted(pad(finding.state, _STATE), _COLOURS[finding.state])
+    head = GAP.join((state, pad(finding.check, _CHECK), ""))
+    room = screen.room(len(_INDENT))
+    if room is None:
+        return [head + finding.message + ("" if finding.next is None else f" {_ARROW}{finding.next}")]
+    first, *rest = _wrapped(finding.message, room) or [""]
+    step = [] if finding.next is None else _wrapped(finding.next, room - len(_ARROW))
+    arrows = [_ARROW, *[" " * len(_ARROW)] * len(step)]
+    return [
+        head + first,
+        *(_INDENT + each for each in rest),
+        *(_INDENT + arrow + screen.painted(each, None) for arrow, each in zip(arrows, step, strict=False)),
+    ]
+
+
+def verdict(findings: Sequence[Finding], screen: Screen) -> str:
+    """Return what it all means, with the one thing to do next on lines of its own."""
+    if heard(findings):
+        warned = sum(each.state == WARNING for each in findings)
+        seen = "" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings"
+        return f"a sentence is heard, unless the loudspeaker itself is off{seen}"
+    step = next_step(findings)
+    if step is None:
+        return "a sentence would not be heard"
+    room = screen.room(len(_STEP))
+    return "\n".join(["a sentence would not be heard; do this next:", *(_STEP + each for each in _wrapped(step, room))])
+
+
+def _wrapped(text: str, room: int | None) -> list[str]:
+    """Return the text as lines of so many columns; None for one line."""
+    if room is None:
+        return [text]
+    # Paths and commands are copied: they are cut only where a line has no blank at all.
+    return textwrap.wrap(text, room, break_on_hyphens=False)

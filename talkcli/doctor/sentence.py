@@ -1,0 +1,90 @@
+"""The proof: a sentence that was sent all the way, and what its end means. Pure."""
+
+from __future__ import annotations
+
+from talkcli.doctor.findings import SENTENCE, Finding, done, failed
+from talkcli.states import State
+from talkcli.values import frozen
+
+#: What is said; short, and worth hearing.
+TEXT = "If you hear this, talk works."
+
+#: What to do about a reason. What isn't here is told by `reason` and message alone.
+REMEDIES = {
+    "no_player": "sudo apt-get install -y alsa-utils",
+    "audio_device": "plug in and switch on the loudspeaker, close what else plays, and try: aplay -l",
+    "audio_lost": "look whether the loudspeaker was unplugged, and try another: talk serve --device NAME",
+    "audio_stalled": "wake the device (pactl suspend-sink @DEFAULT_SINK@ 0), or restart the sound server",
+    "engine_failed": "install what the message names, into the Python that serves",
+    "engine_crashed": "run talk doctor again; if it comes back, try another voice: talk set --voice en",
+    "engine_hung": "run talk doctor again on a machine that is less busy",
+    "not_silent": "start the server again: a player of its cannot be killed",
+    "unknown_voice": "choose one that 'talk voices' lists: talk set --voice NAME",
+    "nothing_to_say": "choose a voice for the text's language: talk set --voice NAME",
+    "queue_full": "empty the queue: talk cancel",
+    "shutdown": "start the server again: talk serve",
+    "lost": "start the server again: talk serve",
+    "late": "see what is in the way with 'talk status', or end it with 'talk cancel'",
+    "paused": "talk resume",
+}
+_BUSY = "another program holds the device: close it, or play through a sound server (PipeWire, PulseAudio)"
+_OF_SOUND = frozenset({"no_player", "audio_device", "audio_lost", "audio_stalled"})
+_OF_START = frozenset({"engine_failed", "engine_hung"})
+_AGAIN = "somebody else ended it: run talk doctor again"
+
+
+@frozen
+class Played:
+    """How a sentence ended."""
+
+    state: State
+    #: as a goal has it; besides these "late": it was still waiting at the limit and was taken back
+    reason: str | None = None
+    words: str | None = None
+    #: seconds of audio
+    duration: float | None = None
+    player: str | None = None
+
+
+def remedy(reason: str | None, words: str | None = None) -> str:
+    """Return what to do about a goal that ended for this reason."""
+    if reason == "audio_device" and words and "busy" in words.lower():
+        return _BUSY
+    if reason == "audio_device" and words and ("denied" in words.lower() or "not permitted" in words.lower()):
+        return "sudo usermod -aG audio USER for the user who serves, log in again, and start the server again"
+    return REMEDIES.get(reason or "", _AGAIN)
+
+
+def judge(
+    played: Played,
+    *,
+    silent: bool,
+    server: bool,
+    suspended: tuple[str, ...] = (),
+    behind: str | None = None,
+    hangs: bool = False,
+) -> Finding:
+    """Judge the sentence; `silent`: whether it made no sound; `server`: whether a server has played it.
+
+    `suspended`: sinks that took no data when it had ended; `behind`: what is to be done about player and device;
+    `hangs`: whether the sound server does, for which engines wait at their start.
+    """
+    how = "through the server" if server else "by an engine of this command's own"
+    if played.state is State.SUCCEEDED:
+        seconds = "" if played.duration is None else f", {played.duration:.1f} s"
+        player = f", {played.player}" if played.player else ""
+        said = "played to its end without sound" if silent else f'"{TEXT}" was played to its end'
+        return done(SENTENCE, f"{said} {how}{player}{seconds}")
+    if played.reason in {"late", "paused"}:
+        return failed(SENTENCE, f"not spoken: {played.words}", remedy(played.reason))
+    words = (played.words or "it ended without a reason").removeprefix(f"Talk {played.state.name.lower()}: ")
+    label = f"{played.state.name}, {played.reason}" if played.reason else played.state.name
+    if played.reason == "audio_stalled" and suspended:
+        words = f"{words}; suspended: {', '.join(suspended)}"
+        return failed(SENTENCE, f"{label}: {words}", f"pactl suspend-sink {suspended[0]} 0")
+    step = remedy(played.reason, words)
+    # Player and device have been looked at from nearer before, unless the player itself names the cause.
+    causes = _OF_SOUND | _OF_START if hangs else _OF_SOUND
+    if played.reason in causes and behind is not None and step != _BUSY:
+        step = behind
+    return failed(SENTENCE, f"{label}: {words}", step)

@@ -1,0 +1,74 @@
+"""What makes sound of a text: Python, pyttsx3, libespeak-ng with its data and voices. Pure."""
+
+from __future__ import annotations
+
+from talkcli.doctor.findings import Finding, done, failed, warning
+from talkcli.values import frozen
+
+
+@frozen
+class Python:
+    """The interpreter that runs this."""
+
+    version: str
+    executable: str
+    #: version of the installed pyttsx3; None where none is installed
+    pyttsx3: str | None
+
+
+@frozen
+class Engine:
+    """What an engine process said that was started to look."""
+
+    driver: str | None = None
+    #: "eSpeak NG 1.51 (system)"
+    synthesizer: str | None = None
+    #: None where it didn't come to list them
+    voices: int | None = None
+    #: why it didn't start, for programs and in its own words; None where it did
+    reason: str | None = None
+    words: str = ""
+
+
+def judge(python: Python, engine: Engine, *, server: bool) -> list[Finding]:
+    """Judge the voice; `server`: whether one runs, so that a sentence needs nothing of this."""
+    return [done("python", f"Python {python.version} ({python.executable})"), *_engine(python, engine, server)]
+
+
+def _engine(python: Python, engine: Engine, server: bool) -> list[Finding]:
+    broken = warning if server else failed
+    version = python.pyttsx3 or "of an unknown version"
+    if engine.reason is None:
+        return [done("pyttsx3", f"{version}, driver {engine.driver}"), *_library(engine)]
+    words = engine.words
+    if "pyttsx3 is missing" in words or python.pyttsx3 is None:
+        return [broken("pyttsx3", words or "pyttsx3 is missing", "pip install pyttsx3, into the same Python")]
+    found = done("pyttsx3", version)
+    if engine.reason == "unknown_voice":
+        step = "choose one that 'talk voices' lists, in TALK_VOICE or --voice"
+        return [found, done("libespeak-ng", "loaded"), broken("voices", words, step)]
+    if "data" in words and "espeak" in words:
+        return [found, broken("libespeak-ng", words, "sudo apt-get install -y espeak-ng-data")]
+    if "libespeak-ng" in words:
+        step = "sudo apt-get install -y libespeak-ng1, or: pip install espeakng-loader"
+        return [found, broken("libespeak-ng", words, step)]
+    if engine.reason == "engine_crashed":
+        step = "install it again: sudo apt-get install --reinstall -y libespeak-ng1 espeak-ng-data"
+        return [found, broken("libespeak-ng", f"the engine process died while it loaded the library: {words}", step)]
+    if engine.reason == "engine_hung":
+        # It asks PulseAudio at its start, though it is to play nothing itself.
+        step = "restart the sound server if that hangs (see below): libespeak-ng waits for it at its start"
+        return [found, broken("libespeak-ng", words, step)]
+    return [found, broken("libespeak-ng", words, "TALK_DEBUG=1 talk serve shows the engine's own words")]
+
+
+def _library(engine: Engine) -> list[Finding]:
+    found = []
+    if engine.synthesizer is not None:
+        found.append(done("libespeak-ng", f"{engine.synthesizer}, with its data"))
+    if engine.voices is None:
+        return [*found, warning("voices", "the engine listed none in time", "run talk doctor again")]
+    if not engine.voices:
+        step = "sudo apt-get install --reinstall -y espeak-ng-data"
+        return [*found, warning("voices", "the engine has none", step)]
+    return [*found, done("voices", f"{engine.voices}, listed by 'talk voices'")]

@@ -1,0 +1,245 @@
+"""`talk doctor` beside a running server: what it says of it, and of a sentence that waits its turn as any other."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli import Client
+from talkcli.doctor import reach, sentence
+from talkcli.states import State
+from tests.faults.broken import sound, write
+from tests.support.compare import assert_silent, extent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tests.conftest import MakeTalk
+    from tests.support.connection import Message
+    from tests.support.processes import Finished, Talk
+    from tests.support.sink import Sink
+
+__all__ = ["sound"]
+
+#: The checks, in the order of a sentence's way.
+CHECKS = [
+    "python", "pyttsx3", "libespeak-ng", "voices", "session", "player", "device", "cards", "group", "sound server",
+    "loudness", "socket", "server", "settings", "failures", "sentence",
+]  # fmt: skip
+#: Seconds in which it ends, whatever it finds.
+LIMIT = 60.0
+
+
+def doctor(talk: Talk, *options: str) -> tuple[Finished, dict[str, dict[str, str]]]:
+    """Run it, and return how it ended and its findings by their checks."""
+    done = talk.run("--json", "doctor", *options, timeout=LIMIT)
+    findings = [json.loads(line) for line in done.out.splitlines()]
+    for each in findings:
+        assert list(each) == ["check", "state", "message", "next"]
+        assert each["state"] in {"done", "warning", "failed"}
+        assert (each["next"] is None) == (each["state"] == "done"), each
+    assert len({each["check"] for each in findings}) == len(findings)
+    assert done.code == (4 if any(each["state"] == "failed" for each in findings) else 0), done.out
+    return done, {each["check"]: each for each in findings}
+
+
+def logged(talk: Talk) -> list[Message]:
+    """Return the goals that have ended, oldest first."""
+    return [json.loads(line) for line in talk.run("--json", "log").out.splitlines()]
+
+
+def test_all_is_well_and_its_sentence_is_heard_as_a_goal_of_its_own(make_talk: MakeTalk, sound: Sink) -> None:
+    talk = make_talk(sink=sound)
+    done, found = doctor(talk)
+    assert done.code == 0, done.out
+    assert done.err == ""
+    assert list(found) == CHECKS
+    assert "eSpeak NG" in found["libespeak-ng"]["message"]
+    assert f"{talk.socket} (TALK_SOCKET, process {talk.pid})" in found["socket"]["message"]
+    assert "plays to null" in found["sound server"]["message"]
+    assert "through the server, aplay" in found["sentence"]["message"]
+    (goal,) = logged(talk)
+    assert (goal["text"], goal["state"], goal["client"]["name"]) == (sentence.TEXT, "SUCCEEDED", "talk doctor")
+    assert extent(talk.recording.samples)
+
+
+def test_silent_leaves_out_the_sound_and_nothing_else(make_talk: MakeTalk, sound: Sink) -> None:
+    talk = make_talk(sink=sound)
+    done, found = doctor(talk, "--silent")
+    assert done.code == 0, done.out
+    assert list(found) == CHECKS
+    assert "without sound" in found["sentence"]["message"]
+    assert logged(talk)[0]["state"] == "SUCCEEDED"
+    assert_silent(talk.recording)
+
+
+def test_for_people_it_is_a_line_a_finding_and_the_end_is_a_note(make_talk: MakeTalk, sound: Sink) -> None:
+    talk = make_talk("--volume", "0.1", sink=sound)
+    done = talk.run("doctor", "--silent", timeout=LIMIT)
+    assert done.code == 0
+    assert [line[9:23].strip() for line in done.out.splitlines()] == CHECKS
+    assert "\x1b" not in done.out
+    assert "volume 0.1, voice the driver's own" in done.out
+    assert "-> talk set --volume 1" in done.out
+    assert done.err == "talk: a sentence is heard, unless the loudspeaker itself is off; 1 warning\n"
+    quiet = talk.run("doctor", "--silent", "-q", timeout=LIMIT)
+    assert (quiet.code, quiet.err) == (0, "")
+
+
+def test_paused_speech_is_named_and_no_goal_is_left_behind(make_talk: MakeTalk, sound: Sink) -> None:
+    talk = make_talk(sink=sound)
+    assert talk.run("pause").code == 0
+    done, found = doctor(talk)
+    assert done.code == 4
+    assert (found["server"]["state"], found["server"]["next"]) == ("failed", "talk resume")
+    assert "speech is paused" in found["sentence"]["message"]
+    assert talk.request("status")["server"]["pending"] == 0
+    assert_silent(talk.recording)
+
+
+@pytest.mark.parametrize("behind", ["sentence never-ends", "sentence length=8"])
+def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk, behind: str) -> None:
+    with Client(scripted.socket) as client:
+        first = client.say(behind)
+        for number in range(3):
+            client.say(f"number {number} never-ends")
+        began = time.monotonic()
+        played = reach.speak(client, sentence.TEXT, None, 0.3)
+        assert time.monotonic() - began < 8
+        assert (played.state, played.reason) == (State.RECALLED, "late")
+        assert played.words == "it still waited behind 4 goals after 0.3 s, and was taken back"
+        assert len(client.status().pending) == 3
+        assert first.state in {State.PENDING, State.ACTIVE}
+        client.cancel()
+
+
+def test_a_sentence_that_was_begun_and_is_not_over_in_time_is_cancelled(scripted: Talk) -> None:
+    with Client(scripted.socket) as client:
+        played = reach.speak(client, "sentence never-ends", None, 0.5)
+        assert (played.state, played.reason) == (State.PREEMPTED, "late")
+        assert "begun and not over after 0.5 s" in str(played.words)
+        assert client.status().active is None
+
+
+def test_a_sentence_preempts_nothing(make_talk: MakeTalk) -> None:
+    talk = make_talk("--preempt", scripted=True)
+    with Client(talk.socket) as client:
+        first = client.say("sentence length=0.5")
+        assert reach.speak(client, sentence.TEXT, None, 10).state is State.SUCCEEDED
+        assert first.wait(10).state is State.SUCCEEDED
+
+
+def test_a_sentence_that_somebody_else_cancels_says_so(scripted: Talk) -> None:
+    with Client(scripted.socket) as client:
+        client.say("sentence never-ends")
+        talk_doctor = scripted.start("doctor", "--json")
+        while not client.status().pending:
+            time.sleep(0.01)  # no event tells a client of another's goal but a watch
+        client.cancel()
+        done = scripted.finish(talk_doctor, LIMIT)
+    found = json.loads(done.out.splitlines()[-1])
+    assert (done.code, found["state"]) == (4, "failed")
+    assert found["message"].startswith("RECALLED, canceled")
+    assert "run talk doctor again" in found["next"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_takes_its_goal_along(scripted: Talk, number: signal.Signals) -> None:
+    with Client(scripted.socket) as client:
+        client.say("sentence never-ends")
+        process = scripted.start("doctor")
+        while not client.status().pending:
+            time.sleep(0.01)  # as above
+        process.send_signal(number)
+        done = scripted.finish(process, 10)
+        assert done.code == 128 + number
+        end = time.monotonic() + 5
+        while client.status().pending:
+            assert time.monotonic() < end
+        client.cancel()
+
+
+def test_a_player_without_sound_is_not_heard(make_talk: MakeTalk) -> None:
+    done, found = doctor(make_talk("--player", "null"))
+    assert done.code == 4
+    assert (found["player"]["state"], found["sentence"]["state"]) == ("failed", "done")
+    assert "null (the server's)" in found["player"]["message"]
+
+
+def test_a_player_that_fails_is_told_in_its_own_words(make_talk: MakeTalk, tmp_path: Path) -> None:
+    words = "ALSA lib pcm.c:1: snd_open\naplay: main:831: audio open error: Device or resource busy\n"
+    player = write(tmp_path / "player", f"#!/bin/sh\nprintf '{words}' >&2\nexit 1\n", 0o755)
+    talk = make_talk("--player", str(player))
+    done, found = doctor(talk)
+    assert done.code == 4
+    assert "aplay: audio open error: Device or resource busy" in found["sentence"]["message"]
+    assert found["sentence"]["message"].startswith("ABORTED, audio_device")
+    assert "another program holds the device" in found["sentence"]["next"]
+    _, found = doctor(talk)
+    assert found["failures"]["state"] == "warning"
+    assert "1 of the last goal ABORTED" in found["failures"]["message"]
+
+
+def test_a_sink_that_is_suspended_is_named_with_the_command_that_wakes_it(
+    make_talk: MakeTalk, private_sink: Callable[[], Sink]
+) -> None:
+    sink = private_sink()
+    talk = make_talk(sink=sink)
+    sink.suspend()
+    done, found = doctor(talk)
+    assert done.code == 4
+    assert "audio_stalled" in found["sentence"]["message"]
+    assert found["sentence"]["next"] == "pactl suspend-sink null 0"
+    sink.resume()
+
+
+def test_a_sink_that_is_muted_is_not_heard_though_all_was_played(
+    make_talk: MakeTalk, private_sink: Callable[[], Sink]
+) -> None:
+    sink = private_sink()
+    talk = make_talk(sink=sink)
+    sink._pactl("set-sink-mute", "null", "1")
+    done, found = doctor(talk, "--silent")
+    assert (done.code, found["sentence"]["state"]) == (4, "done")
+    assert (found["loudness"]["state"], found["loudness"]["message"]) == ("failed", "the default sink is muted")
+
+
+@pytest.mark.slow
+def test_a_sound_server_that_hangs_is_named_and_it_ends_all_the_same(
+    make_talk: MakeTalk, private_sink: Callable[[], Sink]
+) -> None:
+    sink = private_sink()
+    talk = make_talk(sink=sink)
+    sink.freeze()
+    done, found = doctor(talk)
+    sink.thaw()
+    assert done.code == 4
+    assert found["sound server"]["state"] == "warning"
+    assert "does not answer from the server" in found["sound server"]["message"]
+    assert found["sentence"]["state"] == "failed"
+    assert found["sentence"]["next"] == found["sound server"]["next"]
+
+
+def test_a_server_that_hangs_is_named(make_talk: MakeTalk) -> None:
+    talk = make_talk("--player", "null", watched=False)
+    talk.freeze()
+    done, found = doctor(talk, "--silent")
+    talk.thaw()
+    assert done.code == 4
+    assert found["socket"]["state"] == "failed"
+    assert f"does not answer; look at process {talk.pid}" in found["socket"]["message"]
+    assert "server" not in found
+
+
+def test_a_full_server_is_named(make_talk: MakeTalk) -> None:
+    talk = make_talk("--player", "null", "--max-clients", "1", watched=False)
+    with talk.connect() as wire:
+        assert wire.request("hello")["ok"]
+        done, found = doctor(talk, "--silent")
+    assert done.code == 4
+    assert "--max-clients" in found["socket"]["next"]

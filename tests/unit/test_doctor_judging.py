@@ -1,0 +1,232 @@
+"""What `talk doctor` makes of facts about voice, socket, server and sentence, and how it shows what it found."""
+
+from __future__ import annotations
+
+import pytest
+
+from talkcli import __version__
+from talkcli.columns import Screen, width
+from talkcli.doctor import places, report, sentence, serving, voice
+from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding, behind, done, failed, heard, next_step, warning
+from talkcli.doctor.places import Place, Places
+from talkcli.doctor.sentence import Played
+from talkcli.doctor.voice import Engine, Python
+from talkcli.messages import Goal
+from talkcli.states import State
+
+PYTHON = Python("3.11.2", "/usr/bin/python3", "2.99")
+ENGINE = Engine("espeak", "eSpeak NG 1.51 (system)", 141)
+SPOKEN = Goal("k3fz-1", State.SUCCEEDED, text="x")
+SERVER: dict[str, object] = {
+    "pid": 4711, "version": __version__, "engine": "ready", "player": "aplay", "uptime": 100.0, "rate": 200,
+    "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None, "paused": False, "pending": 0,
+    "clients": 1, "max_clients": 256,
+}  # fmt: skip
+
+
+def of(findings: list[Finding], check: str) -> Finding:
+    return next(each for each in findings if each.check == check)
+
+
+def test_a_sentence_is_heard_if_one_was_played_and_nothing_failed() -> None:
+    played = done("sentence", "played")
+    assert heard([done("python", "3"), warning("cards", "none", "plug in"), played])
+    assert not heard([failed("socket", "no server", "talk serve"), played])
+    assert not heard([done("python", "3")]), "nothing was proved"
+
+
+def test_the_one_thing_to_do_is_for_the_first_that_failed() -> None:
+    group = warning("group", "not in audio", "usermod")
+    stuck = failed("sentence", "ABORTED", "look at the loudspeaker")
+    assert next_step([done("python", "3"), group, stuck]) == "look at the loudspeaker"
+    assert next_step([group, failed("socket", "no server", "talk serve"), stuck]) == "talk serve"
+    assert next_step([group, done("sentence", "played")]) is None
+
+
+def test_a_sentence_that_found_no_device_is_cured_where_the_device_was_looked_at() -> None:
+    looked = [warning("cards", "none", "plug in"), warning("group", "not in audio", "usermod"), done("python", "3")]
+    assert behind(looked) == "usermod"
+    assert behind(looked[2:]) is None
+
+    def cure(reason: str, words: str) -> str | None:
+        played = Played(State.ABORTED, reason, words)
+        return sentence.judge(played, silent=False, server=True, behind="usermod").next
+
+    assert cure("audio_device", "aplay: Permission denied") == "usermod"
+    assert cure("audio_lost", "unplugged") == "usermod"
+    assert "another program" in str(cure("audio_device", "aplay: Device or resource busy"))
+    assert "talk set --voice" in str(cure("nothing_to_say", "nothing"))
+
+
+def test_text_of_others_is_escaped_in_every_finding() -> None:
+    found = failed("device", "aplay: \x1b[2Jred", "remove \u202e it\n")
+    assert found.to_json() == {
+        "check": "device", "state": "failed", "message": "aplay: \\x1b[2Jred", "next": "remove \\u202e it\\n"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("engine", "python", "check", "step"),
+    [
+        (Engine(reason="engine_failed", words="pyttsx3 is missing: pip install pyttsx3"), PYTHON, "pyttsx3", "pip"),
+        (Engine(reason="engine_failed", words="libespeak-ng is missing: install it"), PYTHON, "libespeak-ng", "libesp"),
+        (
+            Engine(reason="engine_failed", words="there is no espeak-ng data: install espeak-ng-data"),
+            PYTHON,
+            "libespeak-ng",
+            "espeak-ng-data",
+        ),
+        (Engine(reason="engine_crashed", words="it was killed by SIGSEGV"), PYTHON, "libespeak-ng", "reinstall"),
+        (
+            Engine(reason="engine_hung", words="the engine process said nothing"),
+            PYTHON,
+            "libespeak-ng",
+            "restart the sound server",
+        ),
+        (Engine(reason="unknown_voice", words='unknown voice "x"'), PYTHON, "voices", "talk voices"),
+    ],
+)
+def test_a_voice_that_cannot_speak_is_named(engine: Engine, python: Python, check: str, step: str) -> None:
+    found = of(voice.judge(python, engine, server=False), check)
+    assert found.state == FAILED
+    assert engine.words in found.message
+    assert step in (found.next or "")
+    assert of(voice.judge(python, engine, server=True), check).state == WARNING, "the server has its own"
+
+
+def test_a_voice_that_can_speak_is_told_with_its_version_and_voices() -> None:
+    found = voice.judge(PYTHON, ENGINE, server=False)
+    assert [each.check for each in found] == ["python", "pyttsx3", "libespeak-ng", "voices"]
+    assert {each.state for each in found} == {DONE}
+    assert "1.51 (system)" in found[2].message
+    assert "141" in found[3].message
+    for voices in (None, 0):
+        assert voice.judge(PYTHON, Engine("espeak", "eSpeak", voices), server=False)[-1].state == WARNING
+
+
+PATH = "/run/user/1000/talk/talk.sock"
+
+
+@pytest.mark.parametrize(
+    ("found", "words", "step"),
+    [
+        (Places((Place(PATH, places.ABSENT),)), "not there", "talk serve"),
+        (Places((Place(PATH, places.STALE, 1000),)), "left over", "talk serve (it takes the place"),
+        (Places((Place(PATH, places.FORBIDDEN, 7),)), "no permission (uid 7)", "have uid 7 let you in"),
+        (Places((Place(PATH, places.FOREIGN, 7),)), "another user's server (uid 7)", f"talk --socket {PATH} doctor"),
+        (Places((Place(PATH, places.ABSENT),), "TALK_SOCKET"), "named by TALK_SOCKET", "unset TALK_SOCKET, or"),
+        (Places((Place(PATH, places.ABSENT),), "--socket"), "named by --socket", "leave --socket out, or"),
+        (Places((Place("/x", places.ABSENT),), "TALK_SOCKET", elsewhere=PATH), "/x", f"a server is on {PATH}"),
+        (Places((Place(PATH, places.MUTE),), None, None, "it does not answer"), "it does not answer", "restart"),
+        (Places((Place(PATH, places.MUTE),), None, None, "busy", "busy"), "busy", "--max-clients"),
+        (Places((Place(PATH, places.ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
+    ],
+)
+def test_where_no_server_is_each_place_is_named_with_what_is_there(found: Places, words: str, step: str) -> None:
+    judgement = places.judge(found)
+    assert judgement.state == FAILED
+    assert words in judgement.message
+    assert step in str(judgement.next)
+
+
+def test_where_a_server_is_what_lies_before_it_is_a_warning() -> None:
+    served = Place(PATH, places.SERVER)
+    found = places.judge(Places((Place("/a", places.ABSENT), served), pid=4711))
+    assert (found.state, found.message) == (DONE, f"the server is on {PATH} (process 4711)")
+    found = places.judge(Places((Place("/a", places.FOREIGN, 7), served), pid=4711))
+    assert found.state == WARNING
+    assert "/a: another user's server (uid 7)" in found.message
+
+
+@pytest.mark.parametrize(
+    ("change", "check", "state", "step"),
+    [
+        ({}, "server", DONE, None),
+        ({"paused": True}, "server", FAILED, "talk resume"),
+        ({"version": "0.0.1"}, "server", WARNING, "start the server again"),
+        ({"engine": "pyttsx3 is missing"}, "server", WARNING, "install what"),
+        ({"volume": 0.0}, "settings", FAILED, "talk set --volume 1"),
+        ({"volume": 0.1}, "settings", WARNING, "talk set --volume 1"),
+        ({"ttl": 5.0, "lead_in": 300, "preempt": True}, "settings", DONE, None),
+    ],
+)
+def test_a_server_is_judged_by_what_it_says_of_itself(
+    change: dict[str, object], check: str, state: str, step: str | None
+) -> None:
+    found = of(serving.judge({**SERVER, **change}, [], 0.0), check)
+    assert found.state == state
+    assert (step in str(found.next)) if step else found.next is None
+
+
+def test_the_last_failures_are_counted_and_the_last_one_told() -> None:
+    aborted = Goal(
+        "k3fz-2", State.ABORTED, reason="audio_device", ended_at=0.0, message="Talk aborted: aplay: device is busy"
+    )
+    found = of(serving.judge(SERVER, [SPOKEN, aborted], 600.0), "failures")
+    assert found.state == WARNING
+    assert "1 of the last 2 goals ABORTED, last k3fz-2, 10 min ago" in found.message
+    assert "audio_device: aplay: device is busy" in found.message
+    assert "another program holds the device" in str(found.next)
+    found = of(serving.judge(SERVER, [aborted, SPOKEN], 600.0), "failures")
+    assert (found.state, "1 succeeded since" in found.message) == (DONE, True)
+    assert of(serving.judge(SERVER, [SPOKEN], 0.0), "failures").message == "none in the last goal"
+
+
+def test_the_sentence_says_how_it_ended_and_what_to_do() -> None:
+    played = Played(State.SUCCEEDED, duration=1.7, player="aplay")
+    found = sentence.judge(played, silent=False, server=True)
+    assert found.state == DONE
+    assert found.message.endswith("was played to its end through the server, aplay, 1.7 s")
+    assert "without sound" in sentence.judge(played, silent=True, server=False).message
+    denied = Played(State.ABORTED, "audio_device", "Talk aborted: aplay: audio open error: Permission denied")
+    found = sentence.judge(denied, silent=False, server=True)
+    assert found.message == "ABORTED, audio_device: aplay: audio open error: Permission denied"
+    assert "usermod -aG audio" in str(found.next)
+    stalled = Played(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
+    found = sentence.judge(stalled, silent=False, server=True, suspended=("usb",))
+    assert (found.next, "suspended: usb" in found.message) == ("pactl suspend-sink usb 0", True)
+    late = Played(State.RECALLED, "late", "it still waited behind 7 goals after 20 s, and was taken back")
+    found = sentence.judge(late, silent=False, server=True)
+    assert found.message.startswith("not spoken: it still waited behind 7 goals")
+    assert "talk status" in str(found.next)
+    assert "run talk doctor again" in str(
+        sentence.judge(Played(State.PREEMPTED, "canceled", "Talk preempted"), silent=False, server=True).next
+    )
+
+
+def test_every_reason_of_an_aborted_goal_has_a_remedy_of_its_own() -> None:
+    reasons = {
+        "no_player", "audio_device", "audio_lost", "audio_stalled", "engine_failed", "engine_crashed", "engine_hung",
+        "nothing_to_say", "not_silent", "unknown_voice",
+    }  # fmt: skip
+    assert reasons <= sentence.REMEDIES.keys()
+
+
+FOUND = [
+    done("python", "Python 3.11.2"),
+    warning("sound server", "one " * 40, "do " * 40),
+    failed("socket", "no server", "talk serve"),
+]
+
+
+@pytest.mark.parametrize("columns", [40, 80, 120])
+def test_on_a_terminal_nothing_is_wider_than_it_is(columns: int) -> None:
+    screen = Screen(columns, colour=True)
+    for finding in FOUND:
+        lines = report.lines(finding, screen)
+        assert max(map(width, lines)) <= columns, lines
+        assert all("\x1b" not in each or each.endswith("\x1b[0m") or "\x1b[0m  " in each for each in lines)
+        if finding.next is not None:
+            assert any("-> " in each for each in lines)
+    assert max(map(len, report.verdict(FOUND, screen).splitlines()), default=0) + len("talk: ") <= columns + 12
+
+
+def test_in_a_pipe_a_finding_is_one_line_without_colour() -> None:
+    assert [report.lines(each, Screen()) for each in FOUND[::2]] == [
+        ["done     python        Python 3.11.2"],
+        ["failed   socket        no server -> talk serve"],
+    ]
+    assert report.verdict(FOUND, Screen()) == "a sentence would not be heard; do this next:\n  talk serve"
+    played = [done("python", "3"), done("sentence", "played")]
+    assert report.verdict(played, Screen()) == "a sentence is heard, unless the loudspeaker itself is off"
+    assert report.verdict([FOUND[1], *played], Screen()).endswith("; 1 warning")

@@ -1,0 +1,150 @@
+"""What `talk doctor` makes of facts about sound: each fault of a robot's is named, with the one thing to do."""
+
+from __future__ import annotations
+
+import pytest
+
+from talkcli.doctor import level, session, sound
+from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding
+from talkcli.doctor.session import Session
+from talkcli.doctor.sound import Cards, Devices, Players, SoundServer
+from talkcli.values import replace
+
+PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)
+PACKAGES = {"aplay": "alsa-utils", "pacat": "pulseaudio-utils", "pw-cat": "pipewire-bin"}
+PLAYERS = Players(PACKAGES, ("aplay", "pacat"), None)
+DEVICES = Devices("aplay -L", ("default", "plughw:CARD=Device,DEV=0"))
+CARDS = Cards(kernel=True, names=("USB Audio Device",), nodes=("/dev/snd/pcmC0D0p",), group="audio")
+NO_CARDS = Cards(kernel=True)
+NO_SERVER = SoundServer(trouble="Connection refused")
+PULSE = SoundServer(name="PulseAudio (on PipeWire 1.2.7)", sink="alsa_output.usb")
+
+
+def judged(
+    check: str,
+    players: Players = PLAYERS,
+    devices: Devices | None = DEVICES,
+    cards: Cards = CARDS,
+    server: SoundServer = NO_SERVER,
+    session: Session = PI,
+    *,
+    running: bool = False,
+) -> Finding:
+    found = sound.judge(players, devices, cards, server, session, running=running)
+    return next(each for each in found if each.check == check)
+
+
+def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
+    found = sound.judge(PLAYERS, DEVICES, CARDS, SoundServer(), PI, running=False)
+    assert [each.check for each in found] == ["player", "device", "cards", "group", "sound server"]
+    assert {each.state for each in found} == {DONE}, found
+    assert found[0].message == "aplay is used; then pacat"
+
+
+def test_no_player_names_the_package() -> None:
+    found = judged("player", Players(PACKAGES, (), None))
+    assert (found.state, found.next) == (FAILED, "sudo apt-get install -y alsa-utils")
+    assert judged("player", Players(PACKAGES, (), None), running=True).state == WARNING
+
+
+def test_a_player_that_is_set_and_not_there_is_named() -> None:
+    found = judged("player", Players(PACKAGES, ("aplay",), "pw-cat", "TALK_PLAYER", runs=False))
+    assert (found.state, found.next) == (FAILED, "sudo apt-get install -y pipewire-bin")
+    found = judged("player", Players(PACKAGES, ("aplay",), "/opt/play", "TALK_PLAYER", runs=False))
+    assert found.state == FAILED
+    assert "/opt/play (TALK_PLAYER)" in found.message
+
+
+@pytest.mark.parametrize("player", ["null", "file:/tmp/x.wav"])
+def test_a_player_without_sound_is_not_heard(player: str) -> None:
+    found = sound.judge(Players(PACKAGES, (), player, "the server's"), None, CARDS, PULSE, PI, running=True)
+    assert [each.state for each in found] == [FAILED]
+    assert found == sound.judge_setting(player, "the server's")
+    assert sound.judge_setting("aplay", "the server's") == []
+
+
+def test_a_device_is_looked_for_among_those_that_the_player_lists() -> None:
+    assert judged("device", devices=replace(DEVICES, wanted="default")).state == DONE
+    assert judged("device", devices=replace(DEVICES, wanted="plughw:1,0")).state == DONE
+    found = judged("device", devices=replace(DEVICES, wanted="robot_speaker"))
+    assert found.state == WARNING
+    assert "robot_speaker is not among" in found.message
+    assert "plughw:CARD=Device,DEV=0" in found.message
+    assert judged("device", devices=Devices("aplay -L")).state == WARNING
+    assert "no answer" in judged("device", devices=Devices("aplay -L", trouble="no answer")).message
+
+
+def test_no_device_is_named_with_what_to_plug_in_or_to_hand_in() -> None:
+    found = judged("cards", cards=NO_CARDS)
+    assert (found.state, "plug in" in str(found.next)) == (WARNING, True)
+    found = judged("cards", cards=NO_CARDS, session=replace(PI, kinds=("a container",)))
+    assert "--device /dev/snd" in str(found.next)
+    assert judged("cards", cards=NO_CARDS, server=PULSE).state == DONE
+
+
+def test_no_permission_for_the_device_names_the_group_and_the_user() -> None:
+    stranger = replace(PI, groups=("pi",), gids=(1000,))
+    forbidden = replace(CARDS, forbidden=CARDS.nodes)
+    found = judged("group", cards=forbidden, session=stranger)
+    assert found.state == WARNING
+    assert "user pi may not open /dev/snd/pcmC0D0p" in found.message
+    assert found.next == "sudo usermod -aG audio pi, and log in again"
+    found = judged("group", cards=replace(forbidden, from_next_login=True), session=stranger)
+    assert found.next == "log out and in again"
+    assert judged("group", cards=forbidden, session=stranger, server=PULSE).state == DONE, "it opens them"
+
+
+@pytest.mark.parametrize(
+    ("change", "step"),
+    [
+        ({"kinds": ("a container",)}, "PULSE_SERVER"),
+        ({"kinds": ("a system service",)}, "--print-unit user"),
+        ({"uid": 0, "sudo_uid": 1000}, "leave sudo out"),
+        ({"runtime": None, "usual_runtime": "/run/user/1000"}, "export XDG_RUNTIME_DIR=/run/user/1000"),
+        ({}, "systemctl --user restart"),
+    ],
+)
+def test_why_a_sound_server_is_out_of_reach_depends_on_where_this_runs(change: dict[str, object], step: str) -> None:
+    server = replace(NO_SERVER, sockets=("/run/user/1000/pulse/native",))
+    found = judged("sound server", server=server, session=replace(PI, **change))
+    assert found.state == WARNING
+    assert "/run/user/1000/pulse/native cannot be reached from here: Connection refused" in found.message
+    assert step in str(found.next)
+
+
+def test_a_sound_server_that_hangs_or_is_named_wrongly_or_cannot_be_asked() -> None:
+    assert "does not answer" in judged("sound server", server=SoundServer(hangs=True)).message
+    assert "unset PULSE_SERVER" in str(judged("sound server", server=SoundServer(named="unix:/x")).next)
+    found = judged("sound server", server=SoundServer(sockets=("/run/user/1000/pipewire-0",), askable=False))
+    assert found.next == "sudo apt-get install -y pulseaudio-utils"
+    service = judged("sound server", server=SoundServer(), cards=NO_CARDS, session=replace(PI, kinds=("a cron job",)))
+    assert service.state == WARNING
+
+
+def test_without_a_runtime_directory_the_session_says_what_to_set() -> None:
+    found = session.judge(replace(PI, runtime=None, runtime_owner=None, usual_runtime="/run/user/1000"))[0]
+    assert (found.state, found.next) == (WARNING, "export XDG_RUNTIME_DIR=/run/user/1000")
+    assert "cron, sudo" in found.message
+    served = session.judge(replace(PI, runtime=None, usual_runtime="/run/user/1000", server=7))[0]
+    assert "where the server is started" in str(served.next)
+    assert session.judge(replace(PI, runtime=None))[0].state == DONE
+    assert "not there" in session.judge(replace(PI, runtime_owner=None))[0].message
+    assert "uid 33's" in session.judge(replace(PI, runtime_owner=33))[0].message
+
+
+def test_what_is_muted_is_not_heard() -> None:
+    pulse = level.of_pactl("Mute: yes\n", "Volume: mono: 65536 / 100% / 0.00 dB\n")
+    assert (pulse.muted, pulse.percent) == (True, 100)
+    wire = level.of_wpctl("Volume: 0.05\n")
+    assert (wire.muted, wire.percent) == (False, 5)
+    assert level.of_wpctl("Volume: 0.40 [MUTED]\n").muted
+    alsa = level.of_amixer("Master", "  Front Left: Playback 0 [0%] [-65.25dB] [off]\n  Front Right: 9 [40%] [on]\n")
+    assert (alsa.muted, alsa.percent) == (False, 40)
+    off = level.of_amixer("Master", "  Mono: Playback 0 [0%] [-65.25dB] [off]\n")
+    assert level.judge((alsa, off), default=True)[0].next == "amixer sset Master unmute"
+    assert level.judge((pulse,), default=True)[0].state == FAILED
+    assert level.judge((pulse,), default=False)[0].state == WARNING, "another device is played to"
+    assert level.judge((wire,), default=True)[0].state == WARNING
+    assert level.judge((replace(wire, percent=0),), default=True)[0].state == FAILED
+    assert level.judge((alsa,), default=True)[0].state == DONE
+    assert level.judge((), default=True) == []
