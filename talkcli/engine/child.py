@@ -6,7 +6,11 @@ on a Raspberry Pi each is five to ten times that. So nothing of ours runs in the
 pipe that nobody writes to, and whose writing end is here and nowhere else. The kernel closes that when this process
 ends, however it ends, and sends the signal that it was asked for to the group of processes that it was given.
 
-Linux only; elsewhere a player that nobody has killed ends with its input.
+Whoever is killed between the start of a player and its leash, a ten-thousandth of a second, leaves one that was given
+nothing to play, and ends with its input.
+
+So does one that closes what it has inherited (ssh, sudo), if it is the server that is killed: the server kills what a
+dead engine leaves behind. Linux only; elsewhere a player that nobody has killed ends with its input.
 """
 
 from __future__ import annotations

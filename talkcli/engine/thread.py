@@ -187,8 +187,9 @@ class EngineThread:
             self._lose_process("the engine takes no commands", "engine_hung")
 
     def _tell_followed(self, goal_id: str, followed: bool) -> None:
-        if self._goal and self._goal.id == goal_id and self._goal.spoken:
-            self._tell(protocol.Followed(goal_id, followed))
+        if self._process and self._goal and self._goal.id == goal_id and self._goal.spoken:
+            # No command: an engine that has no room for it at this moment is not hung for that, and little is lost.
+            self._process.send(protocol.Followed(goal_id, followed))
 
     def _hold(self, goal_id: str, pause: int | None) -> None:
         goal = self._goal

@@ -73,7 +73,7 @@ class Connection:
         """`connected`: the client's socket, which doesn't block; it is closed with the connection."""
         #: set by the handler when the client joins
         self.sender: Sender
-        self.admitted = True
+        self.admitted = False
         #: answers that are still to come for requests taken: the connection stays open for them
         self.owed = 0
         self._handler = handler
@@ -245,7 +245,7 @@ class Connection:
                     self._lines.extend(self._splitter.feed(data))
         except LineTooLong as error:
             self._lines.extend(error.before)
-        while self._lines:
+        while self._lines and self._bad_lines < MAX_BAD_LINES:
             self._take(self._lines.popleft())
 
     def _work(self) -> None:

@@ -214,6 +214,8 @@ class Stream:
     def _end(self, error: OSError | None) -> None:
         if self._ended:
             return
+        if self._closing:
+            error = None  # the end was ours: what the client has sent since is nobody's to hear
         self._closing = self._ended = True
         self.pause_reading()
         if self._blocked:

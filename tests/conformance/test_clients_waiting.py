@@ -52,8 +52,9 @@ def test_row_07_server_that_is_killed_loses_the_goal(scripted: Talk) -> None:
 def _until_watched(talk: Talk, clients: int) -> None:
     """Wait until so many clients are connected: this one's question, the watcher and those that wait."""
     end = time.monotonic() + 5
-    while talk.request("status")["server"]["clients"] != clients:
-        assert time.monotonic() < end, "the clients have not connected"
+    with talk.connect() as wire:  # one for all questions: each would count until the server has seen it go
+        while wire.request("status")["server"]["clients"] != clients:
+            assert time.monotonic() < end, "the clients have not connected"
 
 
 def test_row_08_timeout_holds_while_the_server_is_frozen(scripted: Talk) -> None:

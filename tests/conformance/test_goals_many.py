@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import random
+import signal
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ import pytest
 from tests.conformance.hearing import HELP, PRECISION
 from tests.conformance.told import assert_told_in_order
 from tests.conformance.witness import ends
+from tests.support import census
 from tests.support.compare import compare
 from tests.support.reference import RATE, render
 from tests.support.timing import assert_within, retry_if_late
@@ -194,3 +196,19 @@ def _assert_alike(heard: Samples, reference: Samples) -> None:
         for samples in (heard[compared.offset :], reference[begin:])
     ]
     assert np.max(np.abs(frames[0] - frames[1])) < 0.1 * np.max(frames[1]), compared
+
+
+def test_an_engine_that_reads_nothing_for_a_second_while_goals_come_and_go_is_not_lost(scripted: Talk) -> None:
+    """It is told each time whether a goal waits behind the one in hand: of that it may miss what it has no room for."""
+    goal = scripted.run("say", "length=3").id
+    scripted.watcher.wait_for_word(goal)
+    (engine,) = census.descendants(scripted.pid)
+    with scripted.connect() as wire:
+        os.kill(engine, signal.SIGSTOP)
+        try:
+            for _ in range(800):
+                waiting = wire.request("say", text="behind it")["goal"]["id"]
+                assert wire.request("cancel", ids=[waiting])["ok"]
+        finally:
+            os.kill(engine, signal.SIGCONT)
+    assert scripted.watcher.wait_for_terminal(goal) == "SUCCEEDED"
