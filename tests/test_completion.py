@@ -248,7 +248,7 @@ def test_shells_complete_what_is_there_and_quote_it(busy: tuple[Talk, list[str]]
     expected = {
         "talk st": "talk status ",
         "talk say --fl": "talk say --flush ",
-        "talk cancel d": "talk cancel door:open.1 ",
+        "talk cancel door": "talk cancel door:open.1 ",
         "talk cancel door:o": "talk cancel door:open.1 ",
         "talk cancel 'door:o": "talk cancel 'door:open.1' ",
         "talk cancel --before=door:": "talk cancel --before=door:open.1 ",
@@ -263,10 +263,10 @@ def test_shells_complete_what_is_there_and_quote_it(busy: tuple[Talk, list[str]]
         'talk cancel --key "low b': f"talk cancel --key {IN_DOUBLE} ",
         "talk serve --player=pa": "talk serve --player=pacat ",
         f"talk --socket {talk.directory}/bin/t": f"talk --socket {talk.directory}/bin/talk ",
-        "talk --socket /nowhere cancel d": "talk --socket /nowhere cancel d",
+        "talk --socket /nowhere cancel door": "talk --socket /nowhere cancel door",
         "talk cancel nothing": "talk cancel nothing",
         "talk nonsense x": "talk nonsense x",
-        "~/bin/talk cancel d": "~/bin/talk cancel door:open.1 ",
+        "~/bin/talk cancel door": "~/bin/talk cancel door:open.1 ",
     }
     with contextlib.ExitStack() as stack:
         shell = Shell(name, talk, stack)
