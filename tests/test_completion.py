@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pathlib
     from collections.abc import Mapping
 
+    from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
 CHECKED_IN = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "completions")
@@ -60,8 +61,15 @@ def values(line: str, talk: Talk) -> list[str]:
 
 
 @pytest.fixture
-def busy(scripted: Talk) -> tuple[Talk, list[str]]:
-    """A server that has said one goal, says one and will say one; the ids of these."""
+def busy(make_talk: MakeTalk) -> tuple[Talk, list[str]]:
+    """A server that has said one goal, says one and will say one; the ids of these.
+
+    Its own ids begin neither as the other one, nor with the number of a goal: what is typed here fits one alone.
+    """
+    scripted = make_talk(scripted=True)
+    while scripted.request("status")["server"]["boot"][0] in "123d":
+        scripted.stop()
+        scripted = make_talk(scripted=True)
     ended = scripted.run("say", "--wait", "--key", "over", "length=0").id
     active = scripted.request("say", text="moving, slowly: never-ends\t\x1b[31m", key=KEY, id="door:open.1")["goal"][
         "id"

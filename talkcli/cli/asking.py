@@ -45,14 +45,16 @@ def cancel(
 def status(options: Common, goal_id: str | None, opened: Opened | None = None) -> int:
     """Show how the server stands, or one goal, and return the exit code."""
     from talkcli import output
+    from talkcli.messages import Goal
 
     with options.connect(urgent=True, opened=opened) as client:
-        found = client.status() if goal_id is None else None
-        goal = None if goal_id is None else client.goal(goal_id)
+        found = client.status() if goal_id is None else client.goal(goal_id)
     if options.json:
-        show_json((found or goal).to_json())  # type: ignore[union-attr]
+        show_json(found.to_json())
+    elif isinstance(found, Goal):
+        _show_lines(output.goal_lines(found, screen()))
     else:
-        _show_lines(output.status_lines(found, screen()) if found else output.goal_lines(goal, screen()))  # type: ignore[arg-type]
+        _show_lines(output.status_lines(found, screen()))
     return EXIT_OK
 
 
