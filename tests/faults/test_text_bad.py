@@ -131,13 +131,7 @@ def test_every_assigned_character_once(common: bool) -> None:
     tally = speak_all([Case("gmw/en", text) for text in texts], guarded=True)
     print(tally)
     assert tally.texts == len(texts) > 0
-    assert tally.faults == []
-    # The library dies of some texts by chance, of one in a thousand or so, which is what its process is for: of none of
-    # these it may die twice.
-    assert len(tally.deaths) <= 1
-    for each in tally.deaths:
-        again = speak_all([each.case], guarded=True)
-        assert (again.deaths, again.faults) == ([], [])
+    assert (tally.deaths, tally.faults) == ([], [])
 
 
 def test_the_longest_words_and_writing_from_right_to_left_are_spoken_whole(tmp_path: Path) -> None:
