@@ -173,7 +173,7 @@ class EspeakDriver:
     def _synthesise(self, text: str) -> None:
         espeak = self._espeak
         self._caught = None
-        self._spoken = guard.guarded(text)
+        self._spoken = guard.guarded(text, self._voice)
         encoded = self._spoken.encode("utf-8", "replace")
         status = espeak.Synth(encoded, flags=espeak.CHARS_UTF8 | espeak.ENDPAUSE)
         caught, self._caught = self._caught, None

@@ -27,7 +27,7 @@ from talkcli.engine import guard
 tell = lambda what: sys.stderr.write(what + "\\n")
 sys.addaudithook(lambda name, _: name in ("os.posix_spawn", "os.fork", "subprocess.Popen") and tell(name))
 guarded = guard.guarded
-guard.guarded = lambda text: (tell("text"), guarded(text))[1]
+guard.guarded = lambda *text: (tell("text"), guarded(*text))[1]
 """
 
 
@@ -157,10 +157,10 @@ library.load = lambda: replace(load(), rate=16_000)
 
 
 def test_all_that_a_player_has_started_dies_with_a_killed_process(tmp_path: Path) -> None:
-    """What a shell starts behind itself, too: it would go on with what it holds."""
+    """What a shell starts behind itself, too: it would go on with what it holds. Sound comes to one that is tied."""
     begun, script = tmp_path / "begun", tmp_path / "pipeline"
     os.mkfifo(begun)
-    script.write_text(f"#!/bin/sh\nsleep 100 &\necho > {begun}\nwait\n")
+    script.write_text(f"#!/bin/sh\nsleep 100 &\nhead -c 1 > /dev/null\necho > {begun}\nwait\n")
     script.chmod(0o755)
     with Spawned(str(script)) as engine:
         engine.until(protocol.Ready)

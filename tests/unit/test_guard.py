@@ -120,3 +120,24 @@ def _words(text: str) -> list[str]:
             words.append("")
         words[-1] += here
     return words
+
+
+#: Voices, what they must not be given, and what they say as it stands.
+UNKNOWN = (
+    ("gmw/en", "৩ ೬ ॰ ൟ ಌ ᇃ ᆀ ჻ ֏ \u0387", "ক ಕ क ക ᄀ 가 გ հ α", "٣ १ ๓ ՞ · 3"),
+    ("inc/bn", "൧ ॰", "৩ ৳ ক", "१"),
+    ("inc/pa", "৩", "੩ ૩", "१"),
+    ("dra/ml+f3", "৩", "ൟ ൧ ൔ", ""),
+    ("ko", "৩", "ᇃ ᆀ", ""),
+    ("grk/el", "৩", "\u0387 \u0384", "·"),
+    ("", "৩ ᇃ", "ক", ""),
+)
+
+
+@pytest.mark.parametrize(("voice", "blanked", "own", "others"), UNKNOWN)
+def test_what_the_language_of_its_script_has_no_word_for_is_given_to_voices_of_it_alone(
+    voice: str, blanked: str, own: str, others: str
+) -> None:
+    for each in blanked.split():
+        assert guarded(f"one{each}two {each}", voice) == "one two  ", each
+    assert guarded(f"{own} {others} low", voice) == f"{own} {others} low"
