@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.opening import open_early
+from talkcli import opening
+from talkcli.opening import Opened, open_early, stand_back
 from talkcli.paths import client_sockets
 from tests.conformance.bareserve import TALK, run
 from tests.support.connection import PATIENCE
@@ -103,6 +104,57 @@ def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
     for words in (["say", "--wait", "length=0"], ["say", "length=0"], ["status"], ["cancel"], ["pause"], ["resume"]):
         done = run([sys.executable, "-c", code.format(words)], scripted.env)
         assert [done.out.splitlines()[each] for each in (0, -1) if done.out] == ["[]", "False"], done
+
+
+def test_who_waits_for_a_goal_imports_nothing_until_the_server_has_had_its_time(scripted: Talk) -> None:
+    """They would run beside the engine and the player until the first sound."""
+    code = (
+        "import sys\n"
+        "from talkcli import opening\n"
+        "stand_back = opening.stand_back\n"
+        "def spy(opened):\n"
+        "    found = stand_back(opened)\n"
+        "    print('stood back', b'ACTIVE' in found.received, {{'json', 'talkcli.client'}} & {{*sys.modules}})\n"
+        "    return found\n"
+        "opening.stand_back = spy\n"
+        "from talkcli.cli import run\n"
+        "assert run({}) == 0\n"
+    )
+    for words, stands_back in (
+        (["say", "--wait", "-q", "length=0.3"], True),
+        (["say", "--wait", "--feedback", "-q", "length=0.3"], False),
+        (["say", "-q", "length=0.3"], False),
+        (["status", "-q"], False),
+    ):
+        done = run([sys.executable, "-c", code.format(words)], scripted.env)
+        assert ("stood back True set()" in done.out.splitlines()) == stands_back, (words, done)
+
+
+def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair()
+    monkeypatch.setattr(opening.time, "process_time", lambda: 0.1)
+
+    def answer() -> None:
+        theirs.sendall(b"reply\n")
+        time.sleep(0.02)
+        theirs.sendall(b"event\n")
+
+    begun = Opened(ours.detach(), "s", b"greeting\n", b"request\n")
+    with theirs:
+        thread = threading.Thread(target=answer)
+        thread.start()
+        began = time.monotonic()
+        found = stand_back(begun)
+        assert time.monotonic() - began >= 0.1
+        thread.join()
+        assert found == Opened(begun.descriptor, "s", b"greeting\nreply\nevent\n", b"request\n")
+    monkeypatch.setattr(
+        opening.time, "process_time", lambda: PATIENCE
+    )  # it is limited, and who is gone isn't waited for
+    assert stand_back(found) == found
+    assert time.monotonic() - began < PATIENCE
+    with socket.socket(fileno=found.descriptor) as kept:
+        assert (os.get_blocking(kept.fileno()), kept.recv(1)) == (False, b"")
 
 
 def test_commands_that_send_one_request_need_no_click(scripted: Talk) -> None:

@@ -11,7 +11,7 @@ import _signal
 import os
 import time
 
-from talkcli.opening import open_early
+from talkcli.opening import open_early, stand_back
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -88,6 +88,8 @@ def carry_out(plain: Plain, arguments: list[str]) -> int:
     named = plain.common.get("socket") or os.environ.get("TALK_SOCKET") or None
     try:
         opened = open_early(named, *said, hold) if said else None
+        if opened and opened.sent and plain.given.get("wait") and not plain.given.get("feedback"):
+            opened = stand_back(opened)
     except KeyboardInterrupt:
         return 128 + int(_signal.SIGINT)  # nothing was sent
     from talkcli.cli.ends import ended
