@@ -116,7 +116,7 @@ def _try_all(named: str | None, hello: Hello, version: str, patience: float, int
             connected = _connect(path)
         except OSError as error:
             denied = denied or error.errno in {errno.EACCES, errno.EPERM}
-            failures.append(f"{path}: {_why(error)}")
+            failures.append(f"{path}: {_why(error, path)}")
             continue
         try:
             _check_owner(connected, path, named is not None)
@@ -128,7 +128,7 @@ def _try_all(named: str | None, hello: Hello, version: str, patience: float, int
         except BaseException:
             connected.close()
             raise
-    raise _nobody(failures, denied)
+    raise _nobody(failures, denied, named)
 
 
 def _connect(path: str) -> _socket.socket:
@@ -146,9 +146,13 @@ def _connect(path: str) -> _socket.socket:
     return connected
 
 
-def _why(error: OSError) -> str:
+def _why(error: OSError, path: str) -> str:
     if error.errno in {errno.ENOENT, errno.ENOTDIR}:
         return "not there"
+    if os.path.isdir(path):
+        return f"a directory, and no socket: name the one in it, {path.rstrip('/')}/{paths.SOCKET}"
+    if os.path.isfile(path):
+        return "a file, and no socket"
     if error.errno == errno.ECONNREFUSED:
         return "nobody answers (left over from a server that ended)"
     if error.errno in {errno.EACCES, errno.EPERM}:
@@ -217,10 +221,14 @@ def _next_step(connected: _socket.socket) -> str:
     return f"look at process {pid}, and restart it if it hangs"
 
 
-def _nobody(failures: list[str], denied: bool) -> TalkError:
+def _nobody(failures: list[str], denied: bool, named: str | None) -> TalkError:
     tried = "\n".join(f"  {each}" for each in failures)
     hint = paths.sudo_hint()
     step = "start one with: talk serve"
+    if named and named == os.environ.get("TALK_SOCKET"):
+        step += "\nor unset TALK_SOCKET, which names this place: no other was tried"
+    elif named:
+        step += f" --socket {named}"
     if hint and not os.environ.get("TALK_SOCKET"):
         step += f"\nthe server of the user who called sudo would be reached with: talk --socket {hint}"
     if denied:

@@ -35,7 +35,7 @@ RAW = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028\u2029\u202a-\u2
 def alone(*words: str, **extra: str) -> Any:
     """Run `talk` where there is no server."""
     with short_directory() as home:
-        return run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", **extra))
+        return run([*TALK, *words], environment(home, **{"TALK_SOCKET": f"{home}/s", **extra}))
 
 
 def error_of(err: str) -> dict[str, Any]:
@@ -54,28 +54,18 @@ def test_version_and_help() -> None:
     assert (done := alone("--version")).out == f"talk {__version__}\n"
     assert done.code == 0
     helps = [alone(*words) for words in (["-h"], ["--help"], [])]
-    assert len({each.out for each in helps}) == 1
+    assert helps[0].out == helps[1].out
     assert [each.code for each in helps] == [0, 0, 0]
     for command, words in COMMANDS.items():
-        assert re.search(rf"(?m)^  {command} +{re.escape(words)}$", helps[0].out)
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_fits_a_terminal_and_tells_the_exit_codes(command: str) -> None:
-    done = alone(command, "--help", COLUMNS="80")
-    assert done.code == 0
-    assert [each for each in done.out.splitlines() if len(each) > 80] == []
-    assert "Exit codes: 0 " in done.out
-    assert done.out == alone(command, "-h", COLUMNS="80").out
-    for option in ("--socket PATH", "--json", "--quiet"):
-        assert option in done.out
+        for each in helps:
+            assert re.search(rf"(?m)^  {command} +{re.escape(words)}$", each.out)
 
 
 @pytest.mark.parametrize(
     ("words", "hint"),
     [
-        (["sya", "hello"], "Did you mean 'say'?"),
-        (["stauts"], "Did you mean 'status'?"),
+        (["sya", "hello"], "did you mean 'say'?"),
+        (["stauts"], "did you mean 'status'?"),
         (["battery", "low"], 'talk say "battery low"'),
         (["say", "--wiat", "hello"], "--wait"),
         (["say", "-5", "degrees"], "talk say -- TEXT"),
@@ -281,3 +271,20 @@ def test_what_else_may_answer(says: bytes, code: int, error: str, words: str) ->
     told = error_of(done.err)
     assert (done.code, told["code"], told["exit"]) == (code, error, code)
     assert words in told["message"]
+
+
+def test_a_place_that_is_no_socket_is_told_from_what_a_server_left_there(tmp_path: Path) -> None:
+    place = tmp_path / "talk"
+    place.mkdir()
+    file = tmp_path / "file"
+    file.touch()
+    for named, words in (
+        (place, f"a directory, and no socket: name the one in it, {place}/talk.sock"),
+        (file, "a file"),
+    ):
+        by_variable, by_option = alone("status", TALK_SOCKET=str(named)), alone("--socket", str(named), "status")
+        assert (by_variable.code, by_option.code) == (3, 3)
+        assert f"{named}: {words}" in by_variable.err
+        assert f"{named}: {words}" in by_option.err
+        assert "or unset TALK_SOCKET" in by_variable.err
+        assert f"talk serve --socket {named}" in by_option.err

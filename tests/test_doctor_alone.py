@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -24,7 +25,6 @@ from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from tests.support.sink import Sink
 
@@ -131,6 +131,25 @@ def test_a_stale_socket_is_named_and_no_obstacle(home: str) -> None:
     found = doctor(environment(home, TALK_PLAYER="null", XDG_RUNTIME_DIR=f"{home}/run"))
     assert f"{path}: nobody answers: left over from a server that ended" in found["socket"]["message"]
     assert found["socket"]["next"] == "talk serve (it takes the place of what was left over)"
+
+
+def test_what_is_no_socket_is_told_from_one_that_was_left(home: str) -> None:
+    os.mkdir(f"{home}/run/talk", 0o700)
+    Path(f"{home}/file").touch()
+    for extra, words, step in (
+        (
+            {"TALK_SOCKET": f"{home}/run"},
+            "run: a directory, and",
+            f"name the socket in it: TALK_SOCKET={home}/run/talk.s",
+        ),
+        ({"TALK_SOCKET": f"{home}/file"}, "file: a file, and no", "unset TALK_SOCKET, or name a socket"),
+    ):
+        found = doctor(environment(home, TALK_PLAYER="null", **extra))["socket"]
+        assert words in found["message"]
+        assert found["next"].startswith(step)
+    Path(f"{home}/run/talk/talk.sock").touch()
+    found = doctor(environment(home, TALK_PLAYER="null", XDG_RUNTIME_DIR=f"{home}/run"))["socket"]
+    assert found["next"] == f"remove {home}/run/talk/talk.sock, and: talk serve"
 
 
 @pytest.mark.parametrize(

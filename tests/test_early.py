@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli import opening
 from talkcli.opening import Opened, open_early, stand_back
 from talkcli.paths import client_sockets
 from tests.conformance.bareserve import TALK, run
@@ -132,7 +131,7 @@ def test_who_waits_for_a_goal_imports_nothing_until_the_server_has_had_its_time(
 
 def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
-    monkeypatch.setattr(opening.time, "process_time", lambda: 0.1)
+    monkeypatch.setattr("talkcli.opening.time.process_time", lambda: 0.1)
 
     def answer() -> None:
         theirs.sendall(b"reply\n")
@@ -149,7 +148,7 @@ def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(mon
         thread.join()
         assert found == Opened(begun.descriptor, "s", b"greeting\nreply\nevent\n", b"request\n")
     monkeypatch.setattr(
-        opening.time, "process_time", lambda: PATIENCE
+        "talkcli.opening.time.process_time", lambda: PATIENCE
     )  # it is limited, and who is gone isn't waited for
     assert stand_back(found) == found
     assert time.monotonic() - began < PATIENCE

@@ -5,6 +5,8 @@ They know no click: plain command lines come here without it.
 
 from __future__ import annotations
 
+import sys
+
 from talkcli.cli.show import note, screen, show, show_json
 from talkcli.errors import EXIT_OK, UnknownGoal
 from talkcli.values import TYPE_CHECKING
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.cli.show import Common
+    from talkcli.client import Client
     from talkcli.messages import Goal, JsonObject
     from talkcli.opening import Opened
     from talkcli.replies import Canceled
@@ -33,7 +36,10 @@ def cancel(
     """Cancel what these select, or everything, and return the exit code. `opened`: the connection, if it has been."""
     with options.connect(urgent=True, opened=opened) as client:
         try:
-            _show_canceled(client.cancel(ids or None, current=current, before=before, key=key), options)
+            done = client.cancel(ids or None, current=current, before=before, key=key)
+            _show_canceled(done, options)
+            if key and not done.canceled and not options.quiet and sys.stderr and sys.stderr.isatty():
+                _suggest_key(key, client)
         except UnknownGoal as error:
             from talkcli.replies import Canceled
 
@@ -77,12 +83,12 @@ def voices(options: Common, language: str | None, opened: Opened | None = None) 
     from talkcli import output
 
     with options.connect(opened=opened) as client:
-        found = client.voices()
+        found = every = client.voices()
     if language:
         wanted = language.lower()
-        found = [each for each in found if _language(each) == wanted or _language(each).startswith(f"{wanted}-")]
+        found = [each for each in every if _language(each) == wanted or _language(each).startswith(f"{wanted}-")]
         if not found and not options.quiet:
-            note(f"no voice speaks {language!r}: 'talk voices' lists all")
+            note(_no_voice(language, every))
     if options.json:
         for voice in found:
             show_json(voice)
@@ -150,6 +156,31 @@ def _show_canceled(done: Canceled, options: Common) -> None:
     for goal in done.ended:
         if not options.quiet:
             note(f"{goal.id} had ended already: {goal.state.name}")
+
+
+def _suggest_key(key: str, client: Client) -> None:
+    """Where nothing has this key, but something a similar one, tell whoever typed it."""
+    from talkcli.cli.nearest import nearest
+    from talkcli.printable import printable
+
+    status = client.status()
+    goals = [status.active, *status.pending] if status.active else status.pending
+    near = nearest(key, {each.key for each in goals if each.key})
+    if near:
+        note(f"no goal has the key '{printable(key)}': did you mean '{printable(near)}'?")
+
+
+def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
+    """Return what is said where no voice speaks a language, which may have been given by its name."""
+    from talkcli.cli.nearest import nearest
+    from talkcli.printable import printable
+
+    codes = {_language(each): _language(each) for each in voices}
+    # "German", "English_(America)": all that speak it are listed by the first part of its code
+    names = {str(each.get("name") or "").partition(" ")[0]: _language(each).partition("-")[0] for each in voices}
+    near = nearest(language, names) or nearest(language, codes)
+    hint = f"did you mean '{printable({**codes, **names}[near])}'?" if near else "'talk voices' lists all"
+    return f"no voice speaks '{printable(language)}': {hint}"
 
 
 def _show_lines(lines: Iterable[str]) -> None:

@@ -1,4 +1,4 @@
-"""`talk cancel`."""
+"""`talk cancel` as click reads it: its options and its help. What it does is in `asking`."""
 
 from __future__ import annotations
 
@@ -6,10 +6,24 @@ import click
 
 from talkcli.cli import complete
 from talkcli.cli.asking import cancel
-from talkcli.cli.common import common, common_options, filled
+from talkcli.cli.common import common, common_options, filled, talk_command
+from talkcli.cli.usage import ASKING
 
 
-@click.command("cancel")
+@talk_command(
+    "cancel",
+    examples="""
+        talk cancel                 everything, now
+        talk cancel --current       this sentence; the next one follows
+        talk cancel --key battery   what was sent with --key battery
+        talk cancel 12 13           these goals of this server
+    """,
+    exit_codes={
+        **ASKING,
+        0: "it is silent, or was already",
+        8: "an ID is unknown; the others are cancelled all the same",
+    },
+)
 @click.argument("ids", nargs=-1, metavar="[ID]...", shell_complete=complete.goal_ids)
 @click.option("--current", is_flag=True, help="The goal that is being spoken.")
 @click.option(
@@ -32,13 +46,5 @@ def command(context: click.Context, ids: tuple[str, ...], current: bool, before:
     """Stop speaking: the goals that are named, or everything, from every client. Returns when it is silent.
 
     Prints the ids of the goals that ended because of it. Nothing to cancel is success. Selectors add up.
-
-    \b
-      talk cancel                 everything, now
-      talk cancel --current       this sentence; the next one follows
-      talk cancel --key battery   what was sent with --key battery
-      talk cancel 12 13           these goals of this server
-
-    Exit codes: 0 done; 3 no server; 8 an ID is unknown (the others are cancelled all the same).
     """
     return cancel(common(context), ids, current, before, key)

@@ -14,7 +14,8 @@ import click
 from talkcli import __version__
 from talkcli.cli.common import common_options
 from talkcli.cli.ends import OutputClosed, ended
-from talkcli.cli.show import Common, show_error
+from talkcli.cli.show import Common, note, show_error
+from talkcli.cli.usage import told, unknown_command, write_examples, write_exit_codes, write_lines, write_options
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, UsageError
 from talkcli.printable import printable
 
@@ -32,6 +33,33 @@ COMMANDS = {
     "set": "Change the running server's settings, or print them.",
     "voices": "List the voices.",
     "doctor": "Check everything between a sentence and a loudspeaker.",
+}
+
+
+_EXAMPLES = """
+    talk serve &                      one server on the robot
+    talk say --wait -- "battery low"  the exit code tells whether it was heard
+    talk cancel                       silence, now
+    talk status                       what it says, will say, has said
+    talk doctor                       silent? what to do next
+"""
+#: All of them, as the README's table has them; each command's help says which are its own.
+ALL_EXIT_CODES: dict[int | str, str] = {
+    0: "accepted; with --wait succeeded: all of it was played",
+    1: "anything not named here; a bug says so, and TALK_DEBUG=1 where",
+    2: "usage",
+    3: "no server: nothing was sent, so it is safe to try again",
+    4: "aborted: engine or audio failed, or nothing in the text can be spoken",
+    5: "rejected: never queued",
+    6: "recalled: taken out of the queue before it was spoken",
+    7: "preempted: stopped while it was spoken",
+    8: "unknown goal",
+    9: "client and server speak different versions of the protocol",
+    10: "permission denied",
+    11: "the socket is served already, or its directory is not safe",
+    12: "lost: it was sent, then the server went away; it may still be spoken",
+    124: "timed out",
+    "128+n": "ended by signal n; 141 for a closed standard output",
 }
 
 
@@ -66,40 +94,50 @@ class _Commands(click.Group):
         if ctx.resilient_parsing:  # a shell asks for completion: nothing may be said
             return super().resolve_command(ctx, args)
         if name and not name.startswith("-") and name not in COMMANDS:
-            import difflib
-
-            near = difflib.get_close_matches(name, COMMANDS, n=1)
-            hint = f"Did you mean {near[0]!r}?" if near else f'To speak it, write: talk say "{" ".join(args)}"'
-            raise click.UsageError(f"No such command '{name}'. {hint}", ctx)
+            raise click.UsageError(unknown_command(args, COMMANDS), ctx)
         return super().resolve_command(ctx, args)
+
+    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        super().format_help_text(ctx, formatter)
+        write_examples(_EXAMPLES, formatter)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        self.format_commands(ctx, formatter)
+        write_options(self, ctx, formatter, "Options, before or after the command")
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         with formatter.section("Commands"):
             formatter.write_dl(list(COMMANDS.items()))
 
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        write_exit_codes(ALL_EXIT_CODES, formatter)
+
 
 @click.group(
     cls=_Commands,
     invoke_without_command=True,
+    subcommand_metavar="COMMAND [ARGS]...",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="'talk COMMAND --help' says more. Exit codes: 0 succeeded, 3 no server, 4 aborted, 5 rejected, 6 recalled, "
-    "7 preempted, 124 timed out; all of them are in the README.",
 )
 @common_options
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
 def talk(context: click.Context) -> None:
-    """Speech for robots: sentences as goals that can be awaited, cancelled and preempted.
-
-    \b
-      talk serve &                      one server on the robot
-      talk say --wait -- "battery low"  the exit code tells whether it was heard
-      talk cancel                       silence, now
-      talk status                       what it says, will say, has said
-    """
+    """Speech for robots: sentences that can be awaited, cancelled and preempted."""
     context.ensure_object(Common)
     if context.invoked_subcommand is None:
-        click.echo(context.get_help())
+        click.echo(_first_screen(context))
+
+
+def _first_screen(context: click.Context) -> str:
+    """Return what a newcomer needs first; with the prompt below it, it fits a terminal of 24 lines."""
+    formatter = context.make_formatter()
+    formatter.write(f"{talk.help}\n\n")
+    with formatter.indentation():
+        write_lines(_EXAMPLES, formatter)
+    talk.format_commands(context, formatter)
+    formatter.write("\n'talk COMMAND --help' says more of each, 'talk --help' has the exit codes.")
+    return formatter.getvalue()
 
 
 def run(arguments: list[str], options: Common) -> int:
@@ -133,11 +171,11 @@ def _complete(options: Common) -> int:
 
 def _show_click_error(error: click.ClickException, *, json: bool) -> None:
     """Show a usage error. What was typed may be text of somebody else's, so its controls are escaped."""
-    words = printable(error.format_message())
+    words = printable(told(error))
     if json:
         show_error(UsageError(words), json=True)
-    else:
+        return
+    note(words)
+    if "--help" not in words:
         context = getattr(error, "ctx", None)
-        if context is not None:
-            click.echo(f"{context.get_usage()}\nTry '{context.command_path} --help' for help.\n", err=True)
-        click.echo(f"Error: {words}", err=True)
+        note(f"see '{context.command_path if context else 'talk'} --help'")

@@ -9,11 +9,21 @@ import click
 
 from talkcli.cli import complete
 from talkcli.cli.show import Common
+from talkcli.cli.usage import Command, Number
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from talkcli.cli.usage import Codes
+
 _F = TypeVar("_F", bound="Callable[..., Any]")
+
+
+def talk_command(
+    name: str, *, examples: str, exit_codes: Codes, cls: type[Command] = Command
+) -> Callable[[Callable[..., Any]], Command]:
+    """Make a command of a function: its docstring says what it is for. See `Command` for the rest."""
+    return click.command(name, cls=cls, examples=examples, exit_codes=exit_codes)
 
 
 def common(context: click.Context) -> Common:
@@ -36,9 +46,15 @@ def common_options(command: _F) -> _F:
                 expose_value=False,
                 callback=_store,
                 shell_complete=complete.files,
-                help="Socket of the server. [env: TALK_SOCKET; default: the usual places, see the README]",
+                help="Socket of the server.  [env var: TALK_SOCKET; default: the usual places, as 'talk doctor' lists]",
             ),
-            click.option("--json", is_flag=True, expose_value=False, callback=_store, help="One JSON object a line."),
+            click.option(
+                "--json",
+                is_flag=True,
+                expose_value=False,
+                callback=_store,
+                help="For programs: one JSON object a line; errors, too.",
+            ),
             click.option(
                 "-q",
                 "--quiet",
@@ -56,25 +72,25 @@ def common_options(command: _F) -> _F:
 def number(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
     """Refuse NaN, which compares with nothing and so is in any range."""
     if value is not None and math.isnan(value):
-        raise click.BadParameter(f"{value!r} is not a number.", context, parameter)
+        raise click.BadParameter(f"{value!r} is not a number", context, parameter)
     return value
 
 
 def seconds(context: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
     """Refuse what is no length of time: NaN, and infinity, for which there is another word: no limit is 0."""
     if value is not None and math.isinf(value):
-        raise click.BadParameter("no limit is 0.", context, parameter)
+        raise click.BadParameter("no limit is 0", context, parameter)
     return number(context, parameter, value)
 
 
 def filled(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
     """Refuse an empty word: it comes from a variable that isn't set, and selects nothing."""
     if value == "":
-        raise click.BadParameter("is empty: is the variable set that it comes from?", context, parameter)
+        raise click.BadParameter("empty; is the variable set that it comes from?", context, parameter)
     return value
 
 
 def timeout_option(words: str) -> Callable[[_F], _F]:
     """Return the option --timeout; `words` is its help: what the command does when the time is over."""
-    above_zero = click.FloatRange(0, min_open=True)
+    above_zero = Number(0, min_open=True)
     return click.option("-t", "--timeout", type=above_zero, callback=number, metavar="SEC", help=words)

@@ -29,7 +29,8 @@ _ENDED = 100
 #: Characters of a text that stand beside an id.
 _MAX_TEXT = 60
 
-_PLAYERS = {
+#: The players that talk knows by name.
+PLAYERS = {
     "aplay": "ALSA",
     "pacat": "PulseAudio",
     "pw-cat": "PipeWire",
@@ -88,7 +89,7 @@ def files(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
 
 def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
     """Return the players that talk knows by name."""
-    return _items(_PLAYERS.items(), incomplete)
+    return _items(PLAYERS.items(), incomplete)
 
 
 def _ask(context: click.Context, question: Callable[[Client], _Answer]) -> _Answer | None:

@@ -1,19 +1,35 @@
-"""`talk doctor`."""
+"""`talk doctor`: shows each finding as it is made, and what they mean together. It looks at nothing itself."""
 
 from __future__ import annotations
 
 import click
 
-from talkcli.cli.common import common, common_options
+from talkcli.cli.common import common, common_options, talk_command
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, screen, show, show_json
 from talkcli.dial import Interrupted
+from talkcli.states import EXIT_CODES, State
 
-#: What nobody would hear: design's code of a goal that is ABORTED.
-_NOT_HEARD = 4
+#: What nobody would hear ends as a goal that nobody hears.
+_NOT_HEARD = EXIT_CODES[State.ABORTED]
 
 
-@click.command("doctor")
+@talk_command(
+    "doctor",
+    examples="""
+        talk doctor
+        talk doctor --silent                    at night: all of it, without a sound
+        ssh robot talk doctor                   the exit code comes back
+        talk --json doctor | jq 'select(.state != "done")'
+    """,
+    exit_codes={
+        0: "a sentence would be heard",
+        1: "anything not named here; a bug says so",
+        2: "usage",
+        4: "it would not, as without a server",
+        "128+n": "ended by signal n",
+    },
+)
 @click.option("--silent", is_flag=True, help="Play the test sentence without sound; all else is checked as ever.")
 @common_options
 @click.pass_context
@@ -22,14 +38,6 @@ def command(context: click.Context, silent: bool) -> int:
 
     Each check is a line: done, warning or failed. At last a sentence is played: by the server, where it waits its turn
     (20 seconds at most), or without a server by an engine of this command's own, with TALK_PLAYER and TALK_VOICE.
-
-    \b
-      talk doctor
-      talk doctor --silent                    at night: all of it, without a sound
-      ssh robot talk doctor                   the exit code comes back
-      talk --json doctor | jq 'select(.state != "done")'
-
-    Exit codes: 0 a sentence would be heard; 4 it would not, as without a server; 2 usage.
     """
     from talkcli.doctor.examine import Examination
     from talkcli.doctor.findings import heard

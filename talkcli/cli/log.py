@@ -1,19 +1,31 @@
-"""`talk log`."""
+"""`talk log` as click reads it: its option and its help. What it does is in `asking`."""
 
 from __future__ import annotations
 
 import click
 
 from talkcli.cli.asking import log
-from talkcli.cli.common import common, common_options
+from talkcli.cli.common import common, common_options, talk_command
+from talkcli.cli.usage import ASKING, WholeNumber
 from talkcli.requests import MAX_LOG
 
 
-@click.command("log")
+@talk_command(
+    "log",
+    examples="""
+        talk log
+        talk log -n 100 | grep patrol
+        talk --json log | jq -r 'select(.state == "ABORTED").message'
+    """,
+    exit_codes={
+        **ASKING,
+        0: "listed",
+    },
+)
 @click.option(
     "-n",
     "--count",
-    type=click.IntRange(1, MAX_LOG),
+    type=WholeNumber(1, MAX_LOG),
     default=20,
     show_default=True,
     metavar="N",
@@ -26,12 +38,5 @@ def command(context: click.Context, count: int) -> int:
 
     Who sent it is the program that called talk, the process id of talk itself, and after "as" what the sender calls
     itself. Rejected goals are listed, too.
-
-    \b
-      talk log
-      talk log -n 100 | grep patrol
-      talk --json log | jq -r 'select(.state == "ABORTED").message'
-
-    Exit codes: 0 listed; 3 no server.
     """
     return log(common(context), count)

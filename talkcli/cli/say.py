@@ -1,4 +1,7 @@
-"""`talk say`."""
+"""`talk say` as click reads it: its options, how they go together, its help.
+
+What it does is in `saying`, `lines`, `rendering`.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +13,54 @@ from click.core import ParameterSource
 
 from talkcli.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
 from talkcli.cli import complete
-from talkcli.cli.common import common, common_options, filled, number, seconds, timeout_option
+from talkcli.cli.common import common, common_options, filled, number, seconds, talk_command, timeout_option
 from talkcli.cli.outcome import rest
 from talkcli.cli.saying import GOAL_OPTIONS, say
+from talkcli.cli.usage import ASKING, Command, Number, WholeNumber, told
 from talkcli.requests import Say
 
 #: Options that mean something to a server alone.
 _SERVER_ONLY = ("wait", "feedback", "lines", "preempt", "flush", "priority", "ttl", "key", "throttle", "id", "name")
 
 
-class _SayCommand(click.Command):
+class _SayCommand(Command):
     """Says how to speak a text that looks like an option."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            words = f"{error.format_message()} To speak a text that starts with '-', write: talk say -- TEXT"
+            words = told(error)
+            words += (
+                f"{'' if words.endswith('?') else '.'} To speak a text that starts with '-', write: talk say -- TEXT"
+            )
             raise click.UsageError(words, ctx) from error
 
 
-@click.command("say", cls=_SayCommand)
+@talk_command(
+    "say",
+    cls=_SayCommand,
+    examples="""
+        talk say "battery low"
+        talk say --wait -- "$text" || echo "nobody heard it"
+        talk say -wf "please step back"         each word as it is heard
+        talk say --key battery --throttle 60 "battery low"
+        fortune | talk say -
+        tail -n 0 -F log | talk say --lines --ttl 10
+        talk say -o hello.wav "hello"           needs no server
+    """,
+    exit_codes={
+        **ASKING,
+        0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
+        4: "aborted: engine or audio failed; 'talk doctor' says more",
+        5: "rejected: never queued (bad text, full queue or full server)",
+        6: "recalled: taken out of the queue before it was spoken",
+        7: "preempted: stopped while it was spoken",
+        12: "lost: it was sent, then the server went away; it may still be spoken",
+        124: "timed out, and cancelled",
+        "128+n": "ended by signal n, and cancelled",
+    },
+)
 @click.argument("text", nargs=-1, metavar="TEXT...")
 @click.option("-w", "--wait", is_flag=True, help="Wait until it has ended; the exit code tells how.")
 @timeout_option("With --wait: cancel it after SEC seconds, time in the queue included; exit code 124.")
@@ -51,7 +81,7 @@ class _SayCommand(click.Command):
 )
 @click.option(
     "--ttl",
-    type=click.FloatRange(0),
+    type=Number(0),
     callback=seconds,
     metavar="SEC",
     help="Drop it if it has not begun within SEC seconds; 0: no limit.",
@@ -65,7 +95,7 @@ class _SayCommand(click.Command):
 )
 @click.option(
     "--throttle",
-    type=click.FloatRange(0),
+    type=Number(0),
     callback=seconds,
     metavar="SEC",
     help="Don't speak it if its key, or else its text, was spoken less than SEC seconds ago.",
@@ -74,22 +104,22 @@ class _SayCommand(click.Command):
 @click.option(
     "--as", "name", metavar="NAME", envvar="TALK_NAME", show_envvar=True, help="What the sender calls itself."
 )
-@click.option("--rate", type=click.IntRange(*RATES), metavar="N", help="Words per minute. [env, with -o: TALK_RATE]")
+@click.option("--rate", type=WholeNumber(*RATES), metavar="N", help="Words per minute.  [env var, with -o: TALK_RATE]")
 @click.option(
     "--volume",
-    type=click.FloatRange(*VOLUMES),
+    type=Number(*VOLUMES),
     callback=number,
     metavar="X",
-    help="Loudness. [env, with -o: TALK_VOLUME]",
+    help="Loudness.  [env var, with -o: TALK_VOLUME]",
 )
 @click.option(
     "--voice",
     metavar="VOICE",
     callback=filled,
     shell_complete=complete.voices,
-    help="Voice by id, name or language: see 'talk voices'. [env, with -o: TALK_VOICE]",
+    help="Voice by id, name or language: see 'talk voices'.  [env var, with -o: TALK_VOICE]",
 )
-@click.option("--pitch", type=click.IntRange(*PITCHES), metavar="N", help="Pitch of the voice; 50 is its own.")
+@click.option("--pitch", type=WholeNumber(*PITCHES), metavar="N", help="Pitch of the voice; 50 is its own.")
 @click.option("--lines", is_flag=True, help="Speak each line of standard input, as it comes; no TEXT then.")
 @click.option(
     "-o",
@@ -104,19 +134,7 @@ def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> i
     """Speak TEXT: its words, joined by blanks; or standard input, as one sentence, where TEXT is '-'.
 
     Prints the goal's id. Without --wait it returns as soon as the goal is accepted. With --wait it owns the goal:
-    Ctrl-C and SIGTERM cancel it.
-
-    \b
-      talk say "battery low"
-      talk say --wait -- "$text" || echo "nobody heard it"
-      talk say -wf "please step back"         each word as it is heard
-      talk say --key battery --throttle 60 "battery low"
-      fortune | talk say -
-      tail -f log | talk say --lines --ttl 10
-      talk say -o hello.wav "hello"
-
-    Exit codes: 0 accepted, succeeded, or throttled; 3 no server; 4 aborted; 5 rejected; 6 recalled; 7 preempted;
-    12 the server went away; 124 timed out. With --lines, the first line's that did not succeed.
+    Ctrl-C and SIGTERM cancel it. With --lines its exit code is that of the first line that did not succeed.
     """
     began = time.monotonic()
     given["wait"] = given["wait"] or given["feedback"]
@@ -158,7 +176,7 @@ def _check(context: click.Context, text: tuple[str, ...], given: dict[str, Any])
     if given["lines"] and given["id"] is not None:
         refuse("--lines makes a goal of each line, and --id names one: leave out one of them")
     if not given["lines"] and not text:
-        refuse("Missing argument 'TEXT...'.")
+        refuse("TEXT is missing: what is to be said, or '-' for standard input")
     if given["flush"] and given["preempt"] is False:
         refuse("--flush goes first, and --queue does not: leave out one of them")
     if given["timeout"] is not None and not given["wait"] and given["output"] is None:

@@ -1,4 +1,4 @@
-"""`talk serve`."""
+"""`talk serve`: its options and its help; it runs the server, or prints a unit. No other module imports the server."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ import click
 from click.core import ParameterSource
 
 from talkcli.cli import complete, units
-from talkcli.cli.common import common, common_options, filled, number, seconds
+from talkcli.cli.common import common, common_options, filled, number, seconds, talk_command
 from talkcli.cli.show import note, show
+from talkcli.cli.usage import Number, WholeNumber
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE, Settings
+from talkcli.text import MAX_CHARACTERS
 
+#: As `admission` has them, which imports what printing a unit doesn't need; a test compares the two.
+RATES, VOLUMES, PITCHES = (80, 450), (0.0, 1.0), (0, 100)
 #: Milliseconds of silence before a sentence: no output needs longer to wake.
 MAX_LEAD_IN = 5000
 
@@ -21,15 +25,28 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     """Return the mode of a file; the owner must be able to use the socket, and nobody executes it."""
     mode = int(value, 8) if re.fullmatch("[0-7]{3,4}", value) else 0
     if mode & ~0o666 or mode & 0o600 != 0o600:
-        words = f"{value!r} is not a mode such as 0600 (mine alone), 0660 (my group's) or 0666."
+        words = f"{value!r} is not a mode such as 0600 (mine alone), 0660 (my group's) or 0666"
         raise click.BadParameter(words, context, parameter)
     return mode
 
 
-@click.command("serve")
+@talk_command(
+    "serve",
+    examples="""
+        talk serve --rate 150
+        talk serve --player null       no sound, same timing: for simulation and CI
+        talk serve --print-unit user   a service for systemd, with how to install it
+    """,
+    exit_codes={
+        0: "ended by SIGTERM or SIGINT; by a second one 128+n",
+        1: "anything not named here; a bug says so",
+        2: "usage: an option or a voice that there isn't",
+        11: "this socket is served already, or its directory is not safe",
+    },
+)
 @click.option(
     "--rate",
-    type=click.IntRange(80, 450),
+    type=WholeNumber(*RATES),
     default=200,
     show_default=True,
     envvar="TALK_RATE",
@@ -38,7 +55,7 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
 )
 @click.option(
     "--volume",
-    type=click.FloatRange(0, 1),
+    type=Number(*VOLUMES),
     callback=number,
     default=1.0,
     show_default=True,
@@ -48,17 +65,20 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
 )
 @click.option(
     "--voice",
+    metavar="VOICE",
     envvar="TALK_VOICE",
     show_envvar=True,
     callback=filled,
     shell_complete=complete.voices,
     help="Voice by id, name or language: see 'talk voices'.",
 )
-@click.option("--pitch", type=click.IntRange(0, 100), default=50, show_default=True, help="Pitch of the voice.")
+@click.option(
+    "--pitch", type=WholeNumber(*PITCHES), default=50, show_default=True, help="Pitch of the voice; 50 is its own."
+)
 @click.option("--preempt", is_flag=True, help="Every goal stops the one before it, unless it says --queue.")
 @click.option(
     "--ttl",
-    type=click.FloatRange(0),
+    type=Number(0),
     callback=seconds,
     default=0,
     show_default=True,
@@ -67,21 +87,21 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
 )
 @click.option(
     "--max-queue",
-    type=click.IntRange(1),
+    type=WholeNumber(1),
     default=MAX_QUEUE,
     show_default=True,
     help="Goals that may wait.",
 )
 @click.option(
     "--max-text",
-    type=click.IntRange(1, 10_000),
-    default=10_000,
+    type=WholeNumber(1, MAX_CHARACTERS),
+    default=MAX_CHARACTERS,
     show_default=True,
     help="Characters of one text.",
 )
 @click.option(
     "--max-clients",
-    type=click.IntRange(1),
+    type=WholeNumber(1),
     default=MAX_CLIENTS,
     show_default=True,
     help="Clients at once.",
@@ -92,8 +112,8 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     envvar="TALK_PLAYER",
     show_envvar=True,
     shell_complete=complete.players,
-    help="aplay, pacat or pw-cat; null (silent, in real time); file:PATH.wav; or a command that reads 16-bit mono PCM, "
-    "with {rate} for its rate and {device} for the --device. [default: the first of the three that works]",
+    help="One of aplay, pacat and pw-cat; null (silent, in real time); file:PATH.wav; or a command that reads 16-bit "
+    "mono PCM, with {rate} for its rate and {device} for the --device. [default: the first of the three that works]",
 )
 @click.option(
     "--device",
@@ -103,14 +123,14 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
 )
 @click.option(
     "--lead-in",
-    type=click.IntRange(0, MAX_LEAD_IN),
+    type=WholeNumber(0, MAX_LEAD_IN),
     default=0,
     show_default=True,
     metavar="MS",
     help="Milliseconds of silence before a sentence, where the output was idle: HDMI, USB and Bluetooth outputs fall "
     "asleep, and swallow what comes while they wake.",
 )
-@click.option("--driver", metavar="NAME", help="pyttsx3 driver. [default: the one for this system]")
+@click.option("--driver", metavar="NAME", help="A driver of pyttsx3's. [default: the one for this system]")
 @click.option(
     "--socket-mode",
     metavar="MODE",
@@ -123,7 +143,9 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
 @click.option(
     "--print-unit",
     type=click.Choice(list(units.UNITS)),
-    help="Print a unit for systemd that serves with the options given here, and end; it says where it goes.",
+    metavar="UNIT",
+    help=f"Print a unit for systemd that serves with the options given here, and end: {', '.join(units.UNITS)}. "
+    "It says where it goes.",
 )
 @common_options
 @click.pass_context
@@ -131,24 +153,36 @@ def command(context: click.Context, /, print_unit: str | None, **options: object
     """Run the server, in the foreground, until SIGTERM or Ctrl-C.
 
     It queues sentences and speaks one at a time; its log is on standard error. For systemd it prints its own units.
-
-    \b
-      talk serve --rate 150
-      talk serve --player null      no sound, same timing: for simulation and CI
-      talk serve --print-unit user  a service for systemd, with how to install it
-
-    Exit codes: 0 ended by SIGTERM or SIGINT; 2 usage; 11 another server serves already, or the socket's directory is
-    not safe.
     """
-    if options["device"] and str(options["player"] or "").startswith(("null", "file:")):
-        raise click.UsageError(f"--device means nothing to the player {options['player']}", context)
+    player = str(options["player"] or "")
+    if options["device"] and player.startswith(("null", "file:")):
+        raise click.UsageError(f"--device means nothing to the player {player}", context)
+    if player == "file:":
+        raise click.UsageError("--player file: names no file: write file:PATH.wav", context)
     if print_unit:
         _print_unit(context, print_unit)
         return 0
+    _warn_of_player(player)
     from talkcli import paths
     from talkcli.server.run import serve
 
     return serve(Settings(socket=paths.named_socket(common(context).socket), **options))  # type: ignore[arg-type]
+
+
+def _warn_of_player(player: str) -> None:
+    """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
+    from talkcli.cli.nearest import nearest
+    from talkcli.engine.players import commands, on_path
+    from talkcli.engine.sink import AudioFailed
+
+    if not player or player == "null" or player.startswith("file:"):
+        return
+    try:
+        commands(player, None, 0, on_path, None)
+    except AudioFailed as error:
+        near = nearest(player, set(complete.PLAYERS) - {player})
+        hint = f"did you mean '{near}'? " if near else ""
+        note(f"{error}: {hint}until it is there, nothing can be heard")
 
 
 def _print_unit(context: click.Context, name: str) -> None:
@@ -161,7 +195,7 @@ def _print_unit(context: click.Context, name: str) -> None:
     if hidden:
         note(
             f"this talk is in {hidden}, where the service's own user can't get: install it for all, as with "
-            "'sudo python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install talkcli', and print the unit with that"
+            "'sudo python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in a checkout, then print the unit"
         )
 
 

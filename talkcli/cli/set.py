@@ -1,4 +1,4 @@
-"""`talk set`."""
+"""`talk set` as click reads it: its options and its help. What it does is in `asking`."""
 
 from __future__ import annotations
 
@@ -9,19 +9,33 @@ import click
 from talkcli.admission import PITCHES, RATES, VOLUMES
 from talkcli.cli import complete
 from talkcli.cli.asking import change
-from talkcli.cli.common import common, common_options, filled, number, seconds
+from talkcli.cli.common import common, common_options, filled, number, seconds, talk_command
+from talkcli.cli.usage import ASKING, Number, WholeNumber
 
 
-@click.command("set")
-@click.option("--rate", type=click.IntRange(*RATES), help="Words per minute.")
-@click.option("--volume", type=click.FloatRange(*VOLUMES), callback=number, help="Loudness.")
+@talk_command(
+    "set",
+    examples="""
+        talk set
+        talk set --rate 150 --volume 0.5
+        talk set --voice en-us --no-preempt
+    """,
+    exit_codes={
+        **ASKING,
+        0: "changed, or printed",
+        2: "usage: a value out of its range, or an unknown voice; nothing was changed",
+    },
+)
+@click.option("--rate", type=WholeNumber(*RATES), help="Words per minute.")
+@click.option("--volume", type=Number(*VOLUMES), callback=number, help="Loudness.")
 @click.option(
     "--voice",
+    metavar="VOICE",
     callback=filled,
     shell_complete=complete.voices,
     help="Voice by id, name or language: see 'talk voices'; 'default' is the engine's own.",
 )
-@click.option("--pitch", type=click.IntRange(*PITCHES), help="Pitch of the voice; 50 is its own.")
+@click.option("--pitch", type=WholeNumber(*PITCHES), help="Pitch of the voice; 50 is its own.")
 @click.option(
     "--preempt/--no-preempt",
     default=None,
@@ -29,7 +43,7 @@ from talkcli.cli.common import common, common_options, filled, number, seconds
 )
 @click.option(
     "--ttl",
-    type=click.FloatRange(0),
+    type=Number(0),
     callback=seconds,
     metavar="SEC",
     help="A goal that has not begun after SEC seconds is recalled; 0: no limit.",
@@ -41,12 +55,5 @@ def command(context: click.Context, /, **changes: Any) -> int:
 
     They hold for each goal that doesn't bring its own, from the next one that begins; --preempt and --ttl from the
     next one that is sent. A server that is started anew has those of its command line.
-
-    \b
-      talk set
-      talk set --rate 150 --volume 0.5
-      talk set --voice en-us --no-preempt
-
-    Exit codes: 0 done; 2 a value out of its range, or an unknown voice: nothing was changed; 3 no server.
     """
     return change(common(context), **changes)

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 #: Columns of a terminal that doesn't say how many it has.
 _USUAL_WIDTH = 80
+#: Columns into which what is said always goes; a terminal that says it has fewer is not believed.
+_NARROWEST = 40
 
 
 class Common:
@@ -60,10 +62,29 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 
 
 def note(words: str) -> None:
-    """Write something for people to standard error."""
+    """Write something for people to standard error; a terminal's lines end between two words."""
     if sys.stderr is not None:
-        sys.stderr.write(f"talk: {words}\n")
+        lines = f"talk: {words}"
+        if len(lines) > _NARROWEST and sys.stderr.isatty():
+            lines = _folded(lines)
+        sys.stderr.write(f"{lines}\n")
         sys.stderr.flush()
+
+
+def _folded(text: str) -> str:
+    """Return the text in lines that a terminal needs not break."""
+    try:
+        width = os.get_terminal_size(sys.stderr.fileno()).columns or _USUAL_WIDTH
+    except OSError:
+        width = _USUAL_WIDTH
+    if all(len(line) <= width for line in text.split("\n")):
+        return text
+    import textwrap
+
+    fold = textwrap.TextWrapper(
+        max(width, _NARROWEST), subsequent_indent="      ", break_long_words=False, break_on_hyphens=False
+    )
+    return "\n".join(fold.fill(line) for line in text.split("\n"))
 
 
 def show_error(error: TalkError, *, json: bool) -> None:

@@ -1,4 +1,7 @@
-"""`talk watch`."""
+"""`talk watch`: shows what happens until it is interrupted, or until nobody reads any more.
+
+What a line says is in `transcript`.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,28 @@ import threading
 
 import click
 
-from talkcli.cli.common import common, common_options
+from talkcli.cli.common import common, common_options, talk_command
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import Common, screen, show, show_json
+from talkcli.cli.usage import ASKING
 from talkcli.dial import Interrupted
 from talkcli.errors import EXIT_SIGNAL
 from talkcli.transcript import Transcript
 
 
-@click.command("watch")
+@talk_command(
+    "watch",
+    examples="""
+        talk watch
+        ssh robot talk watch
+        talk --json watch | jq -r 'select(.event == "word").word'
+    """,
+    exit_codes={
+        **ASKING,
+        12: "lost: the server went away",
+        "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
+    },
+)
 @click.option("-f", "--words", is_flag=True, help="A line for each word as it is heard, too.")
 @common_options
 @click.pass_context
@@ -30,13 +46,6 @@ def command(context: click.Context, words: bool) -> int:
     waits where nothing is before it, that one is being stopped. In a pipe, each event is a line.
 
     With --json each event is an object a line, words included; the first is {"event": "snapshot", ...}.
-
-    \b
-      talk watch
-      ssh robot talk watch
-      talk --json watch | jq -r 'select(.event == "word").word'
-
-    Exit codes: 0 never; 3 no server; 12 the server went away; 130 ended by Ctrl-C.
     """
     options = common(context)
     _end_with_reader()
@@ -64,7 +73,8 @@ def _end_with_reader() -> None:
     poll.register(sys.stdout.fileno(), 0)  # nothing but errors and hang-ups, which a file never has
 
     def wait() -> None:
-        poll.poll()
-        os._exit(EXIT_SIGNAL + signal.SIGPIPE)  # nothing is left to be written or tidied up
+        (_, found), *_ = poll.poll()
+        if found & (select.POLLERR | select.POLLHUP):  # and not POLLNVAL, which is what macOS says of a terminal
+            os._exit(EXIT_SIGNAL + signal.SIGPIPE)  # nothing is left to be written or tidied up
 
     threading.Thread(target=wait, daemon=True).start()

@@ -6,8 +6,10 @@ from talkcli.doctor.findings import Finding, done, failed, warning
 from talkcli.values import frozen
 
 #: What is found at a place.
-ABSENT, STALE, FORBIDDEN, FOREIGN, MUTE, SERVER = (
+ABSENT, FILE, DIRECTORY, STALE, FORBIDDEN, FOREIGN, MUTE, SERVER = (
     "not there",
+    "a file, and no socket",
+    "a directory, and no socket",
     "nobody answers: left over from a server that ended",
     "no permission",
     "another user's server",
@@ -21,6 +23,9 @@ _ANSWERS = {
     "busy": "end some of its clients, or give it more places: talk serve --max-clients 512",
     "permission_denied": "have its owner let you in: talk serve --socket-mode 0660, and join the socket's group",
 }
+#: By what names a socket: what stands between it and the name, and how it is not named any more.
+_AS = {"TALK_SOCKET": "=", "--socket": " "}
+_OFF = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
 
 
 @frozen
@@ -76,8 +81,7 @@ def _shown(place: Place) -> str:
 
 def _step(found: Places) -> str:
     if found.elsewhere is not None:
-        away = "unset TALK_SOCKET" if found.named == "TALK_SOCKET" else "leave --socket out"
-        return f"{away}: a server is on {found.elsewhere}"
+        return f"{_OFF[found.named or '--socket']}: a server is on {found.elsewhere}"
     by_what = {each.what: each for each in reversed(found.places)}
     if FORBIDDEN in by_what:
         place = by_what[FORBIDDEN]
@@ -89,12 +93,25 @@ def _step(found: Places) -> str:
     if MUTE in by_what:
         step = _ANSWERS.get(found.code or "")
         return step or f"restart the server on {by_what[MUTE].path}; if it is none of talk's, remove that"
+    if FILE in by_what or DIRECTORY in by_what:
+        return _no_socket(by_what.get(FILE) or by_what[DIRECTORY], found.named)
     if STALE in by_what:
         return "talk serve (it takes the place of what was left over)"
     if found.others:
         return f"talk serve; or use another user's server: talk --socket {found.others[0]} doctor"
-    if found.named == "TALK_SOCKET":
-        return "unset TALK_SOCKET, or start a server there: talk serve"
-    if found.named is not None:
-        return f"leave --socket out, or start a server there: talk serve --socket {found.places[0].path}"
-    return "talk serve"
+    return _start(found)
+
+
+def _no_socket(place: Place, named: str | None) -> str:
+    if named is None:
+        return f"remove {place.path}, and: talk serve"
+    if place.what == DIRECTORY:
+        return f"name the socket in it: {named}{_AS[named]}{place.path.rstrip('/')}/talk.sock"
+    return f"{_OFF[named]}, or name a socket"
+
+
+def _start(found: Places) -> str:
+    if found.named is None:
+        return "talk serve"
+    option = f" --socket {found.places[0].path}" if found.named == "--socket" else ""
+    return f"{_OFF[found.named]}, or start a server there: talk serve{option}"

@@ -14,7 +14,18 @@ from typing import TYPE_CHECKING
 from talkcli import paths, peers
 from talkcli.client import Client
 from talkcli.dial import Interrupted
-from talkcli.doctor.places import ABSENT, FORBIDDEN, FOREIGN, MUTE, SERVER, STALE, Place, Places
+from talkcli.doctor.places import (
+    ABSENT,
+    DIRECTORY,
+    FILE,
+    FORBIDDEN,
+    FOREIGN,
+    MUTE,
+    SERVER,
+    STALE,
+    Place,
+    Places,
+)
 from talkcli.doctor.sentence import Played
 from talkcli.errors import TalkError
 from talkcli.states import State
@@ -67,12 +78,16 @@ def _place(path: str, *, trusted: bool) -> Place:
         try:
             probe.connect(path)
         except OSError as error:
-            return Place(path, _why(error), _owner(path))
+            return Place(path, _why(error, path), _owner(path))
         _, uid = peers.credentials(probe)
     return Place(path, MUTE if trusted or uid in {os.getuid(), 0} else FOREIGN, uid)
 
 
-def _why(error: OSError) -> str:
+def _why(error: OSError, path: str) -> str:
+    if os.path.isdir(path):
+        return DIRECTORY
+    if os.path.isfile(path):
+        return FILE
     if error.errno in {errno.ENOENT, errno.ENOTDIR}:
         return ABSENT
     if error.errno == errno.ECONNREFUSED:

@@ -59,7 +59,7 @@ def _engine(python: Python, engine: Engine, server: bool) -> list[Finding]:
         # It asks PulseAudio at its start, though it is to play nothing itself.
         step = "restart the sound server if that hangs (see below): libespeak-ng waits for it at its start"
         return [found, broken("libespeak-ng", words, step)]
-    return [found, broken("libespeak-ng", words, "TALK_DEBUG=1 talk serve shows the engine's own words")]
+    return [found, broken("libespeak-ng", words, "talk serve logs the engine's own words")]
 
 
 def _library(engine: Engine) -> list[Finding]:

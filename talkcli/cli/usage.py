@@ -1,0 +1,173 @@
+"""How click shows help, and what it tells of a command line that is wrong, in talk's own words: what, and what next.
+
+It knows nothing of any one command: those bring their examples and exit codes along.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from talkcli.cli.nearest import nearest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    Codes = Mapping[int | str, str]
+
+#: Exit codes of every command that asks the server for something; a command says more of those that mean more to it.
+ASKING: dict[int | str, str] = {
+    1: "anything not named here; a bug says so",
+    2: "usage: what is wrong stands on standard error",
+    3: "no server: nothing was sent, so it is safe to try again",
+    5: "the server has as many clients as it takes",
+    9: "this command and the server speak different versions of the protocol",
+    10: "permission denied",
+}
+#: What a command is called elsewhere, where that isn't near to its name here.
+_ELSEWHERE = {
+    "check": "doctor",
+    "follow": "watch",
+    "history": "log",
+    "kill": "cancel",
+    "queue": "status",
+    "speak": "say",
+    "start": "serve",
+    "stop": "cancel",
+    "unpause": "resume",
+}
+
+
+class Number(click.FloatRange):
+    """A number from a limit on, or within two, or any."""
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str | None:  # noqa: ARG002
+        return "X"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return _convert(super().convert, f"a number {_limits(self)}".rstrip(), value, param, ctx)
+
+    def _describe_range(self) -> str:
+        return _limits(self)
+
+
+class WholeNumber(click.IntRange):
+    """As Number, without a fraction."""
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str | None:  # noqa: ARG002
+        return "N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return _convert(super().convert, f"a whole number {_limits(self)}".rstrip(), value, param, ctx)
+
+    def _describe_range(self) -> str:
+        return _limits(self)
+
+
+def _limits(kind: Number | WholeNumber) -> str:
+    if kind.min is None:
+        return ""
+    if kind.max is not None:
+        return f"from {kind.min:g} to {kind.max:g}"
+    return f"above {kind.min:g}" if kind.min_open else f"from {kind.min:g} on"
+
+
+def _convert(
+    convert: Callable[..., Any], wanted: str, value: Any, param: click.Parameter | None, ctx: click.Context | None
+) -> Any:
+    try:
+        return convert(value, param, ctx)
+    except click.BadParameter as error:
+        raise click.BadParameter(f"{value!r} is not {wanted}", ctx, param) from error
+
+
+class Command(click.Command):
+    """A command of talk's: what it is for, examples, options, exit codes."""
+
+    def __init__(self, *arguments: Any, examples: str, exit_codes: Codes, **extra: Any) -> None:
+        """`examples`: lines, each a command line; `exit_codes`: what each means after this command."""
+        super().__init__(*arguments, **extra)
+        self.examples = examples
+        self.exit_codes = exit_codes
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.allow_extra_args = True  # so that it is said here what is too much
+        try:
+            rest = super().parse_args(ctx, args)
+        except click.UsageError as error:
+            error.ctx = error.ctx or ctx  # the help to look at is this command's
+            raise
+        if rest and not ctx.resilient_parsing:
+            names = [each.make_metavar(ctx) for each in self.params if isinstance(each, click.Argument)]
+            takes = f"nothing after {names[0]}" if names else "options alone"
+            raise click.UsageError(f"'{ctx.command_path}' takes {takes}: what is '{' '.join(rest)}'?", ctx)
+        return rest
+
+    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        super().format_help_text(ctx, formatter)
+        write_examples(self.examples, formatter)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        write_options(self, ctx, formatter, "Options of every command")
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        write_exit_codes(self.exit_codes, formatter)
+
+
+def write_examples(examples: str, formatter: click.HelpFormatter) -> None:
+    """Write a section of command lines, as they are."""
+    with formatter.section("Examples"):
+        write_lines(examples, formatter)
+
+
+def write_lines(text: str, formatter: click.HelpFormatter) -> None:
+    """Write lines as they are, indented as the formatter is at this moment."""
+    for line in text.strip().splitlines():
+        formatter.write(f"{'':{formatter.current_indent}}{line.strip()}\n")
+
+
+def write_options(command: click.Command, ctx: click.Context, formatter: click.HelpFormatter, shared: str) -> None:
+    """Write the command's own options, and then, under the heading `shared`, those that all have."""
+    own: list[tuple[str, str]] = []
+    common: list[tuple[str, str]] = []
+    for parameter in command.get_params(ctx):
+        record = parameter.get_help_record(ctx)
+        if record and isinstance(parameter, click.Option):
+            (own if parameter.expose_value else common).append(record)
+    for heading, records in (("Options", own), (shared, common)):
+        if records:
+            with formatter.section(heading):
+                formatter.write_dl(records)
+
+
+def write_exit_codes(exit_codes: Codes, formatter: click.HelpFormatter) -> None:
+    """Write a section of exit codes, in their order."""
+    rows = sorted(exit_codes.items(), key=lambda row: row[0] if isinstance(row[0], int) else 128)
+    with formatter.section("Exit codes"):
+        formatter.write_dl([(str(code), words) for code, words in rows])
+
+
+def unknown_command(words: list[str], commands: Iterable[str]) -> str:
+    """Return what is said of a command that there isn't: which was meant, or how to speak these words."""
+    name, commands = words[0], list(commands)
+    if name.lower() == "help":
+        meant = next((each for each in words[1:] if each in commands), None)
+        return f"no such command '{name}': write 'talk{f' {meant}' if meant else ''} --help'"
+    near = _ELSEWHERE.get(name.lower()) or nearest(name, commands)
+    return f"no such command '{name}': " + (
+        f"did you mean '{near}'?" if near else f'to speak it, write: talk say "{" ".join(words)}"'
+    )
+
+
+def told(error: click.ClickException) -> str:
+    """Return what is wrong with a command line, without the next step."""
+    if isinstance(error, click.NoSuchOption):
+        # Without the dashes, which make any two of them alike.
+        near = nearest(error.option_name.lstrip("-"), [each.lstrip("-") for each in error.possibilities or ()])
+        return f"no such option '{error.option_name}'" + (f": did you mean '--{near}'?" if near else "")
+    words = error.format_message().rstrip(".")
+    if isinstance(error, click.BadParameter):
+        option, colon, wrong = words.removeprefix("Invalid value for ").partition(": ")
+        return option.replace("'", "") + colon + wrong
+    return words if words[:2].isupper() else words[:1].lower() + words[1:]

@@ -1,0 +1,212 @@
+"""Help and what is told of a command line that is wrong: read by people, in a terminal, who don't know talk yet."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from typing import TYPE_CHECKING
+
+import click
+import pytest
+
+from talkcli import admission, errors, states
+from talkcli.cli import commands, serve
+from talkcli.cli.usage import Command
+from tests.conformance.bareserve import TALK, environment, run
+from tests.support.surroundings import short_directory
+from tests.support.terminal import Terminal
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+HEADINGS = ["Usage:", "Examples:", "Options:", "Options of every command:", "Exit codes:"]
+
+
+def alone(*words: str, **extra: str) -> tuple[int, str, str]:
+    """Run `talk` where there is no server, in 80 columns; return its exit code and what it wrote."""
+    with short_directory() as home:
+        done = run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", **{"COLUMNS": "80", **extra}))
+    return done.code, done.out, done.err
+
+
+def command(name: str) -> Command:
+    found = commands.talk.get_command(click.Context(commands.talk), name)
+    assert isinstance(found, Command), name
+    return found
+
+
+def too_wide(text: str, columns: int = 80) -> list[str]:
+    return [line for line in text.splitlines() if len(line) > columns]
+
+
+# What a newcomer sees
+
+
+def test_talk_alone_fits_a_small_terminal_and_shows_every_command() -> None:
+    code, out, err = alone()
+    assert (code, err, too_wide(out)) == (0, "", [])
+    assert len(out.splitlines()) < 24  # the prompt comes below it
+    assert re.findall(r"(?m)^  ([a-z]+)  +[A-Z]", out) == [*commands.COMMANDS]
+    for words in ("talk serve &", "talk say ", "talk doctor", "talk --help", "talk COMMAND --help"):
+        assert words in out
+
+
+def test_help_of_talk_has_all_exit_codes() -> None:
+    code, out, _ = alone("--help")
+    assert (code, too_wide(out)) == (0, [])
+    classes = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.TalkError)]
+    used = {each.exit_code for each in classes} | set(states.EXIT_CODES.values())
+    used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_TIMEOUT}
+    shown = re.findall(r"(?m)^  (\S+) +\S", out.partition("\nExit codes:\n")[2])
+    assert shown == [*map(str, sorted(used)), f"{errors.EXIT_SIGNAL}+n"]
+    assert "TALK_SOCKET" in out
+    assert "TALK_DEBUG" in out
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_help_of_each_command_has_a_purpose_examples_options_and_exit_codes(name: str) -> None:
+    for columns in (80, 120):
+        code, out, err = alone(name, "--help", COLUMNS=str(columns))
+        assert (code, err, too_wide(out, columns)) == (0, "", [])
+    code, out, _ = alone(name, "--help")
+    assert out == alone(name, "-h")[1]
+    found = re.findall(r"(?m)^([A-Z][a-z ]+:)", out)
+    own = any(isinstance(each, click.Option) and each.expose_value for each in command(name).params)
+    assert found == [each for each in HEADINGS if own or each != "Options:"]
+    purpose = (command(name).help or "").partition("\n")[0]
+    assert purpose.endswith((".", ":", ","))
+    assert len(purpose) > 30
+    for option in ("--socket PATH", "--json", "--quiet", "--help"):
+        assert option in out.partition("Options of every command:")[2]
+    codes = command(name).exit_codes
+    assert 2 in codes
+    assert codes.keys() <= commands.ALL_EXIT_CODES.keys()
+    assert re.findall(r"(?m)^  (\d\S*) +\S", out.partition("\nExit codes:\n")[2]) == [
+        *map(str, sorted(each for each in codes if isinstance(each, int))),
+        *(each for each in codes if isinstance(each, str)),
+    ]
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_every_option_says_what_it_is_for(name: str) -> None:
+    for each in command(name).params:
+        if isinstance(each, click.Option):
+            assert each.help, each.name
+            assert each.help[0].isupper(), each.name
+            assert each.help.endswith((".", "]")), each.name
+            named = each.metavar or (each.is_flag and "-") or each.type.get_metavar(each, click.Context(command(name)))
+            assert named in {"-", "N", "X"} or each.metavar, f"{each.name} shows click's own word for its value"
+
+
+def test_limits_of_the_server_s_defaults_are_those_of_a_goal() -> None:
+    assert (serve.RATES, serve.VOLUMES, serve.PITCHES) == (admission.RATES, admission.VOLUMES, admission.PITCHES)
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_the_examples_can_be_typed(name: str) -> None:
+    """The words of each `talk` in them are read as the command line would be; nothing is carried out."""
+    seen = []
+    for line in command(name).examples.strip().splitlines():
+        for part in re.findall(r"\btalk ((?:\"[^\"]*\"|[^|;&)\"])*)", re.split(r"(?<=\S)   +", line.strip())[0]):
+            words = [each for each in shlex.split(part.partition("'")[0]) if each != "--json"]
+            seen.append(words[0])
+            with command(words[0]).make_context(words[0], words[1:], parent=click.Context(commands.talk)) as context:
+                assert context.params is not None
+    assert name in seen
+
+
+# Words that were mistyped
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["cancle"], "no such command 'cancle': did you mean 'cancel'?"),
+        (["STATUS"], "no such command 'STATUS': did you mean 'status'?"),
+        (["stop"], "no such command 'stop': did you mean 'cancel'?"),
+        (["start"], "no such command 'start': did you mean 'serve'?"),
+        (["help"], "no such command 'help': write 'talk --help'"),
+        (["help", "say"], "no such command 'help': write 'talk say --help'"),
+        (["good", "morning"], "no such command 'good': to speak it, write: talk say \"good morning\""),
+        (["set", "--volum", "1"], "no such option '--volum': did you mean '--volume'?"),
+        (
+            ["say", "--wiat", "x"],
+            "no such option '--wiat': did you mean '--wait'? To speak a text that starts with '-',",
+        ),
+        (
+            ["say", "--loud", "x"],
+            "no such option '--loud'. To speak a text that starts with '-', write: talk say -- TEXT",
+        ),
+        (["say", "-5"], "no such option '-5'. To speak a text that starts with '-', write: talk say -- TEXT"),
+        (["say", "--rate", "fast", "x"], "--rate: 'fast' is not a whole number from 80 to 450"),
+        (["say", "--volume", "3", "x"], "--volume: '3' is not a number from 0 to 1"),
+        (["say", "--ttl", "-1", "x"], "--ttl: '-1' is not a number from 0 on"),
+        (["wait", "-t", "0"], "-t / --timeout: '0' is not a number above 0"),
+        (["serve", "--max-queue", "0"], "--max-queue: '0' is not a whole number from 1 on"),
+        (["say", "--priority", "high", "x"], "--priority: 'high' is not a "),
+        (["say", "--key", "", "x"], "--key: empty; is the variable set that it comes from?"),
+        (["say"], "TEXT is missing: what is to be said, or '-' for standard input"),
+        (["log", "5"], "'talk log' takes options alone: what is '5'?"),
+        (["status", "1", "2"], "'talk status' takes nothing after [ID]: what is '2'?"),
+        (["set", "--voice"], "option '--voice' requires an argument"),
+        (["serve", "--print-unit", "usr"], "--print-unit: 'usr' is not one of 'user', 'system', "),
+        (["serve", "--player", "file:"], "--player file: names no file: write file:PATH.wav"),
+    ],
+)
+def test_what_was_mistyped_is_named_with_the_next_step(words: list[str], said: str) -> None:
+    code, out, err = alone(*words)
+    assert (code, out) == (2, "")
+    first, *rest = err.splitlines()
+    assert first.startswith(f"talk: {said}")
+    asked = f"talk {words[0]}" if words[0] in commands.COMMANDS else "talk"
+    assert rest == ([] if "--help" in first else [f"talk: see '{asked} --help'"])
+    told = json.loads(alone("--json", *words)[2])["error"]
+    assert told == {"code": "usage", "exit": 2, "message": first.removeprefix("talk: ")}
+
+
+@pytest.mark.parametrize(("columns", "lines"), [(60, 4), (80, 3), (200, 2)])
+def test_on_a_terminal_what_is_told_breaks_between_words(columns: int, lines: int) -> None:
+    words = ["say", "--wiat", "hello"]
+    with short_directory() as home:
+        with Terminal([*TALK, *words], environment(home), columns) as shown:
+            assert shown.finish() == 2
+            assert max(map(len, shown.lines)) <= columns
+            assert shown.screen.wraps == 0
+        whole = run([*TALK, *words], environment(home)).err
+    assert " ".join(" ".join(shown.lines).split()) == " ".join(whole.split())
+    assert len(shown.lines) == lines
+
+
+def test_variable_with_a_wrong_value_is_named() -> None:
+    assert alone("serve", TALK_RATE="fast")[2].startswith("talk: --rate (env var: 'TALK_RATE'): 'fast' is not a whole ")
+
+
+def test_player_that_is_not_there_is_told_at_the_start(make_talk: MakeTalk) -> None:
+    first = make_talk("--player", "aply").log.splitlines()[0]
+    assert first == "talk: player \"aply\" not found: did you mean 'aplay'? until it is there, nothing can be heard"
+
+
+def test_key_that_was_mistyped_is_told_to_people(scripted: Talk) -> None:
+    scripted.run("say", "--key", "battery", "never-ends")
+    for key, said in (("batery", "talk: no goal has the key 'batery': did you mean 'battery'?\n"), ("door", "")):
+        with Terminal([*TALK, "cancel", "--key", key], scripted.env) as shown:
+            assert shown.finish() == 0
+            assert shown.text == said
+        assert scripted.run("cancel", "--key", key).err == ""  # a script cancels what may be there
+    with Terminal([*TALK, "-q", "cancel", "--key", "batery"], scripted.env) as shown:
+        assert (shown.finish(), shown.text) == (0, "")
+    with Terminal([*TALK, "cancel", "--key", "battery"], scripted.env) as shown:
+        assert shown.finish() == 0
+        assert re.fullmatch(r"\w{4}-\d+\n", shown.text)
+
+
+def test_language_may_be_meant_by_its_name(make_talk: MakeTalk) -> None:
+    talk = make_talk("--player", "null")
+    for given, meant in (("german", "de"), ("Englsh", "en"), ("en-gbb", "en-gb")):
+        done = talk.run("voices", "--language", given)
+        assert (done.code, done.out) == (0, "")
+        assert done.err == f"talk: no voice speaks '{given}': did you mean '{meant}'?\n"
+        assert talk.run("voices", "--language", meant).out
+    assert "'talk voices' lists all" in talk.run("voices", "--language", "1234").err
