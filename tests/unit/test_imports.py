@@ -1,8 +1,12 @@
-"""Imports point one way, and what is heavy is imported only where it is needed: read from the source, with ast."""
+"""The package's layout: who may import whom, what is pure, who may print; read from the source, with ast.
+
+Imports point one way, and what is heavy is imported only where it is needed.
+"""
 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -13,6 +17,7 @@ from pathlib import Path
 import pytest
 
 import talkcli
+from talkcli.cli.commands import COMMANDS
 
 PACKAGE = Path(talkcli.__file__).parent
 
@@ -43,7 +48,19 @@ PURE = [
     "engine.murmur",
     "engine.restarts",
 ]
-IMPURE = {"asyncio", "threading", "socket", "time", "click", "pyttsx3", "os", "subprocess"}
+IMPURE = {
+    *("asyncio", "threading", "_thread", "socket", "_socket", "select", "selectors", "signal", "time", "datetime"),
+    *("random", "secrets", "click", "pyttsx3", "platformdirs", "os", "io", "pathlib", "subprocess", "multiprocessing"),
+}
+#: What the package is made of, at its top: each a module, or a folder of them.
+PARTS = {
+    *("engine", "engine.thread", "engine.process", "engine.espeak", "engine.players", "scheduler"),
+    *("server", "paths", "client", "output", "completion", "cli"),
+}
+#: What stands at the top of the project; beside it only files and folders whose names begin with a dot.
+TOP = {"pyproject.toml", "talkcli", "tests", "completions", "README.md", "LICENSE"}
+#: The longest that a module may be: what can be kept in mind as one thing.
+LONGEST = 350
 #: Who may name these, by the first part of a module's name.
 ONLY = {
     "pyttsx3": {"engine"},
@@ -137,8 +154,37 @@ def inside(module: str) -> list[tuple[str, Import]]:
 
 
 def test_the_modules_that_these_rules_are_about_are_there() -> None:
-    assert set(PURE) <= sources().keys()
+    assert set(PURE) | set(CHAIN) | PARTS <= sources().keys()
     assert {"asyncio", "json"} & set().union(*map(outside, sources()))
+
+
+def test_the_top_of_the_project_holds_what_it_should() -> None:
+    known = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=60, check=False
+    )
+    if known.returncode:
+        pytest.skip("this is no checkout")
+    top = {each.partition("/")[0] for each in known.stdout.split("\0") if each}
+    assert top >= TOP
+    assert not {each for each in top - TOP if not each.startswith(".")}
+
+
+def test_every_module_says_what_it_is_and_is_no_longer_than_one_can_keep_in_mind() -> None:
+    for module, tree in sources().items():
+        assert ast.get_docstring(tree), f"talkcli.{module} has no docstring"
+        lines = [each.end_lineno or 0 for each in tree.body]
+        assert max(lines) <= LONGEST, f"talkcli.{module} has {max(lines)} lines"
+
+
+def test_every_module_is_used() -> None:
+    """By the command, by the engine process, or by a module that is itself run."""
+    used: set[str] = set()
+    new = {"__main__", "engine.process", "completion", "cli.tabulate", *(f"cli.{each}" for each in COMMANDS)}
+    while new:
+        used |= new
+        new = {name for module in new for name, _ in inside(module)} - used
+    parents = {module.rpartition(".")[0] for module in sources()}
+    assert sources().keys() - used <= parents
 
 
 @pytest.mark.parametrize("name", CHAIN)
@@ -176,10 +222,13 @@ def test_only_its_own_part_names_a_library(library: str) -> None:
     assert {part(each) for each in naming} <= ONLY[library]
 
 
-def test_platformdirs_is_imported_only_when_a_path_is_asked_for() -> None:
-    for module in sources():
-        for each in imports(module):
-            assert each.name.partition(".")[0] != "platformdirs" or each.function, f"talkcli.{module}:{each.line}"
+def test_platformdirs_is_imported_only_when_a_server_asks_for_its_path() -> None:
+    found = [each for module in sources() for each in imports(module) if each.name.startswith("platformdirs")]
+    assert {each.function for each in found} == {"server_socket"}
+    for module, tree in sources().items():
+        if part(module) not in {"server", "paths"}:
+            names = {each.attr if isinstance(each, ast.Attribute) else "" for each in ast.walk(tree)}
+            assert "server_socket" not in names, f"talkcli.{module} asks for the server's path"
 
 
 def test_the_server_is_imported_by_the_serve_command_alone() -> None:
@@ -188,20 +237,23 @@ def test_the_server_is_imported_by_the_serve_command_alone() -> None:
             continue
         for name, each in inside(module):
             if part(name) == "server" and not each.typing:
-                assert part(module) == "cli", f"talkcli.{module} imports the server"
-                serves = module.endswith("serve") or "serve" in (each.function or "")
-                assert serves, f"talkcli.{module}:{each.line} imports the server, not in the serve command"
+                assert module == "cli.serve", f"talkcli.{module}:{each.line} imports the server"
+
+
+#: Who else may end the process on the spot: the server, on its second signal, in the handler.
+ENDING = {"server.run": {"os._exit"}}
+#: Who else may write to standard error: the server's log, and the engine process, whose server reads it.
+COMPLAINING = {"server.log", "engine.process", "engine.session"}
 
 
 def test_only_the_cli_prints_and_exits() -> None:
     for module, tree in sources().items():
         if part(module) == "cli":
             continue
-        for node in ast.walk(tree):
-            ends = isinstance(node, ast.Attribute) and ast.unparse(node) == "sys.exit"
-            if isinstance(node, ast.Name):
-                ends = node.id in {"print", "SystemExit", "exit", "quit"}
-            assert not ends, f"talkcli.{module}:{getattr(node, 'lineno', 0)} prints or exits"
+        words = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute | ast.Name)}
+        ending = words & {"print", "exit", "quit", "SystemExit", "sys.exit", "os._exit", "sys.stdout"}
+        assert ending <= ENDING.get(module, set()), f"talkcli.{module} has {ending}"
+        assert "sys.stderr" not in words or module in COMPLAINING, f"talkcli.{module} writes to standard error"
 
 
 HEAVY = ["asyncio", "pyttsx3", "click", "platformdirs", "espeakng_loader", "talkcli.server", "talkcli.scheduler"]
@@ -217,6 +269,7 @@ COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", 
         ("from talkcli import Client", [*HEAVY, *COSTLY]),
         ("import talkcli.cli, talkcli.cli.early", [*HEAVY, *COSTLY, "json", "re", "enum", "signal"]),
         ("import talkcli.cli.asking, talkcli.cli.saying, talkcli.cli.waiting", [*HEAVY, *COSTLY]),
+        ("import talkcli.output, talkcli.transcript, talkcli.cli.show, talkcli.cli.nearest", HEAVY),
     ],
 )
 def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> None:
@@ -250,3 +303,13 @@ def test_the_doctor_is_imported_by_its_command_alone_and_the_engine_where_it_nee
             if part(name) == "doctor" and part(module) != "doctor":
                 assert module == "cli.doctor", f"talkcli.{module} imports {name}"
                 assert each.function, "the other commands don't pay for it"
+
+
+def test_contributing_names_every_file_that_an_option_goes_through() -> None:
+    """By the option that it takes as its example: --ttl."""
+    text = (PACKAGE.parent / ".github" / "CONTRIBUTING.md").read_text("utf-8")
+    steps = text.partition("**An option of `say`**")[2].partition("What is forgotten")[0]
+    named = {module_name(PACKAGE / each) for each in re.findall(r"talkcli/([\w/]+\.py)", steps)}
+    having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
+    assert named <= having
+    assert having - named <= {"doctor.reach"}  # which says a sentence, as any client does
