@@ -27,7 +27,7 @@ LINES = [
     '{"request": "say", "text": "length=0 one two", "wait": true, "preempt": true, "format": "text"}',
     '{"request": "say", "text": "length=0 é 😀 \\ud83d", "data": {"a": [1, -2.5e3, null, "b"]}}',
     '{"request": "say", "text": "length=0", "key": "eta", "throttle": 0.5, "ttl": 2, "priority": -3, "flush": true}',
-    '{"request": "say", "text": "length=0", "id": "dock-17", "rate": 300, "volume": 0.25, "pitch": 70, "voice": "en"}',
+    '{"request": "say", "text": "length=0", "id": "dock17", "rate": 300, "volume": 0.25, "pitch": 70, "voice": "en"}',
     '{"request": "wait", "ids": ["abcd-1", "7"], "feedback": true}',
     '{"request": "cancel", "ids": ["abcd-1"], "current": true, "before": null, "key": "eta"}',
     '{"request": "cancel"}',

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
-import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -50,15 +48,6 @@ robot = Robot()
 print(*robot.lips)
 """
 
-#: What jq does for the microphone, where there is none.
-JQ = """
-import json, sys
-for line in sys.stdin:
-    event = json.loads(line)
-    if event["event"] == "state":
-        print(event["state"])
-"""
-
 
 def only(language: str, title: str, mark: str) -> str:
     """Return the one example of a section that has a mark in it."""
@@ -76,29 +65,6 @@ def run(talk: Talk, *command: str) -> subprocess.CompletedProcess[str]:
     done = subprocess.run(command, env=talk.env, capture_output=True, text=True, timeout=20, check=False)
     assert "Traceback" not in done.stderr, done.stderr
     return done
-
-
-def write_program(path: Path, script: str) -> None:
-    path.write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
-    path.chmod(0o755)
-
-
-def with_talk(talk: Talk, directory: Path) -> dict[str, str]:
-    """Return an environment in which `talk` is a program, as it is where talk is installed."""
-    write_program(directory / "talk", f'exec {sys.executable} -m talkcli "$@"')
-    return {**talk.env, "PATH": f"{directory}:{os.environ['PATH']}"}
-
-
-def shell(talk: Talk, directory: Path, script: str) -> subprocess.CompletedProcess[str]:
-    """Run a script that calls `talk`."""
-    env = with_talk(talk, directory)
-    return subprocess.run(["sh", "-c", script], env=env, capture_output=True, text=True, timeout=20, check=False)
-
-
-def test_shell_can_read_every_example() -> None:
-    for each in examples("sh"):
-        done = subprocess.run(["sh", "-n"], input=each, capture_output=True, text=True, timeout=20, check=False)
-        assert (done.returncode, done.stderr) == (0, ""), each
 
 
 def test_line_of_socat_says_a_sentence(scripted: Talk) -> None:
@@ -203,42 +169,3 @@ def test_loop_of_a_robot_whose_server_is_killed(scripted: Talk) -> None:
     done = run(scripted, sys.executable, "-c", "import os, signal\n" + robot.format(example=example))
     scripted.unfinished = True
     assert (done.returncode, done.stdout, done.stderr) == (0, "lights\n", "")
-
-
-def test_battery_low_is_not_said_twice(scripted: Talk, tmp_path: Path) -> None:
-    (line,) = [each for each in examples("sh") if "--key battery" in each]
-    first = shell(scripted, tmp_path, line)
-    assert first.returncode == 0, first
-    assert scripted.watcher.wait_for_terminal(first.stdout.strip()) == "SUCCEEDED"
-    second = shell(scripted, tmp_path, line)
-    assert (second.returncode, second.stdout) == (0, "")
-    assert scripted.watcher.wait_until(lambda each: each.get("state") == "REJECTED")["goal"]["reason"] == "throttled"
-
-
-def test_lines_of_a_log_are_spoken(scripted: Talk, tmp_path: Path) -> None:
-    (line,) = [row for each in examples("sh") for row in each.splitlines() if "--lines" in row]
-    command = line.split("|")[1].split("#")[0].strip()
-    done = shell(scripted, tmp_path, f"printf 'docking\\n\\ndocked\\n' | {command}")
-    assert done.returncode == 0, done
-    scripted.watcher.wait_until(lambda each: (each.get("goal") or {}).get("text") == "docked")
-    texts = [each["goal"]["text"] for each in scripted.watcher.events() if each.get("state") == "PENDING"]
-    assert texts == ["docking", "docked"]
-
-
-def test_microphone_is_muted_while_the_robot_speaks(scripted: Talk, tmp_path: Path) -> None:
-    (line,) = [each for each in examples("sh") if "wpctl" in each]
-    if shutil.which("jq") is None:
-        write_program(tmp_path / "jq", f"exec {sys.executable} -u -c '{JQ}'")
-    calls = tmp_path / "calls"
-    os.mkfifo(calls)
-    write_program(tmp_path / "wpctl", f'echo "$3" > {calls}')
-    watching = subprocess.Popen(["sh", "-c", line], env=with_talk(scripted, tmp_path), start_new_session=True)
-    with watching, open(os.open(calls, os.O_RDWR), encoding="utf-8") as told:
-        try:
-            while scripted.request("status")["server"]["clients"] < 3:  # the test's watcher, this, and the README's
-                time.sleep(0.02)  # who watches is no event
-            for text in ("one", "two"):
-                assert scripted.run("say", "--wait", "--", text).code == 0
-                assert [told.readline(), told.readline()] == ["1\n", "0\n"]
-        finally:
-            os.killpg(watching.pid, signal.SIGTERM)

@@ -1,0 +1,65 @@
+"""No example of the README is without a test: an example that is added fails here, by its name, until it has one."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.readme.blocks import BLOCKS, RUN
+from tests.wire.readme import ROOT
+
+#: Examples that tests elsewhere run.
+ELSEWHERE = {
+    "A tour: From Python": "tests/wire/test_examples.py::test_first_example_of_the_library",
+    "A tour: From Python #2": "tests/wire/test_examples.py::test_loop_of_a_robot",
+    "The wire": "tests/wire/test_examples.py::test_line_of_socat_says_a_sentence",
+    "Two clients": "tests/wire/test_examples.py::test_client_in_shell",
+    "Two clients #2": "tests/wire/test_examples.py::test_client_in_plain_python",
+    "Speed": "tests/bench/test_bench_rows.py::*",
+}
+#: Examples that no test runs, and why. A shell reads them all the same.
+NOT_RUN = {
+    "Start": "it installs, from the network; CI runs what it is made of: a wheel in an environment of its own",
+    "Start #2": "CI runs it: it is what runs this test",
+    "Debian, Ubuntu, Raspberry Pi OS: For one user": "it installs system packages and into the home directory",
+    "Debian, Ubuntu, Raspberry Pi OS: For all users": "it installs into /opt and /usr/local, as root",
+}
+for _path in Path(__file__).parent.glob("test_*.py"):
+    if _path != Path(__file__):
+        importlib.import_module(f"tests.readme.{_path.stem}")
+
+
+def test_every_example_has_a_test_or_a_reason() -> None:
+    assert sorted([*RUN, *ELSEWHERE, *NOT_RUN]) == sorted(BLOCKS)
+
+
+@pytest.mark.parametrize("test", ELSEWHERE.values())
+def test_tests_elsewhere_are_there(test: str) -> None:
+    path, _, name = test.partition("::")
+    names = [
+        each.name for each in ast.walk(ast.parse((ROOT / path).read_text("utf-8"))) if isinstance(each, ast.FunctionDef)
+    ]
+    assert any(each.startswith("test_") if name == "*" else each == name for each in names)
+
+
+@pytest.mark.parametrize("name", [each for each, (language, _) in BLOCKS.items() if language == "sh"])
+def test_shell_can_read_it(name: str) -> None:
+    done = subprocess.run(["sh", "-n"], input=BLOCKS[name][1], capture_output=True, text=True, timeout=20, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", [each for each, (language, _) in BLOCKS.items() if language == "python"])
+def test_python_can_read_it(name: str) -> None:
+    compile(BLOCKS[name][1], name, "exec")
+
+
+def test_a_text_that_is_not_known_is_behind_two_dashes() -> None:
+    """A text that comes from a variable may begin with a dash, and would be an option."""
+    for name, (_, code) in BLOCKS.items():
+        for line in code.splitlines():
+            rest = line.partition("talk say")[2]
+            assert '"$' not in rest or " -- " in rest, f"{name}: {line}"

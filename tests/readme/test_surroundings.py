@@ -1,0 +1,81 @@
+"""The examples that install, contain, serve and search: with stand-ins for what would change the machine."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from tests.readme.blocks import block, runs
+from tests.wire.readme import ROOT
+
+if TYPE_CHECKING:
+    from tests.readme.shell import Shell
+    from tests.support.processes import Talk
+
+#: `docker exec talk COMMAND`, here.
+_DOCKER = """case $1 in exec) shift 2; exec "$@" ;; *) exit 0 ;; esac"""
+#: `sudo tee FILE` writes into the directory of the test.
+_SUDO = """case $1 in tee) mkdir -p system; exec tee "system/${2##*/}" ;; *) exit 0 ;; esac"""
+
+
+@runs("In a container")
+def test_dockerfile() -> None:
+    lines = block("In a container").splitlines()
+    assert [each.split()[0] for each in lines] == ["FROM", "RUN", "COPY", "RUN", "CMD"]
+    assert json.loads(lines[-1].removeprefix("CMD")) == ["talk", "serve"]
+    assert (ROOT / "pyproject.toml").is_file()  # what COPY . takes can be installed
+
+
+@runs("In a container #2", "In a container #3")
+def test_containers(speaking: Talk, shell: Shell) -> None:
+    shell.stand_in("docker", _DOCKER)
+    shell.stand_in("getent", "echo audio:x:29:")
+    done = shell.run(block("In a container #2"))
+    assert done.returncode == 0, done
+    build, run, _, _ = shell.calls("docker")
+    assert build == ["build", "-t", "talk", "."]
+    assert run[-5:] == ["--device", "/dev/snd", "--group-add", "29", "talk"]
+    assert speaking.watcher.goals()
+    assert shell.run(block("In a container #3"), XDG_RUNTIME_DIR="/run/user/1000").returncode == 0
+    run = shell.calls("docker")[-1]
+    assert run[run.index("-v") + 1] == "/run/user/1000/pulse/native:/tmp/pulse.sock"
+    assert run[-5:] == ["talk", "talk", "serve", "--player", "pacat"]
+
+
+@runs("Another talk")
+def test_which_talk(shell: Shell) -> None:
+    path, version = shell.run(block("Another talk")).stdout.splitlines()
+    assert path == f"{shell.directory}/bin/talk"
+    assert version.startswith("talk ")
+
+
+@runs("As a service")
+def test_services(shell: Shell) -> None:
+    for name, then in {"sudo": _SUDO, "systemctl": "exit 0", "loginctl": "exit 0"}.items():
+        shell.stand_in(name, then)
+    done = shell.run(block("As a service"))
+    assert done.returncode == 0, done
+    user = shell.directory / ".config/systemd/user/talk.service"
+    for unit, options in (
+        (user, "serve --rate=150"),
+        (shell.directory / "system/talk.service", "serve --socket-mode=0660"),
+    ):
+        command = next(each for each in unit.read_text(encoding="utf-8").splitlines() if "ExecStart=" in each)
+        assert options in command.replace("--rate 150", "--rate=150")
+    assert shell.calls("systemctl") == [["--user", "daemon-reload"], ["--user", "enable", "--now", "talk"]]
+    assert shell.calls("loginctl") == [["enable-linger"]]
+    assert shell.calls("sudo")[1:] == [
+        ["systemctl", "daemon-reload"],
+        ["systemctl", "enable", "--now", "talk"],
+        ["usermod", "-aG", "audio", "NAME"],
+    ]
+
+
+@runs("Troubleshooting")
+def test_troubleshooting(shell: Shell) -> None:
+    """The server's player makes no sound, and doctor says so, there and over ssh."""
+    shell.ssh()
+    done = shell.run(block("Troubleshooting"))
+    assert done.returncode == 0, done
+    assert done.stdout.endswith("the robot is mute\n")
+    assert done.stdout.count("it keeps the time and makes no sound") == 2
