@@ -182,7 +182,7 @@ def test_a_player_that_fails_is_told_in_its_own_words(make_talk: MakeTalk, tmp_p
     assert "another program holds the device" in found["sentence"]["next"]
     _, found = doctor(talk)
     assert found["failures"]["state"] == "warning"
-    assert "1 of the last goal ABORTED" in found["failures"]["message"]
+    assert "the last goal ABORTED, " in found["failures"]["message"]
 
 
 def test_a_sink_that_is_suspended_is_named_with_the_command_that_wakes_it(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 
 from talkcli.cli.show import note, show_json
@@ -62,6 +63,8 @@ def report(goal: Goal, options: Common, shown: Feedback | None = None) -> int:
 
         tell = shown.aside if shown else note
         tell(output.ending(goal))
+        if goal.state is State.ABORTED and goal.reason != "nothing_to_say" and sys.stderr and sys.stderr.isatty():
+            tell("see 'talk doctor'")
     return exit_code(goal)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from talkcli.doctor.findings import SENTENCE, Finding, done, failed
+from talkcli.doctor.voice import INSTALL_LIBRARY
 from talkcli.states import State
 from talkcli.values import frozen
 
@@ -52,6 +53,8 @@ def remedy(reason: str | None, words: str | None = None) -> str:
         return _BUSY
     if reason == "audio_device" and words and ("denied" in words.lower() or "not permitted" in words.lower()):
         return "sudo usermod -aG audio USER for the user who serves, log in again, and start the server again"
+    if reason == "engine_failed" and words and "libespeak-ng" in words:
+        return INSTALL_LIBRARY
     return REMEDIES.get(reason or "", _AGAIN)
 
 

@@ -38,7 +38,7 @@ def _itself(server: JsonObject) -> Finding:
     if server.get("paused") is True:
         return failed("server", f"speech is paused; {words}", "talk resume")
     if engine not in {"ready", "starting"}:
-        return warning("server", words, remedy("engine_failed"))
+        return warning("server", words, remedy("engine_failed", words))
     if version != __version__:
         step = "start the server again, with the talk that is installed now"
         return warning("server", f"{words}; this is talk {__version__}", step)
@@ -75,7 +75,8 @@ def _failures(log: Sequence[Goal], now: float) -> Finding:
     last = aborted[-1]
     words = (last.message or "").removeprefix("Talk aborted: ")
     when = "" if last.ended_at is None else f", {_when(last.ended_at, now)}"
-    told = f"{len(aborted)} of {many} ABORTED, last {last.id}{when}: {last.reason}: {words}"
+    who = f"{many} ABORTED, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many} ABORTED, last {last.id}"
+    told = f"{who}{when}: {last.reason}: {words}"
     after = [each for each in log[log.index(last) + 1 :] if each.state is State.SUCCEEDED]
     if after:
         return done("failures", f"{told}; {len(after)} succeeded since")

@@ -5,6 +5,9 @@ from __future__ import annotations
 from talkcli.doctor.findings import Finding, done, failed, warning
 from talkcli.values import frozen
 
+#: What to do where there is no library.
+INSTALL_LIBRARY = "sudo apt-get install -y libespeak-ng1, or: pip install espeakng-loader"
+
 
 @frozen
 class Python:
@@ -50,8 +53,7 @@ def _engine(python: Python, engine: Engine, server: bool) -> list[Finding]:
     if "data" in words and "espeak" in words:
         return [found, broken("libespeak-ng", words, "sudo apt-get install -y espeak-ng-data")]
     if "libespeak-ng" in words:
-        step = "sudo apt-get install -y libespeak-ng1, or: pip install espeakng-loader"
-        return [found, broken("libespeak-ng", words, step)]
+        return [found, broken("libespeak-ng", words, INSTALL_LIBRARY)]
     if engine.reason == "engine_crashed":
         step = "install it again: sudo apt-get install --reinstall -y libespeak-ng1 espeak-ng-data"
         return [found, broken("libespeak-ng", f"the engine process died while it loaded the library: {words}", step)]

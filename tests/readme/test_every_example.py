@@ -23,10 +23,10 @@ ELSEWHERE = {
 }
 #: Examples that no test runs, and why. A shell reads them all the same.
 NOT_RUN = {
-    "Start": "it installs, from the network; CI runs what it is made of: a wheel in an environment of its own",
+    "Start": "it installs, from the network; tests/fresh/machine runs it, by hand",
     "Start #2": "CI runs it: it is what runs this test",
-    "Debian, Ubuntu, Raspberry Pi OS: For one user": "it installs system packages and into the home directory",
-    "Debian, Ubuntu, Raspberry Pi OS: For all users": "it installs into /opt and /usr/local, as root",
+    "Debian, Ubuntu, Raspberry Pi OS: For one user": "it installs; tests/fresh/machine runs it, by hand",
+    "Debian, Ubuntu, Raspberry Pi OS: For all users": "it installs; tests/fresh/machine runs it, by hand",
 }
 for _path in Path(__file__).parent.glob("test_*.py"):
     if _path != Path(__file__):

@@ -200,6 +200,9 @@ def test_every_reason_of_an_aborted_goal_has_a_remedy_of_its_own() -> None:
         "nothing_to_say", "not_silent", "unknown_voice",
     }  # fmt: skip
     assert reasons <= sentence.REMEDIES.keys()
+    missing = "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader"
+    assert "apt-get install -y libespeak-ng1" in sentence.remedy("engine_failed", missing)
+    assert sentence.remedy("engine_failed", "no module named pyttsx3") == sentence.REMEDIES["engine_failed"]
 
 
 FOUND = [
