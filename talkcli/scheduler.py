@@ -208,8 +208,8 @@ class Scheduler:
 
     def deadline(self) -> float | None:
         """Return the monotonic time at which `tick` has something to do."""
-        due = [self._silence_deadline(), self._pending.next_expiry()]
-        return min((each for each in due if each is not None), default=None)
+        silence, expiry = self._silence_deadline(), self._pending.next_expiry()
+        return silence if expiry is None else expiry if silence is None else min(silence, expiry)
 
     def tick(self, now: Now) -> list[Effect]:
         """Do what is due: recall goals whose time is over; abort one that was stopped and isn't silent in time."""

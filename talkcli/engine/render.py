@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from talkcli import text as texts
 from talkcli.dial import Interrupted, ready
 from talkcli.engine import protocol, spawn
-from talkcli.engine.thread import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
+from talkcli.engine.limits import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 
 if TYPE_CHECKING:

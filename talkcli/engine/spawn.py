@@ -12,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,8 @@ class EngineProcess:
         self.ready = False
         #: whether the process said itself why it cannot start
         self.explained = False
+        # Held for a send that doesn't wait: the descriptor must not be closed, and be another's, in the middle of one.
+        self._sending = threading.Lock()
         self._lines = LineSplitter(limit=None)
         self._stderr_tail = b""
         self._on_stderr = on_stderr
@@ -90,12 +93,15 @@ class EngineProcess:
         return self._process.pid
 
     def send(self, command: protocol.Command) -> bool:
-        """Write a command; False if the process is gone or takes nothing any more."""
+        """Write a command, from any thread; False if the process is gone or takes nothing any more."""
         line = protocol.encode(command)
-        try:
-            return self.socket.send(line) == len(line)
-        except (BlockingIOError, BrokenPipeError, ConnectionResetError):
-            return False
+        with self._sending:
+            if self.socket.fileno() < 0:
+                return False  # closed
+            try:
+                return self.socket.send(line) == len(line)
+            except (BlockingIOError, BrokenPipeError, ConnectionResetError):
+                return False
 
     def receive(self) -> Iterator[protocol.Event | None]:
         """Return what the process said; None as the last one if it closed the connection or said what can't be read."""
@@ -169,7 +175,8 @@ class EngineProcess:
         """Reap the process, which must be gone or ignore a kill, and close the descriptors."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_LAST_BREATH)
-        self.socket.close()
+        with self._sending:
+            self.socket.close()
         os.close(self.liveness)
         os.close(self.stderr)
 

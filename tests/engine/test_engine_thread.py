@@ -4,59 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
 import sys
 import time
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import pytest
 
 import talkcli
 from talkcli.engine import protocol, spawn
 from talkcli.engine import thread as engine_thread
+from talkcli.engine.limits import HANG_AFTER
 from talkcli.engine.murmur import LINES
-from talkcli.engine.reports import EngineDied, EngineSaid, Report
-from talkcli.engine.thread import HANG_AFTER, EngineThread
+from talkcli.engine.reports import EngineDied, EngineSaid
+from tests.engine.threads import Thread
 from tests.support import scripted_engine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
-
-_R = TypeVar("_R")
-
-#: Seconds after which a report is late on the busiest machine.
-PATIENCE = 20.0
-
-
-class Thread:
-    """A running engine thread and what it has posted."""
-
-    def __init__(self) -> None:
-        self.seen: list[Report] = []
-        self._posted: queue.Queue[Report] = queue.Queue()
-        self.engine = EngineThread(protocol.Configure(os.getpid(), None, None, None, None), self._posted.put)
-        self.engine.start()
-
-    def say(self, text: str, goal: str = "g1") -> None:
-        self.engine.say(protocol.Say(goal, text, 200, 1.0, None, 50))
-
-    def next(self, seconds: float = PATIENCE) -> Report | None:
-        """Return the next report, None if there is none for so long."""
-        with contextlib.suppress(queue.Empty):
-            self.seen.append(self._posted.get(timeout=seconds))
-            return self.seen[-1]
-        return None
-
-    def until(self, kind: type[_R]) -> _R:
-        while (report := self.next()) is not None:
-            if isinstance(report, kind):
-                return report
-        raise AssertionError(f"no {kind.__name__} in {self.seen}")
-
-    def close(self) -> None:
-        self.engine.close()
-        self.engine.join(PATIENCE)
 
 
 @pytest.fixture

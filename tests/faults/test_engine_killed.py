@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.thread import START_LIMIT
+from talkcli.engine.limits import START_LIMIT
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, player_process, send
 from tests.faults.broken import (
     ENGINE_START_LIMIT,

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.engine.limits import HANG_AFTER, SILENCE_LIMIT, STOP_LIMIT
 from talkcli.engine.playback import GONE_WITHIN, STALLED_AFTER
-from talkcli.engine.thread import HANG_AFTER, SILENCE_LIMIT, STOP_LIMIT
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, player_process, send
 from tests.faults import trapped
 from tests.faults.broken import (

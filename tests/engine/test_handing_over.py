@@ -1,0 +1,197 @@
+"""A goal goes to the engine process without a detour, and whatever happens to the process it is spoken, or ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from typing import TYPE_CHECKING, cast
+
+import pytest
+
+import talkcli
+from talkcli.engine import protocol, spawn
+from talkcli.engine import thread as engine_thread
+from talkcli.engine.reports import EngineDied
+from talkcli.engine.thread import EngineThread
+from tests.engine.threads import Thread
+from tests.support import scripted_engine
+
+if TYPE_CHECKING:
+    import selectors
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from talkcli.engine.reports import Report
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], Thread]]:
+    monkeypatch.setattr(spawn, "engine_command", lambda: [sys.executable, scripted_engine.__file__])
+    with contextlib.ExitStack() as stack:
+
+        def make() -> Thread:
+            thread = Thread()
+            stack.callback(thread.close)
+            return thread
+
+        yield make
+
+
+#: An engine process that says of each goal, in one piece, that it was begun and played: one thing to wake up for.
+PROMPT = """
+import os, sys
+sys.path.insert(0, {root!r})
+from talkcli.engine import protocol
+for line in os.fdopen(0, "rb"):
+    command = protocol.decode_command(line)
+    if isinstance(command, protocol.Configure):
+        os.write(0, protocol.encode(protocol.Ready("prompt", None, None)))
+    elif isinstance(command, protocol.Say):
+        told = protocol.Started(command.id), protocol.Ended(command.id, protocol.COMPLETED)
+        os.write(0, b"".join(map(protocol.encode, told)))
+"""
+
+
+def test_a_goal_behind_another_wakes_the_thread_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    program = tmp_path / "engine.py"
+    program.write_text(PROMPT.format(root=os.path.dirname(os.path.dirname(talkcli.__file__))))
+    monkeypatch.setattr(spawn, "engine_command", lambda: [sys.executable, str(program)])
+    monkeypatch.setattr(engine_thread, "HANG_AFTER", 600.0)  # so that no goal is slow enough on any machine
+    thread = Thread()
+    try:
+        thread.until(protocol.Ready)
+        thread.say("the first may find it asleep for longer", "g0")
+        thread.until(protocol.Ended)
+        woken: list[list[int]] = []
+        select = thread.engine._selector.select
+
+        def counted(timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+            found = select(timeout)
+            woken.append([key.fd for key, _ in found])
+            return found
+
+        monkeypatch.setattr(thread.engine._selector, "select", counted)
+        for number in range(1, 51):
+            thread.say("yes", f"g{number}")
+            assert thread.until(protocol.Ended) == protocol.Ended(f"g{number}", protocol.COMPLETED)
+        # By what the process said, and by nothing else; its answer to the first may have come to a `select` before.
+        process = thread.engine._process
+        assert process is not None
+        assert {each for fds in woken for each in fds} == {process.socket.fileno()}
+        # A thread that was not asleep yet looks once more; where it is, that is one for a goal.
+        assert sum(bool(fds) for fds in woken) <= 50
+    finally:
+        thread.close()
+
+
+def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(
+    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine_thread, "HANG_AFTER", 1.0)
+    thread = start()
+    thread.say("length=0")
+    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    thread.say("length=0.05 hang", "g2")  # handed over while the thread dozes
+    assert thread.until(protocol.Ended).reason == "engine_hung"
+    thread.say("yes", "g3")
+    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert thread.next(1.5) is None  # it does not doze any more
+    thread.say("length=0.05 hang", "g4")
+    assert thread.until(protocol.Ended).reason == "engine_hung"
+
+
+class Swift:
+    """Stands for a process that has answered before anybody looked."""
+
+    def __init__(self) -> None:
+        self._said: list[str] = []
+
+    def send(self, command: protocol.Command) -> bool:
+        if isinstance(command, protocol.Say):
+            self._said.append(command.id)
+        return True
+
+    def receive(self) -> list[protocol.Event]:
+        return [protocol.Ended(each, protocol.COMPLETED) for each in self._said]
+
+
+def test_the_answer_to_a_goal_is_understood_although_the_goal_has_not_been_noted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    posted: list[Report] = []
+    engine, process = EngineThread(protocol.Configure(os.getpid(), None, None, None, None), posted.append), Swift()
+    for name in ("_process", "_open"):
+        monkeypatch.setattr(engine, name, process)
+    engine.say(protocol.Say("g1", "yes", 200, 1.0, None, 50))
+    engine._hear(cast("spawn.EngineProcess", process))
+    assert posted == [protocol.Ended("g1", protocol.COMPLETED)]
+    engine._inbox.close()
+
+
+class Lost:
+    """Stands for a process that is lost while a goal is being sent to it."""
+
+    def __init__(self, *, takes: bool) -> None:
+        self._takes = takes
+
+    def send(self, _: protocol.Command) -> bool:
+        return self._takes
+
+
+@pytest.mark.parametrize("takes", [True, False], ids=["taken by the system", "refused"])
+def test_a_goal_that_was_sent_to_a_process_that_is_lost_is_spoken_by_the_next(
+    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch, takes: bool
+) -> None:
+    thread = start()
+    thread.until(protocol.Ready)
+    monkeypatch.setattr(thread.engine, "_open", Lost(takes=takes))
+    thread.say("yes")
+    assert thread.until(protocol.Ended) == protocol.Ended("g1", protocol.COMPLETED, duration=0.1)
+    assert not any(isinstance(each, EngineDied) for each in thread.seen)
+
+
+def test_a_process_that_takes_no_goal_is_ended(start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch) -> None:
+    thread = start()
+    thread.until(protocol.Ready)
+    process = thread.engine._process
+    assert process is not None
+    monkeypatch.setattr(process, "send", lambda _: False)
+    thread.say("yes")
+    ended = thread.until(protocol.Ended)
+    assert (ended.reason, ended.message) == ("engine_hung", "the engine takes no commands")
+    thread.say("yes", "g2")
+    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+
+
+def test_a_process_that_was_given_up_gets_no_other_goal(start: Callable[[], Thread]) -> None:
+    thread = start()
+    thread.say("never-ends ignore-stop")
+    thread.until(protocol.Word)
+    lost = thread.engine._process
+    thread.engine.give_up("g1")
+    thread.say("yes", "g2")
+    assert thread.until(protocol.Ended) == protocol.Ended("g2", protocol.COMPLETED, duration=0.1)
+    assert thread.engine._process is not lost
+
+
+def test_a_goal_that_ended_before_it_was_given_up_costs_no_process(start: Callable[[], Thread]) -> None:
+    thread = start()
+    thread.say("length=0")
+    thread.until(protocol.Ended)
+    process = thread.engine._process
+    thread.engine.give_up("g1")
+    for number in (2, 3):
+        thread.say("yes", f"g{number}")
+        assert thread.until(protocol.Ended).id == f"g{number}"
+    assert thread.engine._process is process
+    assert thread.engine._open is process
+
+
+def test_a_closed_process_takes_no_command(start: Callable[[], Thread]) -> None:
+    thread = start()
+    thread.until(protocol.Ready)
+    process = thread.engine._process
+    thread.close()
+    assert process is not None
+    assert not process.send(protocol.Stop("g1"))

@@ -1,0 +1,146 @@
+"""What is left for a thread that waits is done, in its order, and wakes the thread only where it must."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine.inbox import NEVER, Inbox
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+#: Seconds after which the other thread is late on the busiest machine.
+PATIENCE = 20.0
+
+
+class Sleeper:
+    """A thread that does nothing but wait for actions; `wakes` counts the bytes that were written to wake it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, doze: float) -> None:
+        self.inbox = Inbox(doze)
+        self.wakes = 0
+        self.asleep = threading.Event()
+        self._ending = False
+        select, write = self.inbox.selector.select, os.write
+
+        def told(timeout: float | None = None) -> object:
+            self.asleep.set()
+            return select(timeout)
+
+        def counted(descriptor: int, data: bytes) -> int:
+            self.wakes += descriptor == self.inbox._wake
+            return write(descriptor, data)
+
+        monkeypatch.setattr(self.inbox.selector, "select", told)
+        monkeypatch.setattr("os.write", counted)
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._ending:
+            self.inbox.wait(NEVER)
+
+    def do(self, action: Callable[[], None]) -> None:
+        """Have an action done, and wait for that and for the thread to sleep again."""
+        done = threading.Event()
+
+        def act() -> None:
+            action()
+            self.asleep.clear()
+            done.set()
+
+        self.inbox.call(act)
+        assert done.wait(PATIENCE)
+        assert self.asleep.wait(PATIENCE)
+
+    def close(self) -> None:
+        def end() -> None:
+            self._ending = True
+
+        self.inbox.call(end)
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive()
+        self.inbox.refuse()
+        self.inbox.close()
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], Sleeper]]:
+    started: list[Sleeper] = []
+
+    def make(doze: float) -> Sleeper:
+        started.append(Sleeper(monkeypatch, doze))
+        assert started[-1].asleep.wait(PATIENCE)
+        return started[-1]
+
+    yield make
+    for each in started:
+        each.close()
+
+
+def test_what_is_left_for_a_thread_that_dozes_does_not_wake_it_and_is_done_before_what_comes_next(
+    start: Callable[[float], Sleeper],
+) -> None:
+    sleeper, done = start(1000.0), list[str]()
+    sleeper.do(lambda: None)
+    wakes = sleeper.wakes
+    for each in ("first", "second"):
+        sleeper.inbox.leave(lambda each=each: done.append(each), by=time.monotonic() + 1000)  # type: ignore[misc]
+    assert sleeper.wakes == wakes
+    sleeper.do(lambda: done.append("third"))
+    assert done == ["first", "second", "third"]
+    assert sleeper.wakes == wakes + 1
+
+
+def test_what_must_be_done_sooner_than_the_thread_would_wake_wakes_it(start: Callable[[float], Sleeper]) -> None:
+    sleeper, done = start(0.0), threading.Event()
+    sleeper.do(lambda: None)
+    wakes = sleeper.wakes
+    sleeper.inbox.leave(done.set, by=time.monotonic() + 1000)  # it does not doze, so it would sleep for ever
+    assert done.wait(PATIENCE)
+    assert sleeper.wakes == wakes + 1
+
+
+def test_a_thread_that_dozes_looks_at_what_was_left_when_it_would_sleep_on(start: Callable[[float], Sleeper]) -> None:
+    sleeper, done = start(0.2), threading.Event()
+    sleeper.do(lambda: None)
+    wakes = sleeper.wakes
+    sleeper.inbox.leave(done.set, by=time.monotonic() + 1000)
+    assert done.wait(PATIENCE)
+    assert sleeper.wakes <= wakes + 1  # one, where this test itself came later than the doze was long
+
+
+def test_nothing_is_lost_and_nothing_overtakes_while_several_threads_hand_in(start: Callable[[float], Sleeper]) -> None:
+    sleeper, done = start(0.001), list[tuple[int, int]]()
+    count = 3000
+
+    def hand_in(who: int) -> None:
+        for number in range(count):
+            action = lambda number=number: done.append((who, number))  # noqa: E731
+            if number % 3:
+                sleeper.inbox.call(action)
+            else:
+                sleeper.inbox.leave(action, by=time.monotonic() + 0.002 * (number % 2))
+
+    threads = [threading.Thread(target=hand_in, args=(who,)) for who in range(3)]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join(PATIENCE)
+    sleeper.do(lambda: None)
+    assert [[number for who, number in done if who == each] for each in range(3)] == [list(range(count))] * 3
+    assert sleeper.wakes <= 3 * count + 1
+
+
+def test_nothing_is_done_once_no_more_is_taken() -> None:
+    inbox, done = Inbox(0.0), list[str]()
+    inbox.refuse()
+    inbox.call(lambda: done.append("late"))
+    assert inbox.wait(0.0) == []
+    assert done == []
+    inbox.close()

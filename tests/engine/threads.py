@@ -1,0 +1,49 @@
+"""An engine thread that runs, and what it has posted: what its tests are made of."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+from typing import TYPE_CHECKING, TypeVar
+
+from talkcli.engine import protocol
+from talkcli.engine.thread import EngineThread
+
+if TYPE_CHECKING:
+    from talkcli.engine.reports import Report
+
+_R = TypeVar("_R")
+
+#: Seconds after which a report is late on the busiest machine.
+PATIENCE = 20.0
+
+
+class Thread:
+    """A running engine thread and what it has posted."""
+
+    def __init__(self) -> None:
+        self.seen: list[Report] = []
+        self._posted: queue.Queue[Report] = queue.Queue()
+        self.engine = EngineThread(protocol.Configure(os.getpid(), None, None, None, None), self._posted.put)
+        self.engine.start()
+
+    def say(self, text: str, goal: str = "g1") -> None:
+        self.engine.say(protocol.Say(goal, text, 200, 1.0, None, 50))
+
+    def next(self, seconds: float = PATIENCE) -> Report | None:
+        """Return the next report, None if there is none for so long."""
+        with contextlib.suppress(queue.Empty):
+            self.seen.append(self._posted.get(timeout=seconds))
+            return self.seen[-1]
+        return None
+
+    def until(self, kind: type[_R]) -> _R:
+        while (report := self.next()) is not None:
+            if isinstance(report, kind):
+                return report
+        raise AssertionError(f"no {kind.__name__} in {self.seen}")
+
+    def close(self) -> None:
+        self.engine.close()
+        self.engine.join(PATIENCE)
