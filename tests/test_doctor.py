@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
+import subprocess
 import time
 from typing import TYPE_CHECKING
 
@@ -14,6 +16,7 @@ from talkcli.doctor import reach, sentence
 from talkcli.states import State
 from tests.faults.broken import sound, write
 from tests.support.compare import assert_silent, extent
+from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -243,3 +246,23 @@ def test_a_full_server_is_named(make_talk: MakeTalk) -> None:
         done, found = doctor(talk, "--silent")
     assert done.code == 4
     assert "--max-clients" in found["socket"]["next"]
+
+
+def test_sound_behind_a_forwarded_socket_is_not_looked_for_here(make_talk: MakeTalk, sound: Sink) -> None:
+    """As by ssh -L: what answers is the forwarder, and the server's player is elsewhere."""
+    needs("socat")
+    talk = make_talk(sink=sound)
+    forwarded = f"{talk.socket}.here"
+    forwarder = subprocess.Popen(["socat", f"UNIX-LISTEN:{forwarded},fork", f"UNIX-CONNECT:{talk.socket}"])
+    try:
+        while not os.path.exists(forwarded):
+            time.sleep(0.01)  # it tells nobody
+        done, found = doctor(talk, "--socket", forwarded)
+    finally:
+        forwarder.kill()
+        forwarder.wait()
+    assert done.code == 0, done.out
+    assert "on another machine or in a container: run talk doctor there" in found["session"]["message"]
+    assert not found.keys() & {"player", "device", "cards", "group", "sound server", "loudness"}
+    assert "through the server, aplay" in found["sentence"]["message"]
+    assert extent(talk.recording.samples)
