@@ -27,6 +27,8 @@ ANSWER_LIMIT = 5.0
 #: that were turned away together don't come back together.
 BUSY_LIMIT = 5.0
 _BUSY_PAUSE = (0.02, 0.2)
+#: What is said of a place that this user may not use.
+_FORBIDDEN = "no permission"
 
 
 @frozen
@@ -115,8 +117,9 @@ def _try_all(named: str | None, hello: Hello, version: str, patience: float, int
         try:
             connected = _connect(path)
         except OSError as error:
-            denied = denied or error.errno in {errno.EACCES, errno.EPERM}
-            failures.append(f"{path}: {_why(error, path)}")
+            why = _why(error, path)
+            denied = denied or why == _FORBIDDEN
+            failures.append(f"{path}: {why}")
             continue
         try:
             _check_owner(connected, path, named is not None)
@@ -156,7 +159,7 @@ def _why(error: OSError, path: str) -> str:
     if error.errno == errno.ECONNREFUSED:
         return "nobody answers (left over from a server that ended)"
     if error.errno in {errno.EACCES, errno.EPERM}:
-        return "no permission"
+        return _FORBIDDEN
     return error.strerror or str(error)
 
 
@@ -222,13 +225,15 @@ def _next_step(connected: _socket.socket) -> str:
 
 
 def _nobody(failures: list[str], denied: bool, named: str | None) -> TalkError:
+    import shlex  # it loads `re`
+
     tried = "\n".join(f"  {each}" for each in failures)
     hint = paths.sudo_hint()
     step = "start one with: talk serve"
     if named and named == os.environ.get("TALK_SOCKET"):
         step += "\nor unset TALK_SOCKET, which names this place: no other was tried"
     elif named:
-        step += f" --socket {named}"
+        step += f" --socket {shlex.quote(printable(named))}"
     if hint and not os.environ.get("TALK_SOCKET"):
         step += f"\nthe server of the user who called sudo would be reached with: talk --socket {hint}"
     if denied:

@@ -24,6 +24,8 @@ GREETING = b'{"talk": 1, "version": '
 AT_ONCE = 0.2
 #: Seconds for which a client stands back at most.
 _BACK = 0.2
+#: What is in the answer to a request after which there is nothing to wait for.
+_REFUSED = (b'"ok": false', b'"state": "REJECTED"')
 
 
 @frozen
@@ -85,14 +87,16 @@ def _begin(
     return Opened(connected.detach(), path, received, sent)
 
 
-def stand_back(opened: Opened) -> Opened:
+def stand_back(opened: Opened, timeout: float | None) -> Opened:
     """Leave the processor to the server for a while, and return the connection with what the server says meanwhile.
 
     For who waits for a goal to end and has nothing to do before. Until the first sound, server, engine, player and
     sound server take about the processor time that this process has had so far, whatever the machine; the rest of the
     client, imported in that time, made it 1.4 times as long where both cores of two had other work as well.
+
+    `timeout`: the seconds that the whole command may take, or None.
     """
-    end = time.monotonic() + min(time.process_time(), _BACK)
+    end = time.monotonic() + min(time.process_time(), _BACK, _BACK if timeout is None else timeout)
     connected = _socket.socket(fileno=opened.descriptor)
     received = opened.received
     try:
@@ -102,6 +106,8 @@ def stand_back(opened: Opened) -> Opened:
             if not said:
                 break
             received += said
+            if any(each in said for each in _REFUSED):
+                break
     except OSError:  # the time is up; or the connection has broken, which whoever reads on will find
         pass
     connected.setblocking(False)

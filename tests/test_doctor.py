@@ -256,6 +256,7 @@ def test_sound_behind_a_forwarded_socket_is_not_looked_for_here(make_talk: MakeT
     forwarder = subprocess.Popen(["socat", f"UNIX-LISTEN:{forwarded},fork", f"UNIX-CONNECT:{talk.socket}"])
     try:
         while not os.path.exists(forwarded):
+            assert forwarder.poll() is None
             time.sleep(0.01)  # it tells nobody
         done, found = doctor(talk, "--socket", forwarded)
     finally:

@@ -111,9 +111,9 @@ def test_who_waits_for_a_goal_imports_nothing_until_the_server_has_had_its_time(
         "import sys\n"
         "from talkcli import opening\n"
         "stand_back = opening.stand_back\n"
-        "def spy(opened):\n"
-        "    found = stand_back(opened)\n"
-        "    print('stood back', b'ACTIVE' in found.received, {{'json', 'talkcli.client'}} & {{*sys.modules}})\n"
+        "def spy(*opened):\n"
+        "    found = stand_back(*opened)\n"
+        "    print('stood back', {{'json', 'talkcli.client'}} & {{*sys.modules}})\n"
         "    return found\n"
         "opening.stand_back = spy\n"
         "from talkcli.cli import run\n"
@@ -126,31 +126,28 @@ def test_who_waits_for_a_goal_imports_nothing_until_the_server_has_had_its_time(
         (["status", "-q"], False),
     ):
         done = run([sys.executable, "-c", code.format(words)], scripted.env)
-        assert ("stood back True set()" in done.out.splitlines()) == stands_back, (words, done)
+        assert ("stood back set()" in done.out.splitlines()) == stands_back, (words, done)
 
 
 def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
-    monkeypatch.setattr("talkcli.opening.time.process_time", lambda: 0.1)
-
-    def answer() -> None:
-        theirs.sendall(b"reply\n")
-        time.sleep(0.02)
-        theirs.sendall(b"event\n")
-
     begun = Opened(ours.detach(), "s", b"greeting\n", b"request\n")
     with theirs:
-        thread = threading.Thread(target=answer)
-        thread.start()
+        theirs.sendall(b"reply\n")
+        monkeypatch.setattr("talkcli.opening.time.process_time", lambda: 0.1)
         began = time.monotonic()
-        found = stand_back(begun)
+        found = stand_back(begun, None)
         assert time.monotonic() - began >= 0.1
-        thread.join()
-        assert found == Opened(begun.descriptor, "s", b"greeting\nreply\nevent\n", b"request\n")
-    monkeypatch.setattr(
-        "talkcli.opening.time.process_time", lambda: PATIENCE
-    )  # it is limited, and who is gone isn't waited for
-    assert stand_back(found) == found
+        assert found == Opened(begun.descriptor, "s", b"greeting\nreply\n", b"request\n")
+        monkeypatch.setattr("talkcli.opening.time.process_time", lambda: PATIENCE)
+        monkeypatch.setattr("talkcli.opening._BACK", PATIENCE)
+        began = time.monotonic()
+        assert stand_back(found, 0.05) == found  # its own limit comes first
+        for refused in (b'{"seq": 1, "ok": false}\n', b'{"goal": {"state": "REJECTED"}}\n'):
+            theirs.sendall(refused)
+            assert stand_back(found, None).received.endswith(refused)  # there is nothing to wait for
+        theirs.sendall(b"event\n")
+    assert stand_back(found, None).received.endswith(b"reply\nevent\n")  # nor is there when the server is gone
     assert time.monotonic() - began < PATIENCE
     with socket.socket(fileno=found.descriptor) as kept:
         assert (os.get_blocking(kept.fileno()), kept.recv(1)) == (False, b"")

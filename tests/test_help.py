@@ -11,7 +11,7 @@ import click
 import pytest
 
 from talkcli import admission, errors, states
-from talkcli.cli import commands, serve
+from talkcli.cli import commands, serve, show
 from talkcli.cli.usage import Command
 from tests.conformance.bareserve import TALK, environment, run
 from tests.support.surroundings import short_directory
@@ -130,6 +130,7 @@ def test_the_examples_can_be_typed(name: str) -> None:
         (["help"], "no such command 'help': write 'talk --help'"),
         (["help", "say"], "no such command 'help': write 'talk say --help'"),
         (["good", "morning"], "no such command 'good': to speak it, write: talk say \"good morning\""),
+        (["sudo", "$(reboot)", 'a"b'], "no such command 'sudo': to speak it, write: talk say 'sudo $(reboot) a\"b'"),
         (["set", "--volum", "1"], "no such option '--volum': did you mean '--volume'?"),
         (
             ["say", "--wiat", "x"],
@@ -179,13 +180,22 @@ def test_on_a_terminal_what_is_told_breaks_between_words(columns: int, lines: in
     assert len(shown.lines) == lines
 
 
+def test_a_command_is_not_broken_and_what_stands_around_it_is() -> None:
+    command = "sudo python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install ."
+    for told in (f"one two {'three ' * 20}'{command}' four {'five ' * 20}", f"{'one ' * 30}start one with: {command}"):
+        lines = show._folded(told).splitlines()
+        assert len(lines) > 2
+        assert sum(command in each for each in lines) == 1
+        assert " ".join(each.strip() for each in lines) == told.strip()
+
+
 def test_variable_with_a_wrong_value_is_named() -> None:
     assert alone("serve", TALK_RATE="fast")[2].startswith("talk: --rate (env var: 'TALK_RATE'): 'fast' is not a whole ")
 
 
 def test_player_that_is_not_there_is_told_at_the_start(make_talk: MakeTalk) -> None:
     first = make_talk("--player", "aply").log.splitlines()[0]
-    assert first == "talk: player \"aply\" not found: did you mean 'aplay'? until it is there, nothing can be heard"
+    assert first == "talk: player \"aply\" not found: did you mean 'aplay'? nothing can be heard until it is there"
 
 
 def test_key_that_was_mistyped_is_told_to_people(scripted: Talk) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 
 from talkcli.cli.show import note, screen, show, show_json
-from talkcli.errors import EXIT_OK, UnknownGoal
+from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -163,7 +163,10 @@ def _suggest_key(key: str, client: Client) -> None:
     from talkcli.cli.nearest import nearest
     from talkcli.printable import printable
 
-    status = client.status()
+    try:
+        status = client.status()
+    except TalkError:
+        return  # what was asked for is done
     goals = [status.active, *status.pending] if status.active else status.pending
     near = nearest(key, {each.key for each in goals if each.key})
     if near:

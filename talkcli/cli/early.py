@@ -89,7 +89,7 @@ def carry_out(plain: Plain, arguments: list[str]) -> int:
     try:
         opened = open_early(named, *said, hold) if said else None
         if opened and opened.sent and plain.given.get("wait") and not plain.given.get("feedback"):
-            opened = stand_back(opened)
+            opened = stand_back(opened, plain.given["timeout"])
     except KeyboardInterrupt:
         return 128 + int(_signal.SIGINT)  # nothing was sent
     from talkcli.cli.ends import ended

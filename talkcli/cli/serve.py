@@ -162,7 +162,8 @@ def command(context: click.Context, /, print_unit: str | None, **options: object
     if print_unit:
         _print_unit(context, print_unit)
         return 0
-    _warn_of_player(player)
+    if not common(context).quiet:
+        _warn_of_player(player)
     from talkcli import paths
     from talkcli.server.run import serve
 
@@ -174,6 +175,7 @@ def _warn_of_player(player: str) -> None:
     from talkcli.cli.nearest import nearest
     from talkcli.engine.players import commands, on_path
     from talkcli.engine.sink import AudioFailed
+    from talkcli.printable import printable
 
     if not player or player == "null" or player.startswith("file:"):
         return
@@ -182,7 +184,7 @@ def _warn_of_player(player: str) -> None:
     except AudioFailed as error:
         near = nearest(player, set(complete.PLAYERS) - {player})
         hint = f"did you mean '{near}'? " if near else ""
-        note(f"{error}: {hint}until it is there, nothing can be heard")
+        note(f"{printable(str(error))}: {hint}nothing can be heard until it is there")
 
 
 def _print_unit(context: click.Context, name: str) -> None:

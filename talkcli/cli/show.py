@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _USUAL_WIDTH = 80
 #: Columns into which what is said always goes; a terminal that says it has fewer is not believed.
 _NARROWEST = 40
+#: Stands for a blank at which no line ends.
+_NO_BREAK = "\0"
 
 
 class Common:
@@ -79,12 +81,15 @@ def _folded(text: str) -> str:
         width = _USUAL_WIDTH
     if all(len(line) <= width for line in text.split("\n")):
         return text
+    import re
     import textwrap
 
     fold = textwrap.TextWrapper(
         max(width, _NARROWEST), subsequent_indent="      ", break_long_words=False, break_on_hyphens=False
     )
-    return "\n".join(fold.fill(line) for line in text.split("\n"))
+    # A command is not broken: it would be another one where it is copied from the terminal.
+    kept = re.sub(r"'[^'\n]*'|: (?:talk|sudo) .*", lambda found: found[0].replace(" ", _NO_BREAK), text)
+    return "\n".join(map(fold.fill, kept.split("\n"))).replace(_NO_BREAK, " ")
 
 
 def show_error(error: TalkError, *, json: bool) -> None:

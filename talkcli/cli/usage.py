@@ -5,6 +5,7 @@ It knows nothing of any one command: those bring their examples and exit codes a
 
 from __future__ import annotations
 
+import shlex
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -79,7 +80,7 @@ def _convert(
     try:
         return convert(value, param, ctx)
     except click.BadParameter as error:
-        raise click.BadParameter(f"{value!r} is not {wanted}", ctx, param) from error
+        raise click.BadParameter(f"'{value}' is not {wanted}", ctx, param) from error
 
 
 class Command(click.Command):
@@ -156,8 +157,13 @@ def unknown_command(words: list[str], commands: Iterable[str]) -> str:
         return f"no such command '{name}': write 'talk{f' {meant}' if meant else ''} --help'"
     near = _ELSEWHERE.get(name.lower()) or nearest(name, commands)
     return f"no such command '{name}': " + (
-        f"did you mean '{near}'?" if near else f'to speak it, write: talk say "{" ".join(words)}"'
+        f"did you mean '{near}'?" if near else f"to speak it, write: talk say {_quoted(' '.join(words))}"
     )
+
+
+def _quoted(text: str) -> str:
+    """Return a text as a shell takes it, in the quotes that people write where these do."""
+    return shlex.quote(text) if any(each in text for each in '"$`\\!') else f'"{text}"'
 
 
 def told(error: click.ClickException) -> str:

@@ -105,6 +105,7 @@ class EngineThread:
                 self._keep_limits(time.monotonic())
                 for key in self._inbox.wait(self._next_deadline()):
                     self._handle(key)
+            self._inbox.run()  # what came before `close`, which takes no turn
         except Exception as error:
             self._closing = True
             self._post(ThreadDied(f"a bug in the engine thread: {type(error).__name__}: {error}"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import time
@@ -16,25 +15,13 @@ from talkcli.engine import thread as engine_thread
 from talkcli.engine.limits import HANG_AFTER
 from talkcli.engine.murmur import LINES
 from talkcli.engine.reports import EngineDied, EngineSaid
-from tests.engine.threads import Thread
-from tests.support import scripted_engine
+from tests.engine.threads import Thread, start
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-
-@pytest.fixture
-def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], Thread]]:
-    monkeypatch.setattr(spawn, "engine_command", lambda: [sys.executable, scripted_engine.__file__])
-    with contextlib.ExitStack() as stack:
-
-        def make() -> Thread:
-            thread = Thread()
-            stack.callback(thread.close)
-            return thread
-
-        yield make
+__all__ = ["start"]
 
 
 def test_a_goal_is_held_and_goes_on_where_it_was(start: Callable[[], Thread]) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
+import threading
 from typing import TYPE_CHECKING, cast
 
 import pytest
@@ -14,28 +14,16 @@ from talkcli.engine import protocol, spawn
 from talkcli.engine import thread as engine_thread
 from talkcli.engine.reports import EngineDied
 from talkcli.engine.thread import EngineThread
-from tests.engine.threads import Thread
-from tests.support import scripted_engine
+from tests.engine.threads import PATIENCE, Thread, start
 
 if TYPE_CHECKING:
     import selectors
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
     from talkcli.engine.reports import Report
 
-
-@pytest.fixture
-def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], Thread]]:
-    monkeypatch.setattr(spawn, "engine_command", lambda: [sys.executable, scripted_engine.__file__])
-    with contextlib.ExitStack() as stack:
-
-        def make() -> Thread:
-            thread = Thread()
-            stack.callback(thread.close)
-            return thread
-
-        yield make
+__all__ = ["start"]
 
 
 #: An engine process that says of each goal, in one piece, that it was begun and played: one thing to wake up for.
@@ -88,7 +76,7 @@ def test_a_goal_behind_another_wakes_the_thread_once(monkeypatch: pytest.MonkeyP
 def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(
     start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_thread, "HANG_AFTER", 1.0)
+    monkeypatch.setattr(engine_thread, "HANG_AFTER", 2.0)
     thread = start()
     thread.say("length=0")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
@@ -96,7 +84,7 @@ def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(
     assert thread.until(protocol.Ended).reason == "engine_hung"
     thread.say("yes", "g3")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
-    assert thread.next(1.5) is None  # it does not doze any more
+    assert thread.next(3.0) is None  # it does not doze any more
     thread.say("length=0.05 hang", "g4")
     assert thread.until(protocol.Ended).reason == "engine_hung"
 
@@ -195,3 +183,24 @@ def test_a_closed_process_takes_no_command(start: Callable[[], Thread]) -> None:
     thread.close()
     assert process is not None
     assert not process.send(protocol.Stop("g1"))
+
+
+def test_a_goal_that_is_handed_in_just_before_the_end_has_its_end(
+    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    thread, held = start(), threading.Event()
+    post = thread.engine._post
+
+    def slow(report: Report) -> None:
+        post(report)
+        if isinstance(report, protocol.Ended) and report.id == "g0":
+            held.wait(PATIENCE)  # both come while it is at work, and finds next that it is to end
+
+    monkeypatch.setattr(thread.engine, "_post", slow)
+    thread.say("length=0", "g0")
+    assert thread.until(protocol.Ended).id == "g0"
+    thread.say("never-ends")
+    thread.engine.close()
+    held.set()
+    ended = thread.until(protocol.Ended)
+    assert (ended.id, ended.reason) == ("g1", "shutdown")

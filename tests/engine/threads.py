@@ -5,12 +5,18 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
+import sys
 from typing import TYPE_CHECKING, TypeVar
 
-from talkcli.engine import protocol
+import pytest
+
+from talkcli.engine import protocol, spawn
 from talkcli.engine.thread import EngineThread
+from tests.support import scripted_engine
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from talkcli.engine.reports import Report
 
 _R = TypeVar("_R")
@@ -47,3 +53,17 @@ class Thread:
     def close(self) -> None:
         self.engine.close()
         self.engine.join(PATIENCE)
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], Thread]]:
+    """Starts an engine thread with the scripted engine as its process."""
+    monkeypatch.setattr(spawn, "engine_command", lambda: [sys.executable, scripted_engine.__file__])
+    with contextlib.ExitStack() as stack:
+
+        def make() -> Thread:
+            thread = Thread()
+            stack.callback(thread.close)
+            return thread
+
+        yield make

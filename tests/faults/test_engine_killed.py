@@ -26,6 +26,7 @@ from tests.faults.broken import (
 from tests.support import census
 from tests.support.compare import extent
 from tests.support.reference import render
+from tests.support.surroundings import command_line
 from tests.support.timing import assert_within, retry_if_late
 
 if TYPE_CHECKING:
@@ -183,6 +184,9 @@ def _signal_the_next(talk: Talk, goal: str, folder: Path, number: signal.Signals
     following = send(talk, LOW)
     census.settled(talk.pid, lambda now: now.processes == 2)
     (starting,) = census.descendants(talk.pid)
+    while "talkcli.engine" not in command_line(starting):
+        assert command_line(starting) != "ended"
+        time.sleep(0.001)  # it is forked, and not the engine yet: nobody is told when it is
     hit = time.monotonic()
     os.kill(starting, number)
     flag.unlink()

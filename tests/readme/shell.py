@@ -6,7 +6,6 @@ and gives them to a shell, so that a mistake in quoting shows.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import signal
@@ -122,6 +121,9 @@ class Shell:
     def run(self, script: str, *arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
         """Run a script to its end."""
         began = self.start(script, *arguments, **env)
+        # Its number stays its group's until it is reaped, so what it leaves behind can be ended by that.
+        wait_until(lambda: os.waitid(os.P_PID, began.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None, LIMIT)
+        os.killpg(began.pid, signal.SIGKILL)
         out, err = began.communicate(timeout=LIMIT)
         assert "Traceback" not in err, err
         return subprocess.CompletedProcess(script, began.returncode, out, err)
@@ -148,9 +150,9 @@ class Shell:
 
     def close(self) -> None:
         for each in self._running:
-            with contextlib.suppress(ProcessLookupError):
+            if each.returncode is None:
                 os.killpg(each.pid, signal.SIGKILL)
-            each.communicate()
+                each.communicate()
 
     def _python(self, name: str, code: str) -> None:
         path = self.directory / f"{name}.py"
@@ -158,9 +160,9 @@ class Shell:
         self.program(name, f'exec {sys.executable} -u {path} "$@"')
 
 
-def wait_until(true: Callable[[], bool]) -> None:
-    """Wait for what no event tells: a file that a program writes."""
-    end = time.monotonic() + PATIENCE
+def wait_until(true: Callable[[], bool], seconds: float = PATIENCE) -> None:
+    """Wait for what no event tells: a file that a program writes, a program's end."""
+    end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.02)

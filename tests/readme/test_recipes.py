@@ -78,6 +78,10 @@ def test_microphone_mute(scripted: Talk, scripted_shell: Shell) -> None:
         scripted.run("say", "--wait", "--", text)
         calls = scripted_shell.wait_for_call("wpctl", 2 * number)
         assert calls[-2:] == [["set-mute", "@DEFAULT_AUDIO_SOURCE@", each] for each in "10"]
+    scripted.run("say", "--", "never-ends")
+    scripted_shell.wait_for_call("wpctl", 5)
+    scripted.kill()
+    assert [each[-1] for each in scripted_shell.wait_for_call("wpctl", 6)[-2:]] == ["1", "0"]
 
 
 @runs("Recipes: Watchdog")
@@ -175,13 +179,16 @@ def test_launch_file(speaking: Talk, shell: Shell, monkeypatch: pytest.MonkeyPat
         env = {**shell.env, "TALK_SOCKET": f"{place}/s", "TALK_PLAYER": "null"}
         server = subprocess.Popen(process.cmd, env=env, executable=str(shell.directory / "bin" / "talk"), stderr=-1)
         with server:
-            assert server.stderr
-            told = b""
-            while b'"ready"' not in told:  # its log: the greeting was said
-                told = server.stderr.readline()
-                assert told
-            server.send_signal(signal.SIGINT)  # as launch does
-            server.communicate(timeout=20)
+            try:
+                assert server.stderr
+                told = b""
+                while b'"ready"' not in told:  # its log: the greeting was said
+                    told = server.stderr.readline()
+                    assert told
+                server.send_signal(signal.SIGINT)  # as launch does
+                server.communicate(timeout=20)
+            finally:
+                server.kill()
         assert server.returncode == 0
     assert speaking.running
 

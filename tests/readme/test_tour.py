@@ -98,11 +98,14 @@ def test_priority_and_time(speaking: Talk, shell: Shell) -> None:
 
 
 @runs("A tour: Priority and time #2")
-def test_battery_is_not_said_twice(shell: Shell) -> None:
+def test_battery_is_not_said_twice(speaking: Talk, shell: Shell) -> None:
     (line,) = commands("A tour: Priority and time #2")
-    assert len(shell.run(line).stdout.split()) == 1
+    (said,) = shell.run(line).stdout.split()
+    assert speaking.watcher.wait_for_terminal(said) == "SUCCEEDED"
     again = shell.run(line)
     assert (again.returncode, again.stdout) == (0, "")
+    refused = speaking.watcher.wait_until(lambda each: each.get("state") == "REJECTED")
+    assert refused["goal"]["reason"] == "throttled"
 
 
 @runs("A tour: Cancel")
