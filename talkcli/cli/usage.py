@@ -5,7 +5,6 @@ It knows nothing of any one command: those bring their examples and exit codes a
 
 from __future__ import annotations
 
-import shlex
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -163,6 +162,8 @@ def unknown_command(words: list[str], commands: Iterable[str]) -> str:
 
 def _quoted(text: str) -> str:
     """Return a text as a shell takes it, in the quotes that people write where these do."""
+    import shlex
+
     return shlex.quote(text) if any(each in text for each in '"$`\\!') else f'"{text}"'
 
 
