@@ -19,7 +19,7 @@ import pytest
 import talkcli
 from tests.conformance.bareserve import TALK, environment, serving
 from tests.faults.broken import python_path, sound, write
-from tests.faults.test_users import IMPOSTOR, NOBODY, PYTHON, as_user
+from tests.faults.test_users import NOBODY, as_user, impostor
 from tests.support.compare import assert_silent, extent
 from tests.support.surroundings import needs, short_directory
 
@@ -195,15 +195,9 @@ def test_a_server_of_another_user_is_named_and_told_nothing(home: str) -> None:
     os.mkdir(f"{home}/run/talk")
     os.chmod(f"{home}/run/talk", 0o777)
     path = f"{home}/run/talk/talk.sock"
-    command = [*as_user(NOBODY), PYTHON, "-u", "-c", IMPOSTOR, path]
-    with subprocess.Popen(command, cwd="/", stdout=subprocess.PIPE) as theirs:
-        try:
-            assert theirs.stdout
-            assert theirs.stdout.readline()
-            found = doctor(environment(home, TALK_PLAYER="null", XDG_RUNTIME_DIR=f"{home}/run"))
-            assert theirs.stdout.readline() == b"b''\n", "it hung up without a word"
-        finally:
-            theirs.kill()
+    with impostor(path) as heard:
+        found = doctor(environment(home, TALK_PLAYER="null", XDG_RUNTIME_DIR=f"{home}/run"))
+        assert heard() == b"b''\n", "it hung up without a word"
     assert f"{path}: another user's server (uid {NOBODY})" in found["socket"]["message"]
     assert f"if you trust uid {NOBODY}: talk --socket {path} doctor" in found["socket"]["next"]
 

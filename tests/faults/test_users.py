@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -22,7 +23,7 @@ from tests.support.connection import Wire
 from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
 SCRIPTED = [SERVE[0], processes._SCRIPTED]
 NOBODY = 65534
@@ -100,6 +101,19 @@ def stranger(path: str, *requests: dict[str, object], groups: Sequence[int] = ()
     words = [*as_user(NOBODY, *groups), PYTHON, "-c", PARENT, HOSTILE, "-c", STRANGER, path]
     words += [json.dumps(each) for each in requests]
     return subprocess.run(words, cwd="/", capture_output=True, text=True, timeout=20, check=False)
+
+
+@contextlib.contextmanager
+def impostor(path: str) -> Iterator[Callable[[], bytes]]:
+    """Run another user's server there; gives what waits for a client and returns what it said, as Python shows it."""
+    command = [*as_user(NOBODY), PYTHON, "-u", "-c", IMPOSTOR, path]
+    with subprocess.Popen(command, cwd="/", stdout=subprocess.PIPE) as theirs:
+        try:
+            assert theirs.stdout
+            assert theirs.stdout.readline()
+            yield theirs.stdout.readline
+        finally:
+            theirs.kill()
 
 
 def replies(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
@@ -184,21 +198,15 @@ def test_client_tells_nothing_to_a_server_of_another_user_except_where_it_was_na
     os.makedirs(f"{home}/run/talk")
     os.chmod(f"{home}/run/talk", 0o777)
     path = f"{home}/run/talk/talk.sock"
-    command = [*as_user(NOBODY), PYTHON, "-u", "-c", IMPOSTOR, path]
-    with subprocess.Popen(command, cwd="/", stdout=subprocess.PIPE) as theirs:
-        try:
-            assert theirs.stdout
-            assert theirs.stdout.readline()
-            env = environment(home, XDG_RUNTIME_DIR=f"{home}/run")
-            done = run([*TALK, "say", "a secret"], env)
-            assert done.code == 10, done
-            assert f"belongs to uid {NOBODY}" in done.err
-            for _ in range(2):  # it hung up without a word: early, and again when it was whole
-                assert theirs.stdout.readline() == b"b''\n"
-            run([*TALK, "--socket", path, "status"], env)
-            assert b'"hello"' in theirs.stdout.readline()  # it is named: that is the user's own trust
-        finally:
-            theirs.kill()
+    with impostor(path) as heard:
+        env = environment(home, XDG_RUNTIME_DIR=f"{home}/run")
+        done = run([*TALK, "say", "a secret"], env)
+        assert done.code == 10, done
+        assert f"belongs to uid {NOBODY}" in done.err
+        for _ in range(2):  # it hung up without a word: early, and again when it was whole
+            assert heard() == b"b''\n"
+        run([*TALK, "--socket", path, "status"], env)
+        assert b'"hello"' in heard()  # it is named: that is the user's own trust
 
 
 def test_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
