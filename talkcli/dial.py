@@ -6,7 +6,6 @@ It sends nothing but `hello`, so whatever fails here is safe to try again.
 from __future__ import annotations
 
 import _socket  # see `peers`
-import errno
 import math
 import os
 import select
@@ -16,6 +15,7 @@ from talkcli import paths, peers, wire
 from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
 from talkcli.printable import printable
 from talkcli.requests import Hello, write_request
+from talkcli.unreachable import DIRECTORY, FORBIDDEN
 from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ ANSWER_LIMIT = 5.0
 #: that were turned away together don't come back together.
 BUSY_LIMIT = 5.0
 _BUSY_PAUSE = (0.02, 0.2)
-#: What is said of a place that this user may not use.
-_FORBIDDEN = "no permission"
 
 
 @frozen
@@ -117,9 +115,10 @@ def _try_all(named: str | None, hello: Hello, version: str, patience: float, int
         try:
             connected = _connect(path)
         except OSError as error:
-            why = _why(error, path)
-            denied = denied or why == _FORBIDDEN
-            failures.append(f"{path}: {why}")
+            found = paths.found_at(path, error)
+            denied = denied or found == FORBIDDEN
+            hint = f": name the one in it, {path.rstrip('/')}/{paths.SOCKET}" if found == DIRECTORY else ""
+            failures.append(f"{path}: {found}{hint}")
             continue
         try:
             _check_owner(connected, path, named is not None)
@@ -147,20 +146,6 @@ def _connect(path: str) -> _socket.socket:
         connected.close()
         raise
     return connected
-
-
-def _why(error: OSError, path: str) -> str:
-    if error.errno in {errno.ENOENT, errno.ENOTDIR}:
-        return "not there"
-    if os.path.isdir(path):
-        return f"a directory, and no socket: name the one in it, {path.rstrip('/')}/{paths.SOCKET}"
-    if os.path.isfile(path):
-        return "a file, and no socket"
-    if error.errno == errno.ECONNREFUSED:
-        return "nobody answers (left over from a server that ended)"
-    if error.errno in {errno.EACCES, errno.EPERM}:
-        return _FORBIDDEN
-    return error.strerror or str(error)
 
 
 def _check_owner(connected: _socket.socket, path: str, named: bool) -> None:

@@ -7,8 +7,11 @@ ssh commands run without XDG_RUNTIME_DIR, so both know what to do without it.
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
+
+from talkcli.unreachable import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
 
 #: The name of the socket in its directory.
 SOCKET = "talk.sock"
@@ -29,6 +32,21 @@ def client_sockets(named: str | None) -> list[str]:
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]
     places = [f"{each.rstrip('/')}/talk/{SOCKET}" for each in directories if each and os.path.isabs(each)]
     return list(dict.fromkeys([*places, SYSTEM_SOCKET]))
+
+
+def found_at(path: str, error: OSError) -> str:
+    """Return what is at a place where a connection failed: a constant of `unreachable`, else the system's words."""
+    if os.path.isdir(path):
+        return DIRECTORY
+    if os.path.isfile(path):
+        return FILE
+    if error.errno in {errno.ENOENT, errno.ENOTDIR}:
+        return ABSENT
+    if error.errno == errno.ECONNREFUSED:
+        return STALE
+    if error.errno in {errno.EACCES, errno.EPERM}:
+        return FORBIDDEN
+    return error.strerror or str(error)
 
 
 def _runtime_directories(uid: int) -> list[str]:

@@ -18,6 +18,8 @@ from tests.support.surroundings import short_directory
 from tests.support.terminal import Terminal
 
 if TYPE_CHECKING:
+    import pathlib
+
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
@@ -196,6 +198,19 @@ def test_variable_with_a_wrong_value_is_named() -> None:
 def test_player_that_is_not_there_is_told_at_the_start(make_talk: MakeTalk) -> None:
     first = make_talk("--player", "aply").log.splitlines()[0]
     assert first == "talk: player \"aply\" not found: did you mean 'aplay'? nothing can be heard until it is there"
+
+
+def test_player_beside_a_driver_that_plays_by_itself_is_told(make_talk: MakeTalk) -> None:
+    for player in ("aply", "aplay"):
+        first = make_talk("--player", player, driver="dummy").log.splitlines()[0]
+        assert first == f"talk: --player {player} has no effect: the driver plays by itself"
+
+
+def test_file_of_another_format_is_refused_and_not_written(tmp_path: pathlib.Path) -> None:
+    code, _, err = alone("say", "-o", str(tmp_path / "hello.MP3"), "hello")
+    assert code == 2
+    assert "--output writes WAV, not .MP3: name it .wav" in err
+    assert not list(tmp_path.iterdir())
 
 
 def test_key_that_was_mistyped_is_told_to_people(scripted: Talk) -> None:

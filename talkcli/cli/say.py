@@ -5,6 +5,7 @@ What it does is in `saying`, `lines`, `rendering`.
 
 from __future__ import annotations
 
+import os
 import time
 from typing import Any
 
@@ -21,6 +22,9 @@ from talkcli.requests import Say
 
 #: Options that mean something to a server alone.
 _SERVER_ONLY = ("wait", "feedback", "lines", "preempt", "flush", "priority", "ttl", "key", "throttle", "id", "name")
+
+#: Endings by which a file of another format than WAV would be meant.
+_OTHER_FORMATS = (".aac", ".flac", ".m4a", ".mp3", ".ogg", ".opus")
 
 
 class _SayCommand(Command):
@@ -171,6 +175,9 @@ def _check(context: click.Context, text: tuple[str, ...], given: dict[str, Any])
         named = [_spelt(context, each, given[each]) for each in _SERVER_ONLY if _typed(context, each)]
         if named:
             refuse(f"--output writes a file, without a server: leave out {', '.join(named)}")
+        ending = os.path.splitext(given["output"])[1]
+        if ending.lower() in _OTHER_FORMATS:
+            refuse(f"--output writes WAV, not {ending}: name it .wav, and convert it with ffmpeg or sox")
     if given["lines"] and text:
         refuse("--lines reads standard input: leave out TEXT")
     if given["lines"] and given["id"] is not None:

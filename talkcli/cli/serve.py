@@ -163,20 +163,24 @@ def command(context: click.Context, /, print_unit: str | None, **options: object
         _print_unit(context, print_unit)
         return 0
     if not common(context).quiet:
-        _warn_of_player(player)
+        _warn_of_player(player, options["driver"])
     from talkcli import paths
     from talkcli.server.run import serve
 
     return serve(Settings(socket=paths.named_socket(common(context).socket), **options))  # type: ignore[arg-type]
 
 
-def _warn_of_player(player: str) -> None:
-    """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
+def _warn_of_player(player: str, driver: object) -> None:
+    """Tell of a player that will not play: a word that was mistyped, a program that is not installed yet."""
     from talkcli.cli.nearest import nearest
     from talkcli.engine.players import commands, on_path
     from talkcli.engine.sink import AudioFailed
+    from talkcli.engine.start import is_own
     from talkcli.printable import printable
 
+    if player and not is_own(None if driver is None else str(driver)):
+        note(f"--player {printable(player)} has no effect: the driver plays by itself")
+        return
     if not player or player == "null" or player.startswith("file:"):
         return
     try:

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from talkcli.doctor.findings import Finding, done, failed, warning
+from talkcli.unreachable import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
 from talkcli.values import frozen
 
-#: What is found at a place.
-ABSENT, FILE, DIRECTORY, STALE, FORBIDDEN, FOREIGN, MUTE, SERVER = (
-    "not there",
-    "a file, and no socket",
-    "a directory, and no socket",
-    "nobody answers: left over from a server that ended",
-    "no permission",
-    "another user's server",
-    "something answers",
-    "the server",
-)
+#: What is found at a place, beside what `found_at` finds where nobody can be reached.
+FOREIGN = "another user's server"
+MUTE = "something answers"
+SERVER = "the server"
 
 #: What to do where a server answers and takes no client, by the code of the client's error.
 _ANSWERS = {

@@ -5,7 +5,6 @@ It asks as any client does: with limits of time, and its goal waits its turn and
 
 from __future__ import annotations
 
-import errno
 import glob
 import os
 import socket
@@ -14,18 +13,7 @@ from typing import TYPE_CHECKING
 from talkcli import paths, peers
 from talkcli.client import Client
 from talkcli.dial import Interrupted
-from talkcli.doctor.places import (
-    ABSENT,
-    DIRECTORY,
-    FILE,
-    FORBIDDEN,
-    FOREIGN,
-    MUTE,
-    SERVER,
-    STALE,
-    Place,
-    Places,
-)
+from talkcli.doctor.places import FOREIGN, MUTE, SERVER, Place, Places
 from talkcli.doctor.sentence import Played
 from talkcli.errors import TalkError
 from talkcli.states import State
@@ -77,26 +65,12 @@ def _place(path: str, *, trusted: bool) -> Place:
         probe.setblocking(False)
         try:
             probe.connect(path)
+        except BlockingIOError:  # its backlog is full
+            return Place(path, MUTE, _owner(path))
         except OSError as error:
-            return Place(path, _why(error, path), _owner(path))
+            return Place(path, paths.found_at(path, error), _owner(path))
         _, uid = peers.credentials(probe)
     return Place(path, MUTE if trusted or uid in {os.getuid(), 0} else FOREIGN, uid)
-
-
-def _why(error: OSError, path: str) -> str:
-    if os.path.isdir(path):
-        return DIRECTORY
-    if os.path.isfile(path):
-        return FILE
-    if error.errno in {errno.ENOENT, errno.ENOTDIR}:
-        return ABSENT
-    if error.errno == errno.ECONNREFUSED:
-        return STALE
-    if error.errno in {errno.EACCES, errno.EPERM}:
-        return FORBIDDEN
-    if error.errno == errno.EAGAIN:  # its backlog is full
-        return MUTE
-    return error.strerror or str(error)
 
 
 def _owner(path: str) -> int | None:

@@ -53,7 +53,7 @@ def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait, hol
         import pyttsx3
     except ImportError as error:
         raise CannotStart(f"pyttsx3 is missing: pip install pyttsx3 ({error})") from error
-    own = _is_own(driver)
+    own = is_own(driver)
     version = _register_own(outlet, wait, hold) if own else None
     from talkcli.engine.espeak import DRIVER
 
@@ -69,7 +69,8 @@ def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait, hol
     return OpenEngine(engine, settings, shown, version, None if own else _pump(name))
 
 
-def _is_own(driver: str | None) -> bool:
+def is_own(driver: str | None) -> bool:
+    """Tell whether a driver is `talk`'s own, which plays through a player; others play by themselves."""
     return sys.platform.startswith("linux") and driver in (None, _OWN_NAME)
 
 

@@ -27,6 +27,8 @@ _MBROLA_PLACES = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/sh
 
 #: Words that are proposed in the place of an unknown one, and how near they must be to it.
 _NEAR, _CUTOFF = 3, 0.5
+#: How near a word must be to the English name of a language to be a slip of the finger: "englsh" is, "welsh" is not.
+_SAME_NAME = 0.85
 #: Characters of an unknown word that are repeated in the message.
 _SHOWN = 60
 
@@ -71,7 +73,7 @@ def unknown_voice(wanted: str, voices: tuple[Voice, ...]) -> str:
         for place in reversed(range(4)):  # as `talk voices` writes them: the language's "en-us" before the id's "en-US"
             for each in plain:
                 words.setdefault(_words(each)[place] or each.id, each)
-        near = _near(name, words)
+        near = list(dict.fromkeys([*_in_english(name, plain), *_near(name, words)]))[:_NEAR]
     hint = f"did you mean {' or '.join(repr(word) for word in near)}? " if near else ""
     return f'unknown voice "{shown}": {hint}"talk voices" lists them'
 
@@ -127,6 +129,22 @@ def _near(wanted: str, words: dict[str, Voice]) -> list[str]:
     for each in near:
         result.setdefault(words[folded[each]].id, folded[each])
     return list(result.values())[:_NEAR]
+
+
+def _in_english(wanted: str, voices: list[Voice]) -> list[str]:
+    """Return the languages whose English name was mistyped: libespeak-ng's are "English (Great Britain)" and the like.
+
+    The three shortest; none for a name without a slip, which comes near its voices by itself.
+    """
+    import difflib
+
+    called: dict[str, list[str]] = {}
+    for each in voices:
+        if each.language:
+            called.setdefault(each.name.partition(" ")[0].casefold(), []).append(each.language)
+    word = wanted.casefold()
+    found = [] if word in called else difflib.get_close_matches(word, called, n=1, cutoff=_SAME_NAME)
+    return sorted(called[found[0]], key=len)[:_NEAR] if found else []
 
 
 def _voice(found: Any) -> Voice:

@@ -155,7 +155,12 @@ def _refuse_second_server(named: str | None) -> None:
     except TalkError as error:
         raise AddressInUse(f"a server is there already: {error}") from error
     found.socket.close()
-    raise AddressInUse(f"a server (pid {found.pid}) serves {found.path} already")
+    raise _serves_already(found.pid, found.path)
+
+
+def _serves_already(pid: int | str | None, path: str) -> AddressInUse:
+    how = f" (kill {pid})" if str(pid).isdecimal() else ""
+    return AddressInUse(f"a server (pid {pid}) serves {path} already: use it, or end it first{how}")
 
 
 def _refuse_live_socket(path: str) -> None:
@@ -210,7 +215,7 @@ def _lock(path: str) -> int:
         except OSError:
             holder = _holder(fd)
             os.close(fd)
-            raise AddressInUse(f"a server (pid {holder}) serves {path} already") from None
+            raise _serves_already(holder, path) from None
         if _is_named(fd, name):
             break
         os.close(fd)  # it was removed between the two steps: who locks the next one serves

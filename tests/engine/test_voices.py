@@ -150,6 +150,8 @@ def test_what_the_library_would_refuse_or_pass_over_is_not_found(wanted: str) ->
         ("de-de", ["de"]),
         ("germna", ["German"]),
         ("English", ["English (America)"]),
+        ("englsh", ["en-gb", "en-us"]),
+        ("frnch", ["fr-fr"]),
         ("en-us+whispr", ["en-us+whisper"]),
         ("+whispr", ["+whisper"]),
         ("germna+f3", ["German"]),

@@ -85,13 +85,15 @@ for line in sys.stdin:
 class Shell:
     """Runs examples in a directory of their own; `close()` ends what still runs."""
 
-    def __init__(self, directory: Path, env: Mapping[str, str]) -> None:
+    def __init__(self, directory: Path, env: Mapping[str, str], *, talk: bool = True) -> None:
+        """With `talk` this checkout's is on the PATH."""
         self.directory = directory
         self._bin = directory / "bin"
         self._bin.mkdir()
         self.env = {**env, "PATH": f"{self._bin}:{os.environ['PATH']}", "HOME": str(directory)}
         self._running: list[subprocess.Popen[str]] = []
-        self.program("talk", f'exec {sys.executable} -m talkcli "$@"')
+        if talk:
+            self.program("talk", f'exec {sys.executable} -m talkcli "$@"')
         if shutil.which("jq") is None:
             self._python("jq", _JQ)
 
@@ -118,11 +120,11 @@ class Shell:
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         return [each.split("\037")[:-1] for each in lines]
 
-    def run(self, script: str, *arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
-        """Run a script to its end."""
+    def run(self, script: str, *arguments: str, limit: float = LIMIT, **env: str) -> subprocess.CompletedProcess[str]:
+        """Run a script to its end, which must come within `limit` seconds."""
         began = self.start(script, *arguments, **env)
         # Its number stays its group's until it is reaped, so what it leaves behind can be ended by that.
-        wait_until(lambda: os.waitid(os.P_PID, began.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None, LIMIT)
+        wait_until(lambda: os.waitid(os.P_PID, began.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None, limit)
         os.killpg(began.pid, signal.SIGKILL)
         out, err = began.communicate(timeout=LIMIT)
         assert "Traceback" not in err, err

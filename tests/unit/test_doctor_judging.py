@@ -13,6 +13,7 @@ from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Engine, Python
 from talkcli.messages import Goal
 from talkcli.states import State
+from talkcli.unreachable import ABSENT, FORBIDDEN, STALE
 
 PYTHON = Python("3.11.2", "/usr/bin/python3", "2.99")
 ENGINE = Engine("espeak", "eSpeak NG 1.51 (system)", 141)
@@ -110,16 +111,16 @@ PATH = "/run/user/1000/talk/talk.sock"
 @pytest.mark.parametrize(
     ("found", "words", "step"),
     [
-        (Places((Place(PATH, places.ABSENT),)), "not there", "talk serve"),
-        (Places((Place(PATH, places.STALE, 1000),)), "left over", "talk serve (it takes the place"),
-        (Places((Place(PATH, places.FORBIDDEN, 7),)), "no permission (uid 7)", "have uid 7 let you in"),
+        (Places((Place(PATH, ABSENT),)), "not there", "talk serve"),
+        (Places((Place(PATH, STALE, 1000),)), "left over", "talk serve (it takes the place"),
+        (Places((Place(PATH, FORBIDDEN, 7),)), "no permission (uid 7)", "have uid 7 let you in"),
         (Places((Place(PATH, places.FOREIGN, 7),)), "another user's server (uid 7)", f"talk --socket {PATH} doctor"),
-        (Places((Place(PATH, places.ABSENT),), "TALK_SOCKET"), "named by TALK_SOCKET", "unset TALK_SOCKET, or"),
-        (Places((Place(PATH, places.ABSENT),), "--socket"), "named by --socket", "leave --socket out, or"),
-        (Places((Place("/x", places.ABSENT),), "TALK_SOCKET", elsewhere=PATH), "/x", f"a server is on {PATH}"),
+        (Places((Place(PATH, ABSENT),), "TALK_SOCKET"), "named by TALK_SOCKET", "unset TALK_SOCKET, or"),
+        (Places((Place(PATH, ABSENT),), "--socket"), "named by --socket", "leave --socket out, or"),
+        (Places((Place("/x", ABSENT),), "TALK_SOCKET", elsewhere=PATH), "/x", f"a server is on {PATH}"),
         (Places((Place(PATH, places.MUTE),), None, None, "it does not answer"), "it does not answer", "restart"),
         (Places((Place(PATH, places.MUTE),), None, None, "busy", "busy"), "busy", "--max-clients"),
-        (Places((Place(PATH, places.ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
+        (Places((Place(PATH, ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
     ],
 )
 def test_where_no_server_is_each_place_is_named_with_what_is_there(found: Places, words: str, step: str) -> None:
@@ -131,7 +132,7 @@ def test_where_no_server_is_each_place_is_named_with_what_is_there(found: Places
 
 def test_where_a_server_is_what_lies_before_it_is_a_warning() -> None:
     served = Place(PATH, places.SERVER)
-    found = places.judge(Places((Place("/a", places.ABSENT), served), pid=4711))
+    found = places.judge(Places((Place("/a", ABSENT), served), pid=4711))
     assert (found.state, found.message) == (DONE, f"the server is on {PATH} (process 4711)")
     found = places.judge(Places((Place("/a", places.FOREIGN, 7), served), pid=4711))
     assert found.state == WARNING

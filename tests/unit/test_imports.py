@@ -42,6 +42,7 @@ PURE = [
     "requests",
     "wire",
     "errors",
+    "unreachable",
     "values",
     "engine.changeover",
     "engine.guard",
@@ -283,7 +284,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 #: The doctor's modules that judge facts; they read a clock's format at most, and gather nothing.
 JUDGING = ["findings", "session", "voice", "sound", "level", "places", "sentence", "serving", "report"]
 #: What those may import of the package besides each other.
-FOR_JUDGING = {"", "columns", "messages", "printable", "states", "values"}
+FOR_JUDGING = {"", "columns", "messages", "printable", "states", "unreachable", "values"}
 
 
 def test_the_doctor_judges_without_looking() -> None:

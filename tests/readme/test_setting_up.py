@@ -1,0 +1,182 @@
+"""README's commands that install, run as they stand there: pip and pipx for real, in a copy of this checkout.
+
+Two things have stand-ins, since they would change the machine: apt-get only tells what it would do, and what sudo does
+below `/opt` and `/usr/local` is done below a directory of the test.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.readme.blocks import block, runs
+from tests.readme.shell import Shell
+from tests.support.compare import assert_heard
+from tests.support.reference import Sentence, render
+from tests.support.surroundings import clean_environment, needs, short_directory
+from tests.wire.readme import ROOT, TEXT
+
+if TYPE_CHECKING:
+    import pathlib
+    from collections.abc import Iterator
+
+    from tests.support.sink import Sink
+
+#: Longest time for an example: pip asks a registry, over whatever network there is.
+LIMIT = 120.0
+#: What of this machine's settings pip needs to reach its registry.
+_OF_PIP = re.compile(r"PIP_.*|.*_proxy", re.IGNORECASE)
+#: What a checkout has, and a clone of it has not.
+_MADE = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache", ".hypothesis", "dist", "build")
+_APT = """if [ "$1" = update ]; then exit; fi
+exec APT --simulate "$@"
+"""
+_SUDO = """system=SYSTEM
+for word in "$@"; do
+    case $word in /opt/* | /usr/local/*) word=$system$word ;; esac
+    set -- "$@" "$word"
+    shift
+done
+exec "$@"
+"""
+
+
+@pytest.fixture
+def newcomer(tmp_path: pathlib.Path) -> Iterator[Shell]:
+    """A shell in a fresh checkout, on a machine that knows no `talk`; its HOME is empty but for what it does itself."""
+    home = tmp_path / "home"
+    home.mkdir()
+    shutil.copytree(ROOT, home / "talk", ignore=_MADE, symlinks=True)
+    with short_directory() as directory:
+        env = clean_environment(str(home), _settings_of_pip()) | {"TALK_SOCKET": f"{directory}/s", "SHELL": "/bin/bash"}
+        env.pop("PYTHONPATH", None)  # it would find this checkout, installed or not
+        with contextlib.closing(Shell(home, env, talk=False)) as shell:
+            shell.program("python3", f'exec {sys.executable} "$@"')
+            yield shell
+
+
+def _settings_of_pip() -> dict[str, str]:
+    settings = {name: value for name, value in os.environ.items() if _OF_PIP.fullmatch(name)}
+    for each in ("~/.config/pip/pip.conf", "~/.pip/pip.conf"):  # HOME is another one there
+        if os.path.exists(os.path.expanduser(each)):
+            settings.setdefault("PIP_CONFIG_FILE", os.path.expanduser(each))
+    return settings
+
+
+def _needs_a_registry(shell: Shell, *packages: str) -> None:
+    """Skip where pip reaches no registry; in CI fail."""
+    shell.run("python3 -m venv registry", limit=LIMIT)
+    words = ["registry/bin/pip", "download", "-q", "--no-deps", "-d", "downloaded", *packages]
+    done = shell.run(" ".join(words), limit=LIMIT)
+    if done.returncode == 0:
+        return
+    reason = f"pip reaches no registry: {(done.stderr.strip().splitlines() or ['it says nothing'])[-1]}"
+    if os.environ.get("CI"):
+        pytest.fail(reason, pytrace=False)
+    pytest.skip(reason)
+
+
+def _stand_in_for_the_system(shell: Shell) -> None:
+    needs("apt-get")
+    shell.program("apt-get", _APT.replace("APT", shutil.which("apt-get") or ""))
+    shell.stand_in("sudo", _SUDO.replace("SYSTEM", f"{shell.directory}/system"))
+    (shell.directory / "system/opt").mkdir(parents=True)
+    (shell.directory / "system/usr/local/bin").mkdir(parents=True)
+
+
+@pytest.mark.slow
+@runs("Start")
+def test_first_command_is_heard(newcomer: Shell, sink: Sink) -> None:
+    """From a checkout to the sentence, and `kill %1` ends the server."""
+    _needs_a_registry(newcomer, "click")
+    text = (re.search('talk say "([^"]+)"', block("Start")) or [""])[1]
+    with sink.record() as recording:
+        done = newcomer.run(
+            'exec bash -c "$1"',  # as on a terminal: sh knows no %1 where it reads a script
+            f"cd talk\n{block('Start')}code=$?\ntalk status; kill %1; wait %1; exit $code",
+            limit=LIMIT,
+            **{name: value for name, value in sink.env.items() if name != "HOME"},
+            ALSA_CONFIG_PATH=_alsa_settings(newcomer, sink),
+        )
+        recording.wait_until_quiet(0.1)
+    assert done.returncode == 0, done
+    assert f"ready on {newcomer.env['TALK_SOCKET']}" in done.stderr
+    assert re.search(rf"SUCCEEDED .*{text}", done.stdout), done
+    assert not os.path.exists(newcomer.env["TALK_SOCKET"])
+    assert_heard(recording, render([Sentence(text)]))
+
+
+def _alsa_settings(shell: Shell, sink: Sink) -> str:
+    """Return settings by which aplay finds the sink from another HOME."""
+    path = shell.directory / "asound.conf"
+    path.write_text(f"</usr/share/alsa/alsa.conf>\n<{sink.directory}/.asoundrc>\n", encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.slow
+@runs("Debian, Ubuntu, Raspberry Pi OS: For one user")
+def test_install_for_one_user(newcomer: Shell) -> None:
+    """With the real pipx; a new terminal finds `talk`."""
+    needs("bash")
+    _needs_a_registry(newcomer, "pipx")
+    _stand_in_for_the_system(newcomer)
+    done = newcomer.run("registry/bin/pip install -q pipx && ln -s ../registry/bin/pipx bin/pipx", limit=LIMIT)
+    assert done.returncode == 0, done
+    done = newcomer.run(f"set -e; cd talk\n{block('Debian, Ubuntu, Raspberry Pi OS: For one user')}", limit=LIMIT)
+    assert done.returncode == 0, done
+    assert "Inst pipx " in done.stdout or "pipx is already" in done.stdout, done
+    path = "PATH=/usr/bin:/bin bash -ic 'command -v talk; talk --version' 2> bash.log"
+    where, version = newcomer.run(path).stdout.splitlines()
+    assert where == f"{newcomer.directory}/.local/bin/talk"
+    assert version.startswith("talk ")
+
+
+@pytest.mark.slow
+@runs("Debian, Ubuntu, Raspberry Pi OS: For all users")
+def test_install_for_all_users(newcomer: Shell) -> None:
+    _needs_a_registry(newcomer, "click")
+    _stand_in_for_the_system(newcomer)
+    done = newcomer.run(f"set -e; cd talk\n{block('Debian, Ubuntu, Raspberry Pi OS: For all users')}", limit=LIMIT)
+    assert done.returncode == 0, done
+    talk = newcomer.directory / "system/usr/local/bin/talk"
+    assert newcomer.run(f"{talk} --version").stdout.startswith("talk ")
+    assert newcomer.run(f"{talk} say -o hello.wav -- hello && test -s hello.wav").returncode == 0
+
+
+def _packages(text: str) -> set[str]:
+    """Return the packages that a text installs with apt-get, in a script or within a sentence."""
+    scripts = [*re.findall(r"^```sh\n(.*?)^```$", text, re.MULTILINE | re.DOTALL), *([] if "```" in text else [text])]
+    commands = [each for script in scripts for each in script.replace("\\\n", " ").splitlines()]
+    commands += [each.replace("\n", " ") for each in re.findall(r"(?<!`)`([^`]+)`(?!`)", text)]
+    found = (re.search(r"apt-get install -(?:y|yq) ([a-z0-9.+ -]+)", each) for each in commands)
+    return {name for each in found if each for name in each[1].split()}
+
+
+def test_packages_are_debians() -> None:
+    """Every package that the README names for apt-get, also within a sentence, is one that apt-get finds."""
+    needs("apt-get")
+    packages = _packages(TEXT)
+    assert {"pipx", "libespeak-ng1", "alsa-utils", "pulseaudio"} <= packages
+    done = subprocess.run(
+        ["apt-get", "install", "--simulate", "-y", *sorted(packages)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done
+
+
+@runs("Start #2")
+def test_ci_runs_the_second_command() -> None:
+    """It is what runs this test there: CI takes it from the README, in its own words, and the packages for it too."""
+    ci = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    finds = next(each for each in ci.splitlines() if each.startswith("test_command="))
+    done = subprocess.run(["bash", "-c", f'{finds}; echo "$test_command"'], cwd=ROOT, capture_output=True, check=True)
+    assert done.stdout.decode() == block("Start #2")
+    assert ci.rstrip().endswith('eval "$test_command"')
+    before = TEXT[: TEXT.index(block("Start #2"))].rpartition("passes the tests (")[2]
+    assert "pulseaudio" in _packages(before) <= _packages(ci)
