@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from tests.bench.failure import FailedError
 from tests.bench.groups import GROUPS, measure
 from tests.bench.stage import Options, Stage
 from tests.support.surroundings import needs
+from tests.wire.readme import section, tables
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,6 +23,15 @@ if TYPE_CHECKING:
 
 #: How many rows a group has.
 ROWS = {"onset": 6, "commands": 13, "idle": 3, "throughput": 4, "queue": 4}
+
+
+def _form(*cells: str) -> tuple[str, ...]:
+    """Return cells without their numbers: a short run says less, and waits less."""
+    return tuple(re.sub(r"[0-9][0-9,.]*", "#", each.replace("`", "")) for each in cells)
+
+
+#: What was measured, and its goal, of each row of the README's table.
+README = {_form(row[0], row[7]) for row in tables(section("Speed"))[0][1:]}
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +62,7 @@ def test_a_row_measures_something(stage: Stage, group: str, monkeypatch: pytest.
     for row in rows:
         assert row.values
         assert row.cells()[2].endswith(row.unit)
+        assert _form(row.name, row.goal) in README, "the table in README.md is of an older benchmark"
 
 
 def test_a_group_that_fails_has_a_reason_in_the_place_of_figures(monkeypatch: pytest.MonkeyPatch) -> None:
