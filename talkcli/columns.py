@@ -132,15 +132,25 @@ def fitted(texts: Sequence[str], *others: Sequence[Sequence[str]], weights: Sequ
 
 def wrapped(parts: Sequence[str], first: str, screen: Screen) -> list[str]:
     """Return the parts, joined by commas, as lines that begin under the end of `first` and break between two parts."""
+    return _lines([*(f"{each}," for each in parts[:-1]), parts[-1]], first, screen)
+
+
+def folded(text: str, first: str, screen: Screen) -> list[str]:
+    """Return a text as lines that begin under the end of `first` and break between two words."""
+    return _lines(text.split(" "), first, screen)
+
+
+def _lines(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
+    """Return the pieces, joined by blanks; one that is wider than a line is left to the terminal to break."""
     room = screen.room(width(first))
     lines = []
-    line = parts[0]
-    for part in parts[1:]:
-        if room is not None and width(f"{line}, {part},") > room:
-            lines.append(f"{line},")
-            line = part
+    line = pieces[0]
+    for piece in pieces[1:]:
+        if room is not None and width(line) + 1 + width(piece) > room:
+            lines.append(line)
+            line = piece
         else:
-            line += f", {part}"
+            line += f" {piece}"
     lines.append(line)
     return [f"{' ' * width(first) if number else first}{each}" for number, each in enumerate(lines)]
 

@@ -36,7 +36,7 @@ def ending(goal: Goal) -> str:
 
 
 def goal_lines(goal: Goal, screen: Screen, now: float | None = None) -> list[str]:
-    """Return all that is known of one goal, a line each."""
+    """Return all that is known of one goal, a line each; on a terminal what is longer goes on under its beginning."""
     now = time.time() if now is None else now
     state = screen.painted(goal.state.name, goal.state)
     rows = [
@@ -57,7 +57,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float | None = None) -> list[str
         ("ended at", _moment(goal.ended_at)),
         ("duration", None if goal.duration is None else f"{goal.duration:.2f} s of audio"),
     ]
-    return [f"{name:<{_LABEL}}{value}" for name, value in rows if value]
+    return [line for name, value in rows if value for line in columns.folded(value, f"{name:<{_LABEL}}", screen)]
 
 
 def status_lines(status: ServerStatus, screen: Screen, now: float | None = None) -> list[str]:

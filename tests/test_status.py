@@ -99,3 +99,18 @@ def test_ids_as_long_as_they_may_be_leave_room_for_the_text(scripted: Talk) -> N
         assert width(line) <= 80
         assert '"length=0"' in line
         assert "i" * 64 in scripted.run(command).out
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120])
+def test_one_goal_fits_the_terminal_with_all_of_its_text(scripted: Talk, columns: int) -> None:
+    text = f"length=0 {'ten words of which none may be broken by a line ' * 6}".strip()
+    scripted.run("say", "--id", "long", "--wait", text)
+    with Terminal([*TALK, "status", "long"], {"TERM": "xterm", **scripted.env}, columns) as shown:
+        assert shown.finish() == 0
+        lines = shown.lines
+    assert max(map(width, lines)) <= columns
+    first = next(number for number, each in enumerate(lines) if each.startswith("text "))
+    more = [each for each in lines[first + 1 :] if each.startswith(" ")]
+    assert {each[:9] for each in more} == {" " * 9}
+    assert f'"{text}"' in " ".join(each[9:].rstrip() for each in lines)
+    assert f'text     "{text}"' in scripted.run("status", "long").out.splitlines()

@@ -144,8 +144,8 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     "--print-unit",
     type=click.Choice(list(units.UNITS)),
     metavar="UNIT",
-    help=f"Print a unit for systemd that serves with the options given here, and end: {', '.join(units.UNITS)}. "
-    "It says where it goes.",
+    help=f"Print a systemd unit that serves with these options, and end: {', '.join(units.UNITS)}. It says where it "
+    "goes.",
 )
 @common_options
 @click.pass_context
