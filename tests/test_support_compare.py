@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.support.compare import (
+    alike,
     assert_begun,
     assert_heard,
     assert_resumed,
@@ -154,3 +155,15 @@ def test_a_sentence_that_was_held_is_recognised_by_its_parts(low: Samples) -> No
     ]:
         with pytest.raises(AssertionError):
             assert_resumed(wrong, low, 1.9)
+
+
+def test_a_sentence_that_is_not_repeated_to_the_sample_is_told_from_others(low: Samples) -> None:
+    """Spoken a fifth time by one process, and with a gap where the player ran dry."""
+    again = render([LEFT, LOW, RIGHT, LEFT, LOW])[4]
+    for at in (4_000, 9_000, 20_000):
+        gap = np.zeros(RATE // 40, np.int16)
+        assert alike(recorded(again[:at], gap, again[at:]), low) > 0.35
+        assert alike(recorded(low[:at], gap, low[at:]), low) > 0.9
+        for other in render([LEFT, RIGHT]):
+            assert alike(recorded(other[:at], gap, other[at:]), low) < 0.27
+    assert alike(SILENCE, low) == 0.0

@@ -32,6 +32,8 @@ EXTENT = 0.02
 _PART = RATE // 10
 #: Samples by which a part may sit beside its place.
 _SLACK = 48
+#: Samples by which a quarter of a second may come later, where a player ran dry before it.
+_NEARBY = RATE // 20
 #: Samples that the monitor may lose where a stream starts: up to 211 were seen to be.
 _LOST = 256
 
@@ -144,6 +146,31 @@ def time_heard(recording: Recording, compared: Comparison, reference: Samples, p
     return recording.time_of(compared.offset - found[0] + round(position * RATE))
 
 
+def alike(heard: Recording | Samples, reference: Samples) -> float:
+    """Return how a sound resembles a reference quarter second by quarter second, each where it resembles most nearby.
+
+    For what can't be the same: a library that has spoken already does not repeat itself, and a player that ran dry for
+    a moment plays the rest later. A sentence again: 0.35 to 1.0; another: 0.27 at most (250 of each, with a gap of 10 to
+    40 ms somewhere in it). 0.0 where nothing was heard.
+    """
+    samples = heard.samples if isinstance(heard, Recording) else heard
+    wanted = _sound(reference)
+    if extent(samples) is None:
+        return 0.0
+    floats = samples.astype(np.float64)
+    offset = _align(floats, wanted)
+    dots, energies = 0.0, 0.0
+    length = RATE // 4
+    for start in range(0, len(wanted) - length // 2, length):
+        part = wanted[start : start + length].astype(np.float64)
+        around = _around(floats, offset + start, len(part), _NEARBY)
+        product, energy = _best(around, part)
+        dots += product
+        energies += energy
+    own = wanted[: start + length].astype(np.float64)
+    return dots / float(np.sqrt(float(own @ own) * max(energies, 1.0)))
+
+
 def assert_silent(heard: Recording | Samples) -> None:
     """Assert that nothing was heard."""
     samples = heard.samples if isinstance(heard, Recording) else heard
@@ -173,26 +200,38 @@ def _align(samples: Floats, wanted: Samples, last: int | None = None) -> int:
 
 def _at(samples: Samples, wanted: Samples, offset: int, heard: float) -> Comparison:
     """Compare `wanted` with the samples at an offset, part by part."""
-    padded = np.zeros(len(wanted) + 2 * _SLACK)
-    begin = max(0, offset - _SLACK)
-    piece = samples[begin : offset + len(wanted) + _SLACK]
-    padded[begin - (offset - _SLACK) :][: len(piece)] = piece
+    padded = _around(samples, offset, len(wanted), _SLACK)
     reference = wanted.astype(np.float64)
     dots, energies, worst = 0.0, 0.0, 1.0
     for start in range(0, len(reference), _PART):
         part = reference[start : start + _PART]
         around = padded[start : start + len(part) + 2 * _SLACK]
-        products = np.correlate(around, part, "valid")
-        squares = np.concatenate([[0.0], np.cumsum(around**2)])
-        energy = squares[len(part) :] - squares[: -len(part)]
-        best = int(np.argmax(products / np.sqrt(np.maximum(energy, 1.0))))
+        product, energy = _best(around, part)
         own = float(part @ part)
-        dots += float(products[best])
-        energies += float(energy[best])
+        dots += product
+        energies += energy
         if own > len(part) * LOUD**2:
-            worst = min(worst, float(products[best]) / float(np.sqrt(own * max(float(energy[best]), 1.0))))
+            worst = min(worst, product / float(np.sqrt(own * max(energy, 1.0))))
     whole = float(np.sqrt(float(reference @ reference) * max(energies, 1.0)))
     return Comparison(dots / whole, worst, offset, heard, len(wanted) / RATE)
+
+
+def _around(samples: Samples | Floats, offset: int, length: int, slack: int) -> Floats:
+    """Return the samples from an offset on, with `slack` of them on either side; zeros where there are none."""
+    padded = np.zeros(length + 2 * slack)
+    begin = max(0, offset - slack)
+    piece = samples[begin : offset + length + slack]
+    padded[begin - (offset - slack) :][: len(piece)] = piece
+    return padded
+
+
+def _best(around: Floats, part: Floats) -> tuple[float, float]:
+    """Return the product with a part where that resembles most, and the energy of what it resembles there."""
+    products = np.correlate(around, part, "valid")
+    squares = np.concatenate([[0.0], np.cumsum(around**2)])
+    energy = squares[len(part) :] - squares[: -len(part)]
+    best = int(np.argmax(products / np.sqrt(np.maximum(energy, 1.0))))
+    return float(products[best]), float(energy[best])
 
 
 def _told(samples: Samples, compared: Sequence[Comparison]) -> str:
