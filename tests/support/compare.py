@@ -150,8 +150,8 @@ def alike(heard: Recording | Samples, reference: Samples) -> float:
     """Return how a sound resembles a reference quarter second by quarter second, each where it resembles most nearby.
 
     For what can't be the same: a library that has spoken already does not repeat itself, and a player that ran dry for
-    a moment plays the rest later. A sentence again: 0.35 to 1.0; another: 0.27 at most (250 of each, with a gap of 10 to
-    40 ms somewhere in it). 0.0 where nothing was heard.
+    a moment plays the rest later. A sentence again: 0.35 to 1.0; another: 0.27 at most (250 of each, with a gap of 10
+    to 40 ms somewhere in it). 0.0 where nothing was heard.
     """
     samples = heard.samples if isinstance(heard, Recording) else heard
     wanted = _sound(reference)
