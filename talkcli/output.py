@@ -57,7 +57,13 @@ def goal_lines(goal: Goal, screen: Screen, now: float | None = None) -> list[str
         ("ended at", _moment(goal.ended_at)),
         ("duration", None if goal.duration is None else f"{goal.duration:.2f} s of audio"),
     ]
-    return [line for name, value in rows if value for line in columns.folded(value, f"{name:<{_LABEL}}", screen)]
+    # What is JSON is left to the terminal to break: copied from there it is the same still.
+    return [
+        line
+        for name, value in rows
+        if value
+        for line in columns.folded(value, f"{name:<{_LABEL}}", Screen() if name == "data" else screen)
+    ]
 
 
 def status_lines(status: ServerStatus, screen: Screen, now: float | None = None) -> list[str]:

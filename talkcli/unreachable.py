@@ -1,4 +1,4 @@
-"""What there may be at a place where a client reaches nobody: as all who tell of it call it. Pure."""
+"""What there may be at a place where a client reaches nobody: as clients and the doctor call it. Pure."""
 
 from __future__ import annotations
 

@@ -201,9 +201,14 @@ def test_player_that_is_not_there_is_told_at_the_start(make_talk: MakeTalk) -> N
 
 
 def test_player_beside_a_driver_that_plays_by_itself_is_told(make_talk: MakeTalk) -> None:
-    for player in ("aply", "aplay"):
-        first = make_talk("--player", player, driver="dummy").log.splitlines()[0]
-        assert first == f"talk: --player {player} has no effect: the driver plays by itself"
+    given = make_talk("--player", "aply", "--lead-in", "100", driver="dummy")
+    assert given.run("say", "--wait", "hello").code == 0
+    assert "player its own: --player, --lead-in mean nothing to it\n" in given.log
+    assert "not found" not in given.log
+    plain = make_talk(driver="dummy")
+    assert plain.run("say", "--wait", "hello").code == 0
+    assert "player its own\n" in plain.log
+    assert "mean nothing" not in plain.log
 
 
 def test_file_of_another_format_is_refused_and_not_written(tmp_path: pathlib.Path) -> None:

@@ -24,7 +24,7 @@ from talkcli.requests import Say
 _SERVER_ONLY = ("wait", "feedback", "lines", "preempt", "flush", "priority", "ttl", "key", "throttle", "id", "name")
 
 #: Endings by which a file of another format than WAV would be meant.
-_OTHER_FORMATS = (".aac", ".flac", ".m4a", ".mp3", ".ogg", ".opus")
+_OTHER_FORMATS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
 
 class _SayCommand(Command):

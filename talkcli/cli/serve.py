@@ -171,18 +171,17 @@ def command(context: click.Context, /, print_unit: str | None, **options: object
 
 
 def _warn_of_player(player: str, driver: object) -> None:
-    """Tell of a player that will not play: a word that was mistyped, a program that is not installed yet."""
+    """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
     from talkcli.cli.nearest import nearest
     from talkcli.engine.players import commands, on_path
     from talkcli.engine.sink import AudioFailed
     from talkcli.engine.start import is_own
     from talkcli.printable import printable
 
-    if player and not is_own(None if driver is None else str(driver)):
-        note(f"--player {printable(player)} has no effect: the driver plays by itself")
-        return
     if not player or player == "null" or player.startswith("file:"):
         return
+    if not is_own(None if driver is None else str(driver)):
+        return  # it plays by itself, and the server says so
     try:
         commands(player, None, 0, on_path, None)
     except AudioFailed as error:

@@ -73,7 +73,8 @@ def unknown_voice(wanted: str, voices: tuple[Voice, ...]) -> str:
         for place in reversed(range(4)):  # as `talk voices` writes them: the language's "en-us" before the id's "en-US"
             for each in plain:
                 words.setdefault(_words(each)[place] or each.id, each)
-        near = list(dict.fromkeys([*_in_english(name, plain), *_near(name, words)]))[:_NEAR]
+        # The names of another driver's voices may be anything: macOS has persons'.
+        near = (_in_english(name, plain) if variants else []) or _near(name, words)
     hint = f"did you mean {' or '.join(repr(word) for word in near)}? " if near else ""
     return f'unknown voice "{shown}": {hint}"talk voices" lists them'
 

@@ -15,7 +15,7 @@ import stat
 import sys
 import time
 
-from talkcli import __version__, dial, paths
+from talkcli import __version__, dial, paths, peers
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
 from talkcli.requests import Hello
 
@@ -154,13 +154,16 @@ def _refuse_second_server(named: str | None) -> None:
         return  # nobody there who would answer our clients
     except TalkError as error:
         raise AddressInUse(f"a server is there already: {error}") from error
+    here, _ = peers.credentials(found.socket)  # behind a socket that ssh forwards it is a process of another machine's
     found.socket.close()
-    raise _serves_already(found.pid, found.path)
+    raise _serves_already(found.pid, found.path, here=here == found.pid)
 
 
-def _serves_already(pid: int | str | None, path: str) -> AddressInUse:
-    how = f" (kill {pid})" if str(pid).isdecimal() else ""
-    return AddressInUse(f"a server (pid {pid}) serves {path} already: use it, or end it first{how}")
+def _serves_already(pid: int | None, path: str, *, here: bool) -> AddressInUse:
+    """Return the error; `here`: whether that process is one of this machine."""
+    name = "unknown" if pid is None else pid
+    how = f" (kill {pid})" if here else ""
+    return AddressInUse(f"a server (pid {name}) serves {path} already: use it, or end it first{how}")
 
 
 def _refuse_live_socket(path: str) -> None:
@@ -215,7 +218,7 @@ def _lock(path: str) -> int:
         except OSError:
             holder = _holder(fd)
             os.close(fd)
-            raise _serves_already(holder, path) from None
+            raise _serves_already(holder, path, here=holder is not None) from None
         if _is_named(fd, name):
             break
         os.close(fd)  # it was removed between the two steps: who locks the next one serves
@@ -231,15 +234,15 @@ def _is_named(fd: int, name: str) -> bool:
     return _identity(name) == (status.st_dev, status.st_ino)
 
 
-def _holder(fd: int) -> str:
-    """Return the process id that the holder wrote; it may be about to."""
+def _holder(fd: int) -> int | None:
+    """Return the process id that the holder wrote, which it may be about to; None if it doesn't."""
     end = time.monotonic() + _LOCK_NAMES_HOLDER
     while True:
         words = os.pread(fd, 32, 0).decode(errors="replace")
         if words.endswith("\n") and words.strip().isdecimal():
-            return words.strip()
+            return int(words)
         if time.monotonic() > end:
-            return "unknown"
+            return None
         time.sleep(0.01)
 
 

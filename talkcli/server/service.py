@@ -277,7 +277,9 @@ class Service:
     def _ready(self, ready: protocol.Ready) -> None:
         if self.ready != ready:
             version = f", {log.shown(ready.version)}" if ready.version else ""
-            log.line(f"engine ready: driver {ready.driver}{version}, player {ready.player or 'its own'}")
+            unused = "" if ready.player else ", ".join(self.settings.for_player)
+            hint = f": {unused} mean nothing to it" if unused else ""
+            log.line(f"engine ready: driver {ready.driver}{version}, player {ready.player or 'its own'}{hint}")
         self.ready, self.engine_words = ready, "ready"
         self.changed()
 

@@ -30,3 +30,9 @@ class Settings:
     socket: str | None = None
     socket_mode: int = 0o600
     greeting: str | None = None
+
+    @property
+    def for_player(self) -> list[str]:
+        """The options that were given and are a player's."""
+        given = {"--player": self.player, "--device": self.device, "--lead-in": self.lead_in}
+        return [name for name, value in given.items() if value]

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 ROWS = {"onset": 6, "commands": 13, "idle": 3, "throughput": 4, "queue": 4}
 
 
-def _form(*cells: str) -> tuple[str, ...]:
-    """Return cells without their numbers: a short run says less, and waits less."""
-    return tuple(re.sub(r"[0-9][0-9,.]*", "#", each.replace("`", "")) for each in cells)
+def _form(name: str, goal: str) -> tuple[str, str]:
+    """Return a row's name without its numbers, as a short run has others, and its goal."""
+    return re.sub(r"[0-9][0-9,.]*", "#", name.replace("`", "")), goal
 
 
 #: What was measured, and its goal, of each row of the README's table.

@@ -166,6 +166,12 @@ def test_an_unknown_voice_is_told_what_comes_near(wanted: str, near: list[str]) 
         assert repr(each) in told
 
 
+def test_the_voices_of_another_driver_may_be_called_after_persons() -> None:
+    voices = (Voice("com.apple.Alex", "en_US", "Alex"), Voice("com.apple.Daniel", "en_GB", "Daniel"))
+    assert "did you mean 'Daniel'" in unknown_voice("Danel", voices)
+    assert "en_GB" not in unknown_voice("Danel", voices)
+
+
 def test_a_word_of_any_length_is_answered_shortly() -> None:
     for wanted in ("x" * 60_000, "en-us+" + "y" * 60_000):
         assert find_voice(wanted, listed()) is None

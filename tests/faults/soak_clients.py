@@ -34,7 +34,7 @@ _SENTENCES = (
 #: Seconds by which a sentence may be shorter or longer than in a fresh process, and how much alike it is at least, by
 #: `alike`, which says what the figure is for the right sentence and for another.
 _EXTENT = 0.06
-_ALIKE = 0.3
+ALIKE = 0.3
 
 #: Samples of a hundredth of a second.
 _FRAME = RATE // 100
@@ -146,7 +146,7 @@ class Narrator:
         samples = recording.between(times["ACTIVE"] - _BLOCK, times["SUCCEEDED"] + _BLOCK)
         reference = self._references[text]
         likeness = alike(samples, reference)
-        if abs(_sound(samples) - _sound(reference)) <= _EXTENT and likeness >= _ALIKE:
+        if abs(_sound(samples) - _sound(reference)) <= _EXTENT and likeness >= ALIKE:
             self.heard_whole += 1
         else:
             sound = f"{_sound(samples):.2f} of {_sound(reference):.2f} s of sound, {likeness:.2f} alike"

@@ -165,7 +165,8 @@ def test_server_whose_place_another_one_took_ends_for_its_supervisor(home: str) 
             os.kill(first.process.pid, signal.SIGCONT)
             result = wire.receive_event("result")["goal"]
             assert (result["state"], result["reason"]) == ("PREEMPTED", "shutdown")
-            ends_with_11(first, f"a server (pid {second.process.pid}) serves {path} already")
+            pid = second.process.pid
+            ends_with_11(first, f"a server (pid {pid}) serves {path} already: use it, or end it first (kill {pid})")
             found_again(path, second.process.pid)  # which lost nothing
 
 

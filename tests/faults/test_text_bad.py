@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import subprocess
 import sys
 import unicodedata
@@ -132,6 +133,17 @@ def test_every_assigned_character_once(common: bool) -> None:
     print(tally)
     assert tally.texts == len(texts) > 0
     assert (tally.deaths, tally.faults) == ([], [])
+
+
+@pytest.mark.parametrize("voice", ["sit/yue", "tai/shn"])
+def test_numbers_of_any_length_are_said(voice: str) -> None:
+    """Without the guard these voices die of those with thirteen and fourteen digits."""
+    chance = random.Random(voice)
+    numbers = ["".join(chance.choices("1234567890", k=digits)) for digits in range(1, 21) for _ in range(3)]
+    numbers += ["1111111111111", "1,111,111,111,111"]
+    tally = speak_all([Case(voice, each) for each in numbers], guarded=True)
+    assert (tally.texts, tally.deaths, tally.faults) == (len(numbers), [], [])
+    assert set(tally.outcomes) == {"completed"}
 
 
 def test_the_longest_words_and_writing_from_right_to_left_are_spoken_whole(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """README's commands that install, run as they stand there: pip and pipx for real, in a copy of this checkout.
 
-Two things have stand-ins, since they would change the machine: apt-get only tells what it would do, and what sudo does
-below `/opt` and `/usr/local` is done below a directory of the test.
+Two things have stand-ins, since they would change the machine: apt-get does nothing (that its packages exist is looked
+up), and what sudo does below `/opt` and `/usr/local` is done below a directory of the test.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ if TYPE_CHECKING:
     from tests.support.sink import Sink
 
 #: Longest time for an example: pip asks a registry, over whatever network there is.
-LIMIT = 120.0
-#: What of this machine's settings pip needs to reach its registry.
-_OF_PIP = re.compile(r"PIP_.*|.*_proxy", re.IGNORECASE)
+LIMIT = 90.0
+#: What of this machine's settings pip needs to reach its registry, and nothing by which it would write elsewhere.
+_OF_PIP = re.compile(
+    "PIP_(CERT|CONFIG_FILE|INDEX_URL|EXTRA_INDEX_URL|FIND_LINKS|TRUSTED_HOST|DEFAULT_TIMEOUT)|[a-z]+_proxy"
+    "|SSL_CERT_FILE|REQUESTS_CA_BUNDLE",
+    re.IGNORECASE,
+)
 #: What a checkout has, and a clone of it has not.
 _MADE = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache", ".hypothesis", "dist", "build")
-_APT = """if [ "$1" = update ]; then exit; fi
-exec APT --simulate "$@"
-"""
 _SUDO = """system=SYSTEM
 for word in "$@"; do
     case $word in /opt/* | /usr/local/*) word=$system$word ;; esac
@@ -50,9 +51,10 @@ exec "$@"
 
 @pytest.fixture
 def newcomer(tmp_path: pathlib.Path) -> Iterator[Shell]:
-    """A shell in a fresh checkout, on a machine that knows no `talk`; its HOME is empty but for what it does itself."""
+    """A shell beside a fresh checkout; its HOME is empty but for what it does itself."""
     home = tmp_path / "home"
     home.mkdir()
+    (home / ".hushlogin").touch()  # Ubuntu's bash greets a newcomer
     shutil.copytree(ROOT, home / "talk", ignore=_MADE, symlinks=True)
     with short_directory() as directory:
         env = clean_environment(str(home), _settings_of_pip()) | {"TALK_SOCKET": f"{directory}/s", "SHELL": "/bin/bash"}
@@ -60,6 +62,7 @@ def newcomer(tmp_path: pathlib.Path) -> Iterator[Shell]:
         with contextlib.closing(Shell(home, env, talk=False)) as shell:
             shell.program("python3", f'exec {sys.executable} "$@"')
             yield shell
+    shutil.rmtree(home)  # environments are large, and pytest keeps the directories of three runs
 
 
 def _settings_of_pip() -> dict[str, str]:
@@ -72,9 +75,10 @@ def _settings_of_pip() -> dict[str, str]:
 
 def _needs_a_registry(shell: Shell, *packages: str) -> None:
     """Skip where pip reaches no registry; in CI fail."""
-    shell.run("python3 -m venv registry", limit=LIMIT)
-    words = ["registry/bin/pip", "download", "-q", "--no-deps", "-d", "downloaded", *packages]
-    done = shell.run(" ".join(words), limit=LIMIT)
+    made = shell.run("python3 -m venv registry", limit=LIMIT)
+    assert made.returncode == 0, made
+    words = ["registry/bin/pip", "--timeout", "10", "--retries", "1", "download", "-q", "--no-deps", "-d", "downloaded"]
+    done = shell.run(" ".join([*words, *packages]), limit=LIMIT)
     if done.returncode == 0:
         return
     reason = f"pip reaches no registry: {(done.stderr.strip().splitlines() or ['it says nothing'])[-1]}"
@@ -84,8 +88,7 @@ def _needs_a_registry(shell: Shell, *packages: str) -> None:
 
 
 def _stand_in_for_the_system(shell: Shell) -> None:
-    needs("apt-get")
-    shell.program("apt-get", _APT.replace("APT", shutil.which("apt-get") or ""))
+    shell.stand_in("apt-get")
     shell.stand_in("sudo", _SUDO.replace("SYSTEM", f"{shell.directory}/system"))
     (shell.directory / "system/opt").mkdir(parents=True)
     (shell.directory / "system/usr/local/bin").mkdir(parents=True)
@@ -96,7 +99,9 @@ def _stand_in_for_the_system(shell: Shell) -> None:
 def test_first_command_is_heard(newcomer: Shell, sink: Sink) -> None:
     """From a checkout to the sentence, and `kill %1` ends the server."""
     _needs_a_registry(newcomer, "click")
-    text = (re.search('talk say "([^"]+)"', block("Start")) or [""])[1]
+    said = re.search('talk say "([^"]+)"', block("Start"))
+    assert said, "the README's first command says nothing"
+    text = said[1]
     with sink.record() as recording:
         done = newcomer.run(
             'exec bash -c "$1"',  # as on a terminal: sh knows no %1 where it reads a script
@@ -131,11 +136,11 @@ def test_install_for_one_user(newcomer: Shell) -> None:
     assert done.returncode == 0, done
     done = newcomer.run(f"set -e; cd talk\n{block('Debian, Ubuntu, Raspberry Pi OS: For one user')}", limit=LIMIT)
     assert done.returncode == 0, done
-    assert "Inst pipx " in done.stdout or "pipx is already" in done.stdout, done
-    path = "PATH=/usr/bin:/bin bash -ic 'command -v talk; talk --version' 2> bash.log"
-    where, version = newcomer.run(path).stdout.splitlines()
-    assert where == f"{newcomer.directory}/.local/bin/talk"
-    assert version.startswith("talk ")
+    assert newcomer.calls("apt-get") == [["install", "-y", "pipx", "alsa-utils"]]
+    talk = f"{newcomer.directory}/.local/bin/talk"
+    found = newcomer.run("PATH=/usr/bin:/bin bash -ic 'type -ap talk' 2> bash.log")
+    assert talk in found.stdout.splitlines(), found  # an older `talk` may come before it, as the README says
+    assert newcomer.run(f"{talk} --version").stdout.startswith("talk ")
 
 
 @pytest.mark.slow
@@ -160,14 +165,19 @@ def _packages(text: str) -> set[str]:
 
 
 def test_packages_are_debians() -> None:
-    """Every package that the README names for apt-get, also within a sentence, is one that apt-get finds."""
-    needs("apt-get")
+    """Every package that the README names for apt-get, also within a sentence, is one that apt-get knows."""
+    needs("apt-cache")
     packages = _packages(TEXT)
     assert {"pipx", "libespeak-ng1", "alsa-utils", "pulseaudio"} <= packages
-    done = subprocess.run(
-        ["apt-get", "install", "--simulate", "-y", *sorted(packages)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done
+    missing = sorted(each for each in packages if not _is_a_package(each))
+    if missing == sorted(packages) and not os.environ.get("CI"):
+        pytest.skip("apt-get has no lists of packages: apt-get update")
+    assert missing == []
+
+
+def _is_a_package(name: str) -> bool:
+    done = subprocess.run(["apt-cache", "show", "--no-all-versions", name], capture_output=True, text=True, check=False)
+    return f"Package: {name}\n" in done.stdout
 
 
 @runs("Start #2")

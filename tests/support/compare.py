@@ -150,8 +150,8 @@ def alike(heard: Recording | Samples, reference: Samples) -> float:
     """Return how a sound resembles a reference quarter second by quarter second, each where it resembles most nearby.
 
     For what can't be the same: a library that has spoken already does not repeat itself, and a player that ran dry for
-    a moment plays the rest later. A sentence again: 0.35 to 1.0; another: 0.27 at most (250 of each, with a gap of 10
-    to 40 ms somewhere in it). 0.0 where nothing was heard.
+    a moment plays the rest later. At 450 words a minute a sentence again has 0.35 to 1.0, another one 0.27 at most (250
+    of each, with a gap of 10 to 40 ms somewhere in it); at 200 another one reached 0.31. 0.0 where nothing was heard.
     """
     samples = heard.samples if isinstance(heard, Recording) else heard
     wanted = _sound(reference)
@@ -161,13 +161,13 @@ def alike(heard: Recording | Samples, reference: Samples) -> float:
     offset = _align(floats, wanted)
     dots, energies = 0.0, 0.0
     length = RATE // 4
-    for start in range(0, len(wanted) - length // 2, length):
+    for start in range(0, len(wanted), length):
         part = wanted[start : start + length].astype(np.float64)
         around = _around(floats, offset + start, len(part), _NEARBY)
         product, energy = _best(around, part)
         dots += product
         energies += energy
-    own = wanted[: start + length].astype(np.float64)
+    own = wanted.astype(np.float64)
     return dots / float(np.sqrt(float(own @ own) * max(energies, 1.0)))
 
 

@@ -141,3 +141,19 @@ def test_what_the_language_of_its_script_has_no_word_for_is_given_to_voices_of_i
     for each in blanked.split():
         assert guarded(f"one{each}two {each}", voice) == "one two  ", each
     assert guarded(f"{own} {others} low", voice) == f"{own} {others} low"
+
+
+@pytest.mark.parametrize(
+    ("voice", "text", "expected"),
+    [
+        ("sit/yue", "1234567890123 1,111,111,111,111", "123456⁷890123 1,111,11¹,111,111"),
+        ("tai/shn+f2", "12345678901234.5", "1234567⁸901234.5"),
+        ("sit/yue-Latn-jyutping", "123456789012 123456789012345 room 7", "123456789012 123456789012345 room 7"),
+        ("sit/cmn", "1234567890123", "1234567890123"),
+    ],
+)
+def test_a_number_that_the_library_cannot_say_is_parted_in_these_voices_alone(
+    voice: str, text: str, expected: str
+) -> None:
+    assert guarded(text, voice) == expected
+    assert guarded(expected, voice) == expected
