@@ -135,7 +135,7 @@ def _near(wanted: str, words: dict[str, Voice]) -> list[str]:
 def _in_english(wanted: str, voices: list[Voice]) -> list[str]:
     """Return the languages whose English name was mistyped: libespeak-ng's are "English (Great Britain)" and the like.
 
-    The three shortest; none for a name without a slip, which comes near its voices by itself.
+    The three shortest. None for a name without a slip, or a voice's whole name: these come near by themselves.
     """
     import difflib
 
@@ -144,8 +144,10 @@ def _in_english(wanted: str, voices: list[Voice]) -> list[str]:
         if each.language:
             called.setdefault(each.name.partition(" ")[0].casefold(), []).append(each.language)
     word = wanted.casefold()
-    found = [] if word in called else difflib.get_close_matches(word, called, n=1, cutoff=_SAME_NAME)
-    return sorted(called[found[0]], key=len)[:_NEAR] if found else []
+    found = difflib.get_close_matches(word, called, n=1, cutoff=_SAME_NAME)
+    if not found or found[0] in {word, *(each.name.casefold() for each in voices)}:
+        return []
+    return sorted(called[found[0]], key=len)[:_NEAR]
 
 
 def _voice(found: Any) -> Voice:

@@ -151,6 +151,7 @@ def test_what_the_library_would_refuse_or_pass_over_is_not_found(wanted: str) ->
         ("germna", ["German"]),
         ("English", ["English (America)"]),
         ("englsh", ["en-gb", "en-us"]),
+        ("rusian", ["Russian"]),
         ("frnch", ["fr-fr"]),
         ("en-us+whispr", ["en-us+whisper"]),
         ("+whispr", ["+whisper"]),
