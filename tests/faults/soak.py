@@ -68,13 +68,16 @@ class Report:
         )
 
 
-def soak(seconds: float, seed: int, every: float = 5.0, player: str = "aplay") -> Report:
-    """Run a soak and return what it found; `failures` is empty if all was well."""
+def soak(seconds: float, seed: int, every: float = 5.0, player: str = "aplay", least: int = 0) -> Report:
+    """Run a soak and return what it found; `failures` is empty if all was well.
+
+    It takes longer than `seconds` where there were not `least` faults by then: some take ten seconds each.
+    """
     report = Report(seed, seconds)
     with Sink() as sink, short_directory() as temporary:
         talk = Talk(("--player", player, "--max-queue", "20"), sink=sink, env={"TMPDIR": temporary}, watched=False)
         try:
-            _run(talk, sink, report, every, temporary)
+            _run(talk, sink, report, every, temporary, least)
             talk.stop()
         except AssertionError as error:
             report.failures.append(str(error))
@@ -84,14 +87,14 @@ def soak(seconds: float, seed: int, every: float = 5.0, player: str = "aplay") -
     return report
 
 
-def _run(talk: Talk, sink: Sink, report: Report, every: float, temporary: str) -> None:
+def _run(talk: Talk, sink: Sink, report: Report, every: float, temporary: str, least: int) -> None:
     witness = Witness(talk.socket)
     try:
         _warm_up(talk, witness, report)
         report.before = census.count(talk.pid)
         files = _count_files(talk.directory, temporary)
         known = witness.ended
-        _disturb(talk, sink, report, every)
+        _disturb(talk, sink, report, every, least)
         report.goals, report.ends = witness.ended - known, witness.ends
         _settle(talk, witness, report)
         report.after = census.assert_as_before(talk.pid, report.before, memory=GROWN)
@@ -117,13 +120,13 @@ def _warm_up(talk: Talk, witness: Witness, report: Report) -> None:
     _settle(talk, witness, report)
 
 
-def _disturb(talk: Talk, sink: Sink, report: Report, every: float) -> None:
+def _disturb(talk: Talk, sink: Sink, report: Report, every: float, least: int) -> None:
     chance = random.Random(f"{report.seed} faults")
     faults = Faults(talk, sink, chance, every)
     narrator = Narrator(talk, sink, faults.calm_since, lambda: faults.last)
     senders = Senders(talk, CLIENTS, lambda number: random.Random(f"{report.seed} {number}"))
     try:
-        faults.run(report.seconds, lambda: bool(narrator.failures or senders.failures) or not talk.running)
+        faults.run(report.seconds, least, lambda: bool(narrator.failures or senders.failures) or not talk.running)
     finally:
         for each in (narrator, senders):
             each.stop()

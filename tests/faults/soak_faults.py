@@ -60,18 +60,20 @@ class Faults:
             self.everything_cancelled,
         ]
 
-    def run(self, seconds: float, enough: Callable[[], bool]) -> None:
-        """Inject faults for so long, or until it is enough."""
+    def run(self, seconds: float, least: int, enough: Callable[[], bool]) -> None:
+        """Inject faults for so long, and until there were so many; or until it is enough."""
         end = time.monotonic() + seconds
+
+        def over() -> bool:
+            return enough() or (time.monotonic() >= end and self.done.total() >= least)
+
         kinds: list[Callable[[], None]] = []
         while True:
             due = time.monotonic() + self._every * self._chance.uniform(0.5, 1.5)
-            while time.monotonic() < min(due, end):
+            while time.monotonic() < due:
                 time.sleep(0.1)
-                if enough():
+                if over():
                     return
-            if time.monotonic() >= end:
-                return
             if not kinds:
                 kinds = list(self._kinds)
                 self._chance.shuffle(kinds)
