@@ -10,6 +10,7 @@ from tests.support.compare import compare
 
 if TYPE_CHECKING:
     import subprocess
+    from collections.abc import Callable
 
     import numpy as np
     import numpy.typing as npt
@@ -86,16 +87,19 @@ def assert_aborted(goal: Message, reason: str, *words: str) -> None:
 
 
 def engine_process(talk: Talk) -> int:
-    """Return the process id of the server's engine."""
-    (engine,) = _children(talk.pid)
-    return engine
+    """Return the process id of the server's engine, which may be about to be started, or to be reaped."""
+    return _only_child(lambda: talk.pid, "engine")
 
 
 def player_process(talk: Talk) -> int:
     """Return the process id of the player of the goal that is being spoken."""
+    return _only_child(lambda: engine_process(talk), "player")
+
+
+def _only_child(parent: Callable[[], int], what: str) -> int:
     end = time.monotonic() + _PATIENCE
-    while len(found := _children(engine_process(talk))) != 1:
-        assert time.monotonic() < end, f"not one player: {found}"
+    while len(found := _children(parent())) != 1:
+        assert time.monotonic() < end, f"not one {what}: {found}"
         time.sleep(0.005)  # a child of a child is no event here
     return found[0]
 
