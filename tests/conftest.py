@@ -7,21 +7,20 @@ import signal
 from typing import TYPE_CHECKING, Protocol
 
 import pytest
-from _pytest.runner import runtestprotocol
 
-from tests.support.company import company
 from tests.support.processes import Talk
 from tests.support.sink import Sink
+from tests.support.timing import take_unmeasured
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 
 
-#: Fixtures of tests that listen.
-_LISTENING = frozenset({"sink", "private_sink"})
-#: Set for a test that is tried again; and the same in its reports.
-_AGAIN = pytest.StashKey[bool]()
-_TRIED_AGAIN = "tried again"
+#: What could not be measured, in a test's reports; and the lists of the last runs, in pytest's cache.
+_UNMEASURED = "not measured"
+_LISTED = "talk/unmeasured"
+#: Runs in a row in which no test may be listed twice (conformance).
+_RUNS = 3
 
 
 class MakeTalk(Protocol):
@@ -31,10 +30,12 @@ class MakeTalk(Protocol):
         self,
         *options: str,
         scripted: bool = False,
+        program: str | None = None,
         sink: Sink | None = None,
         driver: str | None = None,
         env: Mapping[str, str] | None = None,
         watched: bool = True,
+        forked: bool = True,
     ) -> Talk:
         """Return the server, greeted and watched."""
         ...
@@ -46,59 +47,42 @@ def _interruptible() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.fixture(autouse=True)
-def _place(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Run beside other tests; alone what is marked so, and what is tried again."""
-    if request.node.get_closest_marker("alone") or request.node.stash.get(_AGAIN, False):
-        company.stay_alone()
-    else:
-        company.join()
-    yield
-    company.leave()
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Say in a test's report what of it was late together with its control."""
+    report = yield
+    if report.when == "call":
+        found = take_unmeasured()
+        if found and report.passed:
+            report.user_properties.append((_UNMEASURED, "; ".join(found)))
+    return report
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run what is alone first, beside short tests, and what takes long last: whoever wants to be alone waits for it."""
-    items.sort(key=lambda item: (item.get_closest_marker("alone") is None, item.get_closest_marker("slow") is not None))
+def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] | None:
+    """Count what was not measured as neither passed nor failed."""
+    if report.when == "call" and report.passed and _UNMEASURED in dict(report.user_properties):
+        return _UNMEASURED, "m", _UNMEASURED.upper()
+    return None
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Try a test that listens again, alone, where it failed beside others: what they did, it may have heard."""
-    listens = not _LISTENING.isdisjoint(getattr(item, "fixturenames", ()))
-    if company.alone or not listens or item.get_closest_marker("alone"):
-        return None
-    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    reports = runtestprotocol(item, nextitem=nextitem, log=False)
-    failed = next((each for each in reports if each.failed), None)
-    if failed:
-        item.stash[_AGAIN] = True
-        reports = runtestprotocol(item, nextitem=nextitem, log=False)
-        for each in reports:
-            each.sections.append(("it failed beside other tests before", failed.longreprtext))
-            each.user_properties.append((_TRIED_AGAIN, failed.longreprtext.splitlines()[-1]))
-    for each in reports:
-        item.ihook.pytest_runtest_logreport(report=each)
-    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-    return True
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Name what passed only when it was alone."""
-    again = [
-        (report.nodeid, dict(report.user_properties)[_TRIED_AGAIN])
-        for report in terminalreporter.getreports("passed")
-        if report.when == "call" and _TRIED_AGAIN in dict(report.user_properties)
-    ]
-    if again:
-        terminalreporter.write_sep("-", "failed beside other tests, passed alone")
-        for name, why in again:
-            terminalreporter.write_line(f"{name}: {why}")
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Name what was not measured, and in how many of the last runs."""
+    reports = terminalreporter.getreports(_UNMEASURED)
+    assert config.cache
+    before: list[list[str]] = config.cache.get(_LISTED, [])
+    listed = [*before, [report.nodeid for report in reports]][-_RUNS:]
+    config.cache.set(_LISTED, listed)
+    if reports:
+        terminalreporter.write_sep("-", "not measured: late, and so was the control")
+    for report in reports:
+        times = sum(report.nodeid in each for each in listed)
+        again = f" ({times} times in the last {len(listed)} runs: that is a failure)" if times > 1 else ""
+        terminalreporter.write_line(f"{report.nodeid}{again}: {dict(report.user_properties)[_UNMEASURED]}")
 
 
 @pytest.fixture(scope="session")
 def sink() -> Iterator[Sink]:
-    """A sound server for tests that leave it as it is."""
+    """A sound server for all tests that leave it as it is."""
     with Sink() as result:
         yield result
 
@@ -118,12 +102,23 @@ def make_talk() -> Iterator[MakeTalk]:
     def make(
         *options: str,
         scripted: bool = False,
+        program: str | None = None,
         sink: Sink | None = None,
         driver: str | None = None,
         env: Mapping[str, str] | None = None,
         watched: bool = True,
+        forked: bool = True,
     ) -> Talk:
-        talk = Talk(options, scripted=scripted, sink=sink, driver=driver, env=env, watched=watched)
+        talk = Talk(
+            options,
+            scripted=scripted,
+            program=program,
+            sink=sink,
+            driver=driver,
+            env=env,
+            watched=watched,
+            forked=forked,
+        )
         servers.append(talk)
         return talk
 

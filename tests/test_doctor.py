@@ -57,7 +57,7 @@ def logged(talk: Talk) -> list[Message]:
 
 
 def test_all_is_well_and_its_sentence_is_heard_as_a_goal_of_its_own(make_talk: MakeTalk, sound: Sink) -> None:
-    talk = make_talk(sink=sound)
+    talk = make_talk(sink=sound, forked=False)
     done, found = doctor(talk)
     assert done.code == 0, done.out
     assert done.err == ""
@@ -72,7 +72,7 @@ def test_all_is_well_and_its_sentence_is_heard_as_a_goal_of_its_own(make_talk: M
 
 
 def test_silent_leaves_out_the_sound_and_nothing_else(make_talk: MakeTalk, sound: Sink) -> None:
-    talk = make_talk(sink=sound)
+    talk = make_talk(sink=sound, forked=False)
     done, found = doctor(talk, "--silent")
     assert done.code == 0, done.out
     assert list(found) == CHECKS
@@ -82,7 +82,7 @@ def test_silent_leaves_out_the_sound_and_nothing_else(make_talk: MakeTalk, sound
 
 
 def test_for_people_it_is_a_line_a_finding_and_the_end_is_a_note(make_talk: MakeTalk, sound: Sink) -> None:
-    talk = make_talk("--volume", "0.1", sink=sound)
+    talk = make_talk("--volume", "0.1", sink=sound, forked=False)
     done = talk.run("doctor", "--silent", timeout=LIMIT)
     assert done.code == 0
     assert [line[9:23].strip() for line in done.out.splitlines()] == CHECKS
@@ -95,7 +95,7 @@ def test_for_people_it_is_a_line_a_finding_and_the_end_is_a_note(make_talk: Make
 
 
 def test_paused_speech_is_named_and_no_goal_is_left_behind(make_talk: MakeTalk, sound: Sink) -> None:
-    talk = make_talk(sink=sound)
+    talk = make_talk(sink=sound, forked=False)
     assert talk.run("pause").code == 0
     done, found = doctor(talk)
     assert done.code == 4
@@ -192,7 +192,7 @@ def test_a_sink_that_is_suspended_is_named_with_the_command_that_wakes_it(
     make_talk: MakeTalk, private_sink: Callable[[], Sink]
 ) -> None:
     sink = private_sink()
-    talk = make_talk(sink=sink)
+    talk = make_talk(sink=sink, forked=False)
     sink.suspend()
     done, found = doctor(talk)
     assert done.code == 4
@@ -205,7 +205,7 @@ def test_a_sink_that_is_muted_is_not_heard_though_all_was_played(
     make_talk: MakeTalk, private_sink: Callable[[], Sink]
 ) -> None:
     sink = private_sink()
-    talk = make_talk(sink=sink)
+    talk = make_talk(sink=sink, forked=False)
     sink._pactl("set-sink-mute", "null", "1")
     done, found = doctor(talk, "--silent")
     assert (done.code, found["sentence"]["state"]) == (4, "done")
@@ -217,7 +217,7 @@ def test_a_sound_server_that_hangs_is_named_and_it_ends_all_the_same(
     make_talk: MakeTalk, private_sink: Callable[[], Sink]
 ) -> None:
     sink = private_sink()
-    talk = make_talk(sink=sink)
+    talk = make_talk(sink=sink, forked=False)
     sink.freeze()
     done, found = doctor(talk)
     sink.thaw()
@@ -251,7 +251,7 @@ def test_a_full_server_is_named(make_talk: MakeTalk) -> None:
 def test_sound_behind_a_forwarded_socket_is_not_looked_for_here(make_talk: MakeTalk, sound: Sink) -> None:
     """As by ssh -L: what answers is the forwarder, and the server's player is elsewhere."""
     needs("socat")
-    talk = make_talk(sink=sound)
+    talk = make_talk(sink=sound, forked=False)
     forwarded = f"{talk.socket}.here"
     forwarder = subprocess.Popen(["socat", f"UNIX-LISTEN:{forwarded},fork", f"UNIX-CONNECT:{talk.socket}"])
     try:

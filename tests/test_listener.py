@@ -226,7 +226,7 @@ def test_server_that_another_user_put_where_ours_would_be_is_not_trusted(home: s
 
 def test_second_sigterm_ends_at_once_and_sighup_not_at_all(home: str) -> None:
     path = f"{home}/s"
-    with serving(environment(home, TALK_SOCKET=path), command=[SERVE[0], processes._SCRIPTED]) as server:
+    with serving(environment(home, TALK_SOCKET=path), command=[SERVE[0], processes.SCRIPTED]) as server:
         server.process.send_signal(signal.SIGHUP)
         with Wire(path) as wire:
             wire.request("watch")

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    import subprocess
     from collections.abc import Iterator
 
-    from tests.support.processes import Talk
+    from tests.support.processes import Process, Talk
 
 
-def lines_of(client: subprocess.Popen[str]) -> Iterator[str]:
+def lines_of(client: Process) -> Iterator[str]:
     """Return what a client prints, line by line as it comes."""
     assert client.stdout
     return (each.rstrip("\n") for each in client.stdout)

@@ -59,6 +59,22 @@ def test_what_the_monitor_drops_is_forgiven(low: Samples) -> None:
     assert_heard(recorded(np.delete(low, slice(9000, 9041))), [low])
 
 
+@pytest.mark.parametrize("at", [9000, 12000, 27000])
+@pytest.mark.parametrize("lost", [0, 41])
+def test_a_player_that_ran_dry_in_a_sentence_is_forgiven(low: Samples, at: int, lost: int) -> None:
+    """What was put between two samples is silence, and no sample of the sentence is missing."""
+    dry = np.concatenate([low[:at], np.zeros(1500, np.int16), low[at + lost : at + 6000], np.zeros(700, np.int16)])
+    heard = recorded(dry, low[at + 6000 :])
+    (result,) = assert_heard(heard, [low])
+    assert result.correlation > 0.99
+    assert compare(heard, low).same
+    assert_heard(recorded(dry, low[at + 6000 :], SILENCE, low), [low, low])
+    with pytest.raises(AssertionError):
+        assert_heard(recorded(dry, low[at + 9000 :]), [low])
+    with pytest.raises(AssertionError):
+        assert_heard(recorded(dry, low[at + 5000 :]), [low])
+
+
 def test_half_the_volume_is_the_same_sentence(low: Samples) -> None:
     assert_heard(recorded((low // 2).astype(np.int16)), [low])
 
@@ -80,7 +96,7 @@ def test_a_gap_in_the_middle_is_noticed(low: Samples) -> None:
 
 def test_a_stutter_is_noticed(low: Samples) -> None:
     with pytest.raises(AssertionError, match="not heard as it should"):
-        assert_heard(recorded(low[:20000], low[19000:]), [low])
+        assert_heard(recorded(low[:12000], low[11000:]), [low])
 
 
 @pytest.mark.parametrize(("right", "wrong"), [(LOW, LOW_IT), (LEFT, RIGHT)])
@@ -137,6 +153,22 @@ def test_a_stopped_sentence_is_recognised_by_its_beginning(low: Samples) -> None
         assert_begun(recorded(low[:20000], low[-20000:]), low)
     with pytest.raises(AssertionError, match="nothing was heard"):
         assert_begun(SILENCE, low)
+
+
+@pytest.mark.parametrize("dry", [5000, 12000])
+def test_a_player_that_ran_dry_changes_nothing_about_a_sentence_that_was_stopped_or_held(
+    low: Samples, dry: int
+) -> None:
+    gap = np.zeros(900, np.int16)
+    begun = np.concatenate([low[:dry], gap, low[dry:20000]])
+    assert assert_begun(recorded(begun), low) == pytest.approx(20000 / RATE, abs=0.1)
+    with pytest.raises(AssertionError):
+        assert_begun(recorded(low[:dry], gap, render([LEFT])[0][dry:20000]), low)
+    pause = np.zeros(2 * RATE, np.int16)
+    assert_resumed(recorded(begun[:16000], pause, low[15100:]), low, 1.9)
+    for wrong in (low[16000:], low[14000:]):
+        with pytest.raises(AssertionError):
+            assert_resumed(recorded(begun[:16000], pause, wrong), low, 1.9)
 
 
 def test_a_sentence_that_was_held_is_recognised_by_its_parts(low: Samples) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -56,15 +54,14 @@ WELL = "PENDING,ACTIVE,SUCCEEDED"
 
 
 @pytest.fixture
-def program(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def program(tmp_path: pathlib.Path) -> str:
     path = tmp_path / "program.py"
     path.write_text(PROGRAM)
-    monkeypatch.setattr(processes, "_SCRIPTED", str(path))
+    return str(path)
 
 
-@pytest.mark.usefixtures("program")
-def test_a_good_server_is_started_watched_and_ended(make_talk: MakeTalk) -> None:
-    talk = make_talk("0", WELL, scripted=True)
+def test_a_good_server_is_started_watched_and_ended(make_talk: MakeTalk, program: str) -> None:
+    talk = make_talk("0", WELL, program=program)
     assert talk.running
     assert talk.log == "serving []\n"
     assert talk.watcher.wait_for("a", "SUCCEEDED")["n"] == 2
@@ -79,15 +76,13 @@ def test_a_good_server_is_started_watched_and_ended(make_talk: MakeTalk) -> None
     talk.watcher.wait_for("a", "SUCCEEDED")
 
 
-@pytest.mark.usefixtures("program")
-def test_a_server_that_was_killed_owes_no_end(make_talk: MakeTalk) -> None:
-    talk = make_talk("0", "ACTIVE", scripted=True)
+def test_a_server_that_was_killed_owes_no_end(make_talk: MakeTalk, program: str) -> None:
+    talk = make_talk("0", "ACTIVE", program=program)
     talk.watcher.wait_for("a", "ACTIVE")
     talk.kill()
     assert not talk.running
 
 
-@pytest.mark.usefixtures("program")
 @pytest.mark.parametrize(
     ("arguments", "fault"),
     [
@@ -99,8 +94,8 @@ def test_a_server_that_was_killed_owes_no_end(make_talk: MakeTalk) -> None:
         (("0", WELL, "traceback"), "Traceback"),
     ],
 )
-def test_a_bad_end_is_noticed(arguments: tuple[str, ...], fault: str) -> None:
-    talk = processes.Talk(arguments, scripted=True)
+def test_a_bad_end_is_noticed(arguments: tuple[str, ...], fault: str, program: str) -> None:
+    talk = processes.Talk(arguments, program=program)
     directory = talk.directory
     try:
         talk.watcher.wait_for("a", arguments[1].rpartition(",")[2])
@@ -111,15 +106,13 @@ def test_a_bad_end_is_noticed(arguments: tuple[str, ...], fault: str) -> None:
     assert not os.path.exists(directory)
 
 
-@pytest.mark.usefixtures("program")
-def test_a_server_that_does_not_start_is_told_with_its_log() -> None:
+def test_a_server_that_does_not_start_is_told_with_its_log(program: str) -> None:
     with pytest.raises(AssertionError, match="no voice"):
-        processes.Talk(("0", WELL, "fails"), scripted=True)
+        processes.Talk(("0", WELL, "fails"), program=program)
 
 
-@pytest.mark.usefixtures("program")
-def test_closing_ends_everything_without_a_word() -> None:
-    talk = processes.Talk(("0", WELL, "leaves"), scripted=True, env={"EXTRA": "1"})
+def test_closing_ends_everything_without_a_word(program: str) -> None:
+    talk = processes.Talk(("0", WELL, "leaves"), program=program, env={"EXTRA": "1"})
     mark = talk.env[MARK].removesuffix("-client")
     client = talk.start("status")
     assert talk.env["EXTRA"] == "1"
@@ -127,23 +120,3 @@ def test_closing_ends_everything_without_a_word() -> None:
     talk.close()
     assert marked(mark) == []
     assert client.returncode is not None
-
-
-@pytest.mark.usefixtures("program")
-def test_clients_are_timed_and_end(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
-    talk = make_talk("0", WELL, scripted=True)
-    script = "import sys; print(sys.stdin.read()); print('late', file=sys.stderr); sys.exit(4)"
-    started = subprocess.Popen
-
-    def popen(command: list[str], **options: object) -> subprocess.Popen[str]:
-        assert command[:3] == [sys.executable, "-m", "talkcli"]
-        return started([sys.executable, "-c", *command[3:]], **options)  # type: ignore[call-overload, no-any-return]
-
-    monkeypatch.setattr(subprocess, "Popen", popen)
-    done = talk.run(script, stdin="battery low")
-    assert (done.code, done.id, done.err) == (4, "battery low", "late\n")
-    assert 0 < done.seconds < 5
-    with pytest.raises(AssertionError, match="did not end within"):
-        talk.run("import time; time.sleep(60)", timeout=0.2)
-    with pytest.raises(AssertionError, match="ValueError"):
-        talk.run("raise ValueError")

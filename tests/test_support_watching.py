@@ -1,4 +1,4 @@
-"""Raw connection, watcher, retry of late attempts and search for leftovers, shown without a server of talk's."""
+"""Raw connection, watcher, search for leftovers, shown without a server of talk's."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from tests.support.surroundings import (
     needs,
     short_directory,
 )
-from tests.support.timing import LateError, assert_within, process_start, retry_if_late
 from tests.support.watcher import Watcher
 
 if TYPE_CHECKING:
@@ -167,50 +166,6 @@ def test_a_goal_may_be_declared_unfinished_but_never_end_twice(serve: Callable[.
 
 def test_rejected_goals_use_no_id_up(serve: Callable[..., Server]) -> None:
     watched(serve, ("a", "REJECTED"), ("a", "PENDING"), ("a", "REJECTED"), ("a", "RECALLED"), ("a", "REJECTED")).check()
-
-
-def test_what_is_in_time_is_tried_once() -> None:
-    (attempt,) = retry_if_late(lambda: assert_within(0.1, 0.2, "it"), lambda: 9.0)
-    assert attempt.late is None
-
-
-@pytest.mark.alone
-def test_what_is_late_beside_a_late_control_is_tried_again() -> None:
-    times = iter([0.3, 0.1])
-    first, second = retry_if_late(lambda: assert_within(next(times), 0.2, "it"), lambda: 9.0)
-    assert first.late == "it took 0.300 s, the limit is 0.2 s"
-    assert second.late is None
-
-
-@pytest.mark.alone
-def test_what_is_late_beside_a_control_in_time_fails_at_once() -> None:
-    times = iter([0.3, 0.1])
-    with pytest.raises(AssertionError, match="the control was in time"):
-        retry_if_late(lambda: assert_within(next(times), 0.2, "it"), lambda: 0.01)
-    assert next(times) == 0.1
-
-
-@pytest.mark.alone
-def test_a_third_late_attempt_fails() -> None:
-    times = iter([0.3, 0.3, 0.3, 0.1])
-    with pytest.raises(AssertionError, match="the control was late too"):
-        retry_if_late(lambda: assert_within(next(times), 0.2, "it"), lambda: 9.0)
-    assert next(times) == 0.1
-
-
-def test_another_failure_is_never_tried_again() -> None:
-    times = iter([1, 2])
-
-    def wrong() -> None:
-        raise AssertionError(f"wrong {next(times)}")
-
-    with pytest.raises(AssertionError, match="wrong 1") as error:
-        retry_if_late(wrong, lambda: 9.0)
-    assert not isinstance(error.value, LateError)
-
-
-def test_a_bare_process_start_takes_time() -> None:
-    assert 0.001 < process_start() < 5
 
 
 def test_what_is_left_running_is_found_and_killed() -> None:

@@ -11,6 +11,8 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tests.support.forking import Forked, forks
+from tests.support.processes import SCRIPTED
 from tests.support.surroundings import clean_environment, dying_with_parent
 
 if TYPE_CHECKING:
@@ -35,17 +37,23 @@ class BareServe:
     """A server in an environment that is given whole."""
 
     def __init__(self, command: Sequence[str], env: Mapping[str, str], pass_fds: Sequence[int] = ()) -> None:
-        self.process = subprocess.Popen(
-            dying_with_parent(list(command)),
-            env=dict(env),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            pass_fds=tuple(pass_fds),
-            start_new_session=True,
-        )
+        self.process: subprocess.Popen[str] | Forked
+        words = None if pass_fds else _forked(command, env)
+        if words is not None:
+            scripted = command[1] == SCRIPTED
+            self.process = Forked(words, env, scripted=scripted, stderr=subprocess.PIPE, start_new_session=True)
+        else:
+            self.process = subprocess.Popen(
+                dying_with_parent(list(command)),
+                env=dict(env),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                errors="replace",
+                pass_fds=tuple(pass_fds),
+                start_new_session=True,
+            )
         self._lines: list[str] = []
         self._settled = threading.Event()
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -104,6 +112,11 @@ def serving(
 
 def run(command: Sequence[str], env: Mapping[str, str], **options: object) -> Ended:
     """Run a program to its end."""
+    words = None if options else _forked(command, env)
+    if words is not None:
+        process = Forked(words, env, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        out, err = process.communicate(timeout=LIMIT)
+        return Ended(process.wait(), out, err)
     done = subprocess.run(  # type: ignore[call-overload]
         list(command),
         env=dict(env),
@@ -114,6 +127,15 @@ def run(command: Sequence[str], env: Mapping[str, str], **options: object) -> En
         **options,
     )
     return Ended(done.returncode, os.fsdecode(done.stdout), os.fsdecode(done.stderr))
+
+
+def _forked(command: Sequence[str], env: Mapping[str, str]) -> list[str] | None:
+    """Return the words of `talk` in a command that can be forked; None if it can't."""
+    if not forks(env):
+        return None
+    if list(command[:2]) == [sys.executable, SCRIPTED]:
+        return ["serve", *command[2:]]
+    return list(command[3:]) if list(command[:3]) == TALK else None
 
 
 def environment(home: str, **extra: str) -> dict[str, str]:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from tests.support.compare import compare
 
 if TYPE_CHECKING:
-    import subprocess
     from collections.abc import Callable
 
     import numpy as np
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 
     from tests.support.compare import Comparison
     from tests.support.connection import Message
-    from tests.support.processes import Talk
+    from tests.support.processes import Process, Talk
 
     Samples = npt.NDArray[np.int16]
 
@@ -56,7 +55,7 @@ def begin(talk: Talk, text: str, **fields: Any) -> str:
     return goal_id
 
 
-def begin_with_client(talk: Talk, text: str, *options: str) -> tuple[str, subprocess.Popen[str]]:
+def begin_with_client(talk: Talk, text: str, *options: str) -> tuple[str, Process]:
     """Send a goal by a client that waits for it, and wait until it is in mid-sentence; return its id and the client."""
     known = {None, *talk.watcher.goals()}
     client = talk.start("say", "--wait", *options, "--", text)

@@ -11,6 +11,7 @@ turn, and writes for each turn the other texts: for each a line with its number 
 from __future__ import annotations
 
 import ctypes
+import functools
 import json
 import os
 import subprocess
@@ -55,7 +56,7 @@ def assert_heard_after_stop(
     """
     samples = heard if isinstance(heard, np.ndarray) else heard.samples
     best, references = max(
-        ((compare(samples, each[0]), each) for each in _render_after_stop([stopped, *following])),
+        ((compare(samples, each[0]), each) for each in _render_after_stop((stopped, *following))),
         key=lambda each: each[0].correlation,
     )
     start = max(0, best.offset - DROPPED)
@@ -66,7 +67,8 @@ def assert_heard_after_stop(
     return assert_heard(samples[start:], references)
 
 
-def _render_after_stop(texts: Sequence[str]) -> list[list[Samples]]:
+@functools.cache
+def _render_after_stop(texts: tuple[str, ...]) -> list[list[Samples]]:
     """Return what follows the first text, for each place where that can be stopped."""
     done = subprocess.run(
         [sys.executable, "-m", __name__],

@@ -15,18 +15,18 @@ from tests.conformance.bareserve import environment
 from tests.conformance.rawsocket import GREETING, FakeServer, Raw
 from tests.conformance.witness import states
 from tests.support.surroundings import short_directory
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tests.support.processes import Talk
+    from tests.support.processes import Process, Talk
 
 #: Seconds that a client's start and end may take besides what is measured.
 START = 0.5
 
 
-def speaking(talk: Talk, *words: str) -> tuple[subprocess.Popen[str], str]:
+def speaking(talk: Talk, *words: str) -> tuple[Process, str]:
     """Start a client whose goal never ends, and return it with the goal's id once it is heard."""
     client = talk.start("say", *words, "--", "never-ends words=1")
     goal_id = str(talk.watcher.wait_for(None, "ACTIVE")["id"])
@@ -58,7 +58,7 @@ def _until_watched(talk: Talk, clients: int) -> None:
 
 
 def test_row_08_timeout_holds_while_the_server_is_frozen(scripted: Talk) -> None:
-    def attempt() -> None:
+    with limits():
         began = time.monotonic()
         client = scripted.start("say", "--wait", "--timeout", "2", "--", "never-ends words=1")
         goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
@@ -75,11 +75,9 @@ def test_row_08_timeout_holds_while_the_server_is_frozen(scripted: Talk) -> None
         assert scripted.goal(goal_id)["state"] == "PREEMPTED"
         assert_within(seconds, 2 + 1 + START, "a timeout of 2 s, and 1 s for silence")
 
-    attempt()
-
 
 def test_row_10_timeout_cancels_the_goal(scripted: Talk) -> None:
-    def attempt() -> None:
+    with limits():
         began = time.time()
         done = scripted.run("--json", "say", "--wait", "--timeout", "2", "length=10 words=1")
         goal = json.loads(done.out)
@@ -87,8 +85,6 @@ def test_row_10_timeout_cancels_the_goal(scripted: Talk) -> None:
         assert goal["ended_at"] - began >= 2
         assert_within(goal["ended_at"] - began, 2 + 0.3, "a timeout of 2 s")
         assert_within(done.seconds, 2 + START, "a client with a timeout of 2 s")
-
-    retry_if_late(attempt)
 
 
 def test_row_10_timeout_counts_the_time_in_the_queue(scripted: Talk) -> None:
@@ -236,18 +232,14 @@ def test_row_34_sigterm_to_a_background_job_of_a_script(scripted: Talk) -> None:
 
 @pytest.mark.parametrize("words", [["status"], ["cancel"], ["say", "hello"], ["say", "-w", "hello"], ["wait"]])
 def test_row_35_no_server_is_told_at_once(words: Sequence[str]) -> None:
-    with short_directory() as home:
-
-        def attempt() -> None:
-            began = time.monotonic()
-            done = _talk(home, *words)
-            seconds = time.monotonic() - began
-            assert (done.returncode, done.stdout) == (3, "")
-            assert f"{home}/s: not there" in done.stderr
-            assert "talk serve" in done.stderr
-            assert_within(seconds, 0.3, "the end of a client without a server")
-
-        retry_if_late(attempt)
+    with short_directory() as home, limits():
+        began = time.monotonic()
+        done = _talk(home, *words)
+        seconds = time.monotonic() - began
+        assert (done.returncode, done.stdout) == (3, "")
+        assert f"{home}/s: not there" in done.stderr
+        assert "talk serve" in done.stderr
+        assert_within(seconds, 0.3, "the end of a client without a server")
 
 
 @pytest.mark.slow

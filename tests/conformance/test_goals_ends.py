@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.witness import ends, states
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
@@ -48,7 +48,7 @@ def test_row_02_engine_that_fails_in_the_middle_aborts_its_goal_alone(scripted: 
 
 @pytest.mark.parametrize("end", ["crash", "exit", "exit=3"])
 def test_row_04_engine_process_that_ends_without_a_result_is_replaced(scripted: Talk, end: str) -> None:
-    def attempt() -> None:
+    with limits():
         with scripted.connect() as wire:
             first = submit(wire, f"length=0.2 {end} and more", wait=True)
             second = submit(wire, "the next one", wait=True)
@@ -60,7 +60,6 @@ def test_row_04_engine_process_that_ends_without_a_result_is_replaced(scripted: 
         word, aborted = watcher.wait_for_word(second), watcher.wait_for(first, "ABORTED")
         assert_within(watcher.arrived(word) - watcher.arrived(aborted), 0.5, "speaking again after a crash")
 
-    retry_if_late(attempt)
     assert scripted.running
 
 
@@ -78,37 +77,34 @@ def test_row_05_sentence_that_ends_before_the_stop_has_succeeded(scripted: Talk)
 
 @pytest.mark.parametrize("how", ["ignore-stop never-ends", "length=20 on-stop=hang"])
 def test_row_06_engine_that_ignores_stop_is_killed(scripted: Talk, how: str) -> None:
-    def attempt() -> None:
-        with scripted.connect() as asker, scripted.connect() as canceler, scripted.connect() as speaker:
-            ended = submit(speaker, "length=0", wait=True)
-            speaker.receive_event("result", timeout=10)
-            goal_id = submit(speaker, f"{how} words=1")
-            following = submit(speaker, "length=0 the next one", wait=True)
-            scripted.watcher.wait_for_word(goal_id)
-            times: dict[str, float] = {"status": 0.0, "cancel": 0.0}
-            began = time.monotonic()
-            canceler.send({"seq": 0, "request": "cancel", "ids": [goal_id]})
-            while scripted.watcher.states(goal_id)[-1] != "PREEMPTED":
-                assert time.monotonic() - began < 2, scripted.watcher.states(goal_id)
-                for request in ("status", "cancel"):
-                    asked = time.monotonic()
-                    reply = asker.request("status") if request == "status" else asker.request("cancel", ids=[ended])
-                    assert reply["ok"]
-                    times[request] = max(times[request], time.monotonic() - asked)
-            silent = scripted.watcher.arrived(scripted.watcher.wait_for(goal_id, "PREEMPTED")) - began
-            reply = canceler.receive()
-            assert reply["canceled"]["id"] == goal_id
-            assert (reply["canceled"]["state"], reply["canceled"]["reason"]) == ("PREEMPTED", "canceled")
-            assert canceler.receive() == {"seq": 0, "ok": True, "count": 1}
-            result = speaker.receive_event("result", timeout=10)["goal"]
-            assert (result["id"], result["state"]) == (following, "SUCCEEDED")
-            assert states(scripted, goal_id) == ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
-            assert silent >= 0.14, "it was killed before the limit"
-            for request, seconds in times.items():
-                assert_within(seconds, ANSWER, request)
-            assert_within(silent, 0.15 + 0.35, "the end of a process that ignores stop")
-
-    retry_if_late(attempt)
+    with limits(), scripted.connect() as asker, scripted.connect() as canceler, scripted.connect() as speaker:
+        ended = submit(speaker, "length=0", wait=True)
+        speaker.receive_event("result", timeout=10)
+        goal_id = submit(speaker, f"{how} words=1")
+        following = submit(speaker, "length=0 the next one", wait=True)
+        scripted.watcher.wait_for_word(goal_id)
+        times: dict[str, float] = {"status": 0.0, "cancel": 0.0}
+        began = time.monotonic()
+        canceler.send({"seq": 0, "request": "cancel", "ids": [goal_id]})
+        while scripted.watcher.states(goal_id)[-1] != "PREEMPTED":
+            assert time.monotonic() - began < 2, scripted.watcher.states(goal_id)
+            for request in ("status", "cancel"):
+                asked = time.monotonic()
+                reply = asker.request("status") if request == "status" else asker.request("cancel", ids=[ended])
+                assert reply["ok"]
+                times[request] = max(times[request], time.monotonic() - asked)
+        silent = scripted.watcher.arrived(scripted.watcher.wait_for(goal_id, "PREEMPTED")) - began
+        reply = canceler.receive()
+        assert reply["canceled"]["id"] == goal_id
+        assert (reply["canceled"]["state"], reply["canceled"]["reason"]) == ("PREEMPTED", "canceled")
+        assert canceler.receive() == {"seq": 0, "ok": True, "count": 1}
+        result = speaker.receive_event("result", timeout=10)["goal"]
+        assert (result["id"], result["state"]) == (following, "SUCCEEDED")
+        assert states(scripted, goal_id) == ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
+        assert silent >= 0.14, "it was killed before the limit"
+        for request, seconds in times.items():
+            assert_within(seconds, ANSWER, request)
+        assert_within(silent, 0.15 + 0.35, "the end of a process that ignores stop")
 
 
 def test_row_09_each_message_belongs_to_its_own_goal(scripted: Talk) -> None:

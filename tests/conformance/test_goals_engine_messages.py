@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.witness import ends, states
-from tests.support import processes
 
 if TYPE_CHECKING:
     import pathlib
@@ -85,12 +84,11 @@ main()
 
 
 @pytest.fixture
-def talk(make_talk: MakeTalk, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Talk:
+def talk(make_talk: MakeTalk, tmp_path: pathlib.Path) -> Talk:
     engine, serve = tmp_path / "engine.py", tmp_path / "serve.py"
     engine.write_text(ENGINE.format(root=ROOT))
     serve.write_text(SERVE.format(root=ROOT, engine=str(engine)))
-    monkeypatch.setattr(processes, "_SCRIPTED", str(serve))
-    return make_talk(scripted=True)
+    return make_talk(program=str(serve))
 
 
 def test_row_44_messages_for_goals_that_are_not_active_change_nothing(talk: Talk) -> None:

@@ -20,7 +20,7 @@ from tests.conformance.witness import ends
 from tests.support import census
 from tests.support.compare import compare
 from tests.support.reference import RATE, render
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from tests.conformance.hearing import Samples
@@ -100,7 +100,7 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_in_a_second_is_spoken_wh
 ) -> None:
     (reference,) = render([HELP])
 
-    def attempt() -> None:
+    with limits():
         talk = make_talk(sink=sink)
         with talk.connect() as wire:
             began = time.monotonic()
@@ -124,8 +124,6 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_in_a_second_is_spoken_wh
         assert_told_in_order(talk)
         talk.stop()
         assert_within(seconds, 1.0, "taking a thousand goals")
-
-    retry_if_late(attempt)
 
 
 def test_row_26_a_burst_from_several_clients_ends_with_one_goal_spoken(scripted: Talk) -> None:

@@ -26,7 +26,7 @@ from tests.conformance.hearing import (
 from tests.conformance.stopped import DROPPED, assert_heard_after_stop
 from tests.support.compare import assert_begun, assert_heard, compare, time_heard
 from tests.support.reference import render
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from tests.conformance.hearing import Samples
@@ -58,7 +58,7 @@ def test_a_text_that_would_crash_the_library_is_spoken(make_talk: MakeTalk, sink
 def test_a_killed_server_is_silent_and_the_next_one_speaks(talk: Talk, sink: Sink) -> None:
     reference, following = render([LONG])[0], render([LOW])[0]
 
-    def attempt() -> None:
+    with limits():
         with sink.record() as recording:
             goal, client = begin_with_client(talk, LONG)
             killed = time.monotonic()
@@ -78,13 +78,11 @@ def test_a_killed_server_is_silent_and_the_next_one_speaks(talk: Talk, sink: Sin
         assert_within(last - killed, 0.3, "the silence after the server was killed")
         assert_within(served, 1, "the start after the server was killed")
 
-    retry_if_late(attempt)
-
 
 def test_a_killed_engine_is_replaced_within_half_a_second(talk: Talk, sink: Sink) -> None:
     reference, following = render([LONG])[0], render([LOW])[0]
 
-    def attempt() -> None:
+    with limits():
         with sink.record() as recording:
             goal, client = begin_with_client(talk, LONG)
             next_goal = send(talk, LOW)
@@ -102,13 +100,11 @@ def test_a_killed_engine_is_replaced_within_half_a_second(talk: Talk, sink: Sink
         assert_begun(recording.samples[:start], reference, shortest=0.2)
         assert_within(began - killed, 0.5, "the next goal after a crash")
 
-    retry_if_late(attempt)
-
 
 def test_a_killed_engine_that_was_idle_is_replaced_within_half_a_second(talk: Talk, sink: Sink) -> None:
     (reference,) = render([LOW])
 
-    def attempt() -> None:
+    with limits():
         assert talk.run("voices").code == 0  # they are known when it is ready, and has nothing to do
         killed = time.monotonic()
         os.kill(engine_process(talk), signal.SIGKILL)
@@ -116,8 +112,6 @@ def test_a_killed_engine_that_was_idle_is_replaced_within_half_a_second(talk: Ta
             assert talk.run("say", "--wait", "--", LOW).code == 0
         compared = assert_same(recording.samples, reference)
         assert_within(time_heard(recording, compared, reference, 0) - killed, 0.5, "the next goal after a crash")
-
-    retry_if_late(attempt)
 
 
 def test_a_killed_player_aborts_its_goal_and_no_other(talk: Talk) -> None:
@@ -138,7 +132,7 @@ def test_a_killed_player_aborts_its_goal_and_no_other(talk: Talk) -> None:
 def test_a_frozen_engine_is_replaced_within_six_seconds(talk: Talk, sink: Sink) -> None:
     (following,) = render([LOW])
 
-    def attempt() -> None:
+    with limits():
         with sink.record() as recording:
             goal = begin(talk, LONG)
             next_goal = send(talk, LOW)
@@ -152,8 +146,6 @@ def test_a_frozen_engine_is_replaced_within_six_seconds(talk: Talk, sink: Sink) 
         assert ended["spoken"] != LONG
         _, began = _began(recording, following)
         assert_within(began - frozen, 6, "the next goal after a hang")
-
-    retry_if_late(attempt)
 
 
 def test_a_frozen_engine_is_killed_by_a_cancel(talk: Talk, sink: Sink) -> None:

@@ -14,7 +14,7 @@ from tests.conformance.told import assert_recalled, assert_told_in_order, submit
 from tests.support.compare import SAME, assert_begun, assert_heard, assert_resumed, assert_silent, compare, extent
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, render
-from tests.support.timing import STATUS_LIMIT, assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from tests.conformance.hearing import Samples
@@ -61,7 +61,7 @@ def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
 ) -> None:
     (reference,) = render([LONG])
 
-    def attempt() -> None:
+    with limits():
         talk = make_talk("--player", player, sink=sink)
         goal = send(talk, LONG)
         await_word(talk, goal, word)
@@ -83,8 +83,6 @@ def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
         assert_told_in_order(talk)
         talk.stop()
         assert_within(silent - asked, SILENT, f"the silence after a pause at word {word}")
-
-    retry_if_late(attempt)
 
 
 def test_row_43_a_sentence_that_is_held_twice_is_heard_whole(talk: Talk) -> None:
@@ -137,7 +135,7 @@ def test_row_43_a_held_goal_is_cancelled_and_is_never_heard_again(talk: Talk, se
 
 
 def test_row_43_the_cancel_of_a_held_goal_is_answered_in_time(talk: Talk) -> None:
-    def attempt() -> None:
+    with limits():
         goal = begin(talk, LONG)
         pause(talk)
         began = time.monotonic()
@@ -145,8 +143,6 @@ def test_row_43_the_cancel_of_a_held_goal_is_answered_in_time(talk: Talk) -> Non
         seconds = time.monotonic() - began
         resume(talk)
         assert_within(seconds, SILENT, "the cancel of a held goal")
-
-    retry_if_late(attempt)
 
 
 def test_row_43_a_pending_goal_is_cancelled_and_its_time_runs_out_while_paused(talk: Talk) -> None:
@@ -165,7 +161,7 @@ def test_row_43_a_pending_goal_is_cancelled_and_its_time_runs_out_while_paused(t
 def test_row_43_the_timeout_of_a_client_runs_out_while_paused(talk: Talk) -> None:
     """It owns the goal: that is cancelled, and the client ends at its time, silent already."""
 
-    def attempt() -> None:
+    with limits():
         known = {None, *talk.watcher.goals()}
         client = talk.start("say", "--wait", "--timeout", "1.5", "--", LONG)
         began = time.monotonic()
@@ -179,8 +175,6 @@ def test_row_43_the_timeout_of_a_client_runs_out_while_paused(talk: Talk) -> Non
         assert talk.watcher.states(goal) == STOPPED
         resume(talk)
         assert_within(took, 2.2, "a timeout of 1.5 s")
-
-    retry_if_late(attempt, control=talk.status, control_limit=STATUS_LIMIT)
 
 
 @pytest.mark.parametrize("how", ["preempt", "flush"])

@@ -21,11 +21,10 @@ from tests.conformance.stopped import assert_heard_after_stop
 from tests.support.compare import assert_begun, assert_silent
 from tests.support.reference import render
 from tests.support.sink import Sink
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     import pathlib
-    import subprocess
     from collections.abc import Callable
 
     from tests.conftest import MakeTalk
@@ -56,7 +55,7 @@ def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
 ) -> None:
     configuration = tmp_path / ".asoundrc"
 
-    def attempt() -> None:
+    with limits():
         configuration.write_text(NO_CARD)
         talk = make_talk(sink=sink, env={"HOME": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"})
         done = talk.run("say", "--wait", "--", LOW)
@@ -67,8 +66,6 @@ def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
         assert talk.run("say", "--wait", "--", HOME).code == 0
         assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False)
         assert_within(done.seconds, 1, "`say --wait` without a device")
-
-    retry_if_late(attempt)
 
 
 @pytest.mark.parametrize(
@@ -118,7 +115,7 @@ def test_row_41_a_sink_that_takes_no_sound_in_mid_sentence(
 ) -> None:
     sink = private_sink()
 
-    def attempt() -> None:
+    with limits():
         talk = make_talk(sink=sink)
         _, client = begin_with_client(talk, LONG)
         hold(sink)
@@ -136,8 +133,6 @@ def test_row_41_a_sink_that_takes_no_sound_in_mid_sentence(
         # 3 s after it took something the last time, which the engine sees within a tenth; and the end of the client.
         assert_within(ended - held, 3.3, "the end of a goal whose sink takes no sound")
 
-    retry_if_late(attempt)
-
 
 def _aborted(talk: Talk, done: Finished) -> Message:
     """Assert that a client's goal was ABORTED and that the client told so; return the goal."""
@@ -147,7 +142,7 @@ def _aborted(talk: Talk, done: Finished) -> Message:
     return goal
 
 
-def _lost(talk: Talk, client: subprocess.Popen[str]) -> None:
+def _lost(talk: Talk, client: Process) -> None:
     """Assert of a client whose goal, the server's first, was LONG: it ended in mid-sentence, as the sound did."""
     goal = _aborted(talk, talk.finish(client))
     assert_aborted(goal, "audio_lost", "aplay: ", "error: Input/output error")

@@ -24,7 +24,7 @@ from tests.conformance.hearing import (
 from tests.conformance.stopped import assert_heard_after_stop
 from tests.support.compare import assert_begun, assert_silent
 from tests.support.reference import render
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
@@ -56,7 +56,7 @@ def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk) -> None:
 def test_row_03_the_reply_to_a_cancel_comes_when_it_is_silent(talk: Talk) -> None:
     """Within 150 ms of the request, wherever in the sentence it comes."""
 
-    def attempt() -> None:
+    with limits():
         for number in (1, 2, 4):
             goal = send(talk, LONG)
             await_word(talk, goal, number)
@@ -67,8 +67,6 @@ def test_row_03_the_reply_to_a_cancel_comes_when_it_is_silent(talk: Talk) -> Non
             talk.recording.wait_until(replied + 0.1)
             assert_silent(talk.recording.between(replied + PRECISION, replied + 0.1))
             assert_within(replied - asked, 0.15, f"the cancel after {number} words")
-
-    retry_if_late(attempt)
 
 
 def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk) -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def test_row_45_of_two_servers_started_at_once_exactly_one_serves() -> None:
-    scripted = [SERVE[0], processes._SCRIPTED]  # the start of an engine is not what is tested
+    scripted = [SERVE[0], processes.SCRIPTED]  # the start of an engine is not what is tested
     with short_directory() as home:
         env = environment(home, TALK_SOCKET=f"{home}/s")
         for attempt in range(20):

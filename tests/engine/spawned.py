@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
 import subprocess
@@ -11,10 +10,9 @@ import time
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.engine import protocol
-from tests.support.timing import LateError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
     from types import TracebackType
 
 _E = TypeVar("_E", bound=protocol.Event)
@@ -149,12 +147,3 @@ def children(pid: int) -> list[int]:
     """Return the child processes of a process."""
     with open(f"/proc/{pid}/task/{pid}/children") as file:
         return [int(word) for word in file.read().split()]
-
-
-@contextlib.contextmanager
-def late_if_it_differs() -> Iterator[None]:
-    """Take sound that differs for that of a machine that is late: players run dry then. `retry_if_late` knows."""
-    try:
-        yield
-    except AssertionError as error:
-        raise LateError(str(error)) from error

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import outlet, protocol
-from tests.engine.spawned import Spawned, children, late_if_it_differs
+from tests.engine.spawned import Spawned, children
 from tests.engine.test_player_faults import Player, player
 from tests.support import compare
 from tests.support.reference import RATE, render
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,31 +33,27 @@ def _bytes() -> list[bytes]:
 
 
 def test_it_is_heard_before_the_first_sentence_and_not_before_the_next(sink: Sink) -> None:
-    def attempt() -> None:
-        with Spawned("aplay", environment=sink.env, lead_in=LEAD_IN) as engine:
-            engine.until(protocol.Voices)
-            onsets = []
-            with sink.record() as recording:
-                for number, text in enumerate(TEXTS):
-                    goal = f"g{number}"
-                    asked = time.monotonic()
-                    engine.say(text, goal)
-                    word = engine.until(protocol.Word)
-                    heard = time.monotonic()
-                    onset = recording.wait_for_sound()
-                    onsets.append(onset - asked)
-                    assert word.time < 0.1
-                    assert abs(onset - (heard - word.time)) < 0.1, "the word did not come as it was heard"
-                    ended = engine.until(protocol.Ended)
-                    assert ended.outcome == protocol.COMPLETED
-                    recording.wait_until_quiet(0.1)
-            with late_if_it_differs():
-                compare.assert_heard(recording, render(TEXTS))
-            assert onsets[0] > LEAD_IN / 1000
-            assert_within(onsets[0], LEAD_IN / 1000 + 0.2, "the first sentence")
-            assert_within(onsets[1], 0.2, "the second sentence")
-
-    retry_if_late(attempt)
+    with limits(), Spawned("aplay", environment=sink.env, lead_in=LEAD_IN) as engine:
+        engine.until(protocol.Voices)
+        onsets = []
+        with sink.record() as recording:
+            for number, text in enumerate(TEXTS):
+                goal = f"g{number}"
+                asked = time.monotonic()
+                engine.say(text, goal)
+                word = engine.until(protocol.Word)
+                heard = time.monotonic()
+                onset = recording.wait_for_sound()
+                onsets.append(onset - asked)
+                assert word.time < 0.1
+                assert abs(onset - (heard - word.time)) < 0.1, "the word did not come as it was heard"
+                ended = engine.until(protocol.Ended)
+                assert ended.outcome == protocol.COMPLETED
+                recording.wait_until_quiet(0.1)
+        compare.assert_heard(recording, render(TEXTS))
+        assert onsets[0] > LEAD_IN / 1000
+        assert_within(onsets[0], LEAD_IN / 1000 + 0.2, "the first sentence")
+        assert_within(onsets[1], 0.2, "the second sentence")
 
 
 def test_a_player_gets_it_once_and_it_does_not_count(player: Player) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import Spawned, children, late_if_it_differs
+from tests.engine.spawned import Spawned, children
 from tests.support import compare
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, render
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -81,60 +81,53 @@ def _speak_to_word(engine: Spawned, number: int) -> None:
 def test_a_pause_is_silent_in_time_and_the_sentence_goes_on_with_the_next_sample(
     sink: Sink, reference: Samples, player: str
 ) -> None:
-    def attempt() -> None:
-        with Spawned(player, environment=sink.env) as engine, sink.record() as recording:
-            _speak_to_word(engine, 6)
-            asked = time.monotonic()
-            took = engine.pause()
-            recording.wait_until_quiet(2)
-            last = recording.last_sound()
-            assert last is not None
-            engine.resume()
-            assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-            recording.wait_until_quiet()
-            assert last - asked <= took, "it said that it was silent before it was"
-            assert_within(took, SILENT_WITHIN, "the pause")
-            with late_if_it_differs():
-                _assert_resumed(recording, reference, 2.0)
-
-    retry_if_late(attempt)
+    with limits(), Spawned(player, environment=sink.env) as engine, sink.record() as recording:
+        _speak_to_word(engine, 6)
+        asked = time.monotonic()
+        took = engine.pause()
+        recording.wait_until_quiet(2)
+        last = recording.last_sound()
+        assert last is not None
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        recording.wait_until_quiet()
+        assert last - asked <= took, "it said that it was silent before it was"
+        assert_within(took, SILENT_WITHIN, "the pause")
+        _assert_resumed(recording, reference, 2.0)
 
 
 def test_words_come_as_they_are_heard_after_a_pause(sink: Sink) -> None:
-    def attempt() -> None:
-        with Spawned("aplay", environment=sink.env) as engine, sink.record() as recording:
-            engine.until(protocol.Voices)
-            engine.say(TEXT)
-            arrived = []
-            while not isinstance(event := engine.event(), protocol.Ended):
-                if not isinstance(event, protocol.Word):
-                    continue
-                arrived.append(time.monotonic() - event.time)
-                if event.number == 5:
-                    engine.pause()
-                    last = recording.wait_until_quiet(1)
-                    engine.resume()
-                    assert last is not None
-                    held = recording.wait_for_sound() - last
-            began = recording.first_sound()
-            assert began is not None
-            assert len(arrived) > 10
-            behind = [moment - began for moment in arrived]
-            assert_within(max(behind[:5]), 0.1, "a word before the pause")
-            assert min(behind[6:]) > held - 0.03, "a word came before it was heard"
-            assert_within(max(behind[6:]), held + 0.1, "a word after the pause")
-            times = [word.time for word in engine.words()]
-            assert times == sorted(times)
-            assert times[-1] * RATE < len(render([TEXT])[0])
-
-    retry_if_late(attempt)
+    with limits(), Spawned("aplay", environment=sink.env) as engine, sink.record() as recording:
+        engine.until(protocol.Voices)
+        engine.say(TEXT)
+        arrived = []
+        while not isinstance(event := engine.event(), protocol.Ended):
+            if not isinstance(event, protocol.Word):
+                continue
+            arrived.append(time.monotonic() - event.time)
+            if event.number == 5:
+                engine.pause()
+                last = recording.wait_until_quiet(1)
+                engine.resume()
+                assert last is not None
+                held = recording.wait_for_sound() - last
+        began = recording.first_sound()
+        assert began is not None
+        assert len(arrived) > 10
+        behind = [moment - began for moment in arrived]
+        assert_within(max(behind[:5]), 0.1, "a word before the pause")
+        assert min(behind[6:]) > held - 0.03, "a word came before it was heard"
+        assert_within(max(behind[6:]), held + 0.1, "a word after the pause")
+        times = [word.time for word in engine.words()]
+        assert times == sorted(times)
+        assert times[-1] * RATE < len(render([TEXT])[0])
 
 
 @pytest.mark.parametrize("player", ["aplay", "pacat"])
 def test_a_long_pause_lets_go_of_the_device(sink: Sink, reference: Samples, player: str) -> None:
-    def attempt() -> None:
-        limits = {"RELEASE_AFTER": 0.4}
-        with Spawned(player, environment=sink.env, limits=limits) as engine, sink.record() as recording:
+    with limits():
+        constants = {"RELEASE_AFTER": 0.4}
+        with Spawned(player, environment=sink.env, limits=constants) as engine, sink.record() as recording:
             _speak_to_word(engine, 6)
             engine.pause()
             assert len(children(engine.process.pid)) == 1
@@ -144,17 +137,14 @@ def test_a_long_pause_lets_go_of_the_device(sink: Sink, reference: Samples, play
             engine.resume()
             assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
             recording.wait_until_quiet()
-            with late_if_it_differs():
-                _assert_restarted(recording.samples[:heard], recording.samples[heard:], reference)
+            _assert_restarted(recording.samples[:heard], recording.samples[heard:], reference)
             assert [word.number for word in engine.words()] == list(range(1, len(engine.words()) + 1))
-
-    retry_if_late(attempt)
 
 
 def test_a_device_that_is_lost_during_a_pause_and_comes_back_is_no_error(
     private_sink: Callable[[], Sink], reference: Samples
 ) -> None:
-    def attempt() -> None:
+    with limits():
         sink = private_sink()
         with Spawned("pacat", environment=sink.env) as engine, sink.record() as recording:
             _speak_to_word(engine, 6)
@@ -168,10 +158,7 @@ def test_a_device_that_is_lost_during_a_pause_and_comes_back_is_no_error(
             engine.resume()
             assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
             recording.wait_until_quiet()
-            with late_if_it_differs():
-                _assert_restarted(recording.samples[:heard], recording.samples[tone:], reference)
-
-    retry_if_late(attempt)
+            _assert_restarted(recording.samples[:heard], recording.samples[tone:], reference)
 
 
 def test_a_device_that_stays_lost_fails_the_sentence_when_it_goes_on(private_sink: Callable[[], Sink]) -> None:
@@ -189,9 +176,9 @@ def test_a_device_that_stays_lost_fails_the_sentence_when_it_goes_on(private_sin
 
 @pytest.mark.parametrize("release", [0.2, 10.0])
 def test_a_stop_ends_a_paused_sentence_at_once(sink: Sink, release: float) -> None:
-    def attempt() -> None:
-        limits = {"RELEASE_AFTER": release}
-        with Spawned("aplay", environment=sink.env, limits=limits) as engine, sink.record() as recording:
+    with limits():
+        constants = {"RELEASE_AFTER": release}
+        with Spawned("aplay", environment=sink.env, limits=constants) as engine, sink.record() as recording:
             _speak_to_word(engine, 4)
             engine.pause()
             if release < 1:
@@ -206,28 +193,20 @@ def test_a_stop_ends_a_paused_sentence_at_once(sink: Sink, release: float) -> No
             assert recording.last_sound() == pytest.approx(heard, abs=0.005)
             assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
 
-    retry_if_late(attempt)
-
 
 def test_a_pause_before_the_first_sound_holds_all_of_it(sink: Sink, reference: Samples) -> None:
-    def attempt() -> None:
-        with Spawned("aplay", environment=sink.env) as engine, sink.record() as recording:
-            engine.until(protocol.Voices)
-            line = protocol.encode(protocol.Say("g1", TEXT, 200, 1.0, None, 50)) + protocol.encode(
-                protocol.Pause("g1", 1)
-            )
-            engine.send_raw(line)
-            engine.until(protocol.Paused)
-            assert children(engine.process.pid) == []
-            recording.wait_until_quiet(0.5)
-            compare.assert_silent(recording)
-            engine.resume()
-            assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-            recording.wait_until_quiet()
-            with late_if_it_differs():
-                compare.assert_heard(recording, [reference])
-
-    retry_if_late(attempt)
+    with limits(), Spawned("aplay", environment=sink.env) as engine, sink.record() as recording:
+        engine.until(protocol.Voices)
+        line = protocol.encode(protocol.Say("g1", TEXT, 200, 1.0, None, 50)) + protocol.encode(protocol.Pause("g1", 1))
+        engine.send_raw(line)
+        engine.until(protocol.Paused)
+        assert children(engine.process.pid) == []
+        recording.wait_until_quiet(0.5)
+        compare.assert_silent(recording)
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        recording.wait_until_quiet()
+        compare.assert_heard(recording, [reference])
 
 
 def _wait_for_no_player(engine: Spawned) -> None:

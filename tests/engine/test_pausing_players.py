@@ -15,7 +15,7 @@ from talkcli.engine import protocol
 from tests.engine.spawned import Spawned, children
 from tests.engine.test_player_faults import Player, player
 from tests.support.reference import RATE, render
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -166,20 +166,17 @@ def test_a_player_that_holds_too_much_is_ended_and_the_rest_is_said_again(player
 
 
 def test_a_frozen_player_is_ended_by_a_pause(player: Player) -> None:
-    def attempt() -> None:
-        with Spawned(player.plays()) as engine:
-            engine.until(protocol.Voices)
-            engine.say(TEXT)
-            engine.until(protocol.Word)
-            engine.until(protocol.Word)
-            (pid,) = children(engine.process.pid)
-            os.kill(pid, signal.SIGSTOP)
-            assert_within(engine.pause(), 0.2, "the pause")
-            assert children(engine.process.pid) == []
-            engine.resume()
-            assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-
-    retry_if_late(attempt)
+    with limits(), Spawned(player.plays()) as engine:
+        engine.until(protocol.Voices)
+        engine.say(TEXT)
+        engine.until(protocol.Word)
+        engine.until(protocol.Word)
+        (pid,) = children(engine.process.pid)
+        os.kill(pid, signal.SIGSTOP)
+        assert_within(engine.pause(), 0.2, "the pause")
+        assert children(engine.process.pid) == []
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
 
 
 def test_a_pause_before_the_player_took_anything_holds_the_whole_sentence(player: Player) -> None:

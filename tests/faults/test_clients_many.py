@@ -16,7 +16,7 @@ import pytest
 
 from tests.conformance.rawsocket import Raw
 from tests.support import census
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -44,7 +44,6 @@ for each in crowd:
 print("ready", flush=True)
 sys.stdin.read()
 """
-
 
 #: A process that asks for the status all the time, and says at last how long the longest took: in a process of its own,
 #: so that what the tests do meanwhile is not timed.
@@ -122,7 +121,6 @@ def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(scripted
     assert scripted.run("say", "--wait", "length=0").code == 0
 
 
-@pytest.mark.alone
 @pytest.mark.parametrize("max_queue", [1000, 100])
 def test_500_say_processes_at_once(make_talk: MakeTalk, max_queue: int) -> None:
     """With room for all none is lost; without, those that were accepted are spoken, and the others know."""
@@ -143,11 +141,10 @@ def test_500_say_processes_at_once(make_talk: MakeTalk, max_queue: int) -> None:
     assert sorted(spoken) == sorted(accepted)
 
 
-@pytest.mark.alone
 def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
 
-    def attempt() -> None:
+    with limits():
         line = json.dumps({"seq": 1, "request": "watch"})
         with crowd(talk, 50, line) as frozen:
             frozen.send_signal(signal.SIGSTOP)
@@ -161,8 +158,6 @@ def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(make_t
                 census.assert_as_before(talk.pid, before, memory=8 * 1024)
             frozen.send_signal(signal.SIGCONT)
         assert_within(longest[0], STATUS, "status for another client")
-
-    retry_if_late(attempt)
 
 
 def speak_words(talk: Talk) -> None:

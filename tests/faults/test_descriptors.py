@@ -18,12 +18,12 @@ from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support import processes
 from tests.support.connection import Wire
 from tests.support.surroundings import short_directory
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-SCRIPTED = [SERVE[0], processes._SCRIPTED]
+SCRIPTED = [SERVE[0], processes.SCRIPTED]
 CLIENTS = 60
 #: Seconds in which a server that was full is itself again.
 SOON = 5.0
@@ -128,7 +128,8 @@ def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) ->
         with crowd(path) as clients:
             inside = greeted(clients)
             assert 5 <= len(inside) < CLIENTS
-            retry_if_late(lambda: assert_within(status_over(inside[0]), 0.1, "status while it is full"))
+            with limits():
+                assert_within(status_over(inside[0]), 0.1, "status while it is full")
             # One that comes now tries again, as long as a client does, and gets in when others leave.
             late = subprocess.Popen([*TALK, "say", "--wait", "late"], env=env, stdout=subprocess.DEVNULL)
             time.sleep(1)
@@ -168,7 +169,8 @@ def test_descriptors_that_something_else_has_used_up(home: str) -> None:
             assert engine
             os.kill(engine, signal.SIGKILL)
             time.sleep(2)  # twice as long as it waits to look again; and three starts of the engine
-            retry_if_late(lambda: assert_within(_status(wire), 0.1, "status without descriptors"))
+            with limits():
+                assert_within(_status(wire), 0.1, "status without descriptors")
             goal = wire.request("say", text="length=0", wait=True)["goal"]
             ended = wire.receive_event("result")
             assert (goal["id"], ended["goal"]["reason"]) == (ended["goal"]["id"], "engine_failed")

@@ -12,11 +12,9 @@ import pytest
 from talkcli.engine.limits import START_LIMIT
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, player_process, send
 from tests.faults.broken import (
-    ENGINE_START_LIMIT,
     SLOW_START,
     await_end,
     began,
-    engine_start,
     nothing_left,
     python_path,
     sound,
@@ -27,7 +25,7 @@ from tests.support import census
 from tests.support.compare import extent
 from tests.support.reference import render
 from tests.support.surroundings import command_line
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,7 +53,7 @@ each_signal = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: sign
 
 @each_signal
 def test_engine_process_signalled_while_idle(talk: Talk, sink: Sink, number: signal.Signals) -> None:
-    def attempt() -> None:
+    with limits():
         with nothing_left(talk), sink.record() as recording:
             engine, hit = engine_process(talk), time.monotonic()
             os.kill(engine, number)
@@ -71,12 +69,10 @@ def test_engine_process_signalled_while_idle(talk: Talk, sink: Sink, number: sig
             assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
         _assert_next(recording, hit, SIGNALS[number][2], f"{number.name} while idle")
 
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
-
 
 @each_signal
 def test_engine_process_signalled_in_synthesis(talk: Talk, sink: Sink, number: signal.Signals) -> None:
-    def attempt() -> None:
+    with limits():
         with nothing_left(talk), sink.record() as recording:
             goal = begin(talk, LONG)
             following = send(talk, LOW)
@@ -87,12 +83,10 @@ def test_engine_process_signalled_in_synthesis(talk: Talk, sink: Sink, number: s
             assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
         _assert_next(recording, hit, SIGNALS[number][2], f"{number.name} in synthesis")
 
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
-
 
 @each_signal
 def test_engine_process_signalled_in_playback(make_talk: MakeTalk, sink: Sink, number: signal.Signals) -> None:
-    def attempt() -> None:
+    with limits():
         talk = make_talk("--player", DEEP, sink=sink)
         with nothing_left(talk), sink.record() as recording:
             goal = send(talk, LONG)
@@ -110,12 +104,10 @@ def test_engine_process_signalled_in_playback(make_talk: MakeTalk, sink: Sink, n
         talk.stop()
         _assert_next(recording, hit, SIGNALS[number][2], f"{number.name} in playback")
 
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
-
 
 @each_signal
 def test_engine_process_signalled_while_paused(talk: Talk, sink: Sink, number: signal.Signals) -> None:
-    def attempt() -> None:
+    with limits():
         with nothing_left(talk), sink.record() as recording:
             goal = begin(talk, LONG)
             assert talk.request("pause")["goal"]["id"] == goal
@@ -132,14 +124,12 @@ def test_engine_process_signalled_while_paused(talk: Talk, sink: Sink, number: s
         begins, limit = (hit, HANG) if number is signal.SIGSTOP else (resumed, CRASH)
         _assert_next(recording, begins, limit, f"{number.name} while paused")
 
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
-
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV], ids=lambda number: number.name)
 def test_engine_process_signalled_in_its_start(
     make_talk: MakeTalk, sink: Sink, tmp_path: Path, number: signal.Signals
 ) -> None:
-    def attempt() -> None:
+    with limits():
         talk = make_talk(sink=sink, env=_slow_start(tmp_path))
         with nothing_left(talk), sink.record() as recording:
             goal = begin(talk, LONG)
@@ -149,11 +139,9 @@ def test_engine_process_signalled_in_its_start(
         talk.stop()
         _assert_next(recording, hit, CRASH, f"{number.name} in its start")
 
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
-
 
 def test_engine_process_frozen_in_its_start(make_talk: MakeTalk, sound: Sink, tmp_path: Path) -> None:
-    def attempt() -> None:
+    with limits():
         talk = make_talk(sink=sound, env=_slow_start(tmp_path))
         with nothing_left(talk), sound.record() as recording:
             goal = begin(talk, LONG)
@@ -166,8 +154,6 @@ def test_engine_process_frozen_in_its_start(make_talk: MakeTalk, sound: Sink, tm
         seconds = recording.time_of(lost + first[0]) - hit
         told("the next goal after SIGSTOP in its start", seconds)
         assert_within(seconds, START_LIMIT + 2 * CRASH, "the next goal after SIGSTOP in its start")
-
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
 
 
 def _slow_start(folder: Path) -> dict[str, str]:

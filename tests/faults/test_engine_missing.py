@@ -17,16 +17,14 @@ import pytest
 from talkcli.engine.restarts import BACK_OFF
 from tests.conformance.hearing import LOW, assert_aborted, send
 from tests.faults.broken import (
-    ENGINE_START_LIMIT,
     assert_answers,
-    engine_start,
     heard_again,
     python_path,
     sound,
     told,
     write,
 )
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -70,7 +68,7 @@ def test_without_pyttsx3_goals_end_at_once_and_it_is_tried_again_at_longer_and_l
 ) -> None:
     attempts = tmp_path / "attempts"
 
-    def attempt() -> None:
+    with limits():
         attempts.write_text("")
         shadow = write(tmp_path / "pyttsx3.py", MISSING.format(attempts=str(attempts)))
         talk = make_talk(sink=sound, env=python_path(tmp_path))
@@ -92,8 +90,6 @@ def test_without_pyttsx3_goals_end_at_once_and_it_is_tried_again_at_longer_and_l
             assert_within(second - first, wait + START, f"the start after {wait} s")
         assert_within(time.monotonic() - back, BACK_OFF[-1] + START + 2, "speaking again")
 
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
-
 
 @pytest.mark.parametrize("what", WITHOUT)
 def test_without_libespeak_ng_or_its_data_goals_end_at_once_until_it_is_installed(
@@ -105,7 +101,7 @@ def test_without_libespeak_ng_or_its_data_goals_end_at_once_until_it_is_installe
     )
     library = tmp_path / "libespeak-ng.so.1"
 
-    def attempt() -> None:
+    with limits():
         library.write_bytes(b"no library")
         talk = make_talk(sink=sound, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
         first = _assert_aborted_at_once(talk, words)
@@ -115,8 +111,6 @@ def test_without_libespeak_ng_or_its_data_goals_end_at_once_until_it_is_installe
         heard_again(talk, sound)
         talk.stop()
         assert_within(max(first, again), AT_ONCE, "the end of a goal without an engine")
-
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
 
 
 def _assert_aborted_at_once(talk: Talk, words: str) -> float:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.hearing import LONG, await_word, send
-from tests.faults.broken import SERVER_START_LIMIT, heard_again, server_start, sound, told
-from tests.support.timing import assert_within, retry_if_late
+from tests.faults.broken import heard_again, sound, told
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
@@ -38,24 +38,20 @@ def test_server_is_killed_in_mid_sentence(make_talk: MakeTalk, sound: Sink) -> N
     silences: list[float] = []
     starts: list[float] = []
 
-    def attempt() -> None:
-        if not talk.running:  # the attempt before was late
+    with limits():
+        for _ in range(KILLS):
+            with sound.record() as recording:
+                await_word(talk, send(talk, LONG), chance.randint(*WORDS))
+                killed = time.monotonic()
+                talk.kill(gone_within=SILENT)
+                last = recording.wait_until_quiet(0.2)
+            assert last is not None
+            began = time.monotonic()
             talk.start_server()
-        with sound.record() as recording:
-            await_word(talk, send(talk, LONG), chance.randint(*WORDS))
-            killed = time.monotonic()
-            talk.kill(gone_within=SILENT)
-            last = recording.wait_until_quiet(0.2)
-        assert last is not None
-        began = time.monotonic()
-        talk.start_server()
-        starts.append(time.monotonic() - began)
-        silences.append(last - killed)
-        assert_within(silences[-1], SILENT, "the silence after the server was killed")
-        assert_within(starts[-1], SERVES, "the start after the server was killed")
-
-    for _ in range(KILLS):
-        retry_if_late(attempt, server_start, SERVER_START_LIMIT)
+            starts.append(time.monotonic() - began)
+            silences.append(last - killed)
+            assert_within(silences[-1], SILENT, "the silence after the server was killed")
+            assert_within(starts[-1], SERVES, "the start after the server was killed")
     for what, times in (("silent after", silences), ("serves after", starts)):
         told(f"{len(times)} kills, {what} at most {max(times):.3f} s, median", statistics.median(times))
     heard_again(talk, sound)

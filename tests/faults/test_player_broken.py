@@ -18,7 +18,7 @@ from tests.conformance.hearing import HOME, LONG, LOW, assert_aborted, begin, pl
 from tests.faults.broken import await_end, heard_again, nothing_left, sound, write
 from tests.support.compare import assert_heard, assert_silent
 from tests.support.reference import render
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -78,7 +78,7 @@ def test_player_is_broken(make_talk: MakeTalk, sound: Sink, tmp_path: Path, what
     player, flag = BROKEN[what], tmp_path / "broken"
     program = _script(tmp_path, player.does)
 
-    def attempt() -> None:
+    with limits():
         flag.touch()
         talk = make_talk("--player", str(program), sink=sound)
         with nothing_left(talk):
@@ -88,8 +88,6 @@ def test_player_is_broken(make_talk: MakeTalk, sound: Sink, tmp_path: Path, what
             heard_again(talk, sound)
         talk.stop()
         assert_within(ended, player.within + SLACK, f"the end of a goal whose player {what}")
-
-    retry_if_late(attempt)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +103,7 @@ def test_player_is_signalled_in_mid_sentence(
 ) -> None:
     program = _script(tmp_path, "")
 
-    def attempt() -> None:
+    with limits():
         talk = make_talk("--player", str(program), sink=sound)
         with nothing_left(talk):
             goal = begin(talk, LONG)
@@ -117,13 +115,11 @@ def test_player_is_signalled_in_mid_sentence(
         talk.stop()
         assert_within(ended, within + SLACK, f"the end of a goal whose player got {number.name}")
 
-    retry_if_late(attempt)
-
 
 def test_player_is_missing_until_it_is_installed(make_talk: MakeTalk, sound: Sink, tmp_path: Path) -> None:
     program = tmp_path / "player"
 
-    def attempt() -> None:
+    with limits():
         program.unlink(missing_ok=True)
         talk = make_talk("--player", str(program), sink=sound)
         with nothing_left(talk):
@@ -134,8 +130,6 @@ def test_player_is_missing_until_it_is_installed(make_talk: MakeTalk, sound: Sin
             heard_again(talk, sound)
         talk.stop()
         assert_within(ended, SLACK, "the end of a goal without a player")
-
-    retry_if_late(attempt)
 
 
 def test_player_that_writes_underrun_and_goes_on_is_no_error(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:

@@ -17,12 +17,12 @@ from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support import processes
 from tests.support.connection import Wire
 from tests.support.surroundings import MARK, assert_none_left, dying_with_parent, short_directory
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-SCRIPTED = [SERVE[0], processes._SCRIPTED]
+SCRIPTED = [SERVE[0], processes.SCRIPTED]
 #: Characters of texts that make an answer long, and requests for it: more than a connection's buffers hold.
 LONG = "word " * 1900
 ASKED = 12
@@ -57,7 +57,7 @@ def stalled(path: str, count: int = 100) -> Iterator[None]:
 def test_sigterm_with_100_stalled_clients_ends_it_within_3_seconds(home: str) -> None:
     path = f"{home}/s"
 
-    def attempt() -> None:
+    with limits():
         mark = uuid.uuid4().hex
         with serving(environment(home, TALK_SOCKET=path, **{MARK: mark})) as server, Wire(path) as wire, stalled(path):
             wire.request("say", text="a sentence that is long enough to be in the middle of it", wait=True)
@@ -71,13 +71,11 @@ def test_sigterm_with_100_stalled_clients_ends_it_within_3_seconds(home: str) ->
         assert not os.path.exists(path)
         assert_none_left(mark, 0.5)
 
-    retry_if_late(attempt)
-
 
 def test_second_sigterm_with_100_stalled_clients_ends_it_at_once(home: str) -> None:
     path = f"{home}/s"
 
-    def attempt() -> None:
+    with limits():
         mark = uuid.uuid4().hex
         with serving(environment(home, TALK_SOCKET=path, **{MARK: mark}), command=SCRIPTED) as server:
             with Wire(path) as wire, stalled(path):
@@ -92,8 +90,6 @@ def test_second_sigterm_with_100_stalled_clients_ends_it_at_once(home: str) -> N
             assert not os.path.exists(path)
         assert_none_left(mark, 0.5)
 
-    retry_if_late(attempt)
-
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGPIPE])
 def test_storm_of_signals_is_survived(home: str, number: signal.Signals) -> None:
@@ -101,16 +97,13 @@ def test_storm_of_signals_is_survived(home: str, number: signal.Signals) -> None
     with serving(environment(home, TALK_SOCKET=path)) as server, Wire(path) as wire:
         goal = wire.request("say", text="spoken to its end, whatever comes", wait=True)["goal"]
         wire.receive_event("state", state="ACTIVE")
-
-        def storm_and_ask() -> None:
-            for _ in range(1000):
-                server.process.send_signal(number)
-            began = time.monotonic()
-            assert wire.request("status")["ok"]
-            assert_within(time.monotonic() - began, 0.1, "status in a storm of signals")
-
-        for _ in range(5):
-            retry_if_late(storm_and_ask)
+        with limits():
+            for _ in range(5):
+                for _ in range(1000):
+                    server.process.send_signal(number)
+                began = time.monotonic()
+                assert wire.request("status")["ok"]
+                assert_within(time.monotonic() - began, 0.1, "status in a storm of signals")
         assert wire.receive_event("result", timeout=10)["goal"]["id"] == goal["id"]
         assert wire.request("status", id=goal["id"])["goal"]["state"] == "SUCCEEDED"
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from tests.conftest import MakeTalk
 
-SCRIPTED = [SERVE[0], processes._SCRIPTED]
+SCRIPTED = [SERVE[0], processes.SCRIPTED]
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="abstract sockets are Linux's alone")
 
 

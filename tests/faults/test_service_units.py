@@ -25,7 +25,7 @@ from tests.support.surroundings import needs, short_directory
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-SCRIPTED = [SERVE[0], processes._SCRIPTED]
+SCRIPTED = [SERVE[0], processes.SCRIPTED]
 UNITS = ["user", "system", "user-socket", "system-socket"]
 #: Starts a program as systemd does that passes it a socket.
 PASSING = """

@@ -13,7 +13,6 @@ SECONDS = float(os.environ.get("TALK_TEST_SOAK") or (60 if os.environ.get("CI") 
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 @pytest.mark.timeout(int(SECONDS) + 400)
 def test_random_goals_with_a_fault_every_few_seconds() -> None:
     report = soak(SECONDS, seed=random.randrange(1 << 30), every=3, least=int(SECONDS / 12) + 1)

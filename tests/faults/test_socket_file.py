@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 HASTY = [sys.executable, os.path.join(os.path.dirname(os.path.abspath(__file__)), "hasty_serve.py")]
-SCRIPTED = [SERVE[0], processes._SCRIPTED]
+SCRIPTED = [SERVE[0], processes.SCRIPTED]
 #: Seconds in which a server that looks every 0.2 s is found again.
 SOON = 5.0
 #: Listens at a path, as another program would, and says so.

@@ -17,7 +17,7 @@ from talkcli.engine.playback import FIRST_WITHIN, LOOK_EVERY, STALLED_AFTER
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, send
 from tests.faults.broken import await_end, heard_again, nothing_left, told
 from tests.support.sink import Sink
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -75,7 +75,7 @@ def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, sinks: list[Sink], wh
     fault = FAULTS[what]
     sink = sinks.pop() if sinks else Sink()
 
-    def attempt() -> None:
+    with limits():
         talk = make_talk("--player", player, sink=sink)
         with nothing_left(talk):
             goal = begin(talk, LONG)
@@ -94,7 +94,6 @@ def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, sinks: list[Sink], wh
 
     with contextlib.ExitStack() as stack:
         stack.callback(sink.close)
-        retry_if_late(attempt)
         stack.pop_all()
         sinks.append(sink)  # whole again, as it was heard
 

@@ -11,10 +11,9 @@ import pytest
 from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, send
 from tests.faults.fuzz_texts import list_voices, speak_all
 from tests.faults.fuzz_texts_generator import Case
-from tests.support import processes
 from tests.support.compare import assert_heard
 from tests.support.reference import render
-from tests.support.timing import assert_within, process_start, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,19 +27,16 @@ CRASHING = "a." * 200
 UNGUARDED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "fuzz_texts_serve.py")
 #: Seconds from the first of a hundred crashing texts to the sound of the goal behind them.
 LOOP_LIMIT = 30.0
-#: Seconds that a bare engine process takes at most on a machine that has time for a hundred of them in 30.
-ENGINE_START = 0.15
 #: Seconds in which `status` is answered, whatever happens.
 ANSWERED = 0.1
 
 
 @pytest.fixture
-def unguarded(make_talk: MakeTalk, sink: Sink, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Talk]:
+def unguarded(make_talk: MakeTalk, sink: Sink) -> Callable[..., Talk]:
     """Starts a server with the real engine, and without the guard before the library."""
 
     def make(*options: str, heard: bool = True) -> Talk:
-        monkeypatch.setattr(processes, "_SCRIPTED", UNGUARDED)
-        return make_talk(*options, scripted=True, sink=sink if heard else None)
+        return make_talk(*options, program=UNGUARDED, sink=sink if heard else None)
 
     return make
 
@@ -64,7 +60,8 @@ def test_a_crashing_text_in_the_middle_of_ten_goals(unguarded: Callable[..., Tal
 
 def assert_nine_spoken(talk: Talk, goals: list[str]) -> None:
     """Assert that the sixth is ABORTED, once, and the others are spoken in their order, while `status` answers."""
-    retry_if_late(lambda: assert_within(_answered(talk), ANSWERED, "status"), control=process_start)
+    with limits():
+        assert_within(_answered(talk), ANSWERED, "status")
     states = [talk.watcher.wait_for_terminal(goal) for goal in goals]
     assert states == ["SUCCEEDED"] * 5 + ["ABORTED"] + ["SUCCEEDED"] * 4
     assert talk.watcher.states(goals[5]) == ["PENDING", "ACTIVE", "ABORTED"]  # never tried again
@@ -79,17 +76,10 @@ def _answered(talk: Talk) -> float:
         return time.monotonic() - began
 
 
-def _engine_start() -> float:
-    """Return the seconds from the start of an engine process until it has told its voices, and is gone again."""
-    began = time.monotonic()
-    speak_all([], guarded=False)
-    return time.monotonic() - began
-
-
 def test_crash_loop_of_100_texts(unguarded: Callable[..., Talk], sink: Sink) -> None:
     talk = unguarded("--max-queue", "200")
 
-    def attempt() -> None:
+    with limits():
         assert talk.run("voices").code == 0  # the engine is ready
         with sink.record() as recording:
             began = time.monotonic()
@@ -106,7 +96,6 @@ def test_crash_loop_of_100_texts(unguarded: Callable[..., Talk], sink: Sink) -> 
         print(f"100 crashing texts and a good one: {heard_at - began:.1f} s")
         assert_within(heard_at - began, LOOP_LIMIT, "the goal behind 100 crashing texts")
 
-    retry_if_late(attempt, control=_engine_start, control_limit=ENGINE_START)
     # A process for each, which was ready: so the next one needed no wait.
     assert talk.log.count("talk: the engine crashed: it was killed by ") % 100 == 0
     assert "engine_failed" not in talk.log

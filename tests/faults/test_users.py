@@ -25,7 +25,7 @@ from tests.support.surroundings import needs, short_directory
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-SCRIPTED = [SERVE[0], processes._SCRIPTED]
+SCRIPTED = [SERVE[0], processes.SCRIPTED]
 NOBODY = 65534
 #: A group that the server gets, and some of the strangers.
 GROUP = 4242

@@ -19,10 +19,8 @@ from talkcli.engine.playback import GONE_WITHIN, STALLED_AFTER
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, player_process, send
 from tests.faults import trapped
 from tests.faults.broken import (
-    ENGINE_START_LIMIT,
     await_end,
     began,
-    engine_start,
     heard_again,
     nothing_left,
     python_path,
@@ -32,7 +30,7 @@ from tests.faults.broken import (
 )
 from tests.support import census
 from tests.support.reference import render
-from tests.support.timing import assert_within, retry_if_late
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -80,7 +78,7 @@ STUCK: dict[str, tuple[Callable[[Talk], object], float]] = {
 def test_synthesis_without_progress(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
     write(tmp_path / "sitecustomize.py", SPINNING)
 
-    def attempt() -> None:
+    with limits():
         talk = make_talk(sink=sink, env=python_path(tmp_path))
         with nothing_left(talk), sink.record() as recording:
             asked = time.monotonic()
@@ -94,11 +92,9 @@ def test_synthesis_without_progress(make_talk: MakeTalk, sink: Sink, tmp_path: P
         told("the next goal after a synthesis without progress", seconds)
         assert_within(seconds, HANG_AFTER + RESTART, "the next goal after a synthesis without progress")
 
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
-
 
 def test_stop_that_is_not_confirmed(talk: Talk, sink: Sink) -> None:
-    def attempt() -> None:
+    with limits():
         with nothing_left(talk), sink.record() as recording:
             goal = begin(talk, LONG)
             following = send(talk, LOW)
@@ -113,8 +109,6 @@ def test_stop_that_is_not_confirmed(talk: Talk, sink: Sink) -> None:
         assert_within(answered - asked, CANCEL, "`cancel`")
         assert_within(seconds, STOP_LIMIT + RESTART, "the next goal after a stop that was not confirmed")
 
-    retry_if_late(attempt, engine_start, ENGINE_START_LIMIT)
-
 
 @pytest.mark.parametrize("what", STUCK)
 def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sound: Sink, tmp_path: Path, what: str) -> None:
@@ -125,7 +119,7 @@ def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sound: Sink, tmp_pat
     program = f"#!/bin/sh\nexec {sys.executable} -S {trapped.__file__} {HELD} {play}\n"
     command = str(write(tmp_path / "player", program, 0o755))
 
-    def attempt() -> None:
+    with limits():
         talk = make_talk("--player", command, sink=sound)
         with nothing_left(talk):
             goal = begin(talk, LONG)
@@ -143,5 +137,3 @@ def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sound: Sink, tmp_pat
         talk.stop()
         told(f"the end of a goal that was {what}, with a player that cannot be reaped", ended)
         assert_within(ended, limit, f"the end of a goal that was {what}")
-
-    retry_if_late(attempt)

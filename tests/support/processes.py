@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tests.support.connection import PATIENCE, Message, Wire
+from tests.support.forking import Forked, forks
 from tests.support.surroundings import MARK, assert_none_left, clean_environment, dying_with_parent, short_directory
 from tests.support.watcher import Watcher
 
@@ -25,7 +26,10 @@ if TYPE_CHECKING:
 #: Seconds in which a server must greet, and in which it must have ended after SIGTERM.
 START_LIMIT = 10.0
 STOP_LIMIT = 5.0
-_SCRIPTED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "scripted_serve.py")
+#: A client or a server, started or forked.
+Process = subprocess.Popen[str] | Forked
+#: The program that is `talk serve` with the scripted engine.
+SCRIPTED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "scripted_serve.py")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +48,21 @@ class Finished:
         return self.out.strip()
 
 
+def start_talk(words: Sequence[str], env: Mapping[str, str], stdin: int = subprocess.DEVNULL) -> Process:
+    """Start `talk` with these words, its output in pipes."""
+    if forks(env):
+        return Forked(words, env, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(
+        [sys.executable, "-m", "talkcli", *words],
+        env=env,
+        stdin=stdin,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        encoding="utf-8",
+        errors="replace",
+    )
+
+
 class Talk:
     """A server, started, greeted and watched from before its first goal; `stop()` ends it and asserts that all is well.
 
@@ -55,22 +74,26 @@ class Talk:
         options: Sequence[str] = (),
         *,
         scripted: bool = False,
+        program: str | None = None,
         sink: Sink | None = None,
         driver: str | None = None,
         env: Mapping[str, str] | None = None,
         watched: bool = True,
+        forked: bool = True,
     ) -> None:
+        """`program` serves in the place of `talk serve`; one that is not `forked` shows in /proc what it is."""
         self.unfinished: Collection[str] | bool = False
         self._mark = uuid.uuid4().hex
-        self._clients: list[subprocess.Popen[str]] = []
-        self._server: subprocess.Popen[bytes] | None = None
+        self._clients: list[Process] = []
+        self._server: subprocess.Popen[bytes] | Forked | None = None
         self._watcher: Watcher | None = None
         self._recording: Recording | None = None
         self._extra = dict(env or {})
         self._sink = sink
         self._watched = watched
-        program = [_SCRIPTED] if scripted else ["-m", "talkcli", "serve"]
-        self._command = [sys.executable, *program, *(["--driver", driver] if driver else []), *options]
+        self._program = SCRIPTED if scripted else program
+        self._forked = forked and program is None
+        self._words = [*(["--driver", driver] if driver else []), *options]
         with contextlib.ExitStack() as stack:
             self.directory = stack.enter_context(short_directory())
             if sink:
@@ -116,15 +139,21 @@ class Talk:
 
     def start_server(self) -> None:
         """Start the server and wait for its greeting; again after it has ended, then with a new watcher."""
+        env = self._environment(self._mark)
         with open(f"{self.directory}/log", "ab") as log:
-            self._server = subprocess.Popen(
-                dying_with_parent(self._command),
-                env=self._environment(self._mark),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
+            if self._forked and forks(env):
+                words, scripted, to = ["serve", *self._words], self._program == SCRIPTED, log.fileno()
+                self._server = Forked(words, env, scripted=scripted, stdout=to, stderr=to, start_new_session=True)
+            else:
+                program = [self._program] if self._program else ["-m", "talkcli", "serve"]
+                self._server = subprocess.Popen(
+                    dying_with_parent([sys.executable, *program, *self._words]),
+                    env=env,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    start_new_session=True,
+                )
         self._await_greeting()
         if self._watcher:
             self._watcher.close()
@@ -136,21 +165,13 @@ class Talk:
         with open(f"{self.directory}/start", "w", encoding="utf-8") as file:
             file.write(behaviour)
 
-    def start(self, *words: str, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
+    def start(self, *words: str, stdin: int = subprocess.DEVNULL) -> Process:
         """Start a client in the background, its output in pipes; `finish()` waits for it."""
-        client = subprocess.Popen(
-            [sys.executable, "-m", "talkcli", *words],
-            env=self.env,
-            stdin=stdin,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            encoding="utf-8",
-            errors="replace",
-        )
+        client = start_talk(words, self.env, stdin)
         self._clients.append(client)
         return client
 
-    def finish(self, client: subprocess.Popen[str], timeout: float = 20, stdin: str | None = None) -> Finished:
+    def finish(self, client: Process, timeout: float = 20, stdin: str | None = None) -> Finished:
         """Wait for a client to end; seconds are counted from this call. It never may show a traceback."""
         began = time.monotonic()
         assert isinstance(client.args, list)
@@ -163,7 +184,7 @@ class Talk:
             raise AssertionError(
                 f"{' '.join(command)} did not end within {timeout} s\nout: {out}\nerr: {err}\nlog: {self.log}"
             ) from None
-        result = Finished(command, client.returncode, out, err, time.monotonic() - began)
+        result = Finished(command, client.wait(), out, err, time.monotonic() - began)
         assert "Traceback" not in err, f"{' '.join(command)}: {err}"
         return result
 
@@ -175,7 +196,7 @@ class Talk:
         return Finished(done.command, done.code, done.out, done.err, time.monotonic() - began)
 
     def status(self) -> float:
-        """Return the seconds that `talk status` takes: on an idle server the control of `retry_if_late`."""
+        """Return the seconds that `talk status` takes: on an idle server the control of `limits`."""
         done = self.run("status")
         assert done.code == 0, done
         return done.seconds

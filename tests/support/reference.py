@@ -6,6 +6,7 @@ reference is the same texts, in the same order, with the same settings, in one f
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import subprocess
@@ -72,7 +73,12 @@ def render(
 
 def render_with_words(sentences: Sequence[str | Sentence], *, timeout: float = 30) -> list[Rendering]:
     """Return the rendering of each sentence, as `render` does, with its words."""
-    asked = [Sentence(each) if isinstance(each, str) else each for each in sentences]
+    return list(_rendered(tuple(Sentence(each) if isinstance(each, str) else each for each in sentences), timeout))
+
+
+@functools.cache
+def _rendered(asked: tuple[Sentence, ...], timeout: float) -> tuple[Rendering, ...]:
+    """A fresh process makes the same samples each time, so one for all tests is enough; nobody may change them."""
     done = subprocess.run(
         [sys.executable, _PROGRAM],
         input=json.dumps([asdict(each) for each in asked]).encode(),
@@ -90,6 +96,7 @@ def render_with_words(sentences: Sequence[str | Sentence], *, timeout: float = 3
         head = json.loads(line)
         end = head["samples"] * 2
         samples = np.frombuffer(rest[:end], dtype="<i2").astype(np.int16)
+        samples.flags.writeable = False
         result.append(Rendering(samples, tuple((start, stop, at) for start, stop, at in head["words"])))
         rest = rest[end:]
-    return result
+    return tuple(result)

@@ -16,9 +16,14 @@ def engine_command() -> list[str]:
     return [sys.executable, _ENGINE]
 
 
+def replace_engine() -> None:
+    """Have this process start the scripted engine."""
+    spawn.engine_command = engine_command
+
+
 def main() -> None:
     """Run `talk serve`."""
-    spawn.engine_command = engine_command
+    replace_engine()
     sys.argv = ["talk", "serve", *sys.argv[1:]]
     run_talk()
 

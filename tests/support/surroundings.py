@@ -29,10 +29,6 @@ _KEPT = ("PATH", "TMPDIR", "SYSTEMROOT", "LD_LIBRARY_PATH", "COVERAGE_PROCESS_ST
 #: Seconds in which a killed process must be gone.
 _KILL_LIMIT = 2.0
 
-_DIE_WITH_PARENT = (
-    "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, signal.SIGKILL); os.execvp(sys.argv[1], sys.argv[1:])"
-)
-
 
 def needs(*programs: str) -> None:
     """Skip the test if one of the programs is missing; where CI is set, fail it: there nothing may be skipped."""
@@ -76,9 +72,7 @@ def clean_environment(home: str, extra: Mapping[str, str] | None = None) -> dict
 
 def dying_with_parent(command: list[str]) -> list[str]:
     """Return the command so that it is killed with the thread that starts it: killed tests leave nothing running."""
-    if sys.platform != "linux":
-        return command
-    return [sys.executable, "-S", "-c", _DIE_WITH_PARENT, *command]
+    return ["setpriv", "--pdeathsig", "KILL", "--", *command] if sys.platform == "linux" else command
 
 
 def marked(mark: str) -> list[int]:

@@ -1,83 +1,108 @@
 """Limits that are promises, on machines that are sometimes late themselves.
 
-A limit is asserted as written. Only where a control, something that has nothing to do with what is tested, was late at
-the same time is a late attempt tried again.
+A limit is asserted as written, and nothing is tried again. What was late is judged against a control, something that
+has nothing to do with what is tested, timed beside it over and over: bare process starts. The control is late where one
+of these took twice as long as they do on this machine when it is quiet, or longer. What took as many times its limit
+then, and no more, counts as not measured: the test goes on, and is listed at the end of the run. Anything else that is
+late fails.
 """
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from tests.support.company import company
 from tests.support.surroundings import clean_environment
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
-#: Seconds of a bare `python -c pass`, measured as 12 ms, above which the machine counts as late.
-PROCESS_START_LIMIT = 0.08
-#: Seconds of `talk status` on an idle server, above which it does.
-STATUS_LIMIT = 0.25
-_TRIES = 3
-
-
-class LateError(AssertionError):
-    """Something took longer than its limit: the only failure that `retry_if_late` may try again."""
+#: Seconds between two controls: they take a tenth of a processor, and a machine is seldom late for less.
+_EVERY = 0.1
+#: Times its usual duration from which a control is late.
+_LATE = 2.0
+#: Controls with which the first user finds out how long one takes when the machine is quiet.
+_FIRST = 5
 
 
-@dataclass(frozen=True, slots=True)
-class Attempt:
-    """One attempt: its controls before and after in seconds, and what was late (None: nothing)."""
+@dataclass(slots=True)
+class Watched:
+    """A block whose limits are judged together."""
 
-    before: float
-    after: float | None
-    late: str | None
+    control: Callable[[], float]
+    controls: list[float] = field(default_factory=list)
+    late: list[tuple[str, float, float]] = field(default_factory=list)  # what, how long it took, its limit
 
 
-def assert_within(seconds: float, limit: float, what: str) -> None:
-    """Assert that something took no longer than its limit."""
-    if seconds > limit:
-        raise LateError(f"{what} took {seconds:.3f} s, the limit is {limit} s")
+#: The shortest that each control has taken in this run, and what could not be measured since `take_unmeasured`.
+_usual: dict[Callable[[], float], float] = {}
+_unmeasured: list[str] = []
+_watched: list[Watched] = []
 
 
 def process_start() -> float:
-    """Return the seconds that a bare process start takes: a control for what starts a process."""
+    """Return the seconds that a bare process start takes, 12 ms where nothing else runs."""
     began = time.monotonic()
-    subprocess.run([sys.executable, "-S", "-c", "pass"], env=clean_environment(tempfile.gettempdir()), check=True)
+    subprocess.run([sys.executable, "-S", "-E", "-c", "pass"], env=clean_environment(tempfile.gettempdir()), check=True)
     return time.monotonic() - began
 
 
-def retry_if_late(
-    attempt: Callable[[], None],
-    control: Callable[[], float] = process_start,
-    control_limit: float = PROCESS_START_LIMIT,
-) -> list[Attempt]:
-    """Run an attempt, at most three times, again only where it was late and so was the control before or after it.
+@contextlib.contextmanager
+def limits(control: Callable[[], float] = process_start) -> Iterator[None]:
+    """Time the control beside the block, and judge against it what `assert_within` finds late there.
 
-    An attempt that raises `LateError` while the control was in time fails, as does any other failure at once, and the
-    third late one. Every attempt's times are in the message, and returned where one was in time at last. One that was
-    late beside other tests, where no control tells what those did meanwhile, does not count: the next are made alone.
+    AssertionError at the end of the block if something was later than the control explains.
     """
-    attempts: list[Attempt] = []
+    watched = Watched(control)
+    if control not in _usual:
+        _usual[control] = min(control() for _ in range(_FIRST))
+    over = threading.Event()
+    beside = threading.Thread(target=_time, args=(watched, over), name="control", daemon=True)
+    beside.start()
+    _watched.append(watched)
+    try:
+        yield
+    finally:
+        _watched.remove(watched)
+        over.set()
+        beside.join()
+    _judge(watched)
+
+
+def assert_within(seconds: float, limit: float, what: str) -> None:
+    """Assert that something took no longer than its limit; inside `limits`, at the end of the block."""
+    if seconds <= limit:
+        return
+    assert _watched, f"{what} took {seconds:.3f} s, the limit is {limit} s"
+    _watched[-1].late.append((what, seconds, limit))
+
+
+def take_unmeasured() -> list[str]:
+    """Return what could not be measured since this was called the last time."""
+    found = _unmeasured.copy()
+    _unmeasured.clear()
+    return found
+
+
+def _time(watched: Watched, over: threading.Event) -> None:
     while True:
-        before = control()
-        try:
-            attempt()
-        except LateError as error:
-            if not company.alone:
-                company.stay_alone()
-                continue
-            after = control()
-            attempts.append(Attempt(before, after, str(error)))
-            in_time = max(before, after) <= control_limit
-            if in_time or len(attempts) == _TRIES:
-                why = "the control was in time" if in_time else "the control was late too"
-                raise AssertionError(f"{error}; {why} (limit {control_limit} s): {attempts}") from error
-        else:
-            attempts.append(Attempt(before, None, None))
-            return attempts
+        watched.controls.append(watched.control())
+        if over.wait(_EVERY):
+            return
+
+
+def _judge(watched: Watched) -> None:
+    usual = _usual[watched.control] = min(_usual[watched.control], *watched.controls)
+    slower = max(watched.controls) / usual
+    allowed = slower if slower >= _LATE else 1.0
+    told = f"the control took {max(watched.controls):.3f} s, usually {usual:.3f} s"
+    for what, seconds, limit in watched.late:
+        line = f"{what} took {seconds:.3f} s, the limit is {limit} s; {told}"
+        assert seconds <= limit * allowed, line
+        _unmeasured.append(line)

@@ -1,0 +1,127 @@
+"""Forks processes that run `talk`, all of it imported already: the program behind `tests.support.forking`.
+
+It reads requests from the socket whose number is its argument: eight bytes of length, with the descriptors that become
+standard input, output and error and one that is told how the child ended; then so many bytes of JSON. It answers with
+the child's id. It ends with its socket, and each child with it.
+
+A child leaves `_serve` and runs to the end of this file as if it had been started for that alone, so that it ends as
+any interpreter does. No thread is started here: a fork would leave it behind.
+"""
+
+from __future__ import annotations
+
+import array
+import ctypes
+import gc
+import importlib
+import io
+import json
+import os
+import pkgutil
+import select
+import signal
+import socket
+import struct
+import sys
+from typing import Any
+
+_KILLED_WITH_PARENT = 1  # PR_SET_PDEATHSIG
+#: What belongs to the engine process alone, or writes files when it is run: no client and no server imports it.
+_LEFT_OUT = ("talkcli.__main__", "talkcli.cli.tabulate", "talkcli.engine.library", "talkcli.engine.process")
+
+
+def _import_talk() -> None:
+    for package in ("talkcli", "talkcli.cli", "talkcli.client", "talkcli.doctor", "talkcli.engine", "talkcli.server"):
+        for each in pkgutil.iter_modules(getattr(importlib.import_module(package), "__path__", ())):
+            name = f"{package}.{each.name}"
+            if name not in _LEFT_OUT and name != "talkcli.engine.espeak":
+                importlib.import_module(name)
+
+
+def _serve(channel: socket.socket) -> dict[str, Any]:
+    """Fork a child for each request; return the request in the child, and never in the parent."""
+    ended: dict[int, tuple[int, int]] = {}  # by the child's pidfd: its id, and who is told of its end
+    poll = select.poll()
+    poll.register(channel, select.POLLIN)
+    while True:
+        for descriptor, _ in poll.poll():
+            if descriptor != channel.fileno():
+                poll.unregister(descriptor)
+                child, told = ended.pop(descriptor)
+                _tell(told, os.waitpid(child, 0)[1])
+                os.close(descriptor)
+                continue
+            asked, given = _receive(channel)
+            child = os.fork()
+            if child == 0:
+                _become(asked, given)
+                return asked
+            for each in given[:3]:
+                os.close(each)
+            watched = os.pidfd_open(child)
+            ended[watched] = (child, given[3])
+            poll.register(watched, select.POLLIN)
+            channel.sendall(struct.pack("<q", child))
+
+
+def _receive(channel: socket.socket) -> tuple[dict[str, Any], list[int]]:
+    given = array.array("i")
+    head, ancillary, _, _ = channel.recvmsg(8, socket.CMSG_SPACE(4 * given.itemsize))
+    if not head:
+        os._exit(0)  # the tests are over
+    for _, _, data in ancillary:
+        given.frombytes(data)
+    length = struct.unpack("<q", head)[0]
+    text = b""
+    while len(text) < length:
+        text += channel.recv(length - len(text))
+    return json.loads(text), list(given)
+
+
+def _tell(told: int, status: int) -> None:
+    try:
+        os.write(told, struct.pack("<i", status))
+    except BrokenPipeError:
+        pass  # nobody waits for it any more
+    os.close(told)
+
+
+def _become(asked: dict[str, Any], given: list[int]) -> None:
+    """Make this child what a process is that was started with these words, environment, directory and descriptors."""
+    ctypes.CDLL(None).prctl(_KILLED_WITH_PARENT, signal.SIGKILL)
+    if os.getppid() != asked["parent"]:
+        os._exit(0)  # which had ended before
+    if asked["session"]:
+        os.setsid()
+    for number, each in enumerate(given[:3]):
+        os.dup2(each, number)
+    os.closerange(3, max(map(int, os.listdir("/proc/self/fd"))) + 1)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ.clear()
+    os.environ.update(asked["env"])
+    os.chdir(asked["directory"])
+    # As Python opens them where the locale is C.UTF-8; `__stdout__` and the like stay as they were, and are not used.
+    sys.stdin, sys.stdout = _stream(0, "r", "surrogateescape"), _stream(1, "w", "surrogateescape")
+    sys.stderr = _stream(2, "w", "backslashreplace")
+    sys.stderr.reconfigure(line_buffering=True)
+    sys.argv = ["talk", *asked["words"]]
+    if asked["scripted"]:
+        from tests.support import scripted_serve
+
+        scripted_serve.replace_engine()
+
+
+def _stream(descriptor: int, mode: str, errors: str) -> io.TextIOWrapper:
+    raw = open(descriptor, f"{mode}b", closefd=False)  # noqa: SIM115 - it lives as long as the process
+    return io.TextIOWrapper(raw, "utf-8", errors, line_buffering=os.isatty(descriptor))
+
+
+if __name__ == "__main__":
+    _import_talk()
+    gc.collect()
+    gc.freeze()  # so that no child copies what none of them frees
+    request = _serve(socket.socket(fileno=int(sys.argv[1])))
+
+    from talkcli.cli import main
+
+    main()

@@ -1,0 +1,214 @@
+"""Starts `talk` as a fork of a process that has imported it: a few ms of processor instead of 45, or 90 for a server.
+
+What runs is a process all the same, with its own environment, descriptors and session, killed with the tests, ended as
+Python ends. It differs in what can be seen of it from outside, its command line and first environment in /proc, and in
+what it no longer has to import. So whoever tests these, signals or limits of a start, streams that are closed or
+another interpreter starts a program of its own; `forks()` tells what may be forked at all.
+"""
+
+from __future__ import annotations
+
+import array
+import atexit
+import json
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+from typing import IO, TYPE_CHECKING
+
+from tests.support.surroundings import clean_environment
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+#: What a forked process can't have of its own: the interpreter's settings, libraries, the locale.
+_INTERPRETER = ("PYTHON", "LD_", "LC_", "LANG", "COVERAGE")
+
+
+class Forked:
+    """A process, with as much of `subprocess.Popen`'s interface as tests use."""
+
+    def __init__(
+        self,
+        words: Sequence[str],
+        env: Mapping[str, str],
+        *,
+        scripted: bool = False,
+        stdin: int = subprocess.DEVNULL,
+        stdout: int = subprocess.DEVNULL,
+        stderr: int = subprocess.DEVNULL,
+        start_new_session: bool = False,
+    ) -> None:
+        """Descriptors are as in `Popen`: a number, PIPE, DEVNULL or STDOUT; pipes are text."""
+        self.args = [sys.executable, "-m", "talkcli", *words]
+        self.returncode: int | None = None
+        self.stdin: IO[str] | None = None
+        self.stdout: IO[str] | None = None
+        self.stderr: IO[str] | None = None
+        asked = {"words": list(words), "env": dict(env), "scripted": scripted, "session": start_new_session}
+        theirs: list[int] = []
+        close: list[int] = []
+        try:
+            for number, wanted in enumerate((stdin, stdout, stderr)):
+                if wanted == subprocess.PIPE:
+                    reading, writing = os.pipe()
+                    theirs.append(writing if number else reading)
+                    close.append(theirs[-1])
+                    self._open(number, reading if number else writing)
+                elif wanted == subprocess.DEVNULL:
+                    theirs.append(os.open(os.devnull, os.O_RDWR))
+                    close.append(theirs[-1])
+                else:
+                    theirs.append(theirs[1] if wanted == subprocess.STDOUT else wanted)
+            self._ended, told = os.pipe()
+            close.append(told)
+            self.pid = _server.fork(asked, [*theirs, told])
+        finally:
+            for each in close:
+                os.close(each)
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Forked:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        for each in (self.stdin, self.stdout, self.stderr):
+            if each:
+                each.close()
+        self.wait()
+
+    def poll(self) -> int | None:
+        """Return the exit code, negative for a signal; None while it runs."""
+        return self._wait(0)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the end, and return the exit code; `subprocess.TimeoutExpired` where it takes longer."""
+        code = self._wait(timeout)
+        if code is None:
+            assert timeout is not None
+            raise subprocess.TimeoutExpired(self.args, timeout)
+        return code
+
+    def communicate(self, input: str | None = None, timeout: float | None = None) -> tuple[str, str]:  # noqa: A002
+        """Send input, read all output, wait for the end."""
+        found = ["", ""]
+
+        def read(number: int, file: IO[str]) -> None:
+            found[number] += file.read()
+
+        files = [each for each in enumerate((self.stdout, self.stderr)) if each[1]]
+        readers = [threading.Thread(target=read, args=each, daemon=True) for each in files]
+        for each in readers:
+            each.start()
+        if self.stdin:
+            try:
+                self.stdin.write(input or "")
+                self.stdin.close()
+            except BrokenPipeError:
+                pass  # it did not want it
+        self.wait(timeout)
+        for each in readers:
+            each.join(timeout)
+            if each.is_alive():  # a child of its own has the pipe
+                raise subprocess.TimeoutExpired(self.args, timeout or 0)
+        for _, file in files:
+            if file:
+                file.close()
+        return found[0], found[1]
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, if it runs."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        """Send SIGTERM."""
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        self.send_signal(signal.SIGKILL)
+
+    def _open(self, number: int, descriptor: int) -> None:
+        file = os.fdopen(descriptor, "r" if number else "w", encoding="utf-8", errors="replace")
+        if number == 0:
+            self.stdin = file
+        elif number == 1:
+            self.stdout = file
+        else:
+            self.stderr = file
+
+    def _wait(self, timeout: float | None) -> int | None:
+        if self.returncode is None:
+            poll = select.poll()
+            poll.register(self._ended, select.POLLIN)
+            if not poll.poll(None if timeout is None else max(0.0, timeout) * 1000):
+                return None
+            with self._lock:
+                if self.returncode is None:  # no other thread was sooner
+                    status = os.read(self._ended, 4)
+                    os.close(self._ended)
+                    assert status, "what forks processes has ended"
+                    self.returncode = os.waitstatus_to_exitcode(struct.unpack("<i", status)[0])
+        return self.returncode
+
+
+def forks(env: Mapping[str, str]) -> bool:
+    """Return whether a process with this environment may be forked: what the interpreter is told is as ever."""
+    return sys.platform == "linux" and _told(env) == _told(clean_environment("/"))
+
+
+def _told(env: Mapping[str, str]) -> dict[str, str]:
+    return {name: value for name, value in env.items() if name.startswith(_INTERPRETER)}
+
+
+class _Server:
+    """The process that forks, started by the first who asks it; it ends when its socket is closed, here or with us."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._channel: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def fork(self, asked: dict[str, object], descriptors: list[int]) -> int:
+        """Have a process forked, and return its id."""
+        with self._lock:
+            channel = self._channel or self._start()
+            assert self._process
+            asked |= {"parent": self._process.pid, "directory": os.getcwd()}
+            text = json.dumps(asked).encode()
+            rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", descriptors))]
+            channel.sendmsg([struct.pack("<q", len(text))], rights)
+            channel.sendall(text)
+            answer = channel.recv(8)
+            assert answer, "what forks processes has ended"
+            child: int = struct.unpack("<q", answer)[0]
+            return child
+
+    def _start(self) -> socket.socket:
+        self._channel, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "tests.support.fork_server", str(theirs.fileno())],
+                cwd=os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))),
+                env=clean_environment(tempfile.gettempdir()),
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+        atexit.register(self._end)
+        return self._channel
+
+    def _end(self) -> None:
+        assert self._channel
+        assert self._process
+        self._channel.close()
+        self._process.wait()
+
+
+_server = _Server()
