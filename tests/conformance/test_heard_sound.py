@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
-    from tests.support.processes import Finished, Talk
+    from tests.support.processes import Finished, Process, Talk
 
 ABORTED = ["PENDING", "ACTIVE", "ABORTED"]
 #: Where ALSA finds no card.
