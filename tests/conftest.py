@@ -68,15 +68,16 @@ def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     """Name what was not measured, and in how many of the last runs."""
     reports = terminalreporter.getreports(_UNMEASURED)
-    assert config.cache
-    before: list[list[str]] = config.cache.get(_LISTED, [])
+    cache: pytest.Cache | None = getattr(config, "cache", None)  # None with `-p no:cacheprovider`
+    before: list[list[str]] = cache.get(_LISTED, []) if cache else []
     listed = [*before, [report.nodeid for report in reports]][-_RUNS:]
-    config.cache.set(_LISTED, listed)
+    if cache:
+        cache.set(_LISTED, listed)
     if reports:
         terminalreporter.write_sep("-", "not measured: late, and so was the control")
     for report in reports:
         times = sum(report.nodeid in each for each in listed)
-        again = f" ({times} times in the last {len(listed)} runs: that is a failure)" if times > 1 else ""
+        again = f" (in {times} of the last {len(listed)} runs: find out why)" if times > 1 else ""
         terminalreporter.write_line(f"{report.nodeid}{again}: {dict(report.user_properties)[_UNMEASURED]}")
 
 

@@ -166,14 +166,15 @@ def assert_begun(heard: Recording | Samples, reference: Samples, shortest: float
     found = extent(samples)
     assert found is not None, "nothing was heard"
     wanted = _sound(reference)
+    places = np.arange(len(wanted))
     sound = samples[found[0] : found[1]]
     if len(sound) > len(wanted) + _SLACK or not _next(samples, wanted[: len(sound)], found[0]).same:
-        own = _sounding(wanted)  # it is another sentence, or the player ran dry
+        places = _sounding(wanted)  # the player ran dry, or it is another sentence
         sound = sound[_sounding(sound)]
-        assert len(sound) <= len(own) + _SLACK, f"more was heard than the sentence: {_told(samples, [])}"
-        wanted = wanted[own]
-    assert_heard(sound, [wanted[: len(sound)]])
-    seconds = len(sound) / RATE if len(wanted) == len(_sound(reference)) else float(own[: len(sound)][-1] + 1) / RATE
+    assert len(sound) <= len(places) + _SLACK, f"more was heard than the sentence: {_told(samples, [])}"
+    places = places[: len(sound)]
+    assert_heard(sound, [wanted[places]])
+    seconds = float(places[-1] + 1) / RATE
     assert seconds >= shortest, f"only {seconds:.3f} s were heard"
     return seconds
 
