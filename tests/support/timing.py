@@ -23,8 +23,8 @@ from tests.support.surroundings import clean_environment
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-#: Seconds between two controls: they take a tenth of a processor, and a machine is seldom late for less.
-_EVERY = 0.1
+#: Seconds between two controls: so they take a thirtieth of a processor.
+_EVERY = 0.25
 #: Times its usual duration from which a control is late.
 _LATE = 2.0
 #: Controls with which the first user finds out how long one takes when the machine is quiet.
@@ -47,7 +47,7 @@ _watched: list[Watched] = []
 
 
 def process_start() -> float:
-    """Return the seconds that a bare process start takes, 12 ms where nothing else runs."""
+    """Return the seconds that a bare process start takes, about 10 ms where nothing else runs."""
     began = time.monotonic()
     subprocess.run([sys.executable, "-S", "-E", "-c", "pass"], env=clean_environment(tempfile.gettempdir()), check=True)
     return time.monotonic() - began
