@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -12,14 +14,24 @@ import pytest
 from talkcli import Client, PausedChanged, State, StateChanged
 from talkcli.errors import BadOption, RequestRefused, UnknownGoal, UsageError
 from talkcli.outgoing import batches
+from talkcli.server import audience
 from talkcli.wire import MAX_LINE, encode
+from tests.support.processes import Talk
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from tests.conftest import MakeTalk
-    from tests.support.processes import Talk
 
+#: Serves with the scripted engine, and says every so many seconds that it is alive.
+ALIVE = """
+import sys
+sys.path.insert(0, {root!r})
+from talkcli.server import audience
+from tests.support import scripted_serve
+audience.ALIVE_EVERY = {every}
+scripted_serve.main()
+"""
 SETTINGS = {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
 
 
@@ -27,6 +39,14 @@ SETTINGS = {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": F
 def client(scripted: Talk) -> Iterator[Client]:
     with Client(scripted.socket, name="patrol") as result:
         yield result
+
+
+@pytest.fixture(scope="module")
+def untouched() -> Iterator[Client]:
+    """A client of a server for all tests that must leave it as it was: it has spoken nothing, with its own settings."""
+    with contextlib.closing(Talk(scripted=True)) as talk, Client(talk.socket) as result:
+        yield result
+        talk.stop()
 
 
 # say
@@ -120,10 +140,10 @@ def test_same_id_again_attaches(client: Client, scripted: Talk) -> None:
         {"data": {"a": math.nan}},
     ],
 )
-def test_option_out_of_its_range_is_an_error_and_nothing_is_sent(client: Client, options: dict[str, Any]) -> None:
+def test_option_out_of_its_range_is_an_error_and_nothing_is_sent(untouched: Client, options: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
-        client.say("hello", **options)
-    assert client.log() == []
+        untouched.say("hello", **options)
+    assert untouched.log() == []
 
 
 @pytest.mark.parametrize(
@@ -138,9 +158,9 @@ def test_ends_of_the_ranges_are_within(client: Client, options: dict[str, Any]) 
     assert client.say("length=0", **options).wait(5).state is State.SUCCEEDED
 
 
-def test_text_of_the_wrong_kind_is_an_error(client: Client) -> None:
+def test_text_of_the_wrong_kind_is_an_error(untouched: Client) -> None:
     with pytest.raises(UsageError, match="'text' must be a string"):
-        client.say(b"hello")  # type: ignore[arg-type]
+        untouched.say(b"hello")  # type: ignore[arg-type]
 
 
 def test_voice_that_the_engine_has_not_is_rejected(client: Client) -> None:
@@ -163,9 +183,12 @@ def test_patient_goal_waits_for_room(make_talk: MakeTalk) -> None:
         assert states == [State.SUCCEEDED]
 
 
-def test_patient_goal_whose_sender_hangs_up_is_not_spoken(make_talk: MakeTalk) -> None:
-    """Takes 5 s: the server sees that somebody who waits has hung up when it says that it is alive."""
-    talk = make_talk("--max-queue", "1", scripted=True)
+@pytest.mark.parametrize("every", [0.5, pytest.param(audience.ALIVE_EVERY, marks=pytest.mark.slow)])
+def test_patient_goal_whose_sender_hangs_up_is_not_spoken(make_talk: MakeTalk, tmp_path: Path, every: float) -> None:
+    """The server sees that somebody who waits has hung up when it says that it is alive."""
+    program = tmp_path / "serve.py"
+    program.write_text(ALIVE.format(root=str(Path(__file__).parents[1]), every=every), encoding="utf-8")
+    talk = make_talk("--max-queue", "1", program=str(program))
     with Client(talk.socket) as client:
         active, pending = client.say("never-ends"), client.say("length=0")
         with talk.connect() as wire:
@@ -257,25 +280,25 @@ def test_settings_are_changed_and_told(client: Client) -> None:
 
 
 @pytest.mark.parametrize("options", [{"rate": 79}, {"volume": 2}, {"pitch": 101}, {"ttl": -1}, {"voice": ""}])
-def test_setting_out_of_its_range_is_an_error_and_changes_nothing(client: Client, options: dict[str, Any]) -> None:
+def test_setting_out_of_its_range_is_an_error_and_changes_nothing(untouched: Client, options: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
-        client.set(preempt=True, **options)
-    assert client.settings() == SETTINGS
+        untouched.set(preempt=True, **options)
+    assert untouched.settings() == SETTINGS
 
 
-def test_voice_that_the_engine_has_not_cannot_be_set(client: Client) -> None:
+def test_voice_that_the_engine_has_not_cannot_be_set(untouched: Client) -> None:
     with pytest.raises(BadOption, match="klingon") as refused:
-        client.set(rate=300, voice="klingon")
+        untouched.set(rate=300, voice="klingon")
     assert (refused.value.code, refused.value.exit_code) == ("unknown_voice", 2)
     assert isinstance(refused.value, RequestRefused)
-    assert client.settings() == SETTINGS
+    assert untouched.settings() == SETTINGS
 
 
 # pause and resume
 
 
 def test_speech_is_held_and_goes_on(client: Client, scripted: Talk) -> None:
-    handle = client.say("length=0.5 one two", feedback=True)
+    handle = client.say("length=0.3 one two", feedback=True)
     scripted.watcher.wait_for_word(handle.id)
     held = client.pause()
     assert held
@@ -285,7 +308,7 @@ def test_speech_is_held_and_goes_on(client: Client, scripted: Talk) -> None:
     waiting = client.say("length=0", preempt=False)
     assert (waiting.speech_paused, waiting.state) == (True, State.PENDING)
     with pytest.raises(TimeoutError):
-        handle.wait(0.7)
+        handle.wait(0.4)
     gone_on = client.resume()
     assert gone_on
     assert (gone_on.id, gone_on.paused) == (handle.id, False)

@@ -7,16 +7,18 @@ import os
 import signal
 import subprocess
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli import Client
+from talkcli import Client, dial
 from talkcli.doctor import reach, sentence
 from talkcli.states import State
-from tests.faults.broken import sound, write
+from tests.faults.broken import write
 from tests.support.compare import assert_silent, extent
 from tests.support.surroundings import needs
+from tests.test_doctor_alone import within
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,8 +29,6 @@ if TYPE_CHECKING:
     from tests.support.processes import Finished, Talk
     from tests.support.sink import Sink
 
-__all__ = ["sound"]
-
 #: The checks, in the order of a sentence's way.
 CHECKS = [
     "python", "pyttsx3", "libespeak-ng", "voices", "session", "player", "device", "cards", "group", "sound server",
@@ -36,6 +36,8 @@ CHECKS = [
 ]  # fmt: skip
 #: Seconds in which it ends, whatever it finds.
 LIMIT = 60.0
+#: The sentence is over sooner.
+FAST = ("--rate", "450")
 
 
 def doctor(talk: Talk, *options: str) -> tuple[Finished, dict[str, dict[str, str]]]:
@@ -51,13 +53,28 @@ def doctor(talk: Talk, *options: str) -> tuple[Finished, dict[str, dict[str, str
     return done, {each["check"]: each for each in findings}
 
 
+def examined(
+    talk: Talk, directory: Path, monkeypatch: pytest.MonkeyPatch, patience: float
+) -> dict[str, dict[str, str]]:
+    """Return what it finds of a server that has so many seconds, and that nobody would hear.
+
+    By the command where these are its own; else in this process, with a file for the sentence, which takes no time.
+    """
+    if patience == dial.ANSWER_LIMIT:
+        done, found = doctor(talk, "--silent")
+        assert done.code == 4
+        return found
+    monkeypatch.setattr(reach, "Client", partial(Client, patience=patience))
+    return within({**talk.env, "TALK_PLAYER": f"file:{directory}/said.wav"}, monkeypatch, silent=True)
+
+
 def logged(talk: Talk) -> list[Message]:
     """Return the goals that have ended, oldest first."""
     return [json.loads(line) for line in talk.run("--json", "log").out.splitlines()]
 
 
-def test_all_is_well_and_its_sentence_is_heard_as_a_goal_of_its_own(make_talk: MakeTalk, sound: Sink) -> None:
-    talk = make_talk(sink=sound, forked=False)
+def test_all_is_well_and_its_sentence_is_heard_as_a_goal_of_its_own(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = make_talk(*FAST, sink=sink, forked=False)
     done, found = doctor(talk)
     assert done.code == 0, done.out
     assert done.err == ""
@@ -71,8 +88,8 @@ def test_all_is_well_and_its_sentence_is_heard_as_a_goal_of_its_own(make_talk: M
     assert extent(talk.recording.samples)
 
 
-def test_silent_leaves_out_the_sound_and_nothing_else(make_talk: MakeTalk, sound: Sink) -> None:
-    talk = make_talk(sink=sound, forked=False)
+def test_silent_leaves_out_the_sound_and_nothing_else(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = make_talk(*FAST, sink=sink, forked=False)
     done, found = doctor(talk, "--silent")
     assert done.code == 0, done.out
     assert list(found) == CHECKS
@@ -81,8 +98,8 @@ def test_silent_leaves_out_the_sound_and_nothing_else(make_talk: MakeTalk, sound
     assert_silent(talk.recording)
 
 
-def test_for_people_it_is_a_line_a_finding_and_the_end_is_a_note(make_talk: MakeTalk, sound: Sink) -> None:
-    talk = make_talk("--volume", "0.1", sink=sound, forked=False)
+def test_for_people_it_is_a_line_a_finding_and_the_end_is_a_note(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = make_talk(*FAST, "--volume", "0.1", sink=sink, forked=False)
     done = talk.run("doctor", "--silent", timeout=LIMIT)
     assert done.code == 0
     assert [line[9:23].strip() for line in done.out.splitlines()] == CHECKS
@@ -94,8 +111,8 @@ def test_for_people_it_is_a_line_a_finding_and_the_end_is_a_note(make_talk: Make
     assert (quiet.code, quiet.err) == (0, "")
 
 
-def test_paused_speech_is_named_and_no_goal_is_left_behind(make_talk: MakeTalk, sound: Sink) -> None:
-    talk = make_talk(sink=sound, forked=False)
+def test_paused_speech_is_named_and_no_goal_is_left_behind(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = make_talk(sink=sink, forked=False)
     assert talk.run("pause").code == 0
     done, found = doctor(talk)
     assert done.code == 4
@@ -168,7 +185,7 @@ def test_a_signal_takes_its_goal_along(scripted: Talk, number: signal.Signals) -
 
 
 def test_a_player_without_sound_is_not_heard(make_talk: MakeTalk) -> None:
-    done, found = doctor(make_talk("--player", "null"))
+    done, found = doctor(make_talk("--player", "null", *FAST))
     assert done.code == 4
     assert (found["player"]["state"], found["sentence"]["state"]) == ("failed", "done")
     assert "null (the server's)" in found["player"]["message"]
@@ -201,13 +218,13 @@ def test_a_sink_that_is_suspended_is_named_with_the_command_that_wakes_it(
     sink.resume()
 
 
-def test_a_sink_that_is_muted_is_not_heard_though_all_was_played(
-    make_talk: MakeTalk, private_sink: Callable[[], Sink]
-) -> None:
-    sink = private_sink()
-    talk = make_talk(sink=sink, forked=False)
+def test_a_sink_that_is_muted_is_not_heard_though_all_was_played(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = make_talk(*FAST, sink=sink, forked=False)
     sink._pactl("set-sink-mute", "null", "1")
-    done, found = doctor(talk, "--silent")
+    try:
+        done, found = doctor(talk, "--silent")
+    finally:
+        sink._pactl("set-sink-mute", "null", "0")
     assert (done.code, found["sentence"]["state"]) == (4, "done")
     assert (found["loudness"]["state"], found["loudness"]["message"]) == ("failed", "the default sink is muted")
 
@@ -228,30 +245,34 @@ def test_a_sound_server_that_hangs_is_named_and_it_ends_all_the_same(
     assert found["sentence"]["next"] == found["sound server"]["next"]
 
 
-def test_a_server_that_hangs_is_named(make_talk: MakeTalk) -> None:
+@pytest.mark.parametrize("limit", [0.5, pytest.param(dial.ANSWER_LIMIT, marks=pytest.mark.slow)])
+def test_a_server_that_hangs_is_named(
+    make_talk: MakeTalk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: float
+) -> None:
     talk = make_talk("--player", "null", watched=False)
     talk.freeze()
-    done, found = doctor(talk, "--silent")
+    found = examined(talk, tmp_path, monkeypatch, limit)
     talk.thaw()
-    assert done.code == 4
     assert found["socket"]["state"] == "failed"
     assert f"does not answer; look at process {talk.pid}" in found["socket"]["message"]
     assert "server" not in found
 
 
-def test_a_full_server_is_named(make_talk: MakeTalk) -> None:
+@pytest.mark.parametrize("limit", [0.5, pytest.param(dial.BUSY_LIMIT, marks=pytest.mark.slow)])
+def test_a_full_server_is_named(
+    make_talk: MakeTalk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: float
+) -> None:
     talk = make_talk("--player", "null", "--max-clients", "1", watched=False)
     with talk.connect() as wire:
         assert wire.request("hello")["ok"]
-        done, found = doctor(talk, "--silent")
-    assert done.code == 4
+        found = examined(talk, tmp_path, monkeypatch, limit)
     assert "--max-clients" in found["socket"]["next"]
 
 
-def test_sound_behind_a_forwarded_socket_is_not_looked_for_here(make_talk: MakeTalk, sound: Sink) -> None:
+def test_sound_behind_a_forwarded_socket_is_not_looked_for_here(make_talk: MakeTalk, sink: Sink) -> None:
     """As by ssh -L: what answers is the forwarder, and the server's player is elsewhere."""
     needs("socat")
-    talk = make_talk(sink=sound, forked=False)
+    talk = make_talk(*FAST, sink=sink, forked=False)
     forwarded = f"{talk.socket}.here"
     forwarder = subprocess.Popen(["socat", f"UNIX-LISTEN:{forwarded},fork", f"UNIX-CONNECT:{talk.socket}"])
     try:

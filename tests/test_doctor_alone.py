@@ -17,18 +17,19 @@ import espeakng_loader
 import pytest
 
 import talkcli
+from talkcli.doctor import examine, programs
+from talkcli.doctor.findings import heard
 from tests.conformance.bareserve import TALK, environment, serving
-from tests.faults.broken import python_path, sound, write
+from tests.faults.broken import python_path, write
 from tests.faults.test_users import NOBODY, as_user, impostor
 from tests.support.compare import assert_silent, extent
+from tests.support.processes import start_talk
 from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from tests.support.sink import Sink
-
-__all__ = ["sound"]
 
 #: Seconds in which it ends, whatever it finds.
 LIMIT = 60.0
@@ -45,22 +46,34 @@ def home() -> Iterator[str]:
         yield path
 
 
+def quick(home: str, **extra: str) -> dict[str, str]:
+    """Return an environment in which the sentence goes to a file, which takes no time, unlike null."""
+    return environment(home, TALK_PLAYER=f"file:{home}/said.wav", **extra)
+
+
 def doctor(
     env: Mapping[str, str], *options: str, command: Sequence[str] = TALK, code: int = 4
 ) -> dict[str, dict[str, str]]:
     """Run it, assert how it ends, and return its findings by their checks."""
-    done = subprocess.run(
-        [*command, "--json", "doctor", *options],
-        env=dict(env),
-        cwd="/",
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=LIMIT,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (code, ""), done
-    findings = [json.loads(line) for line in done.stdout.splitlines()]
+    if command is TALK:
+        process = start_talk(["--json", "doctor", *options], env)
+        out, err = process.communicate(timeout=LIMIT)
+        ended = (process.wait(), err)
+    else:
+        whole = [*command, "--json", "doctor", *options]
+        done = subprocess.run(
+            whole,
+            env=dict(env),
+            cwd="/",
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=LIMIT,
+            check=False,
+        )
+        out, ended = done.stdout, (done.returncode, done.stderr)
+    assert ended == (code, ""), (ended, out)
+    findings = [json.loads(line) for line in out.splitlines()]
     for each in findings:
         assert list(each) == ["check", "state", "message", "next"]
     assert findings[0]["check"] == "python"
@@ -68,11 +81,24 @@ def doctor(
     return {each["check"]: each for each in findings}
 
 
+def within(
+    env: Mapping[str, str], monkeypatch: pytest.MonkeyPatch, *, silent: bool = False
+) -> dict[str, dict[str, str]]:
+    """Return what it finds in this process, whose limits a test can set, and assert that nobody would hear it."""
+    for name in [each for each in os.environ if each not in env]:
+        monkeypatch.delenv(name)
+    for name, value in env.items():
+        monkeypatch.setenv(name, value)
+    found = list(examine.Examination(None, silent=silent).findings())
+    assert not heard(found)
+    return {each.check: json.loads(json.dumps(each.to_json())) for each in found}
+
+
 def test_with_sound_and_no_server_its_own_engine_is_heard_and_the_server_is_what_is_missing(
-    home: str, sound: Sink
+    home: str, sink: Sink
 ) -> None:
-    with sound.record() as recording:
-        found = doctor(environment(home, **sound.env, TALK_SOCKET=f"{home}/s"))
+    with sink.record() as recording:
+        found = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"))
         recording.wait_until_quiet(0.2)
     assert extent(recording.samples)
     assert {each["check"] for each in found.values() if each["state"] == "failed"} == {"socket"}
@@ -81,9 +107,9 @@ def test_with_sound_and_no_server_its_own_engine_is_heard_and_the_server_is_what
     assert "server" not in found
 
 
-def test_silent_makes_no_sound_without_a_server_either(home: str, sound: Sink) -> None:
-    with sound.record() as recording:
-        found = doctor(environment(home, **sound.env, TALK_SOCKET=f"{home}/s"), "--silent")
+def test_silent_makes_no_sound_without_a_server_either(home: str, sink: Sink) -> None:
+    with sink.record() as recording:
+        found = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"), "--silent")
         recording.wait_until_quiet(0.2)
     assert_silent(recording)
     assert found["sentence"]["state"] == "done"
@@ -112,13 +138,13 @@ def test_no_server_names_each_place_and_how_to_start_one(home: str) -> None:
 
 
 def test_without_a_runtime_directory_it_says_so_and_looks_elsewhere(home: str) -> None:
-    found = doctor(environment(home, TALK_PLAYER="null"))
+    found = doctor(quick(home))
     assert "XDG_RUNTIME_DIR" in found["session"]["message"]
     assert f"{home}/runtime-{os.getuid()}/talk/talk.sock: not there" in found["socket"]["message"]
 
 
 def test_a_runtime_directory_that_is_not_there_is_named(home: str) -> None:
-    found = doctor(environment(home, TALK_PLAYER="null", XDG_RUNTIME_DIR=f"{home}/gone"))
+    found = doctor(quick(home, XDG_RUNTIME_DIR=f"{home}/gone"))
     assert found["session"]["state"] == "warning"
     assert f"{home}/gone, which is not there" in found["session"]["message"]
 
@@ -128,7 +154,7 @@ def test_a_stale_socket_is_named_and_no_obstacle(home: str) -> None:
     path = f"{home}/run/talk/talk.sock"
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(path)
-    found = doctor(environment(home, TALK_PLAYER="null", XDG_RUNTIME_DIR=f"{home}/run"))
+    found = doctor(quick(home, XDG_RUNTIME_DIR=f"{home}/run"))
     assert f"{path}: nobody answers: left over from a server that ended" in found["socket"]["message"]
     assert found["socket"]["next"] == "talk serve (it takes the place of what was left over)"
 
@@ -144,11 +170,11 @@ def test_what_is_no_socket_is_told_from_one_that_was_left(home: str) -> None:
         ),
         ({"TALK_SOCKET": f"{home}/file"}, "file: a file, and no", "unset TALK_SOCKET, or name a socket"),
     ):
-        found = doctor(environment(home, TALK_PLAYER="null", **extra))["socket"]
+        found = doctor(quick(home, **extra))["socket"]
         assert words in found["message"]
         assert found["next"].startswith(step)
     Path(f"{home}/run/talk/talk.sock").touch()
-    found = doctor(environment(home, TALK_PLAYER="null", XDG_RUNTIME_DIR=f"{home}/run"))["socket"]
+    found = doctor(quick(home, XDG_RUNTIME_DIR=f"{home}/run"))["socket"]
     assert found["next"] == f"remove {home}/run/talk/talk.sock, and: talk serve"
 
 
@@ -166,15 +192,13 @@ def test_what_answers_and_serves_nobody_is_named(home: str, greeting: str, check
         other.bind(f"{home}/s")
         other.listen()
         other.settimeout(20)
-        command = [*TALK, "--json", "doctor", "--silent"]
-        env = environment(home, TALK_PLAYER="null", TALK_SOCKET=f"{home}/s")
-        with subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) as process:
-            client, _ = other.accept()
-            client.sendall(f"{greeting}\n".encode())
-            client.recv(65536)
-            client.close()
-            out, _ = process.communicate(timeout=LIMIT)
-    assert process.returncode == 4
+        process = start_talk(["--json", "doctor", "--silent"], quick(home, TALK_SOCKET=f"{home}/s"))
+        client, _ = other.accept()
+        client.sendall(f"{greeting}\n".encode())
+        client.recv(65536)
+        client.close()
+        out, _ = process.communicate(timeout=LIMIT)
+    assert process.wait() == 4
     found = {each["check"]: each for each in map(json.loads, out.splitlines())}
     assert found[check]["state"] == "failed"
     assert words in found[check]["message"]
@@ -184,7 +208,7 @@ def test_what_answers_and_serves_nobody_is_named(home: str, greeting: str, check
 def test_a_wrong_variable_is_told_from_the_server_that_runs_elsewhere(home: str) -> None:
     env = environment(home, XDG_RUNTIME_DIR=f"{home}/run")
     with serving(env):
-        found = doctor({**env, "TALK_SOCKET": f"{home}/wrong", "TALK_PLAYER": "null"})
+        found = doctor({**quick(home), **env, "TALK_SOCKET": f"{home}/wrong"})
     assert f"named by TALK_SOCKET: {home}/wrong: not there" in found["socket"]["message"]
     assert found["socket"]["next"] == f"unset TALK_SOCKET: a server is on {home}/run/talk/talk.sock"
 
@@ -196,7 +220,7 @@ def test_a_server_of_another_user_is_named_and_told_nothing(home: str) -> None:
     os.chmod(f"{home}/run/talk", 0o777)
     path = f"{home}/run/talk/talk.sock"
     with impostor(path) as heard:
-        found = doctor(environment(home, TALK_PLAYER="null", XDG_RUNTIME_DIR=f"{home}/run"))
+        found = doctor(quick(home, XDG_RUNTIME_DIR=f"{home}/run"))
         assert heard() == b"b''\n", "it hung up without a word"
     assert f"{path}: another user's server (uid {NOBODY})" in found["socket"]["message"]
     assert f"if you trust uid {NOBODY}: talk --socket {path} doctor" in found["socket"]["next"]
@@ -258,17 +282,21 @@ def test_an_unknown_voice_is_named(home: str) -> None:
     assert 'unknown voice "klingon-7"' in found["voices"]["message"]
 
 
-def test_programs_that_hang_delay_it_and_no_more(home: str) -> None:
+@pytest.mark.parametrize("limit", [0.3, pytest.param(programs.LIMIT, marks=pytest.mark.slow)])
+def test_programs_that_hang_delay_it_and_no_more(home: str, monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
     for name in ("pactl", "aplay", "pw-cli"):
-        write_path = os.path.join(home, "run", name)
-        with open(write_path, "w", encoding="utf-8") as file:
-            file.write("#!/bin/sh\nexec sleep 98\n")
-        os.chmod(write_path, 0o755)
+        write(Path(home, "run", name), "#!/bin/sh\nexec sleep 98\n", 0o755)
     env = environment(home, TALK_SOCKET=f"{home}/s")
+    env["PATH"] = f"{home}/run:{env['PATH']}"
     began = time.monotonic()
-    found = doctor({**env, "PATH": f"{home}/run:{env['PATH']}"})
+    if limit == programs.LIMIT:
+        found = doctor(env)
+    else:
+        monkeypatch.setattr(programs, "LIMIT", limit)
+        monkeypatch.setattr(examine, "LIMIT", 2 * limit)
+        found = within(env, monkeypatch)
     assert time.monotonic() - began < LIMIT / 2
-    assert "no answer within 3 s" in found["device"]["message"]
+    assert f"no answer within {limit:g} s" in found["device"]["message"]
     assert "does not answer" in found["sound server"]["message"]
 
 
@@ -291,6 +319,6 @@ def test_the_library_stays_out_of_its_own_process(home: str) -> None:
         "print([each for each in ('pyttsx3', 'espeakng_loader', 'asyncio') if each in sys.modules], end='')\n"
         "print('espeak' in open('/proc/self/maps').read() if sys.platform == 'linux' else False)\n"
     )
-    env = environment(home, TALK_SOCKET=f"{home}/s", TALK_PLAYER="null")
+    env = quick(home, TALK_SOCKET=f"{home}/s")
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "[]False\n"

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.server import pauses
 from tests.conformance.bareserve import TALK, environment, run
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
+
+
+#: Serves with the scripted engine, and gives a pause so many seconds.
+LIMITED = """
+import sys
+sys.path.insert(0, {root!r})
+from talkcli.server import pauses
+from tests.support import scripted_serve
+pauses.PAUSE_LIMIT = {limit}
+scripted_serve.main()
+"""
 
 
 @pytest.fixture
@@ -112,20 +125,26 @@ def test_silence_of_an_earlier_pause_answers_no_later_one(scripted: Talk) -> Non
     scripted.run("cancel")
 
 
-def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(scripted: Talk) -> None:
-    begin(scripted, "never-ends ignore-pause")
-    with scripted.connect() as wire:
+@pytest.mark.parametrize("limit", [0.5, pytest.param(pauses.PAUSE_LIMIT, marks=pytest.mark.slow)])
+def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(
+    make_talk: MakeTalk, tmp_path: Path, limit: float
+) -> None:
+    program = tmp_path / "serve.py"
+    program.write_text(LIMITED.format(root=str(Path(__file__).parents[1]), limit=limit), encoding="utf-8")
+    talk = make_talk(program=str(program))
+    begin(talk, "never-ends ignore-pause")
+    with talk.connect() as wire:
         wire.send({"seq": 1, "request": "pause"})
         with pytest.raises(TimeoutError):
-            wire.receive(0.5)
+            wire.receive(limit / 4)
         asked = time.monotonic()
         wire.send({"seq": 2, "request": "pause"})
         for seq in (1, 2):
             reply = wire.receive()
             assert (reply["seq"], reply["error"]["code"]) == (seq, "not_silent")
-        assert time.monotonic() - asked >= 1.9
-    scripted.run("resume")
-    scripted.run("cancel")
+        assert time.monotonic() - asked >= 0.95 * limit
+    talk.run("resume")
+    talk.run("cancel")
 
 
 def test_where_nothing_is_spoken_it_is_success_too(make_talk: MakeTalk) -> None:

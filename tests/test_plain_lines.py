@@ -98,9 +98,7 @@ def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], Common]:
             return name, context.params, options
 
 
-@settings(max_examples=2000, deadline=None)
-@given(LINES, ENVIRONMENTS)
-def test_both_read_any_line_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
+def assert_read_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("TALK_NAME", raising=False)
         for name, value in environment.items():
@@ -114,6 +112,19 @@ def test_both_read_any_line_alike(arguments: list[str], environment: Mapping[str
     assert (found.command, found.given) == (command, params)
     assert found.common.get("socket") == options.socket
     assert (found.common.get("json", False), found.common.get("quiet", False)) == (options.json, options.quiet)
+
+
+@settings(max_examples=200, deadline=None)
+@given(LINES, ENVIRONMENTS)
+def test_both_read_any_line_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
+    assert_read_alike(arguments, environment)
+
+
+@pytest.mark.slow
+@settings(max_examples=5000, deadline=None)
+@given(LINES, ENVIRONMENTS)
+def test_both_read_thousands_of_lines_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
+    assert_read_alike(arguments, environment)
 
 
 @pytest.mark.parametrize(
@@ -177,9 +188,7 @@ def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
     return hello, others[found.command]
 
 
-@settings(max_examples=2000, deadline=None)
-@given(LINES, ENVIRONMENTS)
-def test_what_is_sent_early_is_what_the_library_sends(arguments: list[str], environment: Mapping[str, str]) -> None:
+def assert_sent_as_by_the_library(arguments: list[str], environment: Mapping[str, str]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("TALK_NAME", raising=False)
         for name, value in environment.items():
@@ -190,6 +199,21 @@ def test_what_is_sent_early_is_what_the_library_sends(arguments: list[str], envi
             return
         hello, request = library_sends(found)
     assert sent == (wire.encode(write_request(hello)), wire.encode({"seq": 1, **write_request(request)}))
+
+
+@settings(max_examples=200, deadline=None)
+@given(LINES, ENVIRONMENTS)
+def test_what_is_sent_early_is_what_the_library_sends(arguments: list[str], environment: Mapping[str, str]) -> None:
+    assert_sent_as_by_the_library(arguments, environment)
+
+
+@pytest.mark.slow
+@settings(max_examples=5000, deadline=None)
+@given(LINES, ENVIRONMENTS)
+def test_thousands_that_are_sent_early_are_what_the_library_sends(
+    arguments: list[str], environment: Mapping[str, str]
+) -> None:
+    assert_sent_as_by_the_library(arguments, environment)
 
 
 @given(st.text(max_size=40))

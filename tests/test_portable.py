@@ -46,7 +46,14 @@ def on_macos(*command: str, **extra: str) -> str:
 def served(make_talk: MakeTalk, request: pytest.FixtureRequest) -> Talk:
     """A server whose every process misses what macOS misses; by name too, or only in fact."""
     driver = "dummy" if request.param == "darwin" else "espeak"
-    return make_talk("--player", "null", driver=driver, env={"PYTHONPATH": PATH, "TALK_TEST_PLATFORM": request.param})
+    return make_talk(
+        "--player",
+        "null",
+        "--rate",
+        "450",
+        driver=driver,
+        env={"PYTHONPATH": PATH, "TALK_TEST_PLATFORM": request.param},
+    )
 
 
 def test_what_only_linux_has_is_hidden() -> None:
@@ -75,7 +82,7 @@ def test_sentence_is_spoken_waited_for_and_listed(served: Talk) -> None:
     assert "SUCCEEDED" in served.run("status").out
     assert "battery low" in served.run("log").out
     assert served.run("voices").out
-    assert served.run("set", "--rate", "150").code == 0
+    assert served.run("set", "--rate", "440").code == 0
     words = served.run("say", "--feedback", "one two three").out
     assert [line.split()[-1] for line in words.splitlines() if " word " in line] == ["one", "two", "three"]
 
@@ -90,9 +97,9 @@ def test_speech_is_held_goes_on_and_is_cancelled(served: Talk) -> None:
 
 
 def test_player_is_started_told_the_truth_about_and_killed(make_talk: MakeTalk) -> None:
-    """By talk's own driver: a program that plays nothing for a second longer than it is fed, and one that fails."""
+    """By talk's own driver: a program that plays nothing for a while longer than it is fed, and one that fails."""
     env = {"PYTHONPATH": PATH, "TALK_TEST_PLATFORM": "linux"}
-    talk = make_talk("--player", "sh -c 'cat >/dev/null; sleep 1'", env=env)
+    talk = make_talk("--player", "sh -c 'cat >/dev/null; sleep 0.4'", "--rate", "450", env=env)
     assert talk.run("say", "--wait", "hi").code == 0
     goal_id = talk.run("say", "a sentence of some length, which nobody will hear to its very end").id
     talk.watcher.wait_for_word(goal_id)

@@ -62,7 +62,7 @@ def test_a_long_text_is_followed_within_the_width_and_whole_at_the_end(
     scripted: Talk, in_terminal: Callable[..., Terminal]
 ) -> None:
     words = [f"word{number}" for number in range(60)]
-    text = " ".join(["length=1.5", *words])
+    text = " ".join(["length=1", *words])
     terminal = in_terminal("say", "-wf", "--", text, columns=50)
     lit: list[str] = []
 
@@ -74,7 +74,7 @@ def test_a_long_text_is_followed_within_the_width_and_whole_at_the_end(
 
     terminal.wait_until(at_the_end)
     assert terminal.finish() == 0
-    assert set(words) & set(lit) == set(lit) - {"length=1.5"}  # each whole, never cut
+    assert set(words) & set(lit) == set(lit) - {"length=1"}  # each whole, never cut
     assert len(set(lit)) > 20
     goal_id = scripted.watcher.goals()[0]
     whole = f"{goal_id}  SUCCEEDED  {text}"
@@ -83,7 +83,7 @@ def test_a_long_text_is_followed_within_the_width_and_whole_at_the_end(
 
 @pytest.mark.parametrize("columns", [5, 12, 30, 79])
 def test_wide_characters_never_break_the_line(in_terminal: Callable[..., Terminal], columns: int) -> None:
-    text = "length=0.5 日本語の文章です とても長い文 👩👩👩👩 é é é の終わり"
+    text = "length=0.3 日本語の文章です とても長い文 👩👩👩👩 é é é の終わり"
     terminal = in_terminal("say", "-wf", "--", text, columns=columns)
     wrapped: list[int] = []
 

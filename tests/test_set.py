@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.conformance.bareserve import TALK, environment, run
+from tests.support.processes import Talk
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from tests.conftest import MakeTalk
-    from tests.support.processes import Talk
 
 DEFAULTS = {"rate": "200", "volume": "1", "voice": "default", "pitch": "50", "preempt": "no", "ttl": "0"}
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Talk]:
+    """A server for all tests that leave its settings as they were, or as they were by `shared`."""
+    with contextlib.closing(Talk(scripted=True)) as talk:
+        assert talk.run("voices").code == 0  # now they are known
+        yield talk
+        talk.stop()
+
+
+@pytest.fixture
+def shared(server: Talk) -> Talk:
+    """The same server, with the settings of the start."""
+    assert server.request("set", rate=200, volume=1.0, voice="default", pitch=50, preempt=False, ttl=0)["ok"]
+    return server
 
 
 def settings(talk: Talk) -> dict[str, str]:
@@ -24,9 +43,9 @@ def settings(talk: Talk) -> dict[str, str]:
     return dict(each.split() for each in done.out.splitlines())
 
 
-def test_alone_it_prints_them(scripted: Talk) -> None:
-    assert settings(scripted) == DEFAULTS
-    done = scripted.run("set", "--json")
+def test_alone_it_prints_them(shared: Talk) -> None:
+    assert settings(shared) == DEFAULTS
+    done = shared.run("set", "--json")
     assert json.loads(done.out) == {
         "rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None,
     }  # fmt: skip
@@ -51,25 +70,24 @@ def test_alone_it_prints_them(scripted: Talk) -> None:
     ],
 )
 def test_one_is_changed_and_the_others_stay(
-    scripted: Talk, words: list[str], name: str, value: object, shown: str
+    shared: Talk, words: list[str], name: str, value: object, shown: str
 ) -> None:
-    assert scripted.run("voices").code == 0  # now they are known
-    done = scripted.run("set", *words)
+    done = shared.run("set", *words)
     assert (done.code, done.out, done.err) == (0, "", "")
-    assert settings(scripted) == {**DEFAULTS, name: shown}
-    changed = json.loads(scripted.run("--json", "set", *words).out)
+    assert settings(shared) == {**DEFAULTS, name: shown}
+    changed = json.loads(shared.run("--json", "set", *words).out)
     assert changed[name] == value
-    assert json.loads(scripted.run("--json", "set").out) == changed
-    described = json.loads(scripted.run("--json", "status").out)["server"]
+    assert json.loads(shared.run("--json", "set").out) == changed
+    described = json.loads(shared.run("--json", "status").out)["server"]
     assert {each: described[each] for each in changed} == changed
 
 
-def test_what_is_printed_can_be_given_back(scripted: Talk) -> None:
-    scripted.run("set", "--rate", "150", "--volume", "0.1", "--ttl", "1.5", "--pitch", "60", "--voice", "en")
-    before = settings(scripted)
+def test_what_is_printed_can_be_given_back(shared: Talk) -> None:
+    shared.run("set", "--rate", "150", "--volume", "0.1", "--ttl", "1.5", "--pitch", "60", "--voice", "en")
+    before = settings(shared)
     words = [word for name, value in before.items() if name != "preempt" for word in (f"--{name}", value)]
-    assert scripted.run("set", *words).code == 0
-    assert settings(scripted) == before
+    assert shared.run("set", *words).code == 0
+    assert settings(shared) == before
 
 
 @pytest.mark.parametrize(
@@ -80,38 +98,37 @@ def test_what_is_printed_can_be_given_back(scripted: Talk) -> None:
         ["--ttl", "-1"], ["--ttl", "nan"], ["--ttl", "inf"], ["--voice", ""], ["--rate"],
     ],
 )  # fmt: skip
-def test_out_of_range_is_a_usage_error_and_nothing_is_changed(scripted: Talk, words: list[str]) -> None:
-    done = scripted.run("set", "--pitch", "60", *words)
+def test_out_of_range_is_a_usage_error_and_nothing_is_changed(shared: Talk, words: list[str]) -> None:
+    done = shared.run("set", "--pitch", "60", *words)
     assert (done.code, done.out, words[0] in done.err) == (2, "", True)
-    as_json = scripted.run("--json", "set", *words)
+    as_json = shared.run("--json", "set", *words)
     assert json.loads(as_json.err)["error"]["exit"] == 2
-    assert settings(scripted) == DEFAULTS
-    assert scripted.run("set", "60").code == 2
+    assert settings(shared) == DEFAULTS
+    assert shared.run("set", "60").code == 2
 
 
-def test_unknown_voice_is_told_with_what_comes_near(scripted: Talk) -> None:
-    assert scripted.run("voices").code == 0
-    done = scripted.run("set", "--rate", "150", "--voice", "scirpted")
+def test_unknown_voice_is_told_with_what_comes_near(shared: Talk) -> None:
+    done = shared.run("set", "--rate", "150", "--voice", "scirpted")
     assert (done.code, done.out) == (2, "")
     assert "did you mean 'scripted'?" in done.err
-    error = json.loads(scripted.run("--json", "set", "--voice", "x\x1b[31my").err)["error"]
+    error = json.loads(shared.run("--json", "set", "--voice", "x\x1b[31my").err)["error"]
     assert (error["code"], error["exit"]) == ("unknown_voice", 2)
     assert "\x1b" not in error["message"]
-    assert settings(scripted) == DEFAULTS
+    assert settings(shared) == DEFAULTS
 
 
-def test_variables_of_serve_change_nothing(scripted: Talk) -> None:
-    env = {**scripted.env, "TALK_RATE": "100", "TALK_VOLUME": "0.1", "TALK_VOICE": "none"}
+def test_variables_of_serve_change_nothing(shared: Talk) -> None:
+    env = {**shared.env, "TALK_RATE": "100", "TALK_VOLUME": "0.1", "TALK_VOICE": "none"}
     assert run([*TALK, "set", "--pitch", "50"], env).code == 0
-    assert settings(scripted) == DEFAULTS
+    assert settings(shared) == DEFAULTS
 
 
 def test_changes_hold_for_what_comes(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     talk.run("set", "--rate", "450", "--ttl", "30")
-    fast = json.loads(talk.run("--json", "say", "--wait", "one two three four five six").out)
-    talk.run("set", "--rate", "150", "--ttl", "0")
-    slow = json.loads(talk.run("--json", "say", "--wait", "one two three four five six").out)
+    fast = json.loads(talk.run("--json", "say", "--wait", "one two three").out)
+    talk.run("set", "--rate", "200", "--ttl", "0")
+    slow = json.loads(talk.run("--json", "say", "--wait", "one two three").out)
     assert (fast["ttl"], slow["ttl"]) == (30, None)
     assert slow["duration"] > fast["duration"] * 1.5
 

@@ -248,13 +248,13 @@ def test_end_of_input_ends_it(engine: Engine) -> None:
 
 
 def test_what_lingers_outlives_a_kill_and_then_ends(engine: Engine) -> None:
-    engine.say("linger=1 length=10")
+    engine.say("linger=0.6 length=10")
     assert isinstance(engine.receive(), protocol.Started)
     os.killpg(engine.process.pid, signal.SIGKILL)
     engine.process.wait()
     for pid in marked(engine.mark):
         os.kill(pid, signal.SIGTERM)
-    assert not engine.gone(0.5)
+    assert not engine.gone(0.3)
     assert engine.gone(3)
 
 
@@ -284,6 +284,7 @@ def test_a_start_hangs(start: Callable[..., Engine]) -> None:
     engine = start(SCRIPTED_START="hang")
     with pytest.raises(TimeoutError):
         engine.receive(0.5)
+    engine.process.kill()
 
 
 def test_each_start_reads_the_file_anew(start: Callable[..., Engine], tmp_path: pathlib.Path) -> None:

@@ -98,7 +98,8 @@ def test_a_bad_end_is_noticed(arguments: tuple[str, ...], fault: str, program: s
     talk = processes.Talk(arguments, program=program)
     directory = talk.directory
     try:
-        talk.watcher.wait_for("a", arguments[1].rpartition(",")[2])
+        last = arguments[1].count(",")
+        talk.watcher.wait_until(lambda each: each.get("n") == last)
         with pytest.raises(AssertionError, match=fault):
             talk.stop(gone_within=0.2)
     finally:

@@ -34,12 +34,19 @@ if TYPE_CHECKING:
     Samples = npt.NDArray[np.int16]
 
 LOW = "The battery is low, please charge me."
+#: Begins with a moment of silence, for what the monitor drops where a stream starts.
+SHORT = "battery low"
 LEFT = "Please move the arm to the left."
 
 
 @pytest.fixture(scope="module")
 def low() -> Samples:
     return render([LOW])[0]
+
+
+@pytest.fixture(scope="module")
+def short() -> Samples:
+    return render([SHORT])[0]
 
 
 @pytest.mark.parametrize("text", [LOW, LEFT])
@@ -76,7 +83,7 @@ def test_words_have_their_places_in_text_and_sound() -> None:
 
 
 def test_the_time_of_a_word_is_known(sink: Sink) -> None:
-    (rendering,) = render_with_words([LOW])
+    (rendering,) = render_with_words([SHORT])
     with sink.record() as recording:
         sink.play(rendering.samples)
     (compared,) = assert_heard(recording, [rendering.samples])
@@ -90,13 +97,21 @@ def test_the_time_of_a_word_is_known(sink: Sink) -> None:
     assert times[-1] - times[0] == pytest.approx(rendering.words[-1][2] - rendering.words[0][2], abs=0.02)
 
 
-@pytest.mark.parametrize("player", ["aplay", "pacat"])
-def test_what_a_player_plays_is_recorded_sample_for_sample(sink: Sink, low: Samples, player: str) -> None:
+#: With a buffer that does not run dry where the machine is busy: each time that it does, samples are lost.
+PLAYERS = {
+    "aplay": ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-r", str(RATE), "-c", "1", "-"],
+    "pacat": ["pacat", "--raw", "--format=s16le", f"--rate={RATE}", "--channels=1", "--latency-msec=500"],
+}
+
+
+@pytest.mark.parametrize("player", PLAYERS)
+def test_what_a_player_plays_is_recorded_sample_for_sample(sink: Sink, short: Samples, player: str) -> None:
     with sink.record() as recording:
         began = time.monotonic()
-        sink.play(low, player)
+        environment = clean_environment(sink.directory, sink.env)
+        subprocess.run(PLAYERS[player], env=environment, input=short.tobytes(), check=True, timeout=60)
         ended = time.monotonic()
-    (result,) = assert_heard(recording, [low])
+    (result,) = assert_heard(recording, [short])
     assert result.correlation > 0.999
     first, last = recording.first_sound(), recording.last_sound()
     assert first is not None
@@ -123,10 +138,10 @@ def test_a_killed_player_is_silent_at_once(sink: Sink, low: Samples, tmp_path: p
     assert_silent(recording.between(killed + 0.1, killed + 0.4))
 
 
-def test_what_is_not_recorded_is_not_in_the_recording(sink: Sink, low: Samples) -> None:
+def test_what_is_not_recorded_is_not_in_the_recording(sink: Sink, short: Samples) -> None:
     with sink.record() as before:
         before.wait_until_quiet(0.1)
-    sink.play(low)
+    sink.play(short)
     with sink.record() as after:
         after.wait_until_quiet(0.1)
     assert_silent(before)
@@ -155,6 +170,7 @@ def test_waiting_ends(sink: Sink) -> None:
     assert recording.last_sound() is None
 
 
+@pytest.mark.slow
 def test_a_sink_can_be_broken_and_mended(private_sink: Callable[[], Sink], low: Samples) -> None:
     sink = private_sink()
     directory = sink.directory

@@ -12,7 +12,7 @@ from tests.support.census import descendants
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
 
-SECONDS = 5
+SECONDS = 3
 #: The chapter's loop had ten a second.
 AT_MOST = 1
 

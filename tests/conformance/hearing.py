@@ -7,16 +7,20 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from tests.support.compare import compare
+from tests.support.reference import render
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     import numpy as np
     import numpy.typing as npt
 
+    from tests.conftest import MakeTalk
     from tests.support.compare import Comparison
     from tests.support.connection import Message
     from tests.support.processes import Process, Talk
+    from tests.support.reference import Sentence
+    from tests.support.sink import Sink
 
     Samples = npt.NDArray[np.int16]
 
@@ -27,10 +31,23 @@ HOME = "coming home"
 HELP = "please help, I am stuck"
 LONG = "two three four five six seven eight nine ten eleven twelve"
 
+#: Words per minute where the rate is not what is tested: as many as there may be. LONG takes 1.3 s, HELP 0.6 s then.
+QUICK = 450
+
 #: Seconds by which the time of a sample is known: blocks of the monitor, and of the sink before it.
 PRECISION = 0.03
 #: Seconds in which a process that was started must be there.
 _PATIENCE = 5.0
+
+
+def quick_talk(make_talk: MakeTalk, sink: Sink, *options: str) -> Talk:
+    """Start a server with the real engine at a recorded sink that speaks at that rate."""
+    return make_talk("--rate", str(QUICK), *options, sink=sink)
+
+
+def render_quick(sentences: Sequence[str | Sentence]) -> list[Samples]:
+    """Return the samples of each sentence as such a server speaks them."""
+    return render(sentences, rate=QUICK)
 
 
 def send(talk: Talk, text: str, **fields: Any) -> str:
@@ -48,23 +65,23 @@ def await_word(talk: Talk, goal_id: str, number: int = 3) -> None:
     talk.watcher.wait_until(lambda each: wanted.items() <= each.items(), what=f"word {number} of {goal_id}")
 
 
-def begin(talk: Talk, text: str, **fields: Any) -> str:
-    """Send a goal and wait until it is in mid-sentence; return its id."""
+def begin(talk: Talk, text: str, *, number: int = 3, **fields: Any) -> str:
+    """Send a goal and wait until it is in mid-sentence, at this word; return its id."""
     goal_id = send(talk, text, **fields)
-    await_word(talk, goal_id)
+    await_word(talk, goal_id, number)
     return goal_id
 
 
-def begin_with_client(talk: Talk, text: str, *options: str) -> tuple[str, Process]:
+def begin_with_client(talk: Talk, text: str, *options: str, number: int = 3) -> tuple[str, Process]:
     """Send a goal by a client that waits for it, and wait until it is in mid-sentence; return its id and the client."""
     known = {None, *talk.watcher.goals()}
     client = talk.start("say", "--wait", *options, "--", text)
     goal_id = str(talk.watcher.wait_until(lambda each: each.get("id") not in known)["id"])
-    await_word(talk, goal_id)
+    await_word(talk, goal_id, number)
     return goal_id, client
 
 
-def heard(talk: Talk, quiet: float = 0.2) -> Samples:
+def heard(talk: Talk, quiet: float = 0.1) -> Samples:
     """Return all that was heard, once it is quiet."""
     talk.recording.wait_until_quiet(quiet)
     return talk.recording.samples

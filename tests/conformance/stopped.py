@@ -4,8 +4,9 @@ A sentence that follows a stopped one differs from the same sentence in any othe
 where the synthesis was stopped, which is between two of the pieces that the library hands over. So there are as many
 references as pieces, and what was heard must be one of them, sample by sample.
 
-The program reads a list of texts on standard input, stops the first text after each of its pieces in
-turn, and writes for each turn the other texts: for each a line with its number of samples, then these, 16 bit.
+The program reads a list on standard input, the words per minute and the texts. It stops the first text after each of
+its pieces in turn, and writes for each turn the other texts: for each a line with its number of samples, then these, 16
+bit.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tests.support.compare import assert_begun, assert_heard, assert_silent, compare
+from tests.support.compare import assert_begun, assert_heard, assert_silent, extent
 from tests.support.espeak import _Callback, load
+from tests.support.recording import LOUD
 from tests.support.reference import render
 from tests.support.surroundings import clean_environment
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     import numpy.typing as npt
 
@@ -38,41 +40,75 @@ if TYPE_CHECKING:
     Samples = npt.NDArray[np.int16]
 
 #: Samples by which a sentence may begin before the place where it fits best: what the monitor may have dropped of it.
-#: Between two sentences there is more silence than this.
+#: Between two sentences there is more silence than this, of which as much may have been dropped.
 DROPPED = 240
+_SILENCE = 64
+#: Samples in a row that are the same where a sentence begins.
+_SAME = 32
 _SYNCHRONOUS = 2
 _DONT_EXIT = 0x8000
 _UTF8_AND_END_PAUSE = 0x1001
 _RATE = 1
-_WORDS_PER_MINUTE = 200
 
 
 def assert_heard_after_stop(
-    heard: Recording | Samples, stopped: str, following: Sequence[str], *, begun: bool = True
+    heard: Recording | Samples, stopped: str, following: Sequence[str], *, begun: bool = True, rate: int = 200
 ) -> list[Comparison]:
     """Assert that a beginning of a fresh engine's first sentence was heard, then the following ones whole.
 
-    Where it had not `begun`, nothing of it may have been heard. Returns how the following ones compare.
+    Where it had not `begun`, nothing of it may have been heard. Returns how the following ones compare. One place where
+    it can have been stopped has to be right: the one after which the next sentence is the same for longest comes first.
     """
     samples = heard if isinstance(heard, np.ndarray) else heard.samples
-    best, references = max(
-        ((compare(samples, each[0]), each) for each in _render_after_stop((stopped, *following))),
-        key=lambda each: each[0].correlation,
-    )
-    start = max(0, best.offset - DROPPED)
-    if begun:
-        assert_begun(samples[:start], render([stopped])[0])
-    else:
-        assert_silent(samples[:start])
-    return assert_heard(samples[start:], references)
+    wrong: AssertionError | None = None
+    for start, references in _likeliest(samples, _render_after_stop((stopped, *following), rate)):
+        try:
+            if begun:
+                assert_begun(samples[:start], render([stopped], rate=rate)[0])
+            else:
+                assert_silent(samples[:start])
+            return assert_heard(samples[start:], references)
+        except AssertionError as error:
+            wrong = wrong or error
+    assert wrong, f"{following[0]!r} was not heard behind silence, wherever {stopped!r} was stopped"
+    raise wrong
+
+
+def _likeliest(samples: Samples, turns: Sequence[list[Samples]]) -> Iterator[tuple[int, list[Samples]]]:
+    """Yield where the next sentence may begin, behind silence, and what it and those behind it sound like then."""
+    loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
+    silence = np.diff(loud, prepend=-DROPPED)
+    begins = loud[silence >= _SILENCE]
+    before = np.minimum(silence[silence >= _SILENCE] - 1, DROPPED)
+    found = []
+    for references in turns:
+        first, last = extent(references[0]) or (0, 0)
+        wanted = references[0][first:last]
+        for begin, quiet in zip(begins.tolist(), before.tolist(), strict=True):
+            same = _same(samples[begin : begin + len(wanted)], wanted)
+            found += [(same, max(0, begin - quiet), references)] if same else []
+    for _, start, references in sorted(found, key=lambda each: -each[0]):
+        yield start, references
+
+
+def _same(samples: Samples, wanted: Samples) -> int:
+    """Return for how long samples are the same as what is wanted, of which the first may have been dropped."""
+    for dropped in np.flatnonzero(wanted[:DROPPED] == samples[0]):
+        rest = wanted[dropped:]
+        length = min(len(samples), len(rest))
+        different = np.flatnonzero(samples[:length] != rest[:length])
+        same = int(different[0]) if len(different) else length
+        if same >= _SAME:
+            return same
+    return 0
 
 
 @functools.cache
-def _render_after_stop(texts: tuple[str, ...]) -> list[list[Samples]]:
+def _render_after_stop(texts: tuple[str, ...], rate: int) -> list[list[Samples]]:
     """Return what follows the first text, for each place where that can be stopped."""
     done = subprocess.run(
         [sys.executable, "-m", __name__],
-        input=json.dumps(texts).encode(),
+        input=json.dumps([rate, *texts]).encode(),
         capture_output=True,
         timeout=60,
         env=clean_environment(tempfile.gettempdir()),
@@ -91,52 +127,52 @@ def _render_after_stop(texts: tuple[str, ...]) -> list[list[Samples]]:
 
 
 def main() -> None:
-    """Write what standard input asks for; each turn in a fresh child, as the library has a memory."""
-    texts = json.load(sys.stdin)
-    piece = 1
-    while _turn(texts, piece):
-        piece += 1
-
-
-def _turn(texts: list[str], last: int) -> bool:
-    """Stop the first text after a number of pieces; False if it has no more than those."""
-    child = os.fork()
-    if child == 0:
-        os._exit(_speak(texts, last))
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    if status not in (0, 1):
-        sys.exit(f"a rendering ended with {status}")
-    return status == 0
-
-
-def _speak(texts: list[str], last: int) -> int:
+    """Write what standard input asks for; each turn in a child that stops, forked where it does: it has that memory."""
+    rate, first, *following = json.load(sys.stdin)
     library, data = load()
     if library.espeak_Initialize(_SYNCHRONOUS, 0, data, _DONT_EXIT) <= 0:
-        return 2
+        sys.exit("libespeak-ng cannot be initialised: its data is missing")
     pieces: list[bytes] = []
-    limit: int | None = last
+    stopping: bool | None = False  # None where nothing is to be stopped any more
 
     def take(wav: ctypes._Pointer[ctypes.c_short], count: int, _: ctypes._Pointer[_Event]) -> int:
+        nonlocal stopping
         if wav and count > 0:
             pieces.append(ctypes.string_at(wav, count * 2))
-        return int(len(pieces) == limit)
+            stopping = stopping if stopping is not False else _turn()
+        return int(stopping is True)
 
     callback = _Callback(take)  # kept for as long as the library may call it
     library.espeak_SetSynthCallback(callback)
     library.espeak_SetVoiceByName(b"en")
-    library.espeak_SetParameter(_RATE, _WORDS_PER_MINUTE, 0)
-    for text in texts:
+    library.espeak_SetParameter(_RATE, rate, 0)
+    _speak(library, first)
+    if not stopping:
+        return
+    stopping = None
+    for text in following:
         pieces.clear()
-        data = text.encode()
-        library.espeak_Synth(data, ctypes.c_size_t(len(data) + 1), 0, 0, 0, _UTF8_AND_END_PAUSE, None, None)
-        if limit is None:
-            sound = b"".join(pieces)
-            sys.stdout.buffer.write(b"%d\n" % (len(sound) // 2) + sound)
-        elif len(pieces) < limit:
-            return 1
-        limit = None
+        _speak(library, text)
+        sound = b"".join(pieces)
+        sys.stdout.buffer.write(b"%d\n" % (len(sound) // 2) + sound)
     sys.stdout.buffer.flush()
-    return 0
+    os._exit(0)
+
+
+def _turn() -> bool:
+    """Return True in a child, and False when that has ended."""
+    child = os.fork()
+    if child:
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        if status:
+            print(f"a rendering ended with {status}", file=sys.stderr, flush=True)
+            os._exit(1)  # what is raised here, within a call of the library, would be ignored
+    return child == 0
+
+
+def _speak(library: ctypes.CDLL, text: str) -> None:
+    data = text.encode()
+    library.espeak_Synth(data, ctypes.c_size_t(len(data) + 1), 0, 0, 0, _UTF8_AND_END_PAUSE, None, None)
 
 
 if __name__ == "__main__":

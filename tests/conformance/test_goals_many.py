@@ -15,10 +15,12 @@ import numpy as np
 import pytest
 
 from tests.conformance.hearing import HELP, PRECISION
+from tests.conformance.stopped import DROPPED
 from tests.conformance.told import assert_told_in_order
 from tests.conformance.witness import ends
 from tests.support import census
-from tests.support.compare import compare
+from tests.support.compare import alike, compare
+from tests.support.recording import LOUD
 from tests.support.reference import RATE, render
 from tests.support.timing import assert_within, limits
 
@@ -118,9 +120,12 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_in_a_second_is_spoken_wh
         assert (words[0], words[-1]) == ("please", "stuck")
         *others, newest = talk.watcher.goals()
         assert (len(others), newest) == (BURST - 1, last)
-        assert {talk.goal(each)["reason"] for each in others[-500:]} == {"preempted"}
+        with talk.connect() as wire:
+            told = [wire.request("status", id=each)["goal"]["reason"] for each in others[-500:]]
+        assert set(told) == {"preempted"}
         assert set(ends(talk, *others)) == {1}
-        assert {talk.watcher.states(each)[-1] for each in others} <= {"PREEMPTED", "RECALLED"}
+        states = last_states(talk)
+        assert {states[each] for each in others} <= {"PREEMPTED", "RECALLED"}
         assert_told_in_order(talk)
         talk.stop()
         assert_within(seconds, 1.0, "taking a thousand goals")
@@ -145,8 +150,14 @@ def test_row_26_a_burst_from_several_clients_ends_with_one_goal_spoken(scripted:
     goals = scripted.watcher.goals()
     assert (len(goals), goals[-1]) == (BURST, last)
     assert set(ends(scripted, *goals)) == {1}
-    assert {scripted.watcher.states(each)[-1] for each in goals[:-1]} <= {"PREEMPTED", "RECALLED"}
+    states = last_states(scripted)
+    assert {states[each] for each in goals[:-1]} <= {"PREEMPTED", "RECALLED"}
     assert_told_in_order(scripted)
+
+
+def last_states(talk: Talk) -> dict[str, str]:
+    """Return the state that each goal was told to have last."""
+    return {each["id"]: each["state"] for each in talk.watcher.events() if each["event"] == "state"}
 
 
 def _send_batch(wire: Wire, numbers: range) -> None:
@@ -180,25 +191,36 @@ def _send_and_cancel(wire: Wire, chance: random.Random, over: threading.Event, s
 def _assert_alike(heard: Samples, reference: Samples) -> None:
     """Assert that a sentence was heard whole, though not sample by sample: the library remembers those before it.
 
-    It is as long, and each twentieth of a second is as loud, within a tenth of the loudest.
+    It is as long, and each twentieth of a second is as loud, within a tenth of the loudest. Zeros count in neither: a
+    player that ran dry puts them in, and what the monitor drops there shifts what follows a little.
     """
-    compared = compare(heard, reference)
+    sound, wanted = _sounding(heard), _sounding(reference)
+    compared = compare(sound, wanted)
     assert abs(compared.heard - compared.expected) <= 0.02, compared
-    assert compared.correlation > 0.5, compared  # of another sentence it is about 0.1
-    begin = int(np.flatnonzero(np.abs(reference.astype(np.int32)) > 50)[0])
-    length = round(compared.expected * RATE)
-    frames = [
-        np.sqrt(
-            np.mean(samples[: length - length % (RATE // 20)].astype(np.float64).reshape(-1, RATE // 20) ** 2, axis=1)
-        )
-        for samples in (heard[compared.offset :], reference[begin:])
-    ]
-    assert np.max(np.abs(frames[0] - frames[1])) < 0.1 * np.max(frames[1]), compared
+    # Of another sentence they are about 0.1 and 0.2; the first is low as well where the monitor dropped something.
+    assert max(compared.correlation, alike(sound, wanted)) > 0.5, compared
+    heard_from, begin = (int(np.flatnonzero(np.abs(each.astype(np.int32)) > LOUD)[0]) for each in (sound, wanted))
+    frame = RATE // 20
+    starts = np.arange(0, round(compared.expected * RATE) - frame + 1, frame)
+    own = np.array([_loudness(wanted[begin + start :][:frame]) for start in starts])
+    shifts = range(-DROPPED, DROPPED + 1, 16)
+    padded = np.pad(sound[heard_from:], DROPPED)
+    shifted = [[_loudness(padded[DROPPED + start + each :][:frame]) for start in starts] for each in shifts]
+    assert np.max(np.min(np.abs(np.array(shifted) - own), axis=0)) < 0.1 * np.max(own), compared
+
+
+def _sounding(samples: Samples) -> Samples:
+    """Return samples without their zeros."""
+    return np.compress(samples != 0, samples)
+
+
+def _loudness(samples: Samples) -> float:
+    return float(np.sqrt(np.mean(samples.astype(np.float64) ** 2)))
 
 
 def test_an_engine_that_reads_nothing_for_a_second_while_goals_come_and_go_is_not_lost(scripted: Talk) -> None:
     """It is told each time whether a goal waits behind the one in hand: of that it may miss what it has no room for."""
-    goal = scripted.run("say", "length=3").id
+    goal = scripted.run("say", "length=1").id
     scripted.watcher.wait_for_word(goal)
     (engine,) = census.descendants(scripted.pid)
     with scripted.connect() as wire:

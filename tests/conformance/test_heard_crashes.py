@@ -5,15 +5,18 @@ from __future__ import annotations
 import os
 import signal
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
 from talkcli.engine.guard import guarded
+from tests.conformance import stopped
 from tests.conformance.hearing import (
     HOME,
     LONG,
     LOW,
+    QUICK,
     assert_aborted,
     assert_same,
     begin,
@@ -21,11 +24,11 @@ from tests.conformance.hearing import (
     engine_process,
     heard,
     player_process,
+    quick_talk,
+    render_quick,
     send,
 )
-from tests.conformance.stopped import DROPPED, assert_heard_after_stop
 from tests.support.compare import assert_begun, assert_heard, compare, time_heard
-from tests.support.reference import render
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -35,16 +38,26 @@ if TYPE_CHECKING:
     from tests.support.recording import Recording
     from tests.support.sink import Sink
 
-#: Seconds, at 400 words per minute, that a text takes at most which is spelled instead of crashing the library.
+#: Seconds that a text takes at most which is spelled instead of crashing the library.
 SPELLED = 90
 CRASHING = {"initials": "a." * 85, "abbreviations": "e.g. " * 60, "address": "http://" + "x." * 100}
 
 
-@pytest.mark.parametrize("text", CRASHING.values(), ids=CRASHING.keys())
-def test_a_text_that_would_crash_the_library_is_spoken(make_talk: MakeTalk, sink: Sink, text: str) -> None:
-    talk = make_talk("--rate", "400", sink=sink)
+assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
+
+
+@pytest.fixture
+def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
+    return quick_talk(make_talk, sink)
+
+
+@pytest.mark.parametrize(
+    "name", ["initials", *(pytest.param(each, marks=pytest.mark.slow) for each in ("abbreviations", "address"))]
+)
+def test_a_text_that_would_crash_the_library_is_spoken(talk: Talk, sink: Sink, name: str) -> None:
+    text = CRASHING[name]
     assert talk.run("say", "--wait", "--", LOW).code == 0
-    assert_same(heard(talk), render([LOW], rate=400)[0])
+    assert_same(heard(talk), render_quick([LOW])[0])
     engine = engine_process(talk)
     done = talk.run("say", "--wait", "--", text, timeout=SPELLED)
     assert (done.code, talk.goal(done.id)["spoken"]) == (0, text)
@@ -52,15 +65,15 @@ def test_a_text_that_would_crash_the_library_is_spoken(make_talk: MakeTalk, sink
         assert talk.run("say", "--wait", "--", HOME).code == 0
     assert engine_process(talk) == engine
     # The library itself would not survive the text as it is.
-    assert_same(recording.samples, render([LOW, guarded(text), HOME], rate=400)[-1])
+    assert_same(recording.samples, render_quick([LOW, guarded(text), HOME])[-1])
 
 
 def test_a_killed_server_is_silent_and_the_next_one_speaks(talk: Talk, sink: Sink) -> None:
-    reference, following = render([LONG])[0], render([LOW])[0]
+    reference, following = render_quick([LONG])[0], render_quick([LOW])[0]
 
     with limits():
         with sink.record() as recording:
-            goal, client = begin_with_client(talk, LONG)
+            goal, client = begin_with_client(talk, LONG, number=5)
             killed = time.monotonic()
             talk.kill(gone_within=0.3)
             lost = talk.finish(client)
@@ -80,11 +93,11 @@ def test_a_killed_server_is_silent_and_the_next_one_speaks(talk: Talk, sink: Sin
 
 
 def test_a_killed_engine_is_replaced_within_half_a_second(talk: Talk, sink: Sink) -> None:
-    reference, following = render([LONG])[0], render([LOW])[0]
+    reference, following = render_quick([LONG])[0], render_quick([LOW])[0]
 
     with limits():
         with sink.record() as recording:
-            goal, client = begin_with_client(talk, LONG)
+            goal, client = begin_with_client(talk, LONG, number=5)
             next_goal = send(talk, LOW)
             killed = time.monotonic()
             os.kill(engine_process(talk), signal.SIGKILL)
@@ -102,7 +115,7 @@ def test_a_killed_engine_is_replaced_within_half_a_second(talk: Talk, sink: Sink
 
 
 def test_a_killed_engine_that_was_idle_is_replaced_within_half_a_second(talk: Talk, sink: Sink) -> None:
-    (reference,) = render([LOW])
+    (reference,) = render_quick([LOW])
 
     with limits():
         assert talk.run("voices").code == 0  # they are known when it is ready, and has nothing to do
@@ -116,7 +129,7 @@ def test_a_killed_engine_that_was_idle_is_replaced_within_half_a_second(talk: Ta
 
 def test_a_killed_player_aborts_its_goal_and_no_other(talk: Talk) -> None:
     engine = engine_process(talk)
-    goal, client = begin_with_client(talk, LONG)
+    goal, client = begin_with_client(talk, LONG, number=5)
     os.kill(player_process(talk), signal.SIGKILL)
     done = talk.finish(client)
     ended = talk.goal(goal)
@@ -130,7 +143,7 @@ def test_a_killed_player_aborts_its_goal_and_no_other(talk: Talk) -> None:
 
 
 def test_a_frozen_engine_is_replaced_within_six_seconds(talk: Talk, sink: Sink) -> None:
-    (following,) = render([LOW])
+    (following,) = render_quick([LOW])
 
     with limits():
         with sink.record() as recording:
@@ -157,12 +170,12 @@ def test_a_frozen_engine_is_killed_by_a_cancel(talk: Talk, sink: Sink) -> None:
     assert talk.goal(goal)["reason"] == "canceled"
     with sink.record() as recording:
         assert talk.run("say", "--wait", "--", LOW).code == 0
-    assert_same(recording.samples, render([LOW])[0])
+    assert_same(recording.samples, render_quick([LOW])[0])
 
 
 def _began(recording: Recording, whole: Samples) -> tuple[int, float]:
     """Assert that a sentence was heard whole, and last; return the sample and the time at which its sound begins."""
     samples = recording.samples
-    start = max(0, compare(samples, whole).offset - DROPPED)
+    start = max(0, compare(samples, whole).offset - stopped.DROPPED)
     assert_heard(samples[start:], [whole])
     return start, recording.time_of(start)

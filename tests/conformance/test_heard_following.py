@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from talkcli.engine.changeover import MOST
-from tests.conformance.hearing import HELP, HOME, LOW, heard, send
+from tests.conformance.hearing import HOME, LOW, heard, send
 from tests.support.compare import assert_heard, extent
 from tests.support.reference import RATE, render
 
@@ -18,7 +18,7 @@ _LOST = 0.012
 
 def test_what_is_left_out_between_queued_sentences_is_silence_and_never_too_much_of_it(talk: Talk) -> None:
     """How much less than without it a change takes is a matter of speed; that enough of the pause stays is not."""
-    texts = [LOW, HOME, HELP, LOW, HOME]
+    texts = [LOW, HOME, LOW, HOME]
     goals = [send(talk, text) for text in texts]
     assert talk.watcher.wait_for_terminal(goals[-1], 20) == "SUCCEEDED"
     references = render(texts)

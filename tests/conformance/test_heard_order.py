@@ -4,34 +4,52 @@ from __future__ import annotations
 
 import os
 import signal
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from tests.conformance import stopped
 from tests.conformance.hearing import (
     HELP,
     HOME,
     LONG,
     LOW,
+    QUICK,
     assert_aborted,
     assert_same,
     await_word,
     begin,
     heard,
     player_process,
+    quick_talk,
+    render_quick,
     send,
 )
-from tests.conformance.stopped import assert_heard_after_stop
 from tests.conformance.told import assert_recalled, assert_rejected, assert_told_in_order, submit
 from tests.support.compare import assert_heard, compare, loudness
-from tests.support.reference import Sentence, render
+from tests.support.reference import Sentence
 
 if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
     from tests.support.processes import Talk
+    from tests.support.sink import Sink
 
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 STOPPED = ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
 NEVER = "never to be heard"
+
+assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
+
+
+@pytest.fixture
+def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
+    return quick_talk(make_talk, sink)
+
+
+def busy(talk: Talk, **fields: Any) -> str:
+    """Send a goal and wait until it is spoken, which leaves half a second for others to come; return its id."""
+    return begin(talk, HELP, number=1, **fields)
 
 
 def end(talk: Talk, *goals: str) -> None:
@@ -45,8 +63,8 @@ def end(talk: Talk, *goals: str) -> None:
 
 
 def test_row_36_a_goal_whose_time_is_over_is_never_heard(talk: Talk) -> None:
-    """It ends the moment its time runs out, while the sentence of 3 s before it is still being spoken."""
-    long = send(talk, LONG)
+    """It ends the moment its time runs out, while the sentence of 2 s before it is still being spoken."""
+    long = send(talk, LONG, rate=300)
     goal = send(talk, NEVER, ttl=1)
     after = send(talk, LOW)
     assert_recalled(talk, goal, "expired")
@@ -55,20 +73,20 @@ def test_row_36_a_goal_whose_time_is_over_is_never_heard(talk: Talk) -> None:
     assert expired["ended_at"] - expired["queued_at"] == pytest.approx(1, abs=0.1)
     assert (expired["ttl"], expired["message"].startswith("Talk recalled: ")) == (1, True)
     end(talk, long, after)
-    assert_heard(heard(talk), render([LONG, LOW]))
+    assert_heard(heard(talk), render_quick([Sentence(LONG, rate=300), LOW]))
     assert_told_in_order(talk)
 
 
 def test_row_36_a_goal_that_has_begun_in_time_is_heard_to_its_end(talk: Talk) -> None:
     end(talk, begin(talk, LONG, ttl=1))
-    assert_heard(heard(talk), render([LONG]))
+    assert_heard(heard(talk), render_quick([LONG]))
 
 
 # -- row 37: key
 
 
 def test_row_37_of_three_goals_with_one_key_the_newest_is_heard_in_the_first_ones_place(talk: Talk) -> None:
-    long = begin(talk, HELP)
+    long = busy(talk)
     first = send(talk, "never the first", key="battery")
     other = send(talk, HOME)
     second = send(talk, "never the second", key="battery")
@@ -76,39 +94,39 @@ def test_row_37_of_three_goals_with_one_key_the_newest_is_heard_in_the_first_one
     assert_recalled(talk, first, "replaced", by=second)
     assert_recalled(talk, second, "replaced", by=newest)
     end(talk, long, newest, other)
-    assert_heard(heard(talk), render([HELP, LOW, HOME]))
+    assert_heard(heard(talk), render_quick([HELP, LOW, HOME]))
     assert_told_in_order(talk)
 
 
 def test_row_37_the_goal_that_is_spoken_is_not_replaced_by_its_key(talk: Talk) -> None:
-    first = begin(talk, HELP, key="battery")
+    first = busy(talk, key="battery")
     second = send(talk, LOW, key="battery")
     end(talk, first, second)
-    assert_heard(heard(talk), render([HELP, LOW]))
+    assert_heard(heard(talk), render_quick([HELP, LOW]))
 
 
 def test_row_37_with_another_priority_it_is_queued_by_its_own_rules(talk: Talk) -> None:
-    long = begin(talk, HELP)
+    long = busy(talk)
     old = send(talk, NEVER, key="battery")
     other = send(talk, HOME, priority=1)
     newest = send(talk, LOW, key="battery", priority=2)
     assert_recalled(talk, old, "replaced", by=newest)
     end(talk, long, newest, other)
-    assert_heard(heard(talk), render([HELP, LOW, HOME]))
+    assert_heard(heard(talk), render_quick([HELP, LOW, HOME]))
 
 
 # -- row 38: throttle
 
 
 def test_row_38_the_second_is_throttled_and_silent(talk: Talk) -> None:
-    first = begin(talk, HELP, key="battery", throttle=60)
+    first = busy(talk, key="battery", throttle=60)
     while_spoken = submit(talk, NEVER, key="battery", throttle=60)
     end(talk, first)
     after = submit(talk, NEVER, key="battery", throttle=60, flush=True)
     for each in (while_spoken, after):
         assert_rejected(each, "throttled")
         assert each["by"] == {"goal": first}
-    assert_heard(heard(talk), render([HELP]))
+    assert_heard(heard(talk), render_quick([HELP]))
 
 
 def test_row_38_throttled_is_no_failure_for_a_script(talk: Talk) -> None:
@@ -117,16 +135,16 @@ def test_row_38_throttled_is_no_failure_for_a_script(talk: Talk) -> None:
     assert (first.code, first.err) == (0, "")
     second = talk.run(*words)
     assert (second.code, second.out) == (0, "")
-    assert_heard(heard(talk), render([LOW]))
+    assert_heard(heard(talk), render_quick([LOW]))
 
 
 def test_row_38_a_first_one_that_expired_throttles_nothing(talk: Talk) -> None:
-    long = begin(talk, HELP)
+    long = busy(talk)
     first = send(talk, NEVER, key="battery", throttle=60, ttl=0.2)
     assert_recalled(talk, first, "expired")
     second = send(talk, LOW, key="battery", throttle=60)
     end(talk, long, second)
-    assert_heard(heard(talk), render([HELP, LOW]))
+    assert_heard(heard(talk), render_quick([HELP, LOW]))
 
 
 def test_row_38_a_first_one_that_was_aborted_throttles_nothing(talk: Talk) -> None:
@@ -140,7 +158,7 @@ def test_row_38_a_first_one_that_was_aborted_throttles_nothing(talk: Talk) -> No
 
 
 def test_row_38_without_a_key_the_text_is_what_counts(talk: Talk) -> None:
-    long = begin(talk, HELP)
+    long = busy(talk)
     waiting = send(talk, LOW, throttle=60)
     same = submit(talk, LOW, throttle=60)
     assert_rejected(same, "throttled")
@@ -148,43 +166,43 @@ def test_row_38_without_a_key_the_text_is_what_counts(talk: Talk) -> None:
     other = send(talk, HOME, throttle=60)
     end(talk, long, waiting, other)
     assert_rejected(submit(talk, LOW, throttle=60), "throttled")
-    assert_heard(heard(talk), render([HELP, LOW, HOME]))
+    assert_heard(heard(talk), render_quick([HELP, LOW, HOME]))
 
 
 # -- rows 39 and 40: priority
 
 
 def test_row_39_higher_priorities_go_first_equal_ones_in_the_order_in_which_they_came(talk: Talk) -> None:
-    long = begin(talk, HELP)
+    long = busy(talk)
     texts = ["battery zero", "coming five", "battery one", "coming five again"]
     zero, five, one, five_again = [
         send(talk, text, priority=each) for text, each in zip(texts, (0, 5, 1, 5), strict=True)
     ]
     end(talk, long, five, five_again, one, zero)
-    assert_heard(heard(talk), render([HELP, texts[1], texts[3], texts[2], texts[0]]))
+    assert_heard(heard(talk), render_quick([HELP, texts[1], texts[3], texts[2], texts[0]]))
     assert_told_in_order(talk)
 
 
 def test_row_40_a_lower_priority_does_not_interrupt_and_goes_first_among_its_own(talk: Talk) -> None:
-    long = begin(talk, HELP, priority=5)
+    long = busy(talk, priority=5)
     zero = send(talk, HOME)
     high = send(talk, "coming now", priority=3, preempt=True)
     low = send(talk, LOW, preempt=True)
     assert talk.watcher.states(long) == ["PENDING", "ACTIVE"]
     end(talk, long, high, low, zero)
-    assert_heard(heard(talk), render([HELP, "coming now", LOW, HOME]))
+    assert_heard(heard(talk), render_quick([HELP, "coming now", LOW, HOME]))
     assert_told_in_order(talk)
 
 
 def test_row_40_it_recalls_the_preempting_ones_up_to_its_own_priority(talk: Talk) -> None:
-    long = begin(talk, HELP, priority=5)
+    long = busy(talk, priority=5)
     sent = ((HOME, 3), (NEVER, -1), (NEVER, 0))
     higher, lower, same = [send(talk, text, priority=each, preempt=True) for text, each in sent]
     newcomer = send(talk, LOW, preempt=True)
     assert_recalled(talk, lower, "preempted", by=same)
     assert_recalled(talk, same, "preempted", by=newcomer)
     end(talk, long, higher, newcomer)
-    assert_heard(heard(talk), render([HELP, HOME, LOW]))
+    assert_heard(heard(talk), render_quick([HELP, HOME, LOW]))
 
 
 def test_row_40_the_same_priority_interrupts(talk: Talk) -> None:
@@ -215,7 +233,7 @@ def test_set_changes_the_next_sentence_not_the_one_that_is_spoken(talk: Talk) ->
     await_word(talk, first)
     assert talk.request("set", rate=300, volume=0.5)["settings"]["rate"] == 300
     end(talk, first, second)
-    assert_heard(heard(talk), render([HELP, Sentence(HOME, rate=300, volume=0.5)]))
+    assert_heard(heard(talk), render_quick([HELP, Sentence(HOME, rate=300, volume=0.5)]))
 
 
 def test_a_goals_own_rate_and_volume_are_gone_after_it(talk: Talk) -> None:
@@ -223,33 +241,33 @@ def test_a_goals_own_rate_and_volume_are_gone_after_it(talk: Talk) -> None:
     first = send(talk, LOW, rate=own.rate, volume=own.volume)
     second = send(talk, LOW)
     end(talk, first, second)
-    references = render([own, LOW])
+    references = render_quick([own, LOW])
     assert loudness(references[0]) < 0.6 * loudness(references[1])
     assert_heard(heard(talk), references)
 
 
 def test_a_goals_own_pitch_is_heard(talk: Talk) -> None:
     end(talk, send(talk, LOW, pitch=80))
-    assert_heard(heard(talk), render([LOW], pitch=80))
-    assert compare(render([LOW])[0], render([LOW], pitch=80)[0]).same is False
+    assert_heard(heard(talk), render_quick([Sentence(LOW, QUICK, pitch=80)]))
+    assert compare(render_quick([LOW])[0], render_quick([Sentence(LOW, QUICK, pitch=80)])[0]).same is False
 
 
 def test_a_goals_own_voice_is_gone_after_it(talk: Talk) -> None:
     first = send(talk, HOME, voice="de")
     second = send(talk, HOME)
     end(talk, first, second)
-    assert_heard(heard(talk), render([Sentence(HOME, voice="de"), HOME]))
+    assert_heard(heard(talk), render_quick([Sentence(HOME, QUICK, voice="de"), HOME]))
 
 
 def test_settings_are_read_when_a_goal_starts(talk: Talk) -> None:
     """A goal's own rate stays its own, whatever was set meanwhile; the other one has what was set last."""
-    first = begin(talk, HELP)
-    own, general = send(talk, LOW, rate=150), send(talk, HOME)
-    assert talk.request("set", rate=250)["ok"]
+    first = busy(talk)
+    own, general = send(talk, LOW, rate=300), send(talk, HOME)
+    assert talk.request("set", rate=350)["ok"]
     end(talk, first, own, general)
-    assert_heard(heard(talk), render([HELP, Sentence(LOW, rate=150), Sentence(HOME, rate=250)]))
+    assert_heard(heard(talk), render_quick([HELP, Sentence(LOW, rate=300), Sentence(HOME, rate=350)]))
 
 
 def test_a_volume_of_zero_is_silent_and_takes_as_long(talk: Talk) -> None:
     end(talk, send(talk, LONG, volume=0), send(talk, LOW))
-    assert_same(heard(talk), render([Sentence(LONG, volume=0), LOW])[1])
+    assert_same(heard(talk), render_quick([Sentence(LONG, QUICK, volume=0), LOW])[1])

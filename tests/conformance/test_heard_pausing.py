@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from tests.conformance.hearing import HELP, HOME, LONG, LOW, PRECISION, await_word, begin, heard, send
-from tests.conformance.stopped import assert_heard_after_stop
+from tests.conformance import stopped
+from tests.conformance.hearing import (
+    HELP,
+    HOME,
+    LONG,
+    LOW,
+    PRECISION,
+    QUICK,
+    await_word,
+    begin,
+    heard,
+    quick_talk,
+    render_quick,
+    send,
+)
 from tests.conformance.told import assert_recalled, assert_told_in_order, submit
 from tests.support.compare import SAME, assert_begun, assert_heard, assert_resumed, assert_silent, compare, extent
 from tests.support.recording import LOUD
-from tests.support.reference import RATE, render
+from tests.support.reference import RATE
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -25,13 +39,21 @@ if TYPE_CHECKING:
 
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 STOPPED = ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
-#: Seconds for which a sentence is held, and within which it is silent.
-HELD = 2.0
+#: Seconds for which a sentence is held, and fewer of them where it is held in another place; and within which it is
+#: silent.
+HELD, BRIEFLY = 2.0, 0.7
 SILENT = 0.15
 #: Seconds that may be heard again, where the player had to be started again.
 TWICE = 0.05
 #: Samples that the monitor may lose where a stream starts.
 SLACK = 256
+
+assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
+
+
+@pytest.fixture
+def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
+    return quick_talk(make_talk, sink)
 
 
 def pause(talk: Talk) -> Message:
@@ -54,28 +76,38 @@ def assert_silent_since(talk: Talk, moment: float, seconds: float) -> None:
     assert_silent(talk.recording.between(moment + PRECISION, moment + seconds))
 
 
-@pytest.mark.parametrize("word", [1, 3, 8])
-@pytest.mark.parametrize("player", ["aplay", "pacat"])
+@pytest.mark.parametrize(
+    ("player", "word", "seconds"),
+    [
+        ("aplay", 3, HELD),
+        ("aplay", 1, BRIEFLY),
+        ("pacat", 8, BRIEFLY),
+        *(
+            pytest.param(player, word, HELD, marks=pytest.mark.slow)
+            for player, word in (("aplay", 1), ("aplay", 8), ("pacat", 1), ("pacat", 3), ("pacat", 8))
+        ),
+    ],
+)
 def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
-    make_talk: MakeTalk, sink: Sink, player: str, word: int
+    make_talk: MakeTalk, sink: Sink, player: str, word: int, seconds: float
 ) -> None:
-    (reference,) = render([LONG])
+    (reference,) = render_quick([LONG])
 
     with limits():
-        talk = make_talk("--player", player, sink=sink)
+        talk = quick_talk(make_talk, sink, "--player", player)
         goal = send(talk, LONG)
         await_word(talk, goal, word)
         asked = time.monotonic()
         held = pause(talk)["goal"]
         silent = time.monotonic()
         assert (held["id"], held["state"], held["paused"]) == (goal, "ACTIVE", True)
-        assert_silent_since(talk, silent, HELD)
+        assert_silent_since(talk, silent, seconds)
         status = talk.request("status")
         assert (status["server"]["paused"], status["active"]["id"], status["active"]["paused"]) == (True, goal, True)
         going = resume(talk)["goal"]
         assert (going["id"], going["state"], going["paused"]) == (goal, "ACTIVE", False)
         assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-        assert_resumed(heard(talk), reference, pause=HELD - SILENT, twice=TWICE)
+        assert_resumed(heard(talk), reference, pause=seconds - SILENT, twice=TWICE)
         assert talk.watcher.states(goal) == SPOKEN
         numbers = [each["number"] for each in talk.watcher.words(goal)]
         assert numbers == list(range(1, len(numbers) + 1))
@@ -98,7 +130,7 @@ def test_row_43_a_sentence_that_is_held_twice_is_heard_whole(talk: Talk) -> None
     resume(talk)
     assert resume(talk)["goal"]["id"] == goal
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-    _assert_held_twice(heard(talk), render([LONG])[0])
+    _assert_held_twice(heard(talk), render_quick([LONG])[0])
     words = talk.watcher.words(goal)
     assert [each["number"] for each in words] == list(range(1, len(words) + 1))
     assert [each["word"] for each in words] == LONG.split()
@@ -114,7 +146,7 @@ def test_row_43_nothing_starts_while_paused_and_the_sender_is_told(talk: Talk) -
     assert talk.request("status")["server"]["paused"] is True
     resume(talk)
     assert talk.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
-    assert_heard(heard(talk), render([LOW, HOME]))
+    assert_heard(heard(talk), render_quick([LOW, HOME]))
     assert "paused" not in talk.request("say", text=LOW)
     heard(talk)
 
@@ -163,7 +195,7 @@ def test_row_43_the_timeout_of_a_client_runs_out_while_paused(talk: Talk) -> Non
 
     with limits():
         known = {None, *talk.watcher.goals()}
-        client = talk.start("say", "--wait", "--timeout", "1.5", "--", LONG)
+        client = talk.start("say", "--wait", "--timeout", "1", "--", LONG)
         began = time.monotonic()
         goal = str(talk.watcher.wait_until(lambda each: each.get("id") not in known)["id"])
         await_word(talk, goal)
@@ -171,10 +203,10 @@ def test_row_43_the_timeout_of_a_client_runs_out_while_paused(talk: Talk) -> Non
         done = talk.finish(client)
         took = time.monotonic() - began
         assert (done.code, done.id) == (124, goal)
-        assert took >= 1.4
+        assert took >= 0.9
         assert talk.watcher.states(goal) == STOPPED
         resume(talk)
-        assert_within(took, 2.2, "a timeout of 1.5 s")
+        assert_within(took, 1.7, "a timeout of 1 s")
 
 
 @pytest.mark.parametrize("how", ["preempt", "flush"])
@@ -203,6 +235,7 @@ def test_row_43_a_lower_priority_leaves_the_held_one(talk: Talk) -> None:
     assert talk.watcher.states(held) == SPOKEN
 
 
+@pytest.mark.slow
 def test_row_43_the_watchdog_leaves_a_sentence_alone_that_is_held_for_longer_than_its_limits(talk: Talk) -> None:
     goal = begin(talk, LONG)
     pause(talk)
@@ -210,7 +243,7 @@ def test_row_43_the_watchdog_leaves_a_sentence_alone_that_is_held_for_longer_tha
     assert talk.goal(goal)["paused"] is True
     resume(talk)
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-    assert_resumed(heard(talk), render([LONG])[0], pause=5, twice=TWICE)
+    assert_resumed(heard(talk), render_quick([LONG])[0], pause=5, twice=TWICE)
 
 
 def test_row_43_all_who_listen_are_told_who_paused(talk: Talk) -> None:
@@ -235,11 +268,13 @@ def test_a_server_that_is_terminated_while_paused_ends_all(talk: Talk) -> None:
     talk.stop(timeout=2)
     assert talk.watcher.states(held) == STOPPED
     assert talk.watcher.states(waiting) == ["PENDING", "RECALLED"]
-    assert_begun(heard(talk), render([LONG])[0])
+    assert_begun(heard(talk), render_quick([LONG])[0])
 
 
 def _assert_held_twice(samples: Samples, reference: Samples) -> None:
     """Assert that three parts were heard, which together are the sentence, nothing of it missing or heard twice."""
+    if compare(samples, reference).same:
+        return  # with nothing but silence put in
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
     cuts = np.sort(np.argsort(np.diff(loud))[-2:])
     starts, ends = [loud[0], *loud[cuts + 1]], [*loud[cuts], loud[-1]]

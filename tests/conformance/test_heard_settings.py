@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conformance.hearing import HELP, assert_same, heard
+from tests.conformance.hearing import HELP, HOME, QUICK, assert_same, heard, quick_talk, render_quick
 from tests.support.compare import loudness
-from tests.support.reference import render
+from tests.support.reference import Sentence, render
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 def test_row_28_half_the_volume_is_heard_as_half(make_talk: MakeTalk, sink: Sink) -> None:
     found = []
     for volume in (0.5, 1.0):
-        talk = make_talk("--volume", str(volume), sink=sink)
+        talk = quick_talk(make_talk, sink, "--volume", str(volume))
         assert talk.run("say", "--wait", "--", HELP).code == 0
         samples = heard(talk)
-        assert_same(samples, render([HELP], volume=volume)[0])
+        assert_same(samples, render_quick([Sentence(HELP, QUICK, volume)])[0])
         found.append(loudness(samples))
         talk.stop()
     assert found[0] / found[1] == pytest.approx(0.5, abs=0.1)
@@ -39,7 +39,7 @@ def test_row_29_half_the_rate_takes_twice_as_long(make_talk: MakeTalk, sink: Sin
     found = []
     for rate in (100, 200):
         talk = make_talk("--rate", str(rate), sink=sink)
-        assert talk.run("say", "--wait", "--", HELP).code == 0
-        found.append(assert_same(heard(talk), render([HELP], rate=rate)[0]).heard)
+        assert talk.run("say", "--wait", "--", HOME).code == 0
+        found.append(assert_same(heard(talk), render([HOME], rate=rate)[0]).heard)
         talk.stop()
     assert found[0] / found[1] == pytest.approx(2, abs=0.4)

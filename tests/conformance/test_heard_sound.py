@@ -5,27 +5,30 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.conformance import stopped
 from tests.conformance.hearing import (
     HOME,
     LONG,
     LOW,
+    QUICK,
     assert_aborted,
     begin_with_client,
     heard,
+    quick_talk,
+    render_quick,
 )
-from tests.conformance.stopped import assert_heard_after_stop
 from tests.support.compare import assert_begun, assert_silent
-from tests.support.reference import render
 from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     import pathlib
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
@@ -36,10 +39,33 @@ ABORTED = ["PENDING", "ACTIVE", "ABORTED"]
 NO_CARD = "pcm.!default { type hw card 31 }\nctl.!default { type hw card 31 }\n"
 
 
+assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
+
+
+@pytest.fixture(scope="module")
+def broken() -> Iterator[list[Sink]]:
+    """Sound servers that tests of this module have broken and brought back."""
+    found: list[Sink] = []
+    yield found
+    for each in found:
+        each.close()
+
+
+@pytest.fixture
+def breakable(broken: list[Sink]) -> Sink:
+    """A sound server for a test that breaks it and brings it back: the one of the test before, if that did."""
+    if broken:
+        with broken[-1].record() as recording:
+            if recording.wait_until(time.monotonic() + 0.1):
+                return broken[-1]
+    broken.append(Sink())
+    return broken[-1]
+
+
 def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
     make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path
 ) -> None:
-    talk = make_talk(sink=sink, env={"PATH": str(tmp_path)})
+    talk = make_talk("--rate", str(QUICK), sink=sink, env={"PATH": str(tmp_path)})
     goal = _aborted(talk, talk.run("say", "--wait", "--", LOW))
     assert_aborted(goal, "no_player", "no player found: install alsa-utils (aplay)", "pulseaudio-utils (pacat)")
     assert goal["spoken"] == ""
@@ -57,7 +83,8 @@ def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
 
     with limits():
         configuration.write_text(NO_CARD)
-        talk = make_talk(sink=sink, env={"HOME": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"})
+        env = {"HOME": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"}
+        talk = make_talk("--rate", str(QUICK), sink=sink, env=env)
         done = talk.run("say", "--wait", "--", LOW)
         goal = _aborted(talk, done)
         assert_aborted(goal, "audio_device", "aplay: audio open error: No such file or directory")
@@ -78,25 +105,23 @@ def test_row_41_a_device_of_another_name_is_told(make_talk: MakeTalk, sink: Sink
     assert_silent(heard(talk))
 
 
-def test_row_41_a_device_that_is_lost_in_mid_sentence(make_talk: MakeTalk, private_sink: Callable[[], Sink]) -> None:
-    sink = private_sink()
-    talk = make_talk(sink=sink)
-    _, client = begin_with_client(talk, LONG)
+def test_row_41_a_device_that_is_lost_in_mid_sentence(make_talk: MakeTalk, breakable: Sink) -> None:
+    sink = breakable
+    talk = quick_talk(make_talk, sink)
+    _, client = begin_with_client(talk, LONG, number=5)
     sink.unload()
     _lost(talk, client)
     sink.reload()
     _heard_again(talk, sink, LONG)
 
 
-def test_row_41_a_sound_server_that_is_killed_in_mid_sentence(
-    make_talk: MakeTalk, private_sink: Callable[[], Sink]
-) -> None:
-    sink = private_sink()
-    talk = make_talk(sink=sink)
-    _, client = begin_with_client(talk, LONG)
+def test_row_41_a_sound_server_that_is_killed_in_mid_sentence(make_talk: MakeTalk, breakable: Sink) -> None:
+    sink = breakable
+    talk = quick_talk(make_talk, sink)
+    _, client = begin_with_client(talk, LONG, number=5)
     sink.kill_server()
     _lost(talk, client)
-    without = make_talk(sink=sink)
+    without = quick_talk(make_talk, sink)
     goal = _aborted(without, without.run("say", "--wait", "--", LOW))
     assert_aborted(goal, "audio_device", "aplay: audio open error: Connection refused")
     sink.start_server()
@@ -105,19 +130,23 @@ def test_row_41_a_sound_server_that_is_killed_in_mid_sentence(
 
 
 @pytest.mark.parametrize(
-    ("hold", "let_go"), [(Sink.suspend, Sink.resume), (Sink.freeze, Sink.thaw)], ids=["suspended", "frozen"]
+    ("hold", "let_go"),
+    [
+        pytest.param(Sink.suspend, Sink.resume, marks=pytest.mark.slow, id="suspended"),
+        pytest.param(Sink.freeze, Sink.thaw, id="frozen"),
+    ],
 )
 def test_row_41_a_sink_that_takes_no_sound_in_mid_sentence(
     make_talk: MakeTalk,
-    private_sink: Callable[[], Sink],
+    breakable: Sink,
     hold: Callable[[Sink], None],
     let_go: Callable[[Sink], None],
 ) -> None:
-    sink = private_sink()
+    sink = breakable
 
     with limits():
-        talk = make_talk(sink=sink)
-        _, client = begin_with_client(talk, LONG)
+        talk = quick_talk(make_talk, sink)
+        _, client = begin_with_client(talk, LONG, number=5)
         hold(sink)
         held = time.monotonic()
         done = talk.finish(client)
@@ -148,7 +177,7 @@ def _lost(talk: Talk, client: Process) -> None:
     assert_aborted(goal, "audio_lost", "aplay: ", "error: Input/output error")
     assert goal["spoken"].startswith("two three")
     assert goal["spoken"] != LONG
-    assert_begun(talk.recording, render([LONG])[0], shortest=0.2)
+    assert_begun(talk.recording, render_quick([LONG])[0], shortest=0.2)
 
 
 def _heard_again(talk: Talk, sink: Sink, failed: str) -> None:

@@ -9,21 +9,23 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.conformance import stopped
 from tests.conformance.hearing import (
     HELP,
     HOME,
     LONG,
     LOW,
     PRECISION,
+    QUICK,
     await_word,
     begin,
     begin_with_client,
     heard,
+    quick_talk,
+    render_quick,
     send,
 )
-from tests.conformance.stopped import assert_heard_after_stop
 from tests.support.compare import assert_begun, assert_silent
-from tests.support.reference import render
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -36,6 +38,14 @@ STOPPED = ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 
 
+assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
+
+
+@pytest.fixture
+def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
+    return quick_talk(make_talk, sink)
+
+
 def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk) -> None:
     goal = begin(talk, LONG)
     canceled = talk.run("cancel", goal)
@@ -45,7 +55,7 @@ def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk) -> None:
     last = talk.recording.last_sound()
     assert last is not None
     assert last < returned + PRECISION
-    assert_begun(samples, render([LONG])[0])
+    assert_begun(samples, render_quick([LONG])[0])
     assert talk.watcher.states(goal) == STOPPED
     ended = talk.goal(goal)
     assert (ended["reason"], ended["message"]) == ("canceled", "Talk preempted")
@@ -88,14 +98,14 @@ def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk) -> 
     assert {each["reason"] for each in told} == {"shutdown"}
     assert talk.watcher.states(goals[0]) == STOPPED
     assert [talk.watcher.states(each) for each in goals[1:]] == [["PENDING", "RECALLED"]] * 3
-    assert_begun(heard(talk), render([LONG])[0])
+    assert_begun(heard(talk), render_quick([LONG])[0])
     last = talk.recording.last_sound()
     assert last is not None
     assert last < ended + PRECISION
 
 
 def test_row_24_a_newcomer_is_heard_when_the_one_before_it_is_silent(make_talk: MakeTalk, sink: Sink) -> None:
-    talk = make_talk("--preempt", sink=sink)
+    talk = quick_talk(make_talk, sink, "--preempt")
     goal, first = begin_with_client(talk, LONG)
     second = talk.run("say", "--wait", "--", LOW)
     preempted = talk.finish(first)

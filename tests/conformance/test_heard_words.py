@@ -76,7 +76,14 @@ def position(reference: Rendering, start: int) -> float:
     return next(seconds for offset, _, seconds in reference.words if offset == start)
 
 
-@pytest.mark.parametrize(("player", "rate"), [("aplay", 100), ("aplay", 200), ("aplay", 350), ("pacat", 200)])
+@pytest.mark.parametrize(
+    ("player", "rate"),
+    [
+        ("pacat", 350),
+        *(pytest.param("aplay", rate, marks=pytest.mark.slow) for rate in (100, 200, 350)),
+        pytest.param("pacat", 200, marks=pytest.mark.slow),
+    ],
+)
 def test_done_when_thirty_words_are_told_as_they_are_heard(
     make_talk: MakeTalk, sink: Sink, player: str, rate: int
 ) -> None:
@@ -112,7 +119,7 @@ def test_row_42_ten_words_of_any_script_are_told_once_each_in_their_place(make_t
         measured.assert_in_time()
 
 
-@pytest.mark.parametrize("number", [2, 5, 8])
+@pytest.mark.parametrize("number", [2, pytest.param(5, marks=pytest.mark.slow), 8])
 def test_row_42_a_stopped_goal_has_spoken_what_was_heard_of_it(make_talk: MakeTalk, sink: Sink, number: int) -> None:
     (reference,) = render_with_words([LONG])
     begins = extent(reference.samples)

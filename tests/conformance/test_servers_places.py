@@ -63,7 +63,7 @@ def test_server_and_client_meet_without_naming_a_socket(home: str, name: str) ->
     env = filled(home, name)
     if "XDG_RUNTIME_DIR" not in env and os.path.isdir(f"/run/user/{os.getuid()}"):
         pytest.skip("this user has a runtime directory, which is the place then, and not the test's")
-    with serving(env) as server:
+    with serving(env, "--rate", "450") as server:
         assert f"ready on {home}/" in server.log
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
         second = run([*TALK, "serve", "--player", "null"], env)

@@ -7,6 +7,8 @@ import re
 import signal
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run
 from tests.support import processes
 from tests.support.connection import Wire
@@ -16,11 +18,12 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 
-def test_row_45_of_two_servers_started_at_once_exactly_one_serves() -> None:
+@pytest.mark.parametrize("times", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_row_45_of_two_servers_started_at_once_exactly_one_serves(times: int) -> None:
     scripted = [SERVE[0], processes.SCRIPTED]  # the start of an engine is not what is tested
     with short_directory() as home:
         env = environment(home, TALK_SOCKET=f"{home}/s")
-        for attempt in range(20):
+        for attempt in range(times):
             servers = [BareServe(scripted, env) for _ in range(2)]
             try:
                 assert sorted(each.serves() for each in servers) == [False, True], f"attempt {attempt}"

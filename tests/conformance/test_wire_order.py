@@ -11,6 +11,7 @@ import pytest
 
 from talkcli import __version__
 from tests.conformance.rawsocket import Raw
+from tests.conformance.witness import await_ends
 from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
@@ -178,8 +179,12 @@ def test_request_is_not_taken_in_the_middle_of_what_an_end_brings_about(scripted
         # Requests that wait to be taken are there when the goals end, one after the other.
         wire.send_raw(b"".join(line(request="cancel", current=True) for _ in range(4 * count)))
         last = scripted.run("say", "--wait", "length=0 the last")
+        assert wire.request("hello", timeout=20)["ok"]  # then all the others have been taken, too
     assert last.code == 0
-    for goal in scripted.watcher.goals():
+    goals = scripted.watcher.goals()
+    assert len(goals) == count + 1
+    await_ends(scripted, goals)
+    for goal in goals:
         states = scripted.watcher.states(goal)
         assert states[0] == "PENDING"
         assert states[1:] in (

@@ -133,7 +133,7 @@ def peak_memory(pid: int) -> int:
 
 
 def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None:
-    text = "length=2 " + "a " * 4_900
+    text = "length=1 " + "a " * 4_900
     with scripted.connect() as stuck:
         assert stuck.request("watch")["ok"]
         with others_served(scripted) as times:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from tests.conformance.witness import await_ends
 from tests.support.watcher import TERMINAL
 
 if TYPE_CHECKING:
@@ -54,14 +55,16 @@ def assert_recalled(talk: Talk, goal_id: str, reason: str, by: str | None = None
 
 def assert_told_in_order(talk: Talk) -> None:
     """Assert the order of section 9 of all goals that there were; all of them must have ended."""
-    for goal_id in talk.watcher.goals():
-        if talk.watcher.states(goal_id) != ["REJECTED"]:
-            talk.watcher.wait_for_terminal(goal_id)
+    await_ends(talk, talk.watcher.goals())
     events = talk.watcher.events()
     numbers = [each["n"] for each in events]
     assert numbers == list(range(1, len(events) + 1)), "events are missing"
-    for goal_id in talk.watcher.goals():
-        _check_goal([each for each in events if each.get("id") == goal_id and each["event"] != "paused"])
+    goals: dict[str, list[Message]] = {}
+    for each in events:
+        if each.get("id") is not None:
+            goals.setdefault(each["id"], []).append(each)
+    for own in goals.values():
+        _check_goal([each for each in own if each["event"] != "paused"])
     _check_one_at_a_time(events)
     _check_newcomers(events)
 

@@ -19,6 +19,12 @@ _E = TypeVar("_E", bound=protocol.Event)
 
 #: Seconds after which a message is late on the busiest machine.
 PATIENCE = 20.0
+#: Words a minute where they are not what is tested: a sentence takes less than half as long as at talk's own rate. What
+#: is told to another driver is its own, which it need not set.
+FAST = 450
+USUAL = 200
+#: Seconds between two signs of life where a test waits for one to know that some time has passed.
+SOON = 0.1
 
 
 class Spawned:
@@ -37,15 +43,22 @@ class Spawned:
         environment: Mapping[str, str] | None = None,
         lead_in: int = 0,
         list_voices: bool = True,
+        alive_every: float | None = None,
     ) -> None:
-        """`limits` replaces constants of the playback, `before` is code that runs in the process first."""
+        """`limits` replaces constants of the playback, `before` is code that runs in the process first.
+
+        `alive_every`: seconds between signs of life, if not the protocol's.
+        """
         self.events: list[protocol.Event] = []
+        self._rate = FAST if driver in (None, "espeak") else USUAL
         self._rest = b""
         self._pauses = 0
         self._socket, theirs = socket.socketpair()
         self._socket.settimeout(PATIENCE)
         self.liveness, inherited = os.pipe()
         settings = "".join(f"playback.{name} = {value}\n" for name, value in (limits or {}).items())
+        if alive_every is not None:
+            settings += f"from talkcli.engine import protocol\nprotocol.ALIVE_EVERY = {alive_every}\n"
         path = f"import sys\nsys.path[:] = {sys.path!r}\n"
         code = f"{path}{before}\nfrom talkcli.engine import playback\n{settings}"
         with theirs:
@@ -85,8 +98,10 @@ class Spawned:
         """Do what the kernel does when the server dies."""
         self._socket.shutdown(socket.SHUT_RDWR)
 
-    def say(self, text: str, goal: str = "g1", *, rate: int = 200, voice: str | None = None, pitch: int = 50) -> None:
-        self.send(protocol.Say(goal, text, rate, 1.0, voice, pitch))
+    def say(
+        self, text: str, goal: str = "g1", *, rate: int | None = None, voice: str | None = None, pitch: int = 50
+    ) -> None:
+        self.send(protocol.Say(goal, text, rate or self._rate, 1.0, voice, pitch))
 
     def pause(self, goal: str = "g1") -> float:
         """Hold the sentence and return the seconds until the process said that it is silent."""
@@ -118,7 +133,9 @@ class Spawned:
                 return event
         raise AssertionError(f"no {kind.__name__} before the process ended: {self.errors()}")
 
-    def spoken(self, text: str, goal: str = "g1", *, rate: int = 200, voice: str | None = None) -> protocol.Ended:
+    def spoken(
+        self, text: str, goal: str = "g1", *, rate: int | None = None, voice: str | None = None
+    ) -> protocol.Ended:
         """Say a sentence and return how it ended."""
         self.say(text, goal, rate=rate, voice=voice)
         return self.until(protocol.Ended)

@@ -10,7 +10,7 @@ import pytest
 from talkcli.engine import protocol
 from talkcli.engine.changeover import LONGEST, MOST, REMEMBERED, Changeover
 from talkcli.engine.samples import QUIET, Samples
-from tests.engine.spawned import Spawned
+from tests.engine.spawned import FAST, Spawned
 from tests.engine.test_player_faults import Player
 from tests.support.reference import RATE, render
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 TEXTS = ["battery low", "coming home", "please help"]
-#: Seconds that are left out where a test says so, and what that is in bytes.
-LEFT_OUT = 0.05
+#: Seconds that are left out where a test says so, and what that is in bytes: even a fast sentence ends in as much.
+LEFT_OUT = 0.02
 _BYTES = int(LEFT_OUT * RATE) * 2
 _SAYS_SO = f"from talkcli.engine.changeover import Changeover\nChangeover.allowance = lambda *_: {LEFT_OUT}"
 
@@ -29,12 +29,12 @@ def player(tmp_path: Path) -> Player:
     return Player(tmp_path)
 
 
-def _say(text: str, goal: str, *, followed: bool) -> protocol.Say:
-    return protocol.Say(goal, text, 200, 1.0, None, 50, followed)
+def _say(text: str, goal: str, *, followed: bool, rate: int = FAST) -> protocol.Say:
+    return protocol.Say(goal, text, rate, 1.0, None, 50, followed)
 
 
-def _sentences() -> list[bytes]:
-    return [each.tobytes() for each in render(TEXTS)]
+def _sentences(rate: int = FAST) -> list[bytes]:
+    return [each.tobytes() for each in render(TEXTS, rate=rate)]
 
 
 def _changed(changeover: Changeover, took: float, player: str = "aplay") -> None:
@@ -157,12 +157,13 @@ def test_a_file_gets_every_sample(tmp_path: Path) -> None:
 
 def test_a_player_that_ends_too_early_is_seen_as_before(player: Player) -> None:
     """A sentence may not end sooner than so much before its whole length, what was left out of it included."""
-    length = len(_sentences()[0]) / 2 / RATE
+    rate = 200  # at which the silence at the end is that long
+    length = len(_sentences(rate)[0]) / 2 / RATE
     before = "from talkcli.engine.changeover import Changeover\nChangeover.allowance = lambda *_: 0.2"
     hurried = "import os\nwhile os.read(0, 65536): pass"  # it is over by what it gets, which is 0.2 s less
     with Spawned(player.command(hurried), before=before, limits={"EARLY_END": length - 0.2}) as engine:
         engine.until(protocol.Voices)
-        engine.send(_say(TEXTS[0], "g0", followed=True))
+        engine.send(_say(TEXTS[0], "g0", followed=True, rate=rate))
         ended = engine.until(protocol.Ended)
         assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_lost")
 

@@ -14,7 +14,7 @@ from talkcli.engine import protocol
 from talkcli.engine.child import Child
 from talkcli.engine.pipe import PlayerPipe
 from talkcli.engine.players import Command
-from tests.engine.spawned import Spawned, children
+from tests.engine.spawned import FAST, Spawned, children
 from tests.engine.test_player_faults import Player
 from tests.support.reference import render
 
@@ -153,7 +153,7 @@ library.load = lambda: replace(load(), rate=16_000)
         engine.until(protocol.Voices)
         assert engine.spoken("battery low").outcome == protocol.COMPLETED
     assert set(rates.read_text().split()) == {"22050"}
-    assert player.heard.read_bytes() == render(["battery low"])[0].tobytes()
+    assert player.heard.read_bytes() == render(["battery low"], rate=FAST)[0].tobytes()
 
 
 def test_all_that_a_player_has_started_dies_with_a_killed_process(tmp_path: Path) -> None:

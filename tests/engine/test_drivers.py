@@ -10,6 +10,7 @@ import pytest
 
 from talkcli.engine import protocol
 from tests.engine.spawned import Spawned
+from tests.support.timing import assert_within, limits
 
 #: A driver like macOS's: it speaks by itself, gives words as names, and confirms a stop some time later.
 SLOW_DRIVER = """
@@ -146,19 +147,19 @@ def test_a_driver_that_speaks_by_itself_is_stepped_to_its_end() -> None:
 
 
 def test_a_stop_of_a_slow_driver_ends_when_it_says_so() -> None:
-    with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
+    with limits(), Spawned(driver="slow", before=SLOW_DRIVER) as engine:
         engine.until(protocol.Ready)
         engine.say("battery low")
         engine.until(protocol.Word)
         asked = time.monotonic()
         engine.send(protocol.Stop("g1"))
         assert engine.until(protocol.Ended).outcome == protocol.STOPPED
-        assert time.monotonic() - asked < 0.15
+        assert_within(time.monotonic() - asked, 0.15, "the stop")
         assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
 
 
 def _timed(text: str = "battery low, please come home") -> Spawned:
-    engine = Spawned(driver="timed", before=TIMED_DRIVER)
+    engine = Spawned(driver="timed", before=TIMED_DRIVER, alive_every=0.3)
     engine.until(protocol.Voices)
     engine.say(text)
     return engine

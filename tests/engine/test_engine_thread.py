@@ -12,7 +12,6 @@ import pytest
 import talkcli
 from talkcli.engine import protocol, spawn
 from talkcli.engine import thread as engine_thread
-from talkcli.engine.limits import HANG_AFTER
 from talkcli.engine.murmur import LINES
 from talkcli.engine.reports import EngineDied, EngineSaid
 from tests.engine.threads import Thread, start
@@ -27,36 +26,38 @@ __all__ = ["start"]
 def test_a_goal_is_held_and_goes_on_where_it_was(start: Callable[[], Thread]) -> None:
     thread = start()
     began = time.monotonic()
-    thread.say("length=0.6 two three four")
+    thread.say("length=0.4 two three four")
     thread.until(protocol.Word)
     thread.engine.pause("g1", 1)
     assert thread.until(protocol.Paused).id == "g1"
-    assert thread.next(0.8) is None
+    assert thread.next(0.6) is None
     thread.engine.resume("g1")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
-    assert time.monotonic() - began >= 0.6 + 0.8
+    assert time.monotonic() - began >= 0.4 + 0.6
     assert [each.number for each in thread.seen if isinstance(each, protocol.Word)] == [1, 2, 3, 4]
 
 
-def test_a_pause_may_last_longer_than_any_limit(start: Callable[[], Thread]) -> None:
+def test_a_pause_may_last_longer_than_any_limit(start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine_thread, "HANG_AFTER", 1.0)
+    monkeypatch.setattr(engine_thread, "PAUSE_LIMIT", 1.0)
     thread = start()
     thread.say("length=0.3")
     thread.until(protocol.Word)
     thread.engine.pause("g1", 1)
     thread.until(protocol.Paused)
-    assert thread.next(HANG_AFTER + 0.5) is None
+    assert thread.next(1.5) is None
     thread.engine.resume("g1")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
 
 
 def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(start: Callable[[], Thread]) -> None:
     thread = start()
-    thread.say("length=1.5 slow-pause=0.4")
+    thread.say("length=0.9 slow-pause=0.3")
     thread.until(protocol.Word)
     asked = time.monotonic()
     thread.engine.pause("g1", 1)
     thread.until(protocol.Paused)
-    assert time.monotonic() - asked >= 0.4
+    assert time.monotonic() - asked >= 0.3
     thread.engine.resume("g1")
     thread.engine.pause("g1", 2)
     thread.engine.resume("g1")
@@ -66,7 +67,7 @@ def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(star
 
 def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Callable[[], Thread]) -> None:
     thread = start()
-    thread.say("length=1 stale-pause slow-pause=0.3")
+    thread.say("length=0.7 stale-pause slow-pause=0.2")
     thread.until(protocol.Word)
     thread.engine.pause("g1", 1)
     thread.engine.resume("g1")

@@ -76,7 +76,7 @@ def test_a_goal_behind_another_wakes_the_thread_once(monkeypatch: pytest.MonkeyP
 def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(
     start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_thread, "HANG_AFTER", 2.0)
+    monkeypatch.setattr(engine_thread, "HANG_AFTER", 0.7)
     thread = start()
     thread.say("length=0")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
@@ -84,7 +84,7 @@ def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(
     assert thread.until(protocol.Ended).reason == "engine_hung"
     thread.say("yes", "g3")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
-    assert thread.next(3.0) is None  # it does not doze any more
+    assert thread.next(1.0) is None  # it does not doze any more
     thread.say("length=0.05 hang", "g4")
     assert thread.until(protocol.Ended).reason == "engine_hung"
 
@@ -131,6 +131,7 @@ class Lost:
 def test_a_goal_that_was_sent_to_a_process_that_is_lost_is_spoken_by_the_next(
     start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch, takes: bool
 ) -> None:
+    monkeypatch.setattr(engine_thread, "HANG_AFTER", 1.0)  # so long a thread may doze that nothing wakes
     thread = start()
     thread.until(protocol.Ready)
     monkeypatch.setattr(thread.engine, "_open", Lost(takes=takes))

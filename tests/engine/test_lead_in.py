@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import outlet, protocol
-from tests.engine.spawned import Spawned, children
+from tests.engine.spawned import FAST, SOON, Spawned, children
 from tests.engine.test_player_faults import Player, player
 from tests.support import compare
 from tests.support.reference import RATE, render
@@ -29,7 +29,7 @@ _LEAD = LEAD_IN * RATE // 1000 * 2
 
 
 def _bytes() -> list[bytes]:
-    return [samples.astype("<i2").tobytes() for samples in render(TEXTS)]
+    return [samples.astype("<i2").tobytes() for samples in render(TEXTS, rate=FAST)]
 
 
 def test_it_is_heard_before_the_first_sentence_and_not_before_the_next(sink: Sink) -> None:
@@ -50,7 +50,7 @@ def test_it_is_heard_before_the_first_sentence_and_not_before_the_next(sink: Sin
                 ended = engine.until(protocol.Ended)
                 assert ended.outcome == protocol.COMPLETED
                 recording.wait_until_quiet(0.1)
-        compare.assert_heard(recording, render(TEXTS))
+        compare.assert_heard(recording, render(TEXTS, rate=FAST))
         assert onsets[0] > LEAD_IN / 1000
         assert_within(onsets[0], LEAD_IN / 1000 + 0.2, "the first sentence")
         assert_within(onsets[1], 0.2, "the second sentence")
@@ -83,7 +83,8 @@ def test_a_device_that_was_idle_gets_it_again(player: Player) -> None:
 
 def test_a_player_after_a_long_pause_gets_it_again(player: Player) -> None:
     before = "from talkcli.engine import outlet\noutlet.IDLE_AFTER = 0.2"
-    with Spawned(player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": 0.1}, before=before) as engine:
+    constants = {"RELEASE_AFTER": 0.1}
+    with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=0.3) as engine:
         engine.until(protocol.Voices)
         engine.say(TEXTS[0])
         engine.until(protocol.Word)
@@ -101,7 +102,8 @@ def test_a_player_after_a_long_pause_gets_it_again(player: Player) -> None:
 
 
 def test_a_sentence_that_goes_on_as_soon_as_the_device_was_let_go_of_gets_it_again(player: Player) -> None:
-    with Spawned(player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": outlet.IDLE_AFTER}) as engine:
+    before, constants = "from talkcli.engine import outlet\noutlet.IDLE_AFTER = 0.3", {"RELEASE_AFTER": 0.3}
+    with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=SOON) as engine:
         engine.until(protocol.Voices)
         engine.say(TEXTS[0])
         engine.until(protocol.Word)

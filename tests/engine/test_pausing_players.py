@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import Spawned, children
+from tests.engine.spawned import FAST, SOON, Spawned, children
 from tests.engine.test_player_faults import Player, player
 from tests.support.reference import RATE, render
 from tests.support.timing import assert_within, limits
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["player"]
 
-TEXT = "one two three four five six seven eight nine ten"
+TEXT = "one two three four five six seven"
 
 #: A player that takes all it gets at once, plays it in real time, and writes what it got to a file of its own.
 DEEP = """
@@ -37,12 +37,13 @@ time.sleep(max(0, began + taken / 44100 - time.monotonic()))
 
 
 def _bytes(text: str) -> bytes:
-    return render([text])[0].astype("<i2").tobytes()
+    return render([text], rate=FAST)[0].astype("<i2").tobytes()
 
 
 def _without_silence(heard: bytes, sentence: bytes) -> bytes:
     """Return what was heard without the longest run of zeros."""
-    begin = next(at for at in range(0, len(heard), 2) if heard[: at + 2] != sentence[: at + 2])
+    same = (pair[0] == pair[1] for pair in zip(heard, sentence, strict=False))
+    begin = next((at for at, each in enumerate(same) if not each), len(sentence)) // 2 * 2
     end = begin
     while heard[end : end + 2] == b"\0\0":
         end += 2
@@ -50,7 +51,7 @@ def _without_silence(heard: bytes, sentence: bytes) -> bytes:
 
 
 def test_null_stands_still() -> None:
-    with Spawned() as engine:
+    with Spawned(alive_every=0.3) as engine:
         engine.until(protocol.Voices)
         began = time.monotonic()
         engine.say(TEXT)
@@ -65,12 +66,13 @@ def test_null_stands_still() -> None:
         assert ended.duration is not None
         after = [word for word in engine.words() if word.number > 5]
         assert after
-        assert time.monotonic() - began >= ended.duration + protocol.ALIVE_EVERY - 0.1
+        assert time.monotonic() - began >= ended.duration + 0.3 - 0.1
         assert time.monotonic() - held >= ended.duration - after[0].time
 
 
 def test_a_paused_sentence_is_told_to_be_alive_for_as_long_as_it_takes() -> None:
-    with Spawned(limits={"RELEASE_AFTER": 0.3}) as engine:
+    alive_every = 0.2
+    with Spawned(limits={"RELEASE_AFTER": 0.3}, alive_every=alive_every) as engine:
         engine.until(protocol.Voices)
         engine.say(TEXT)
         engine.until(protocol.Word)
@@ -79,14 +81,14 @@ def test_a_paused_sentence_is_told_to_be_alive_for_as_long_as_it_takes() -> None
         for _ in range(5):
             assert isinstance(engine.event(), protocol.Alive)
             now = time.monotonic()
-            assert now - last < protocol.ALIVE_EVERY + 0.2
+            assert now - last < alive_every + 0.2
             last = now
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
 
 
 def test_pausing_twice_and_resuming_for_nothing_is_harmless(player: Player) -> None:
-    with Spawned(player.plays()) as engine:
+    with Spawned(player.plays(), alive_every=SOON) as engine:
         engine.until(protocol.Voices)
         engine.resume()
         engine.say(TEXT)
@@ -118,7 +120,8 @@ def test_resuming_before_it_is_silent_loses_nothing(player: Player) -> None:
 
 
 def test_a_player_gets_silence_in_a_pause_and_then_the_next_sample(player: Player) -> None:
-    with Spawned(player.plays()) as engine:
+    alive_every = 0.3
+    with Spawned(player.plays(), alive_every=alive_every) as engine:
         engine.until(protocol.Voices)
         engine.say(TEXT)
         engine.until(protocol.Word)
@@ -127,12 +130,12 @@ def test_a_player_gets_silence_in_a_pause_and_then_the_next_sample(player: Playe
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     heard, sentence = player.heard.read_bytes(), _bytes(TEXT)
-    assert len(heard) > len(sentence) + protocol.ALIVE_EVERY * 0.8 * RATE * 2
+    assert len(heard) > len(sentence) + alive_every * 0.8 * RATE * 2
     assert _without_silence(heard, sentence) == sentence
 
 
 def test_a_player_that_dies_in_a_pause_is_replaced(player: Player) -> None:
-    with Spawned(player.plays()) as engine:
+    with Spawned(player.plays(), alive_every=SOON) as engine:
         engine.until(protocol.Voices)
         engine.say(TEXT)
         engine.until(protocol.Word)
@@ -144,6 +147,25 @@ def test_a_player_that_dies_in_a_pause_is_replaced(player: Player) -> None:
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     sentence = _bytes(TEXT)
     assert _without_silence(player.heard.read_bytes(), sentence) == sentence
+
+
+def test_a_player_that_dies_in_a_pause_and_cannot_be_replaced_fails_the_sentence_when_it_goes_on(
+    player: Player,
+) -> None:
+    with Spawned(player.plays(), alive_every=SOON) as engine:
+        engine.until(protocol.Voices)
+        engine.say(TEXT)
+        engine.until(protocol.Word)
+        engine.pause()
+        player.command("raise SystemExit('audio open error: Connection refused')")
+        (pid,) = children(engine.process.pid)
+        os.kill(pid, signal.SIGKILL)
+        assert isinstance(engine.event(), protocol.Alive)
+        assert children(engine.process.pid) == []
+        engine.resume()
+        ended = engine.until(protocol.Ended)
+        assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_device")
+        assert ended.message == "audio open error: Connection refused"
 
 
 def test_a_player_that_holds_too_much_is_ended_and_the_rest_is_said_again(player: Player) -> None:
@@ -180,7 +202,7 @@ def test_a_frozen_player_is_ended_by_a_pause(player: Player) -> None:
 
 
 def test_a_pause_before_the_player_took_anything_holds_the_whole_sentence(player: Player) -> None:
-    with Spawned(player.command("import time\ntime.sleep(100)")) as engine:
+    with Spawned(player.command("import time\ntime.sleep(100)"), alive_every=SOON) as engine:
         engine.until(protocol.Voices)
         engine.say(TEXT)
         engine.until(protocol.Alive)
@@ -206,13 +228,13 @@ def test_a_pause_when_only_the_end_is_left_lets_it_end(player: Player) -> None:
 
 @pytest.mark.parametrize("held", ["before", "within"])
 def test_no_silence_is_written_to_a_file(tmp_path: Path, held: str) -> None:
-    text = TEXT if held == "before" else " ".join([TEXT] * 150)
+    text, rate = TEXT if held == "before" else " ".join([TEXT] * 150), 200  # at which it is made the quickest
     plain, target = tmp_path / "plain.wav", tmp_path / "paused.wav"
-    subprocess.run(["espeak-ng", "-s", "200", "-w", str(plain), text], check=True)
-    with Spawned(f"file:{target}") as engine:
+    subprocess.run(["espeak-ng", "-s", str(rate), "-w", str(plain), text], check=True)
+    with Spawned(f"file:{target}", alive_every=SOON) as engine:
         engine.until(protocol.Voices)
         pause = protocol.encode(protocol.Pause("g1", 1))
-        engine.send_raw(protocol.encode(protocol.Say("g1", text, 200, 1.0, None, 50)) + pause * (held == "before"))
+        engine.send_raw(protocol.encode(protocol.Say("g1", text, rate, 1.0, None, 50)) + pause * (held == "before"))
         if held == "within":
             engine.until(protocol.Word)
             engine.send_raw(pause)

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import Spawned, children
+from tests.engine.spawned import SOON, Spawned, children
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -88,7 +89,7 @@ def test_underruns_are_no_error(player: Player) -> None:
 def test_underruns_do_not_hide_the_error(player: Player) -> None:
     during = """
     print("underrun!!! (at least 0.1 ms long)" * 50, file=sys.stderr)
-    if taken > 20000:
+    if taken > 8000:
         sys.exit("aplay: pcm_write:2061: write error: No such device")
 """
     assert _failure(player.plays(during)) == ("audio_lost", "aplay: write error: No such device")
@@ -113,12 +114,12 @@ def test_exits_0_at_once(player: Player) -> None:
 
 
 def test_exits_0_in_mid_sentence(player: Player) -> None:
-    during = "if taken > 20000: sys.exit(0)"
+    during = "if taken > 8000: sys.exit(0)"
     assert _failure(player.plays(during)) == ("audio_lost", "player ended before the sound did")
 
 
 def test_exits_1_in_mid_sentence(player: Player) -> None:
-    during = "if taken > 20000: sys.exit(3)"
+    during = "if taken > 8000: sys.exit(3)"
     assert _failure(player.plays(during)) == ("audio_lost", "player exited with status 3")
 
 
@@ -136,7 +137,7 @@ def test_exits_1_after_it_took_everything(player: Player) -> None:
 
 
 def test_closes_its_input_and_stays(player: Player) -> None:
-    reason, message = _failure(player.plays("if taken > 20000: os.close(0); time.sleep(100)"))
+    reason, message = _failure(player.plays("if taken > 8000: os.close(0); time.sleep(100)"))
     assert (reason, message) == ("audio_lost", "player closed its input before the sound was over")
 
 
@@ -148,7 +149,7 @@ def test_never_reads(player: Player) -> None:
 
 
 def test_stalls_in_mid_sentence(player: Player) -> None:
-    reason, message = _failure(player.plays("if taken > 20000: time.sleep(100)"), STALLED_AFTER=0.4)
+    reason, message = _failure(player.plays("if taken > 8000: time.sleep(100)"), STALLED_AFTER=0.4)
     assert (reason, message) == ("audio_stalled", "player took no sound for 0.4 s")
 
 
@@ -171,7 +172,7 @@ def test_killed_in_mid_sentence(player: Player) -> None:
 
 
 def test_a_stop_leaves_no_process(player: Player) -> None:
-    with Spawned(player.plays()) as engine:
+    with limits(), Spawned(player.plays()) as engine:
         engine.until(protocol.Ready)
         for number in range(3):
             engine.say("one two three four five six seven eight", f"g{number}")
@@ -179,25 +180,25 @@ def test_a_stop_leaves_no_process(player: Player) -> None:
             asked = time.monotonic()
             engine.send(protocol.Stop(f"g{number}"))
             assert engine.until(protocol.Ended).outcome == protocol.STOPPED
-            assert time.monotonic() - asked < 0.02
+            assert_within(time.monotonic() - asked, 0.02, "the stop")
             assert children(engine.process.pid) == []
 
 
 def test_a_stop_ends_a_player_that_never_reads(player: Player) -> None:
-    with Spawned(player.command("import time\ntime.sleep(100)")) as engine:
+    with limits(), Spawned(player.command("import time\ntime.sleep(100)"), alive_every=SOON) as engine:
         engine.until(protocol.Ready)
         engine.say(TEXT)
         engine.until(protocol.Alive)
         asked = time.monotonic()
         engine.send(protocol.Stop("g1"))
         assert engine.until(protocol.Ended).outcome == protocol.STOPPED
-        assert time.monotonic() - asked < 0.02
+        assert_within(time.monotonic() - asked, 0.02, "the stop")
         assert engine.words() == []
 
 
 def test_no_word_is_reported_while_the_player_stands_still(player: Player) -> None:
-    stall = 0.8
-    with Spawned(player.plays(f"if 20000 < taken < 20900: time.sleep({stall}); began += {stall}")) as engine:
+    stall = 0.5
+    with Spawned(player.plays(f"if 13000 < taken < 13900: time.sleep({stall}); began += {stall}")) as engine:
         engine.until(protocol.Ready)
         began = time.monotonic()
         engine.say("one two three four five six seven")
@@ -205,8 +206,8 @@ def test_no_word_is_reported_while_the_player_stands_still(player: Player) -> No
         while not isinstance(event := engine.event(), protocol.Ended):
             if isinstance(event, protocol.Word):
                 late[event.time] = time.monotonic() - began - event.time
-        before = [value for position, value in late.items() if position < 0.35]
-        after = [value for position, value in late.items() if position > 0.5]
+        before = [value for position, value in late.items() if position < 0.2]
+        after = [value for position, value in late.items() if position > 0.35]
         assert before
         assert after
         assert max(before) + stall - 0.15 < min(after)
@@ -262,7 +263,7 @@ def test_where_all_players_fail_the_first_one_is_quoted(player: Player, tmp_path
 
 
 def test_a_player_that_took_sound_is_not_replaced(player: Player, tmp_path: Path) -> None:
-    during = "if taken > 20000: sys.exit('write error: No such device')"
+    during = "if taken > 8000: sys.exit('write error: No such device')"
     code = PLAYS.format(during=during, after="").replace("sys.argv[1]", repr(str(player.heard)))
     player.program(code, "aplay")
     player.program(f"open({str(tmp_path / 'mark')!r}, 'w')", "pacat")

@@ -30,8 +30,11 @@ render(sys.argv[1], sys.argv[2])
 """
 
 
+@pytest.mark.parametrize("times", [5, pytest.param(20, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_killed_at_any_moment_there_is_no_half_file_and_no_process(tmp_path: Path, how: signal.Signals) -> None:
+def test_killed_at_any_moment_there_is_no_half_file_and_no_process(
+    tmp_path: Path, how: signal.Signals, times: int
+) -> None:
     text = "one two three four five. " * 20
     (expected,) = reference([text])
     path = tmp_path / "x.wav"
@@ -41,7 +44,7 @@ def test_killed_at_any_moment_there_is_no_half_file_and_no_process(tmp_path: Pat
     whole = time.monotonic() - began
     moments = random.Random(how)
     outcomes = set()
-    for _ in range(20):
+    for _ in range(times):
         path.write_bytes(BEFORE)
         mark = uuid.uuid4().hex
         with subprocess.Popen(

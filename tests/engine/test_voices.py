@@ -14,7 +14,7 @@ import pytest
 from talkcli.engine import protocol, voices
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import find_voice, unknown_voice
-from tests.engine.spawned import Spawned
+from tests.engine.spawned import USUAL, Spawned
 from tests.support.reference import Sentence, render
 
 if TYPE_CHECKING:
@@ -206,9 +206,9 @@ def test_after_a_goals_own_voice_the_default_sounds_as_before(tmp_path: Path, vo
     with Spawned(f"file:{target}") as engine:
         engine.until(protocol.Ready)
         durations = [
-            engine.spoken(TEXT, "g1").duration,
-            engine.spoken(TEXT, "g2", voice=voice).duration,
-            engine.spoken(TEXT, "g3").duration,
+            engine.spoken(TEXT, "g1", rate=USUAL).duration,
+            engine.spoken(TEXT, "g2", rate=USUAL, voice=voice).duration,
+            engine.spoken(TEXT, "g3", rate=USUAL).duration,
         ]
     with wave.open(str(target)) as file:
         samples = file.readframes(file.getnframes())

@@ -1,4 +1,4 @@
-"""Runs `talk serve` with the scripted engine, looking after its socket's file every 0.2 s; arguments as of `serve`."""
+"""Runs `talk serve` with the scripted engine, looking after its socket's file every 0.05 s; arguments as of `serve`."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ from talkcli.server import upkeep
 from tests.support import scripted_serve
 
 if __name__ == "__main__":
-    upkeep.LOOK_EVERY = 0.2
+    upkeep.LOOK_EVERY = 0.05
     scripted_serve.main()

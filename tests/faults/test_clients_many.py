@@ -26,8 +26,11 @@ if TYPE_CHECKING:
 
 #: Seconds of `status` for somebody else, whatever these clients do.
 STATUS = 0.1
-#: So many words, less a few, go to those who follow a goal: as many as the longest text has, three hundred a second.
-WORDS = "length=16 " + "a " * 4_990
+#: So many words, less a few, go to those who follow a goal: as many as the longest text has.
+WORDS = "a " * 4_990
+#: kB that a waiter which is frozen may cost: it gets what is never dropped, a goal's text three times, 30 kB, and
+#: buffers grow by eighths.
+FROZEN = 8 * 1024 // 50
 
 #: A process with many connections, each of which sends a line, says when all have been answered, and sleeps.
 _CROWD = """
@@ -45,13 +48,14 @@ print("ready", flush=True)
 sys.stdin.read()
 """
 
-#: A process that asks for the status all the time, and says at last how long the longest took: in a process of its own,
-#: so that what the tests do meanwhile is not timed.
+#: A process that says when it is let in, asks for the status all the time, and says at last how long the longest took:
+#: in a process of its own, so that what the tests do meanwhile is not timed.
 _ASKER = """
 import select, socket, sys, time
 wire = socket.socket(socket.AF_UNIX)
 wire.connect(sys.argv[1])
 wire.recv(65536)
+print("ready", flush=True)
 longest = 0.0
 while not select.select([sys.stdin], [], [], 0.005)[0]:
     began = time.monotonic()
@@ -71,6 +75,8 @@ def asking(talk: Talk) -> Iterator[list[float]]:
     longest: list[float] = []
     with subprocess.Popen(command, env=talk.env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
+            assert process.stdout
+            assert process.stdout.readline() == "ready\n"
             yield longest
             out, _ = process.communicate("", timeout=20)
             longest.append(float(out))
@@ -100,7 +106,12 @@ def crowd(talk: Talk, count: int, line: str) -> Iterator[subprocess.Popen[str]]:
         process.stdout.close()
 
 
-def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(scripted: Talk) -> None:
+@pytest.mark.parametrize(
+    "patience", [("--timeout", "0.5"), pytest.param((), marks=pytest.mark.slow)], ids=["its own", "the usual 5 s"]
+)
+def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(
+    scripted: Talk, patience: tuple[str, ...]
+) -> None:
     with contextlib.ExitStack() as stack:
         clients = [stack.enter_context(Raw(scripted.socket)) for _ in range(300)]
         for each in clients:
@@ -112,7 +123,7 @@ def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(scripted
         assert (len(greeted), len(busy)) == (255, 45)
         assert all((each["talk"], each["error"]) == (1, "busy") for each in busy)
         assert all(each.receive_lines(2)[1] == {"seq": 1, "ok": True} for each in greeted)
-        full = scripted.run("--json", "say", "--wait", "length=0")
+        full = scripted.run("--json", "say", "--wait", *patience, "length=0")
         assert (full.code, json.loads(full.err)["error"]["code"]) == (5, "busy")
         assert scripted.run("status").code == 0  # places are kept for those who want to know, and to silence it
         late = scripted.start("say", "--wait", "length=0")
@@ -121,19 +132,27 @@ def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(scripted
     assert scripted.run("say", "--wait", "length=0").code == 0
 
 
-@pytest.mark.parametrize("max_queue", [1000, 100])
-def test_500_say_processes_at_once(make_talk: MakeTalk, max_queue: int) -> None:
+@pytest.mark.parametrize(
+    ("processes", "max_queue"),
+    [
+        (50, 1000),
+        (50, 10),
+        pytest.param(500, 1000, marks=pytest.mark.slow),
+        pytest.param(500, 100, marks=pytest.mark.slow),
+    ],
+)
+def test_500_say_processes_at_once(make_talk: MakeTalk, processes: int, max_queue: int) -> None:
     """With room for all none is lost; without, those that were accepted are spoken, and the others know."""
     talk = make_talk("--max-queue", str(max_queue), scripted=True)
     first = talk.run("say", "never-ends").id
-    clients = [talk.start("say", "--", f"length=0 number {number}") for number in range(500)]
+    clients = [talk.start("say", "--", f"length=0 number {number}") for number in range(processes)]
     done = [talk.finish(each, timeout=120) for each in clients]
     accepted = [each.id for each in done if each.code == 0]
     assert {each.code for each in done} == ({0} if max_queue == 1000 else {0, 5}), [each.err for each in done]
-    assert len(accepted) == min(500, max_queue)
+    assert len(accepted) == min(processes, max_queue)
     assert len(set(accepted)) == len(accepted)
     for client in done:
-        assert client.code == 0 or "100 goals are waiting already" in client.err
+        assert client.code == 0 or f"{max_queue} goals are waiting already" in client.err
     talk.run("cancel", first)
     for each in accepted:
         assert talk.watcher.wait_for_terminal(each, timeout=30) == "SUCCEEDED"
@@ -141,35 +160,44 @@ def test_500_say_processes_at_once(make_talk: MakeTalk, max_queue: int) -> None:
     assert sorted(spoken) == sorted(accepted)
 
 
-def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(make_talk: MakeTalk) -> None:
+@pytest.mark.parametrize(("waiters", "seconds"), [(10, 1), pytest.param(50, 16, marks=pytest.mark.slow)])
+def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(
+    make_talk: MakeTalk, waiters: int, seconds: int
+) -> None:
     talk = make_talk(scripted=True, watched=False)
 
     with limits():
         line = json.dumps({"seq": 1, "request": "watch"})
-        with crowd(talk, 50, line) as frozen:
+        with crowd(talk, waiters, line) as frozen:
             frozen.send_signal(signal.SIGSTOP)
             with asking(talk) as longest:
                 idle = census.count(talk.pid)
-                speak_words(talk)
+                speak_words(talk, seconds)
                 before = census.settled(talk.pid, lambda now: now.descriptors <= idle.descriptors)
-                speak_words(talk)
-                # All words that 50 clients are owed at most are there after the first 5,000. Of the next 5,000, 42 MB
-                # for all, each gets what is never dropped, a goal's text three times, 30 kB; buffers grow by eighths.
-                census.assert_as_before(talk.pid, before, memory=8 * 1024)
+                speak_words(talk, seconds)
+                # All words that clients are owed at most are there after the first 5,000. The next 5,000 are 840 kB
+                # for each.
+                census.assert_as_before(talk.pid, before, memory=waiters * FROZEN)
             frozen.send_signal(signal.SIGCONT)
         assert_within(longest[0], STATUS, "status for another client")
 
 
-def speak_words(talk: Talk) -> None:
+def speak_words(talk: Talk, seconds: int) -> None:
     """Speak a sentence of nearly 5,000 words."""
     with talk.connect() as wire:
-        assert wire.request("say", text=WORDS, wait=True)["ok"]
+        assert wire.request("say", text=f"length={seconds} {WORDS}", wait=True)["ok"]
         assert wire.receive_event("result", timeout=40)["goal"]["state"] == "SUCCEEDED"
 
 
-def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_talk: MakeTalk) -> None:
+@pytest.mark.parametrize(
+    "text",
+    ["never-ends length=60 " + "a " * 600, pytest.param("never-ends", marks=pytest.mark.slow)],
+    ids=["with a word now and then", "in silence"],
+)
+def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_talk: MakeTalk, text: str) -> None:
+    """That one is gone is known when it is told something: a word, or every 5 s that the server is alive."""
     talk = make_talk("--max-clients", "600", scripted=True)
-    goal = talk.run("say", "never-ends").id
+    goal = talk.run("say", text).id
     talk.watcher.wait_for_word(goal)
     line = json.dumps({"seq": 1, "request": "wait", "ids": [goal], "feedback": True})
 
@@ -191,7 +219,15 @@ def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_t
     assert talk.watcher.wait_for_terminal(goal) == "PREEMPTED"
 
 
-def test_server_that_takes_no_connection_at_all_holds_no_client(scripted: Talk) -> None:
+@pytest.mark.parametrize(
+    "commands",
+    [
+        [["say", "--wait", "--timeout", "0.5", "hello"]],
+        pytest.param([["status"], ["cancel"], ["say", "hello"], ["say", "--wait", "hello"]], marks=pytest.mark.slow),
+    ],
+    ids=["its own patience", "the usual 5 s"],
+)
+def test_server_that_takes_no_connection_at_all_holds_no_client(scripted: Talk, commands: list[list[str]]) -> None:
     """Frozen, with its backlog full: nobody accepts, and `connect` itself would wait."""
     scripted.freeze()
     try:
@@ -201,7 +237,6 @@ def test_server_that_takes_no_connection_at_all_holds_no_client(scripted: Talk) 
                     connected = stack.enter_context(socket.socket(socket.AF_UNIX))
                     connected.setblocking(False)
                     connected.connect(scripted.socket)
-            commands = [["status"], ["cancel"], ["say", "hello"], ["say", "--wait", "hello"]]
             for client in [scripted.start(*words) for words in commands]:
                 done = scripted.finish(client, timeout=10)
                 assert (done.code, done.out) == (3, ""), done

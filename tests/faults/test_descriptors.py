@@ -8,7 +8,6 @@ import os
 import resource
 import signal
 import socket
-import subprocess
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -120,7 +119,7 @@ def wait_for_descriptors(pid: int, count: int) -> None:
 def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
-    with serving(env, command=limited(40, SERVE)) as server:
+    with serving(env, command=limited(40, [*SERVE, "--rate", "450"])) as server:
         pid = server.process.pid
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
         wait_for_descriptors(pid, 20)
@@ -131,12 +130,12 @@ def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) ->
             with limits():
                 assert_within(status_over(inside[0]), 0.1, "status while it is full")
             # One that comes now tries again, as long as a client does, and gets in when others leave.
-            late = subprocess.Popen([*TALK, "say", "--wait", "late"], env=env, stdout=subprocess.DEVNULL)
-            time.sleep(1)
-            assert late.poll() is None
-            for each in inside[1:]:
-                each.close()
-            assert late.wait(SOON) == 0
+            with processes.start_talk(["say", "--wait", "late"], env) as late:
+                time.sleep(0.5)
+                assert late.poll() is None
+                for each in inside[1:]:
+                    each.close()
+                assert late.wait(SOON) == 0
         wait_for_descriptors(pid, before)
         with crowd(path) as clients:
             inside = greeted(clients)

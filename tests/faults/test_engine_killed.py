@@ -17,7 +17,6 @@ from tests.faults.broken import (
     began,
     nothing_left,
     python_path,
-    sound,
     told,
     write,
 )
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     from tests.support.recording import Recording
     from tests.support.sink import Sink
 
-__all__ = ["sound"]
-
 #: Seconds from the signal to the first sample of the next goal.
 CRASH, HANG = 0.5, 6.0
 SIGNALS = {
@@ -48,10 +45,22 @@ SIGNALS = {
 #: is left. When the engine process dies, nobody but the server can end what the shell has started.
 DEEP = "sh -c 'cat | cat | cat | aplay -q -t raw -f S16_LE -c 1 -r {rate} --buffer-time=60000'"
 
-each_signal = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: signal.Signals(number).name)
+#: Words per minute of the next goal, the fastest there are.
+RATE = 450
+#: Shortens the time in which an engine must be ready; behind `SLOW_START`.
+IMPATIENT = """
+from talkcli.engine import limits
+limits.START_LIMIT = {limit}
+"""
 
 
-@each_signal
+def signals(*always: signal.Signals) -> pytest.MarkDecorator:
+    """Give each of the signals, all but these in the slow run alone: an engine dies as it dies, whatever it does."""
+    numbers = [each if each in always else pytest.param(each, marks=pytest.mark.slow) for each in SIGNALS]
+    return pytest.mark.parametrize("number", numbers, ids=lambda number: signal.Signals(number).name)
+
+
+@signals(signal.SIGKILL)
 def test_engine_process_signalled_while_idle(talk: Talk, sink: Sink, number: signal.Signals) -> None:
     with limits():
         with nothing_left(talk), sink.record() as recording:
@@ -63,19 +72,19 @@ def test_engine_process_signalled_while_idle(talk: Talk, sink: Sink, number: sig
             else:
                 lost = None
                 census.settled(talk.pid, lambda now: now.processes == 2 and engine_process(talk) != engine)
-            following = send(talk, LOW)
+            following = send(talk, LOW, rate=RATE)
             if lost:
                 _assert_lost(talk, lost, number)
             assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
         _assert_next(recording, hit, SIGNALS[number][2], f"{number.name} while idle")
 
 
-@each_signal
+@signals(signal.SIGSEGV, signal.SIGSTOP)
 def test_engine_process_signalled_in_synthesis(talk: Talk, sink: Sink, number: signal.Signals) -> None:
     with limits():
         with nothing_left(talk), sink.record() as recording:
             goal = begin(talk, LONG)
-            following = send(talk, LOW)
+            following = send(talk, LOW, rate=RATE)
             assert _feeding(talk, player_process(talk)), "the synthesis goes on until the sentence is nearly over"
             hit = time.monotonic()
             os.kill(engine_process(talk), number)
@@ -84,7 +93,7 @@ def test_engine_process_signalled_in_synthesis(talk: Talk, sink: Sink, number: s
         _assert_next(recording, hit, SIGNALS[number][2], f"{number.name} in synthesis")
 
 
-@each_signal
+@signals(signal.SIGKILL)
 def test_engine_process_signalled_in_playback(make_talk: MakeTalk, sink: Sink, number: signal.Signals) -> None:
     with limits():
         talk = make_talk("--player", DEEP, sink=sink)
@@ -96,7 +105,7 @@ def test_engine_process_signalled_in_playback(make_talk: MakeTalk, sink: Sink, n
                 assert time.monotonic() < end, "the player does not take the whole sentence"
                 time.sleep(0.005)  # that a descriptor is closed is no event for others
             recording.wait_for_sound()
-            following = send(talk, LOW)
+            following = send(talk, LOW, rate=RATE)
             hit = time.monotonic()
             os.kill(engine_process(talk), number)
             _assert_lost(talk, goal, number)
@@ -105,13 +114,13 @@ def test_engine_process_signalled_in_playback(make_talk: MakeTalk, sink: Sink, n
         _assert_next(recording, hit, SIGNALS[number][2], f"{number.name} in playback")
 
 
-@each_signal
+@signals(signal.SIGSEGV)
 def test_engine_process_signalled_while_paused(talk: Talk, sink: Sink, number: signal.Signals) -> None:
     with limits():
         with nothing_left(talk), sink.record() as recording:
             goal = begin(talk, LONG)
             assert talk.request("pause")["goal"]["id"] == goal
-            following = send(talk, LOW)
+            following = send(talk, LOW, rate=RATE)
             hit = time.monotonic()
             os.kill(engine_process(talk), number)
             _assert_lost(talk, goal, number)
@@ -125,7 +134,11 @@ def test_engine_process_signalled_while_paused(talk: Talk, sink: Sink, number: s
         _assert_next(recording, begins, limit, f"{number.name} while paused")
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGKILL, pytest.param(signal.SIGSEGV, marks=pytest.mark.slow)],
+    ids=lambda number: signal.Signals(number).name,
+)
 def test_engine_process_signalled_in_its_start(
     make_talk: MakeTalk, sink: Sink, tmp_path: Path, number: signal.Signals
 ) -> None:
@@ -140,24 +153,27 @@ def test_engine_process_signalled_in_its_start(
         _assert_next(recording, hit, CRASH, f"{number.name} in its start")
 
 
-def test_engine_process_frozen_in_its_start(make_talk: MakeTalk, sound: Sink, tmp_path: Path) -> None:
+@pytest.mark.parametrize("limit", [2.0, pytest.param(START_LIMIT, marks=pytest.mark.slow)])
+def test_engine_process_frozen_in_its_start(make_talk: MakeTalk, sink: Sink, tmp_path: Path, limit: float) -> None:
     with limits():
-        talk = make_talk(sink=sound, env=_slow_start(tmp_path))
-        with nothing_left(talk), sound.record() as recording:
+        talk = make_talk(sink=sink, env=_slow_start(tmp_path, IMPATIENT.format(limit=limit)))
+        with nothing_left(talk), sink.record() as recording:
             goal = begin(talk, LONG)
             following, hit = _signal_the_next(talk, goal, tmp_path, signal.SIGSTOP)
+            recording.wait_until_quiet(0.1)  # the rest of what was lost is heard
             lost = len(recording)
-            assert await_end(talk, following, START_LIMIT + HANG) == "SUCCEEDED"
+            assert await_end(talk, following, limit + HANG) == "SUCCEEDED"
             first = extent(recording.samples[lost:])
         talk.stop()
         assert first
         seconds = recording.time_of(lost + first[0]) - hit
         told("the next goal after SIGSTOP in its start", seconds)
-        assert_within(seconds, START_LIMIT + 2 * CRASH, "the next goal after SIGSTOP in its start")
+        assert seconds > limit
+        assert_within(seconds, limit + 2 * CRASH, "the next goal after SIGSTOP in its start")
 
 
-def _slow_start(folder: Path) -> dict[str, str]:
-    write(folder / "sitecustomize.py", SLOW_START.format(flag=str(folder / "starting")))
+def _slow_start(folder: Path, more: str = "") -> dict[str, str]:
+    write(folder / "sitecustomize.py", SLOW_START.format(flag=str(folder / "starting")) + more)
     return python_path(folder)
 
 
@@ -167,7 +183,7 @@ def _signal_the_next(talk: Talk, goal: str, folder: Path, number: signal.Signals
     flag.touch()
     os.kill(engine_process(talk), signal.SIGKILL)
     assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
-    following = send(talk, LOW)
+    following = send(talk, LOW, rate=RATE)
     census.settled(talk.pid, lambda now: now.processes == 2)
     (starting,) = census.descendants(talk.pid)
     while "talkcli.engine" not in command_line(starting):
@@ -193,6 +209,6 @@ def _assert_lost(talk: Talk, goal: str, number: signal.Signals) -> None:
 
 
 def _assert_next(recording: Recording, hit: float, limit: float, what: str) -> None:
-    seconds = began(recording, render([LOW])[0]) - hit
+    seconds = began(recording, render([LOW], rate=RATE)[0]) - hit
     told(f"the next goal after {what}", seconds)
     assert_within(seconds, limit, f"the next goal after {what}")

@@ -20,7 +20,6 @@ from tests.faults.broken import (
     assert_answers,
     heard_again,
     python_path,
-    sound,
     told,
     write,
 )
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
     from tests.support.sink import Sink
-
-__all__ = ["sound"]
 
 #: Seconds in which a goal is ABORTED that waits for nothing.
 AT_ONCE = 0.1
@@ -64,14 +61,14 @@ WITHOUT = {
 
 @pytest.mark.slow
 def test_without_pyttsx3_goals_end_at_once_and_it_is_tried_again_at_longer_and_longer_intervals(
-    make_talk: MakeTalk, sound: Sink, tmp_path: Path
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path
 ) -> None:
     attempts = tmp_path / "attempts"
 
     with limits():
         attempts.write_text("")
         shadow = write(tmp_path / "pyttsx3.py", MISSING.format(attempts=str(attempts)))
-        talk = make_talk(sink=sound, env=python_path(tmp_path))
+        talk = make_talk(sink=sink, env=python_path(tmp_path))
         _await_attempts(attempts, 2)
         took = _assert_aborted_at_once(talk, "pyttsx3 is missing: pip install pyttsx3 (")
         times = _await_attempts(attempts, len(BACK_OFF))
@@ -80,7 +77,7 @@ def test_without_pyttsx3_goals_end_at_once_and_it_is_tried_again_at_longer_and_l
         back = time.monotonic()
         _await_ready(talk)
         told("ready again after pyttsx3 is there", time.monotonic() - back)
-        heard_again(talk, sound)
+        heard_again(talk, sink)
         assert talk.log.count("pyttsx3 is missing") == 3, f"once for the engine, once for each goal: {talk.log}"
         talk.stop()
         assert len(_times(attempts)) == len(BACK_OFF), "it was tried more often than it should have been"
@@ -93,7 +90,7 @@ def test_without_pyttsx3_goals_end_at_once_and_it_is_tried_again_at_longer_and_l
 
 @pytest.mark.parametrize("what", WITHOUT)
 def test_without_libespeak_ng_or_its_data_goals_end_at_once_until_it_is_installed(
-    make_talk: MakeTalk, sound: Sink, tmp_path: Path, what: str
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path, what: str
 ) -> None:
     wheel, words = WITHOUT[what]
     write(
@@ -103,12 +100,12 @@ def test_without_libespeak_ng_or_its_data_goals_end_at_once_until_it_is_installe
 
     with limits():
         library.write_bytes(b"no library")
-        talk = make_talk(sink=sound, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
+        talk = make_talk(sink=sink, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
         first = _assert_aborted_at_once(talk, words)
         again = _assert_aborted_at_once(talk, words)
         library.unlink()
         _await_ready(talk)
-        heard_again(talk, sound)
+        heard_again(talk, sink)
         talk.stop()
         assert_within(max(first, again), AT_ONCE, "the end of a goal without an engine")
 

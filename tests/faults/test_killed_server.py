@@ -1,6 +1,7 @@
 """The server is killed in mid-sentence, again and again: silent, no orphan, and the next one serves at once.
 
-TALK_TEST_KILLS says how often; by hand: `TALK_TEST_KILLS=1000 pytest -s tests/faults/test_killed_server.py`.
+A few times, or with `-m slow` as often as TALK_TEST_KILLS says; by hand:
+`TALK_TEST_KILLS=1000 pytest -s -m slow tests/faults/test_killed_server.py`.
 """
 
 from __future__ import annotations
@@ -14,16 +15,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.hearing import LONG, await_word, send
-from tests.faults.broken import heard_again, sound, told
+from tests.faults.broken import heard_again, told
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.sink import Sink
 
-__all__ = ["sound"]
-
-KILLS = int(os.environ.get("TALK_TEST_KILLS", "20"))
+FEW, KILLS = 3, int(os.environ.get("TALK_TEST_KILLS", "20"))
 #: Seconds from the kill to the last sound and to the end of the last process; from a start to its greeting.
 SILENT, SERVES = 0.3, 1.0
 #: Between which words of LONG it is killed: before the second, nothing loud may have been heard.
@@ -31,16 +30,17 @@ WORDS = (2, 5)
 
 
 @pytest.mark.timeout(60 + 10 * KILLS)
-def test_server_is_killed_in_mid_sentence(make_talk: MakeTalk, sound: Sink) -> None:
-    talk = make_talk(sink=sound)
-    chance = random.Random(KILLS)
+@pytest.mark.parametrize("kills", [FEW, pytest.param(KILLS, marks=pytest.mark.slow)])
+def test_server_is_killed_in_mid_sentence(make_talk: MakeTalk, sink: Sink, kills: int) -> None:
+    talk = make_talk(sink=sink)
+    chance = random.Random(kills)
     files = set(os.listdir(talk.directory))
     silences: list[float] = []
     starts: list[float] = []
 
     with limits():
-        for _ in range(KILLS):
-            with sound.record() as recording:
+        for _ in range(kills):
+            with sink.record() as recording:
                 await_word(talk, send(talk, LONG), chance.randint(*WORDS))
                 killed = time.monotonic()
                 talk.kill(gone_within=SILENT)
@@ -54,5 +54,5 @@ def test_server_is_killed_in_mid_sentence(make_talk: MakeTalk, sound: Sink) -> N
             assert_within(starts[-1], SERVES, "the start after the server was killed")
     for what, times in (("silent after", silences), ("serves after", starts)):
         told(f"{len(times)} kills, {what} at most {max(times):.3f} s, median", statistics.median(times))
-    heard_again(talk, sound)
+    heard_again(talk, sink)
     assert set(os.listdir(talk.directory)) == files

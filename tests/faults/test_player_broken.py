@@ -5,6 +5,7 @@ Each player is a shell script that misbehaves in its own way while a file is the
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -15,7 +16,7 @@ import pytest
 
 from talkcli.engine.playback import DRAIN_WITHIN, FIRST_WITHIN, STALLED_AFTER
 from tests.conformance.hearing import HOME, LONG, LOW, assert_aborted, begin, player_process, send
-from tests.faults.broken import await_end, heard_again, nothing_left, sound, write
+from tests.faults.broken import await_end, heard_again, nothing_left, write
 from tests.support.compare import assert_heard, assert_silent
 from tests.support.reference import render
 from tests.support.timing import assert_within, limits
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
     from tests.support.sink import Sink
-
-__all__ = ["sound"]
 
 #: Seconds above a limit of the engine in which a goal's end is told.
 SLACK = 0.5
@@ -73,61 +72,78 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("what", BROKEN)
-def test_player_is_broken(make_talk: MakeTalk, sound: Sink, tmp_path: Path, what: str) -> None:
-    player, flag = BROKEN[what], tmp_path / "broken"
-    program = _script(tmp_path, player.does)
+#: Those that are waited for until a limit, side by side, and the one that takes longest.
+STALLING, LONGEST = ["reads a byte at a time", "hangs in drain"], "never reads"
 
-    with limits():
-        flag.touch()
-        talk = make_talk("--player", str(program), sink=sound)
-        with nothing_left(talk):
-            began = time.monotonic()
-            ended = _aborted(talk, send(talk, LOW), player.reason, player.words) - began
-            flag.unlink()
-            heard_again(talk, sound)
-        talk.stop()
-        assert_within(ended, player.within + SLACK, f"the end of a goal whose player {what}")
+
+@pytest.mark.parametrize(
+    "whats",
+    [
+        STALLING,
+        pytest.param([LONGEST], marks=pytest.mark.slow),
+        *([each] for each in BROKEN if each not in {*STALLING, LONGEST}),
+    ],
+    ids=" and ".join,
+)
+def test_player_is_broken(make_talk: MakeTalk, sink: Sink, tmp_path: Path, whats: list[str]) -> None:
+    program = {what: _script(tmp_path / what.replace(" ", "-"), BROKEN[what].does) for what in whats}
+
+    with limits(), contextlib.ExitStack() as idle:
+        for each in program.values():
+            (each.parent / "broken").touch()
+        talks = {what: make_talk("--player", str(program[what]), sink=sink) for what in whats}
+        for talk in talks.values():
+            idle.enter_context(nothing_left(talk))
+        goals = {what: (time.monotonic(), send(talk, LOW)) for what, talk in talks.items()}
+        for what, talk in talks.items():
+            player, (began, goal) = BROKEN[what], goals[what]
+            ended = _aborted(talk, goal, player.reason, player.words) - began
+            assert_within(ended, player.within + SLACK, f"the end of a goal whose player {what}")
+        for what, talk in talks.items():
+            (program[what].parent / "broken").unlink()
+            heard_again(talk, sink)
 
 
 @pytest.mark.parametrize(
     ("number", "reason", "words", "within"),
     [
         (signal.SIGKILL, "audio_lost", "player was killed by SIGKILL", 0.0),
-        (signal.SIGSTOP, "audio_stalled", "player took no sound for 3 s", STALLED_AFTER),
+        pytest.param(
+            *(signal.SIGSTOP, "audio_stalled", "player took no sound for 3 s", STALLED_AFTER), marks=pytest.mark.slow
+        ),
     ],
     ids=["SIGKILL", "SIGSTOP"],
 )
 def test_player_is_signalled_in_mid_sentence(
-    make_talk: MakeTalk, sound: Sink, tmp_path: Path, number: signal.Signals, reason: str, words: str, within: float
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path, number: signal.Signals, reason: str, words: str, within: float
 ) -> None:
     program = _script(tmp_path, "")
 
     with limits():
-        talk = make_talk("--player", str(program), sink=sound)
+        talk = make_talk("--player", str(program), sink=sink)
         with nothing_left(talk):
             goal = begin(talk, LONG)
             hit = time.monotonic()
             os.kill(player_process(talk), number)
             ended = _aborted(talk, goal, reason, words) - hit
             assert talk.goal(goal)["spoken"].startswith("two three")
-            heard_again(talk, sound)
+            heard_again(talk, sink)
         talk.stop()
         assert_within(ended, within + SLACK, f"the end of a goal whose player got {number.name}")
 
 
-def test_player_is_missing_until_it_is_installed(make_talk: MakeTalk, sound: Sink, tmp_path: Path) -> None:
+def test_player_is_missing_until_it_is_installed(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
     program = tmp_path / "player"
 
     with limits():
         program.unlink(missing_ok=True)
-        talk = make_talk("--player", str(program), sink=sound)
+        talk = make_talk("--player", str(program), sink=sink)
         with nothing_left(talk):
             asked = time.monotonic()
             ended = _aborted(talk, send(talk, LOW), "no_player", f'player "{program}" not found') - asked
             assert_silent(talk.recording)
             _script(tmp_path, "")
-            heard_again(talk, sound)
+            heard_again(talk, sink)
         talk.stop()
         assert_within(ended, SLACK, "the end of a goal without a player")
 
@@ -136,17 +152,18 @@ def test_player_that_writes_underrun_and_goes_on_is_no_error(make_talk: MakeTalk
     complains = "while echo 'underrun!!! (at least 1.234 ms long)'; do sleep 0.02; done"
     program = _script(tmp_path, f"({complains}) >&2 & sleep 100 & exec {PLAY}")
     (tmp_path / "broken").touch()
-    talk = make_talk("--player", str(program), sink=sink)
+    talk = make_talk("--player", str(program), "--rate", "450", sink=sink)
     with nothing_left(talk):
         for text in (LOW, HOME):
             assert talk.run("say", "--wait", "--", text).code == 0
     talk.recording.wait_until_quiet(0.2)
-    assert_heard(talk.recording, render([LOW, HOME]))
+    assert_heard(talk.recording, render([LOW, HOME], rate=450))
     talk.stop(gone_within=0.1)  # what the player had started went with it
 
 
 def _script(folder: Path, does: str) -> Path:
     """Write a player that does something while the file "broken" is there, and plays otherwise."""
+    folder.mkdir(exist_ok=True)
     text = f"#!/bin/sh\nif [ -e {folder}/broken ]; then\n:\n{does}\nexit\nfi\nexec {PLAY}\n"
     return write(folder / "player", text, 0o755)
 

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
+#: At the fastest rate there is, where what is said need not be long.
+FAST = [*SERVE, "--rate", "450"]
 #: Characters of texts that make an answer long, and requests for it: more than a connection's buffers hold.
 LONG = "word " * 1900
 ASKED = 12
@@ -94,7 +96,7 @@ def test_second_sigterm_with_100_stalled_clients_ends_it_at_once(home: str) -> N
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGPIPE])
 def test_storm_of_signals_is_survived(home: str, number: signal.Signals) -> None:
     path = f"{home}/s"
-    with serving(environment(home, TALK_SOCKET=path)) as server, Wire(path) as wire:
+    with serving(environment(home, TALK_SOCKET=path), command=FAST) as server, Wire(path) as wire:
         goal = wire.request("say", text="spoken to its end, whatever comes", wait=True)["goal"]
         wire.receive_event("state", state="ACTIVE")
         with limits():
@@ -114,7 +116,7 @@ def serving_with(
 ) -> Iterator[tuple[Wire, subprocess.Popen[bytes]]]:
     """Run a server whose log nobody reads, and assert that SIGTERM ends it well."""
     path = f"{home}/s"
-    command = dying_with_parent(["sh", "-c", f'exec "$@" {redirection}', "sh", *SERVE])
+    command = dying_with_parent(["sh", "-c", f'exec "$@" {redirection}', "sh", *FAST])
     with subprocess.Popen(command, env=environment(home, TALK_SOCKET=path), stderr=stderr) as process:
         try:
             yield _greeted(path, process), process

@@ -202,7 +202,7 @@ def test_system_s_service_is_exposed_to_little(home: str) -> None:
 def test_command_serves_in_the_environment_that_systemd_gives_it(home: str) -> None:
     os.mkdir(f"{home}/talk", 0o755)
     with Supervisor(f"{home}/n") as supervisor:
-        command = [*command_of(printed(home, "system", "--player", "null"))]
+        command = [*command_of(printed(home, "system", "--player", "null", "--rate", "450"))]
         env = {
             **{name: value for name, value in environment(home).items() if name in {"PYTHONPATH", "TMPDIR"}},
             "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
@@ -223,7 +223,7 @@ def test_command_serves_in_the_environment_that_systemd_gives_it(home: str) -> N
 
 def test_engine_and_player_run_without_new_privileges(home: str) -> None:
     needs("setpriv")
-    command = ["setpriv", "--no-new-privs", *SERVE]
+    command = ["setpriv", "--no-new-privs", *SERVE, "--rate", "450"]
     env = environment(home, TALK_SOCKET=f"{home}/s")
     with serving(env, command=command):
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0

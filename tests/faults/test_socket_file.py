@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 HASTY = [sys.executable, os.path.join(os.path.dirname(os.path.abspath(__file__)), "hasty_serve.py")]
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
-#: Seconds in which a server that looks every 0.2 s is found again.
+#: Seconds in which a server that looks every 0.05 s is found again.
 SOON = 5.0
 #: Listens at a path, as another program would, and says so.
 OTHER = """
@@ -241,7 +241,7 @@ def test_file_of_a_passed_socket_is_missed_but_not_made(home: str) -> None:
                 while "systemctl restart talk.socket" not in server.log:
                     assert time.monotonic() < end, server.log
                     time.sleep(0.01)
-                time.sleep(0.5)
+                time.sleep(0.2)
                 assert wire.request("status")["ok"]
             assert not os.path.exists(path)
             assert server.log.count("systemctl restart") == 1  # said once, not at every look

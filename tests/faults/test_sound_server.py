@@ -1,13 +1,16 @@
 """The sink is suspended or unloaded, the sound server frozen or killed: goals end in time, and are heard again.
 
 A private PulseAudio each, with `aplay` and with `pacat` as players. A goal is in mid-sentence when it happens, the next
-one comes while there is no sound, and the third is sent when there is sound again.
+one comes while there is no sound, and the third is sent when there is sound again. All faults are there side by side,
+each at a sound server of its own: most of it is waiting.
 """
 
 from __future__ import annotations
 
 import contextlib
+import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,7 +23,8 @@ from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
+    from pathlib import Path
 
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
@@ -60,42 +64,42 @@ FAULTS = {
 }
 
 
-@pytest.fixture(scope="module")
-def sinks() -> Iterator[list[Sink]]:
-    """Sound servers that were mended, each for the next test to break again: a start of one takes seconds."""
-    found: list[Sink] = []
-    yield found
-    for each in found:
-        each.close()
+#: The player of each fault; the other way round shows no more, and takes as long.
+PLAYERS = {
+    "one each": ("pacat", "aplay", "aplay", "pacat"),
+    "the other": ("aplay", "pacat", "pacat", "aplay"),
+}
 
 
-@pytest.mark.parametrize("player", ["aplay", "pacat"])
-@pytest.mark.parametrize("what", FAULTS)
-def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, sinks: list[Sink], what: str, player: str) -> None:
-    fault = FAULTS[what]
-    sink = sinks.pop() if sinks else Sink()
+@pytest.mark.parametrize("players", ["one each", pytest.param("the other", marks=pytest.mark.slow)])
+def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: str) -> None:
+    with limits(), contextlib.ExitStack() as stack:
+        pool = stack.enter_context(ThreadPoolExecutor(len(FAULTS)))
+        sinks = list(pool.map(lambda _: stack.enter_context(Sink()), FAULTS))
+        talks = [make_talk("--player", player, sink=sink) for player, sink in zip(PLAYERS[players], sinks, strict=True)]
+        with contextlib.ExitStack() as idle:  # counted together: they share memory
+            for talk in talks:
+                idle.enter_context(nothing_left(talk))
+            times = list(pool.map(_lose, FAULTS.values(), talks, sinks))
+        for what, player, talk, (lost, meanwhile, again) in zip(FAULTS, PLAYERS[players], talks, times, strict=True):
+            talk.stop()
+            fault, case = FAULTS[what], f"{what}, {player}"
+            told(f"{case}: lost after, ended meanwhile after {lost:.3f}, {meanwhile:.3f} s; heard again", again)
+            assert_within(lost, fault.lost[1], f"the end of a goal, {case}")
+            assert_within(meanwhile, fault.meanwhile[1], f"the end of a goal meanwhile, {case}")
+            assert_within(again, AGAIN, f"the next goal, {case}")
 
-    with limits():
-        talk = make_talk("--player", player, sink=sink)
-        with nothing_left(talk):
-            goal = begin(talk, LONG)
-            broken = time.monotonic()
-            fault.breaks(sink)
-            lost = _ends(talk, goal, fault.lost[0], broken)
-            meanwhile = _ends(talk, send(talk, LOW), fault.meanwhile[0], time.monotonic())
-            fault.mends(sink)
-            returned = time.monotonic()
-            again = heard_again(talk, sink) - returned
-        talk.stop()
-        told(f"{what}, {player}: lost after, ended meanwhile after {lost:.3f}, {meanwhile:.3f} s; heard again", again)
-        assert_within(lost, fault.lost[1], f"the end of a goal, {what}, {player}")
-        assert_within(meanwhile, fault.meanwhile[1], f"the end of a goal meanwhile, {what}, {player}")
-        assert_within(again, AGAIN, f"the next goal, {what}, {player}")
 
-    with contextlib.ExitStack() as stack:
-        stack.callback(sink.close)
-        stack.pop_all()
-        sinks.append(sink)  # whole again, as it was heard
+def _lose(fault: Fault, talk: Talk, sink: Sink) -> tuple[float, float, float]:
+    """Have a fault, mended at last; return after how many seconds goals ended, and one was heard again."""
+    goal = begin(talk, LONG)
+    broken = time.monotonic()
+    fault.breaks(sink)
+    lost = _ends(talk, goal, fault.lost[0], broken)
+    meanwhile = _ends(talk, send(talk, LOW), fault.meanwhile[0], time.monotonic())
+    fault.mends(sink)
+    returned = time.monotonic()
+    return lost, meanwhile, heard_again(talk, sink) - returned
 
 
 def _ends(talk: Talk, goal_id: str, reason: str, since: float) -> float:
@@ -108,13 +112,14 @@ def _ends(talk: Talk, goal_id: str, reason: str, since: float) -> float:
     return talk.watcher.arrived(event) - since
 
 
-def test_sound_server_that_hangs_while_the_engine_starts(make_talk: MakeTalk) -> None:
-    """libespeak-ng looks for PulseAudio when it is initialised, and would wait half a minute for one that hangs."""
-    with Sink() as sink:
-        sink.freeze()
-        try:
-            talk = make_talk("--player", "null", sink=sink)
-            done = talk.run("say", "--wait", "--timeout", "8", LOW)
-            assert (done.code, done.err) == (0, "")
-        finally:
-            sink.thaw()
+def test_sound_server_that_hangs_while_the_engine_starts(make_talk: MakeTalk, tmp_path: Path) -> None:
+    """libespeak-ng looks for PulseAudio when it is initialised, and would wait half a minute for one that hangs.
+
+    One that is frozen is a socket that takes clients, and says nothing.
+    """
+    with socket.socket(socket.AF_UNIX) as frozen:
+        frozen.bind(str(tmp_path / "s"))
+        frozen.listen()
+        talk = make_talk("--player", "null", env={"PULSE_SERVER": f"unix:{tmp_path / 's'}"})
+        done = talk.run("say", "--wait", "--timeout", "8", LOW)
+        assert (done.code, done.err) == (0, "")

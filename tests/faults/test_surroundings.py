@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
     from tests.support.sink import Sink
 
-AUDIBLE = [*TALK, "serve"]
+#: At the fastest rate there is: what is said is not the subject.
+AUDIBLE = [*TALK, "serve", "--rate", "450"]
+QUIET = [*SERVE, "--rate", "450"]
 VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR")
 
 
@@ -87,12 +89,12 @@ def test_speech_goes_on_with_a_temporary_directory_that_takes_nothing(
 def test_socket_in_a_full_directory_is_served_and_its_lock_holds(home: str) -> None:
     with full(f"{home}/tmp"):
         env = environment(home, TALK_SOCKET=f"{home}/tmp/s")
-        with serving(env):
+        with serving(env, command=QUIET):
             speaks(env)
             second = run(SERVE, env)
             assert second.code == 11
             assert "serves" in second.err
-        with serving(env):  # and again
+        with serving(env, command=QUIET):  # and again
             speaks(env)
 
 
@@ -113,7 +115,11 @@ def test_no_directory_at_all_for_the_socket_is_a_clear_error(home: str) -> None:
     assert "Traceback" not in done.err
 
 
-@pytest.mark.parametrize("missing", [*[(each,) for each in VARIABLES], VARIABLES], ids="-".join)
+@pytest.mark.parametrize(
+    "missing",
+    [("HOME",), *(pytest.param((each,), marks=pytest.mark.slow) for each in VARIABLES if each != "HOME"), VARIABLES],
+    ids="-".join,
+)
 def test_speech_goes_on_without_a_variable(home: str, sink: Sink, missing: tuple[str, ...]) -> None:
     env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s"})
     assert "XDG_RUNTIME_DIR" not in env  # what it means that this one is missing: `test_servers_places`
@@ -149,7 +155,7 @@ def test_speech_goes_on_with_a_home_that_is_not_there(home: str, sink: Sink, pla
 
 def test_clients_in_an_empty_environment_reach_the_server(home: str) -> None:
     env = environment(home, TALK_SOCKET=f"{home}/s")
-    with serving(env):
+    with serving(env, command=QUIET):
         for words in (["status"], ["say", "--wait", "größer"], ["cancel"], ["log"]):
             kept = {name: env[name] for name in ("PYTHONPATH",) if name in env}
             done = run([*TALK, "--socket", f"{home}/s", *words], kept)

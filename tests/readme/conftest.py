@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def speaking(make_talk: MakeTalk) -> Talk:
-    """A server with the real engine that speaks fast, and plays to nobody."""
-    return make_talk("--player", "null", "--rate", "450")
+def speaking(make_talk: MakeTalk, tmp_path_factory: pytest.TempPathFactory) -> Talk:
+    """A server with the real engine that plays to nobody, which takes no time."""
+    return make_talk("--player", f"file:{tmp_path_factory.mktemp('said')}/said.wav", "--rate", "450")
 
 
 @pytest.fixture

@@ -8,6 +8,8 @@ import sys
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
+import pytest
+
 from tests.wire.readme import ROOT, TEXT
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ def test_picture_moves_only_where_it_may() -> None:
     assert len(rows) == len(shown(PLACE / "talk.svg"))  # what is there where nothing moves: the last screen
 
 
+@pytest.mark.slow
 def test_picture_shows_what_a_terminal_shows(tmp_path: Path) -> None:
     """If not: `python .github/picture/picture.py`."""
     made = tmp_path / "talk.svg"

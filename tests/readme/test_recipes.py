@@ -116,7 +116,7 @@ def test_cron(speaking: Talk, shell: Shell) -> None:
     clock, _ = said(speaking)
     assert clock.startswith("It is ")
     assert clock.endswith(" o'clock")
-    assert shell.calls("logger") == [["-t", "talk", "the robot is mute"]]  # its player is null
+    assert shell.calls("logger") == [["-t", "talk", "the robot is mute"]]  # its player is a file
 
 
 @runs("Recipes: ssh")

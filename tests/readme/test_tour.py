@@ -8,14 +8,23 @@ import sys
 import wave
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.readme.blocks import commands, runs
 from tests.readme.shell import wait_for_watcher, wait_until
 from tests.support.connection import PATIENCE
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
     from tests.readme.shell import Shell
     from tests.support.processes import Talk
+
+
+@pytest.fixture
+def speaking(make_talk: MakeTalk) -> Talk:
+    """A server with the real engine that speaks fast, and plays to nobody in its time: goals can be preempted."""
+    return make_talk("--player", "null", "--rate", "450")
 
 
 def texts(talk: Talk, *states: str) -> list[str]:
@@ -140,7 +149,7 @@ def test_pause(speaking: Talk, shell: Shell) -> None:
 @runs("A tour: Look")
 def test_look(scripted: Talk, scripted_shell: Shell) -> None:
     for number in range(1, 13):
-        scripted.watcher.wait_for_terminal(scripted.request("say", text=f"number {number}")["goal"]["id"])
+        scripted.watcher.wait_for_terminal(scripted.request("say", text=f"length=0 number {number}")["goal"]["id"])
     for line in commands("A tour: Look"):
         if line == "talk watch":
             scripted_shell.start(f"{line} > watched")
@@ -158,7 +167,7 @@ def test_look(scripted: Talk, scripted_shell: Shell) -> None:
 @runs("A tour: Feedback")
 def test_feedback(scripted: Talk, scripted_shell: Shell) -> None:
     for number in range(1, 13):
-        scripted.watcher.wait_for_terminal(scripted.request("say", text=f"number {number}")["goal"]["id"])
+        scripted.watcher.wait_for_terminal(scripted.request("say", text=f"length=0 number {number}")["goal"]["id"])
     scripted_shell.stand_in("lips", where=scripted_shell.directory)
     done = scripted_shell.run("\n".join(commands("A tour: Feedback")), text="follow me")
     assert (done.returncode, done.stderr) == (0, "")

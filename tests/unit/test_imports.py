@@ -18,6 +18,7 @@ import pytest
 
 import talkcli
 from talkcli.cli.commands import COMMANDS
+from tests.support.surroundings import needs
 
 PACKAGE = Path(talkcli.__file__).parent
 
@@ -127,6 +128,7 @@ def named(module: str, node: ast.AST) -> list[str]:
     return []
 
 
+@cache
 def imports(module: str) -> list[Import]:
     found: list[Import] = []
 
@@ -160,6 +162,7 @@ def test_the_modules_that_these_rules_are_about_are_there() -> None:
 
 
 def test_the_top_of_the_project_holds_what_it_should() -> None:
+    needs("git")
     known = subprocess.run(
         ["git", "ls-files", "-z"], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=60, check=False
     )

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 FEW, MANY = 100, 100_000
+#: A hundred thousand goals are made for it; `test_growth`, with fewer, is for every run.
+pytestmark = pytest.mark.slow
 #: Of the thousand times that there would be.
 AT_MOST = 30
 

@@ -1,0 +1,162 @@
+"""A forked `talk` behaves as one that was started: its end, its streams, its surroundings, and that it dies with us."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support.forking import Forked, forks
+from tests.support.surroundings import clean_environment, short_directory
+
+if TYPE_CHECKING:
+    import pathlib
+    from collections.abc import Iterator
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="talk is forked on Linux alone")
+
+#: Seconds for what takes milliseconds.
+LIMIT = 20.0
+
+
+@pytest.fixture
+def env() -> Iterator[dict[str, str]]:
+    """An environment in which nobody serves."""
+    with short_directory() as home:
+        yield clean_environment(home, {"TALK_SOCKET": f"{home}/s"})
+
+
+def piped(words: list[str], env: dict[str, str]) -> Forked:
+    return Forked(words, env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def ended(words: list[str], env: dict[str, str], text: str | None = None) -> tuple[int, str, str]:
+    """Return how a forked one ended, what it wrote to standard output, and to standard error."""
+    process = piped(words, env)
+    out, err = process.communicate(text, LIMIT)
+    return process.wait(LIMIT), out, err
+
+
+def serving(env: dict[str, str], *, session: bool = False) -> Forked:
+    """Return a server that serves."""
+    words = ["serve", "--player", "null"]
+    process = Forked(words, env, stderr=subprocess.PIPE, start_new_session=session)
+    assert process.stderr
+    assert any("ready on " in line for line in process.stderr)
+    return process
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "out", "err"),
+    [
+        (["--version"], 0, "talk ", ""),
+        (["sya"], 2, "", "did you mean"),
+        (["status"], 3, "", "talk serve"),
+        (["cancel"], 3, "", "talk serve"),
+    ],
+)
+def test_it_ends_and_says_what_one_that_was_started_does(
+    env: dict[str, str], words: list[str], code: int, out: str, err: str
+) -> None:
+    found = ended(words, env)
+    assert (found[0], found[1].startswith(out), err in found[2]) == (code, True, True), found
+    assert "Traceback" not in found[2]
+    command = [sys.executable, "-m", "talkcli", *words]
+    started = subprocess.run(command, env=env, capture_output=True, text=True, timeout=LIMIT, check=False)
+    assert found == (started.returncode, started.stdout, started.stderr)
+
+
+def test_it_reads_its_standard_input(env: dict[str, str], tmp_path: pathlib.Path) -> None:
+    said = tmp_path / "said.wav"
+    assert ended(["say", "-o", str(said), "-"], env, "grün, 日本\n") == (0, "", "")
+    assert said.stat().st_size > 1000
+
+
+def test_its_streams_may_be_files_and_one_another(env: dict[str, str], tmp_path: pathlib.Path) -> None:
+    with open(tmp_path / "both", "wb") as both, Forked(["status"], env, stdout=both.fileno(), stderr=subprocess.STDOUT):
+        pass
+    assert "talk serve" in (tmp_path / "both").read_text("utf-8")
+    nowhere = Forked(["status"], env)
+    assert (nowhere.stdin, nowhere.stdout, nowhere.stderr, nowhere.wait(LIMIT)) == (None, None, None, 3)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
+def test_a_signal_that_kills_it_is_a_negative_code(env: dict[str, str], number: signal.Signals) -> None:
+    with serving(env) as process:
+        assert process.poll() is None
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.01)
+        process.send_signal(number)
+        assert process.wait(LIMIT) == -number
+        assert process.poll() == process.returncode == -number
+        process.send_signal(number)  # it is gone, and nobody else is hit
+
+
+def test_sigint_and_sigterm_are_told_as_a_shell_tells_them(env: dict[str, str]) -> None:
+    with serving(env) as server:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            client = piped(["watch"], env)
+            assert client.stdout
+            assert client.stdout.readline()
+            client.send_signal(number)
+            client.communicate(timeout=LIMIT)
+            assert client.returncode == 128 + number
+        server.terminate()
+        assert server.wait(LIMIT) == 0
+
+
+def test_its_environment_and_directory_are_its_own(env: dict[str, str], tmp_path: pathlib.Path) -> None:
+    first, second = ended(["status"], env), ended(["status"], {**env, "TALK_SOCKET": "/nowhere/else"})
+    assert (env["TALK_SOCKET"] in first[2], "/nowhere/else" in second[2]) == (True, True)
+    assert env["TALK_SOCKET"] not in second[2]
+    for each in ("one", "two"):
+        (tmp_path / each).mkdir()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(tmp_path / each)
+            assert ended(["say", "-o", "here.wav", each], env) == (0, "", "")
+    assert sorted(tmp_path.glob("*/here.wav")) == [tmp_path / "one/here.wav", tmp_path / "two/here.wav"]
+
+
+def test_it_has_a_session_of_its_own_if_asked(env: dict[str, str]) -> None:
+    with serving(env, session=True) as process:
+        assert os.getsid(process.pid) == process.pid != os.getsid(0)
+        process.kill()
+
+
+def test_it_is_killed_with_the_process_that_forks(env: dict[str, str]) -> None:
+    code = (
+        "import os, sys\nfrom tests.support.forking import Forked\n"
+        "server = Forked(['serve', '--player', 'null'], dict(os.environ), stderr=-1)\n"
+        "assert any('ready on ' in line for line in server.stderr)\n"
+        "print('ready', flush=True)\nsys.stdin.read()\n"
+    )
+    root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, env=env, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as owner:
+        assert owner.stdout
+        assert owner.stdout.readline() == b"ready\n"
+        with socket.socket(socket.AF_UNIX) as client:
+            client.settimeout(LIMIT)
+            client.connect(env["TALK_SOCKET"])
+            assert client.recv(65536).startswith(b'{"talk": 1')
+            owner.kill()
+            while client.recv(65536):
+                pass  # until it is gone
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [{"PYTHONPATH": "/elsewhere"}, {"PYTHONUTF8": "0"}, {"LD_PRELOAD": "lib.so"}, {"LC_ALL": "C"}, {"LANG": "C"}],
+    ids=lambda each: next(iter(each)),
+)
+def test_no_process_is_forked_whose_interpreter_libraries_or_locale_differ(
+    env: dict[str, str], extra: dict[str, str]
+) -> None:
+    assert forks(env)
+    assert forks({**env, "TALK_PLAYER": "null", "HOME": "/elsewhere"})
+    assert not forks({**env, **extra})
