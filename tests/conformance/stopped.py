@@ -61,7 +61,7 @@ def assert_heard_after_stop(
     """
     samples = heard if isinstance(heard, np.ndarray) else heard.samples
     wrong: AssertionError | None = None
-    for start, references in _likeliest(samples, _render_after_stop((stopped, *following), rate)):
+    for start, references in likeliest(samples, _render_after_stop((stopped, *following), rate)):
         try:
             if begun:
                 assert_begun(samples[:start], render([stopped], rate=rate)[0])
@@ -74,7 +74,7 @@ def assert_heard_after_stop(
     raise wrong
 
 
-def _likeliest(samples: Samples, turns: Sequence[list[Samples]]) -> Iterator[tuple[int, list[Samples]]]:
+def likeliest(samples: Samples, turns: Sequence[list[Samples]]) -> Iterator[tuple[int, list[Samples]]]:
     """Yield where the next sentence may begin, behind silence, and what it and those behind it sound like then."""
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
     silence = np.diff(loud, prepend=-DROPPED)

@@ -226,9 +226,16 @@ def test_an_engine_that_reads_nothing_for_a_second_while_goals_come_and_go_is_no
     with scripted.connect() as wire:
         os.kill(engine, signal.SIGSTOP)
         try:
-            for _ in range(800):
-                waiting = wire.request("say", text="behind it")["goal"]["id"]
-                assert wire.request("cancel", ids=[waiting])["ok"]
+            for start in range(0, 800, BATCH):
+                names = [f"behind.{start + each}" for each in range(BATCH)]
+                for each in names:
+                    wire.send({"request": "say", "text": "behind it", "id": each})
+                    wire.send({"request": "cancel", "ids": [each]})
+                replies: list[bool] = []
+                while len(replies) < 2 * BATCH:
+                    message = wire.receive()
+                    replies += [message["ok"]] if "ok" in message else []
+                assert all(replies)
         finally:
             os.kill(engine, signal.SIGCONT)
     assert scripted.watcher.wait_for_terminal(goal) == "SUCCEEDED"

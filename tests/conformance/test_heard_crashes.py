@@ -28,7 +28,7 @@ from tests.conformance.hearing import (
     render_quick,
     send,
 )
-from tests.support.compare import assert_begun, assert_heard, compare, time_heard
+from tests.support.compare import assert_begun, assert_heard, time_heard
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -119,8 +119,11 @@ def test_a_killed_engine_that_was_idle_is_replaced_within_half_a_second(talk: Ta
 
     with limits():
         assert talk.run("voices").code == 0  # they are known when it is ready, and has nothing to do
+        engine = engine_process(talk)
         killed = time.monotonic()
-        os.kill(engine_process(talk), signal.SIGKILL)
+        os.kill(engine, signal.SIGKILL)
+        while engine_process(talk) == engine:
+            time.sleep(0.005)  # a goal that comes before its end is seen may be given to it, and is ABORTED
         with sink.record() as recording:
             assert talk.run("say", "--wait", "--", LOW).code == 0
         compared = assert_same(recording.samples, reference)
@@ -176,6 +179,6 @@ def test_a_frozen_engine_is_killed_by_a_cancel(talk: Talk, sink: Sink) -> None:
 def _began(recording: Recording, whole: Samples) -> tuple[int, float]:
     """Assert that a sentence was heard whole, and last; return the sample and the time at which its sound begins."""
     samples = recording.samples
-    start = max(0, compare(samples, whole).offset - stopped.DROPPED)
+    start, _ = next(stopped.likeliest(samples, [[whole]]), (0, [whole]))
     assert_heard(samples[start:], [whole])
     return start, recording.time_of(start)

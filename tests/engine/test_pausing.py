@@ -242,7 +242,8 @@ def test_a_pause_before_the_first_sound_holds_all_of_it(sink: Sink) -> None:
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
         recording.wait_until_quiet(QUIET)
-        compare.assert_heard(recording, render([text], rate=FAST))
+        joins = _joins(recording.samples, render([text], rate=FAST)[0])
+        assert all(0 <= dropped <= _LOST for _, dropped in joins), joins
 
 
 def _wait_for_no_player(engine: Spawned) -> None:

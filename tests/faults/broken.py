@@ -8,7 +8,6 @@ import time
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pytest
 
 import talkcli
 from tests.conformance.hearing import HOME
@@ -16,7 +15,6 @@ from tests.conformance.stopped import DROPPED
 from tests.support import census
 from tests.support.compare import assert_heard, compare, extent
 from tests.support.reference import RATE, render
-from tests.support.sink import Sink
 from tests.support.timing import assert_within
 
 if TYPE_CHECKING:
@@ -26,6 +24,7 @@ if TYPE_CHECKING:
     from tests.conformance.hearing import Samples
     from tests.support.processes import Talk
     from tests.support.recording import Recording
+    from tests.support.sink import Sink
 
 #: Seconds within which `status` is answered, whatever is broken.
 ANSWER = 0.1
@@ -63,13 +62,6 @@ def await_end(talk: Talk, goal_id: str, within: float) -> str:
             return talk.watcher.wait_for_terminal(goal_id, 0.25)
         assert time.monotonic() < end, f"{goal_id} did not end within {within} s: {talk.watcher.states(goal_id)}"
         assert_answers(talk)
-
-
-@pytest.fixture(scope="module")
-def sound() -> Iterator[Sink]:
-    """A sound server for the tests of a module that may break it."""
-    with Sink() as result:
-        yield result
 
 
 @contextlib.contextmanager

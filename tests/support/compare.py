@@ -1,15 +1,16 @@
 """Compares what was heard with reference renderings, sample by sample, ends included.
 
 Three traps decide how. A correlation over a whole sentence hardly sees a short last word that was cut, so that the
-worst of its tenths of a second counts as well, and where the sound ends. The monitor drops up to 41 samples where a
-stream starts and after an underrun, so that each tenth may sit a little beside its place. And on a busy machine a
-player runs dry now and then: the sink puts zeros between two samples of the sentence, which is whole all the same. So
-what is not the reference as it stands is compared again without the zeros of both.
+worst of its tenths of a second counts as well, and where the sound ends. The monitor drops samples where a stream
+starts, so that each tenth may sit a little beside its place. And on a busy machine a player runs dry now and then: the
+sink puts zeros between two samples of the sentence, and the monitor drops some of what follows, of a sentence that is
+whole all the same. So what was heard is first followed sample by sample, which forgives just these, and what is not
+the same then is judged by its correlation.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,16 +35,11 @@ EXTENT = 0.02
 _PART = RATE // 10
 #: Samples by which a part may sit beside the place of the one before it.
 _SLACK = 48
-#: Samples by which a sentence may be shorter where a stream started and a player ran dry in it.
-_DROPPED = 3 * _SLACK
-#: Samples before a sentence that may be the beginning of its first sound.
-_CLICK = 8
-#: So many zeros in a row may be a player that ran dry: fewer, left where one side has them, shift what follows by less
-#: than the slack.
-_ZEROS = 32
+#: Samples that are the same in a row where the sentence goes on after a player ran dry, and zeros that say that it did.
+_RUN = 32
 #: Samples by which a quarter of a second may come later, where a player ran dry before it.
 _NEARBY = RATE // 20
-#: Samples that the monitor may lose where a stream starts: up to 211 were seen to be.
+#: Samples that the monitor may lose where a stream starts, and where a player ran dry: up to 217 were seen to be.
 _LOST = 256
 
 
@@ -83,13 +79,11 @@ def compare(heard: Recording | Samples, reference: Samples) -> Comparison:
     found = extent(samples)
     if found is None:
         return Comparison(0.0, 0.0, 0, 0.0, len(wanted) / RATE)
+    exact = _exact(samples, wanted, found[0])
+    if exact and extent(samples[exact.end + _SLACK :]) is None:
+        return exact
     offset = _align(samples.astype(np.float64), wanted)
-    result = _at(samples, wanted, offset, (found[1] - found[0]) / RATE)
-    if result.same:
-        return result
-    without = _without_zeros(samples, wanted, max(0, found[0] - _LOST))
-    alone = without and extent(samples[without.end + _SLACK :]) is None
-    return without if without and without.same and alone else result
+    return _at(samples, wanted, offset, (found[1] - found[0]) / RATE)
 
 
 def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> list[Comparison]:
@@ -117,44 +111,73 @@ def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> l
 
 def _next(samples: Samples, wanted: Samples, start: int) -> Comparison:
     """Compare what begins with the sound at `start`: before it there is silence, so a sentence begins there."""
+    exact = _exact(samples, wanted, start)
+    if exact:
+        return exact
     first = max(0, start - _LOST)
     nearby = samples[first : start + len(wanted) + _SLACK].astype(np.float64)
     offset = first + _align(nearby, wanted, _LOST + _SLACK)
     inside = extent(samples[max(0, offset - _SLACK) : offset + len(wanted) + _SLACK])
-    result = _at(samples, wanted, offset, (inside[1] - inside[0]) / RATE if inside else 0.0)
-    if result.same:
-        return result
-    without = _without_zeros(samples, wanted, first)
-    return without if without and without.same else result
+    return _at(samples, wanted, offset, (inside[1] - inside[0]) / RATE if inside else 0.0)
 
 
-def _without_zeros(samples: Samples, wanted: Samples, first: int) -> Comparison | None:
-    """Compare what begins at most `_LOST` samples after `first` without its zeros; None where too little is left."""
-    kept, own = first + _sounding(samples[first:]), _sounding(wanted)
-    sound, reference = samples[kept], wanted[own]
-    start = extent(sound)
-    if start is None or len(sound) - start[0] < len(reference) - RATE * EXTENT:
+def _exact(samples: Samples, wanted: Samples, start: int) -> Comparison | None:
+    """Compare what begins with the sound at `start`, sample by sample; None if it is not that, and whole.
+
+    A player may have run dry: there zeros were put in, and the monitor may have lost some of what followed.
+    """
+    runs = _walk(samples, wanted, start)
+    if not runs or len(wanted) - runs[-1][1] - runs[-1][2] > _LOST:
         return None
-    nearby = sound[: start[0] + len(reference) + _SLACK].astype(np.float64)
-    offset = _align(nearby, reference, start[0] + _SLACK)
-    if extent(sound[: max(0, offset - _CLICK)]):
-        return None  # a click before it is no part of it
-    inside = extent(sound[max(0, offset - _SLACK) : offset + len(reference) + _SLACK])
-    length = (inside[1] - inside[0]) / RATE if inside else 0.0
-    result = _at(sound, reference, offset, length)
-    places = kept[offset : offset + len(reference)]
-    return replace(result, offset=int(places[0]), places=(places, own[: len(places)]))
+    length = len(wanted) / RATE
+    return Comparison(1.0, 1.0, runs[0][0] - runs[0][1], length, length, _places(runs))
 
 
-def _sounding(samples: Samples) -> npt.NDArray[np.intp]:
-    """Return the places of all samples that are not in a long run of zeros."""
-    silent = np.concatenate([[False], samples == 0, [False]])
-    edges = np.flatnonzero(np.diff(silent.astype(np.int8)))
-    keep = np.ones(len(samples), bool)
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        if end - begin >= _ZEROS:
-            keep[begin:end] = False
-    return np.flatnonzero(keep)
+def _walk(samples: Samples, wanted: Samples, place: int, ahead: int = 0) -> list[tuple[int, int, int]]:
+    """Return the runs in which both are the same: where each begins in the one and the other, and its length.
+
+    Between two of them there are but zeros in the samples, and no more than was lost is left out of what is wanted.
+    The first run may begin `ahead` samples later in that.
+    """
+    runs: list[tuple[int, int, int]] = []
+    own = 0
+    while True:
+        sound = place + _leading_zeros(samples[place:])
+        dry = sound - place >= _RUN or not runs
+        lost = (_LOST if dry else _SLACK) + (0 if runs else ahead)
+        skipped = _find(samples[sound : sound + _RUN], wanted[own:], lost + sound - place)
+        if skipped is None or np.count_nonzero(wanted[own : own + skipped]) > lost:
+            return runs
+        own += skipped
+        length = _same_length(samples[sound:], wanted[own:])
+        runs.append((sound, own, length))
+        place, own = sound + length, own + length
+
+
+def _leading_zeros(samples: Samples) -> int:
+    found = np.flatnonzero(samples)
+    return int(found[0]) if len(found) else len(samples)
+
+
+def _find(piece: Samples, wanted: Samples, last: int) -> int | None:
+    """Return the first place, up to the last one, at which the piece is in `wanted`, at whose end it may be shorter."""
+    for place in np.flatnonzero(wanted[: last + 1] == piece[0]) if len(piece) else ():
+        rest = wanted[place : place + len(piece)]
+        if np.array_equal(piece[: len(rest)], rest):
+            return int(place)
+    return None
+
+
+def _same_length(samples: Samples, wanted: Samples) -> int:
+    """Return for how many samples both are the same."""
+    length = min(len(samples), len(wanted))
+    different = np.flatnonzero(samples[:length] != wanted[:length])
+    return int(different[0]) if len(different) else length
+
+
+def _places(runs: Sequence[tuple[int, int, int]]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    heard, own = zip(*((np.arange(a, a + length), np.arange(b, b + length)) for a, b, length in runs), strict=True)
+    return np.concatenate(heard), np.concatenate(own)
 
 
 def assert_begun(heard: Recording | Samples, reference: Samples, shortest: float = 0.1) -> float:
@@ -166,15 +189,14 @@ def assert_begun(heard: Recording | Samples, reference: Samples, shortest: float
     found = extent(samples)
     assert found is not None, "nothing was heard"
     wanted = _sound(reference)
-    places = np.arange(len(wanted))
     sound = samples[found[0] : found[1]]
-    if len(sound) > len(wanted) + _SLACK or not _next(samples, wanted[: len(sound)], found[0]).same:
-        places = _sounding(wanted)  # the player ran dry, or it is another sentence
-        sound = sound[_sounding(sound)]
-    assert len(sound) <= len(places) + _SLACK, f"more was heard than the sentence: {_told(samples, [])}"
-    places = places[: len(sound)]
-    assert_heard(sound, [wanted[places]])
-    seconds = float(places[-1] + 1) / RATE
+    last = _walk(sound, wanted, 0)[-1:]  # the player may have run dry
+    if last and last[0][0] + last[0][2] == len(sound):
+        seconds = (last[0][1] + last[0][2]) / RATE
+    else:
+        assert len(sound) <= len(wanted) + _SLACK, f"more was heard than the sentence: {_told(samples, [])}"
+        assert_heard(sound, [wanted[: len(sound)]])
+        seconds = len(sound) / RATE
     assert seconds >= shortest, f"only {seconds:.3f} s were heard"
     return seconds
 
@@ -196,10 +218,20 @@ def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float,
     try:
         _assert_parts(first, second, wanted, twice)
     except AssertionError:
-        without = _without_zeros(samples, wanted, max(0, int(loud[0]) - _LOST))  # the player ran dry, or it is wrong
-        if not (without and without.same and abs(without.heard - without.expected) <= _DROPPED / RATE):
+        if not _ran_dry(first, second, wanted, round(twice * RATE)):
             raise
     return held
+
+
+def _ran_dry(first: Samples, second: Samples, wanted: Samples, twice: int) -> bool:
+    """Return whether these are the two parts of a sentence, in which a player ran dry: see `_exact`."""
+    runs = _walk(first, wanted, 0)
+    if not runs or runs[-1][0] + runs[-1][2] < len(first):
+        return False
+    reached = runs[-1][1] + runs[-1][2]
+    back = min(reached, twice + _SLACK)
+    runs = _walk(second, wanted[reached - back :], 0, ahead=back)
+    return bool(runs) and len(wanted) - (reached - back + runs[-1][1] + runs[-1][2]) <= _LOST
 
 
 def _assert_parts(first: Samples, second: Samples, wanted: Samples, twice: float) -> None:
