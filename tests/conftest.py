@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.processes import Talk
 from tests.support.sink import Sink
-from tests.support.timing import take_unmeasured
+from tests.support.timing import calibrate, take_unmeasured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -45,6 +45,11 @@ class MakeTalk(Protocol):
 def _interruptible() -> None:
     """Start clients with SIGINT as a terminal would: what runs the tests in its background may have it ignored."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure() -> None:
+    """Time the control of limits while the machine is quiet; the workers of a run know of it."""
+    calibrate()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     import pathlib
     from collections.abc import Callable, Iterator
 
+#: What relies on the scripted engine fails with it.
+pytestmark = pytest.mark.slow
+
 PROGRAM = os.path.join(os.path.dirname(os.path.abspath(__file__)), "support", "scripted_engine.py")
 
 

@@ -51,9 +51,8 @@ def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
     return quick_talk(make_talk, sink)
 
 
-@pytest.mark.parametrize(
-    "name", ["initials", *(pytest.param(each, marks=pytest.mark.slow) for each in ("abbreviations", "address"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CRASHING)
 def test_a_text_that_would_crash_the_library_is_spoken(talk: Talk, sink: Sink, name: str) -> None:
     text = CRASHING[name]
     assert talk.run("say", "--wait", "--", LOW).code == 0

@@ -115,6 +115,7 @@ def test_row_41_a_device_that_is_lost_in_mid_sentence(make_talk: MakeTalk, break
     _heard_again(talk, sink, LONG)
 
 
+@pytest.mark.slow
 def test_row_41_a_sound_server_that_is_killed_in_mid_sentence(make_talk: MakeTalk, breakable: Sink) -> None:
     sink = breakable
     talk = quick_talk(make_talk, sink)

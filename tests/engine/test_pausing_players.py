@@ -15,6 +15,7 @@ from talkcli.engine import protocol
 from tests.engine.spawned import FAST, SOON, Spawned, children
 from tests.engine.test_player_faults import Player, player
 from tests.support.reference import RATE, render
+from tests.support.surroundings import needs
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -230,6 +231,7 @@ def test_a_pause_when_only_the_end_is_left_lets_it_end(player: Player) -> None:
 def test_no_silence_is_written_to_a_file(tmp_path: Path, held: str) -> None:
     text, rate = TEXT if held == "before" else " ".join([TEXT] * 150), 200  # at which it is made the quickest
     plain, target = tmp_path / "plain.wav", tmp_path / "paused.wav"
+    needs("espeak-ng")
     subprocess.run(["espeak-ng", "-s", str(rate), "-w", str(plain), text], check=True)
     with Spawned(f"file:{target}", alive_every=SOON) as engine:
         engine.until(protocol.Voices)

@@ -16,6 +16,7 @@ import pytest
 
 from talkcli.engine import protocol
 from tests.engine.spawned import FAST, Spawned, children
+from tests.support.surroundings import needs
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ def test_words_come_as_they_are_heard_and_only_forward() -> None:
 @pytest.mark.parametrize("goals", [1, 3])
 def test_the_first_sentence_is_what_espeak_ng_makes(tmp_path: Path, goals: int) -> None:
     reference = tmp_path / "reference.wav"
+    needs("espeak-ng")
     subprocess.run(["espeak-ng", "-s", str(FAST), "-w", str(reference), "battery low, please recharge"], check=True)
     target = tmp_path / "talk.wav"
     with Spawned(f"file:{target}") as engine:

@@ -177,6 +177,7 @@ def test_server_that_cannot_start_never_says_that_it_is_ready(home: str) -> None
         assert not supervisor.hear(0.1)
 
 
+@pytest.mark.slow
 def test_idle_server_under_a_supervisor_wakes_less_than_once_a_second(home: str) -> None:
     with Supervisor(f"{home}/n") as supervisor:
         env = supervised(home, supervisor, WATCHDOG_USEC="30000000")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
-from tests.support.surroundings import short_directory
+from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -36,6 +36,7 @@ def home() -> Iterator[str]:
 @contextlib.contextmanager
 def mounted(directory: str, options: str) -> Iterator[None]:
     """Mount a small file system of its own; skip where this user may not."""
+    needs("mount", "umount")
     os.mkdir(directory, 0o700)
     command = ["mount", "-t", "tmpfs", "-o", f"mode=700,{options}", "tmpfs", directory]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -221,6 +221,7 @@ def test_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
         "$@" || true
         kill $!
     """
+    needs("unshare", "mount")
     command = ["unshare", "--mount", "sh", "-c", script, "sh", IMPOSTOR, *TALK, "status"]
     with open(f"{home}/heard", "w", encoding="utf-8"):
         os.chown(f"{home}/heard", NOBODY, NOBODY)

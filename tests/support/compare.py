@@ -349,7 +349,7 @@ def _best(around: Floats, part: Floats) -> tuple[float, float, int]:
 def _best_in_two(around: Floats, part: Floats) -> tuple[float, float, int]:
     """As `_best`, of a part in whose middle the monitor may have dropped some samples."""
     found = []
-    for cut in range(len(part) // 8, len(part), max(1, len(part) // 8)):
+    for cut in range(max(1, len(part) // 8), len(part), max(1, len(part) // 8)):
         first = _best(around[: cut + 2 * _SLACK], part[:cut])
         second = _best(around[cut:], part[cut:])
         found.append((first[0] + second[0], first[1] + second[1], second[2]))

@@ -72,7 +72,10 @@ def clean_environment(home: str, extra: Mapping[str, str] | None = None) -> dict
 
 def dying_with_parent(command: list[str]) -> list[str]:
     """Return the command so that it is killed with the thread that starts it: killed tests leave nothing running."""
-    return ["setpriv", "--pdeathsig", "KILL", "--", *command] if sys.platform == "linux" else command
+    if sys.platform != "linux":
+        return command
+    needs("setpriv")
+    return ["setpriv", "--pdeathsig", "KILL", "--", *command]
 
 
 def marked(mark: str) -> list[int]:
