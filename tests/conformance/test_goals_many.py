@@ -58,9 +58,9 @@ OPTIONS: list[dict[str, Any]] = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(int(SECONDS) + 90)
-def test_row_17_five_clients_that_send_wait_and_cancel_meet_no_deadlock(make_talk: MakeTalk) -> None:
+@pytest.mark.parametrize("seconds", [2.0, pytest.param(SECONDS, marks=pytest.mark.slow)])
+def test_row_17_five_clients_that_send_wait_and_cancel_meet_no_deadlock(make_talk: MakeTalk, seconds: float) -> None:
     talk = make_talk("--max-queue", "4", scripted=True)
     over = threading.Event()
     sent: list[list[str]] = [[] for _ in range(CLIENTS)]
@@ -77,7 +77,7 @@ def test_row_17_five_clients_that_send_wait_and_cancel_meet_no_deadlock(make_tal
     threads = [threading.Thread(target=loop, args=(number,)) for number in range(CLIENTS)]
     for each in threads:
         each.start()
-    over.wait(SECONDS)
+    over.wait(seconds)
     over.set()
     for each in threads:
         each.join(20)
@@ -93,7 +93,7 @@ def test_row_17_five_clients_that_send_wait_and_cancel_meet_no_deadlock(make_tal
     assert sorted([*known, goal]) == sorted(talk.watcher.goals())
     rejected = [each for each in known if talk.watcher.states(each) == ["REJECTED"]]
     assert set(ends(talk, *(each for each in known if each not in rejected))) == {1}
-    assert min(len(client) for client in sent) > SECONDS, "a client was starved"
+    assert min(len(client) for client in sent) > seconds, "a client was starved"
     assert_told_in_order(talk)
 
 

@@ -240,6 +240,14 @@ class SchedulerMachine(RuleBasedStateMachine):
         self.both.all_has_ended_once()
 
 
+class BriefMachine(SchedulerMachine):
+    """The same for every run of the tests: in a second it finds what goes wrong often."""
+
+
+TestSchedulerBriefly = BriefMachine.TestCase
+TestSchedulerBriefly.settings = settings(
+    max_examples=settings().max_examples // 5, stateful_step_count=40, suppress_health_check=[HealthCheck.too_slow]
+)
 #: Where it fails, it takes its time to find the shortest sequence.
 TestScheduler = pytest.mark.slow(pytest.mark.timeout(900)(SchedulerMachine.TestCase))
 #: More than other tests have: what goes wrong only where three options meet is rare.
