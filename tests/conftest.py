@@ -16,11 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 
 
-#: What could not be measured, in a test's reports; and the lists of the last runs, in pytest's cache.
+#: What could not be measured, in a test's reports.
 _UNMEASURED = "not measured"
-_LISTED = "talk/unmeasured"
-#: Runs in a row in which no test may be listed twice (conformance).
-_RUNS = 3
 
 
 class MakeTalk(Protocol):
@@ -70,20 +67,13 @@ def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] 
     return None
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Name what was not measured, and in how many of the last runs."""
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Name what was not measured."""
     reports = terminalreporter.getreports(_UNMEASURED)
-    cache: pytest.Cache | None = getattr(config, "cache", None)  # None with `-p no:cacheprovider`
-    before: list[list[str]] = cache.get(_LISTED, []) if cache else []
-    listed = [*before, [report.nodeid for report in reports]][-_RUNS:]
-    if cache:
-        cache.set(_LISTED, listed)
     if reports:
         terminalreporter.write_sep("-", "not measured: late, and so was the control")
     for report in reports:
-        times = sum(report.nodeid in each for each in listed)
-        again = f" (in {times} of the last {len(listed)} runs: find out why)" if times > 1 else ""
-        terminalreporter.write_line(f"{report.nodeid}{again}: {dict(report.user_properties)[_UNMEASURED]}")
+        terminalreporter.write_line(f"{report.nodeid}: {dict(report.user_properties)[_UNMEASURED]}")
 
 
 @pytest.fixture(scope="session")

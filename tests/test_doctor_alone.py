@@ -23,7 +23,7 @@ from tests.conformance.bareserve import TALK, environment, serving
 from tests.faults.broken import python_path, write
 from tests.faults.test_users import NOBODY, as_user, impostor
 from tests.support.compare import assert_silent, extent
-from tests.support.processes import start_talk
+from tests.support.processes import run_talk, start_talk
 from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
@@ -56,9 +56,8 @@ def doctor(
 ) -> dict[str, dict[str, str]]:
     """Run it, assert how it ends, and return its findings by their checks."""
     if command is TALK:
-        process = start_talk(["--json", "doctor", *options], env)
-        out, err = process.communicate(timeout=LIMIT)
-        ended = (process.wait(), err)
+        status, out, err = run_talk(["--json", "doctor", *options], env, LIMIT)
+        ended = (status, err)
     else:
         whole = [*command, "--json", "doctor", *options]
         done = subprocess.run(

@@ -75,6 +75,16 @@ def test_a_player_that_ran_dry_in_a_sentence_is_forgiven(low: Samples, at: int, 
         assert_heard(recorded(dry, low[at + 5000 :]), [low])
 
 
+def test_more_than_a_busy_machine_does_to_a_sentence_is_noticed(low: Samples) -> None:
+    hole = np.zeros(3 * RATE, np.int16)
+    dropped = np.concatenate([low[at : at + 2008] for at in range(0, len(low), 2048)])
+    zeros = np.zeros(40, np.int16)
+    worn = np.concatenate([part for at in range(0, len(low), 2048) for part in (low[at : at + 1798], zeros)])
+    for heard in (np.concatenate([low[:12000], hole, low[12000:]]), dropped, worn):
+        with pytest.raises(AssertionError):
+            assert_heard(recorded(heard), [low])
+
+
 def test_half_the_volume_is_the_same_sentence(low: Samples) -> None:
     assert_heard(recorded((low // 2).astype(np.int16)), [low])
 

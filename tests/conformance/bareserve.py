@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tests.support.forking import Forked, forks
-from tests.support.processes import SCRIPTED
+from tests.support.processes import SCRIPTED, run_talk
 from tests.support.surroundings import clean_environment, dying_with_parent
 
 if TYPE_CHECKING:
@@ -114,9 +114,7 @@ def run(command: Sequence[str], env: Mapping[str, str], **options: object) -> En
     """Run a program to its end."""
     words = None if options else _forked(command, env)
     if words is not None:
-        process = Forked(words, env, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        out, err = process.communicate(timeout=LIMIT)
-        return Ended(process.wait(), out, err)
+        return Ended(*run_talk(words, env, LIMIT))
     done = subprocess.run(  # type: ignore[call-overload]
         list(command),
         env=dict(env),

@@ -81,7 +81,7 @@ def begin_with_client(talk: Talk, text: str, *options: str, number: int = 3) -> 
     return goal_id, client
 
 
-def heard(talk: Talk, quiet: float = 0.1) -> Samples:
+def heard(talk: Talk, quiet: float = 0.2) -> Samples:
     """Return all that was heard, once it is quiet."""
     talk.recording.wait_until_quiet(quiet)
     return talk.recording.samples

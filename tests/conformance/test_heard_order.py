@@ -63,8 +63,8 @@ def end(talk: Talk, *goals: str) -> None:
 
 
 def test_row_36_a_goal_whose_time_is_over_is_never_heard(talk: Talk) -> None:
-    """It ends the moment its time runs out, while the sentence of 2 s before it is still being spoken."""
-    long = send(talk, LONG, rate=300)
+    """It ends the moment its time runs out, while the sentence of 3 s before it is still being spoken."""
+    long = send(talk, LONG, rate=200)
     goal = send(talk, NEVER, ttl=1)
     after = send(talk, LOW)
     assert_recalled(talk, goal, "expired")

@@ -79,9 +79,9 @@ def position(reference: Rendering, start: int) -> float:
 @pytest.mark.parametrize(
     ("player", "rate"),
     [
-        ("pacat", 350),
-        *(pytest.param("aplay", rate, marks=pytest.mark.slow) for rate in (100, 200, 350)),
-        pytest.param("pacat", 200, marks=pytest.mark.slow),
+        ("aplay", 350),
+        *(pytest.param("aplay", rate, marks=pytest.mark.slow) for rate in (100, 200)),
+        *(pytest.param("pacat", rate, marks=pytest.mark.slow) for rate in (200, 350)),
     ],
 )
 def test_done_when_thirty_words_are_told_as_they_are_heard(

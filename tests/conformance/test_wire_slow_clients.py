@@ -18,6 +18,7 @@ from tests.conformance.rawsocket import Raw
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
+    import pathlib
     from collections.abc import Iterator
 
     from tests.conftest import MakeTalk
@@ -27,6 +28,16 @@ if TYPE_CHECKING:
 FIRST_REQUEST = 5.0
 LINE = 10.0
 LATE = 1.0
+#: Serves with the scripted engine, and with limits of a tenth.
+HASTY = """
+import sys
+sys.path.insert(0, {root!r})
+from talkcli.server import connection
+from tests.support import scripted_serve
+connection.FIRST_REQUEST, connection.LINE_LIMIT = {first}, {line}
+scripted_serve.main()
+"""
+ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 HELLO = b'{"request": "hello"}\n'
 
 
@@ -151,6 +162,27 @@ def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None
     for goal_id in ids:
         states = [each["state"] for each in seen if each["id"] == goal_id and each["event"] == "state"]
         assert states == ["PENDING", "ACTIVE", "SUCCEEDED"]
+
+
+def test_slow_clients_are_closed_by_limits_of_a_tenth(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
+    program = tmp_path / "serve.py"
+    program.write_text(HASTY.format(root=ROOT, first=FIRST_REQUEST / 10, line=LINE / 10))
+    talk = make_talk(program=str(program))
+    with limits(), contextlib.ExitStack() as stack:
+        began = time.monotonic()
+        silent, begun, idle = raws = [stack.enter_context(Raw(talk.socket)) for _ in range(3)]
+        for each in (begun, idle):
+            each.send(HELLO)
+        begun.send(b'{"request": "sa')
+        closed: dict[int, float] = {}
+        while len(closed) < 2:
+            assert time.monotonic() - began < LINE, "they are not closed"
+            _collect(raws, closed, began)
+        for each, limit in ((silent, FIRST_REQUEST / 10), (begun, LINE / 10)):
+            assert closed[id(each)] >= limit - 0.1
+            assert_within(closed[id(each)], limit + LATE, "the end of a slow client")
+            assert each.lines[-1]["error"]["code"] == "too_slow"
+        assert id(idle) not in closed
 
 
 @pytest.mark.slow

@@ -84,9 +84,8 @@ def test_it_has_three_streams_what_it_inherits_and_its_leash() -> None:
     reading, writing = os.pipe()
     before = _descriptors(os.getpid())
     child = _run("kill -STOP $$", writing)
-    os.waitid(
-        os.P_PID, child.pid, os.WSTOPPED | os.WNOWAIT
-    )  # what a program opens while it is loaded is closed by then
+    # What a program opens while it is loaded is closed when it has stopped itself.
+    os.waitid(os.P_PID, child.pid, os.WSTOPPED | os.WNOWAIT)
     its = _descriptors(child.pid)
     assert its.pop(1) == os.devnull
     assert its.pop(writing) == os.readlink(f"/proc/self/fd/{writing}")

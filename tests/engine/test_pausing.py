@@ -87,17 +87,17 @@ def _same(one: Samples, other: Samples) -> int:
     return int(different[0]) if len(different) else shorter
 
 
-def _assert_held(samples: Samples, reference: Samples, pause: float, beside: int = _LOST) -> None:
+def _assert_held(samples: Samples, reference: Samples, pause: float, again: int = 0) -> None:
     """Assert that the reference was heard whole, but held once for at least so many seconds.
 
-    Where it was held as many samples as `beside` may be missing or come again. A player that ran dry is as short a
-    silence elsewhere, after which the monitor drops some.
+    Where it was held some samples may be missing, which the monitor drops, and so many come again. A player that ran
+    dry is as short a silence elsewhere, after which the monitor drops some, too.
     """
     joins = _joins(samples, reference)
     assert joins, "it was not held"
     (held, missing), *dry = sorted(joins, reverse=True)
     assert held >= pause
-    assert abs(missing) <= beside, f"{missing} samples are missing where it was held"
+    assert -again <= missing <= _LOST, f"{missing} samples are missing where it was held"
     assert all(seconds < pause and 0 <= dropped <= _LOST for seconds, dropped in dry), dry
 
 

@@ -32,7 +32,7 @@ WORDS = (2, 5)
 @pytest.mark.timeout(60 + 10 * KILLS)
 @pytest.mark.parametrize("kills", [FEW, pytest.param(KILLS, marks=pytest.mark.slow)])
 def test_server_is_killed_in_mid_sentence(make_talk: MakeTalk, sink: Sink, kills: int) -> None:
-    talk = make_talk(sink=sink)
+    talk = make_talk(sink=sink, forked=False)  # its start is timed
     chance = random.Random(kills)
     files = set(os.listdir(talk.directory))
     silences: list[float] = []
@@ -43,13 +43,14 @@ def test_server_is_killed_in_mid_sentence(make_talk: MakeTalk, sink: Sink, kills
             with sink.record() as recording:
                 await_word(talk, send(talk, LONG), chance.randint(*WORDS))
                 killed = time.monotonic()
-                talk.kill(gone_within=SILENT)
+                gone = talk.kill()
                 last = recording.wait_until_quiet(0.2)
             assert last is not None
             began = time.monotonic()
             talk.start_server()
             starts.append(time.monotonic() - began)
             silences.append(last - killed)
+            assert_within(gone, SILENT, "the end of all processes after the server was killed")
             assert_within(silences[-1], SILENT, "the silence after the server was killed")
             assert_within(starts[-1], SERVES, "the start after the server was killed")
     for what, times in (("silent after", silences), ("serves after", starts)):

@@ -72,7 +72,7 @@ BROKEN = {
 }
 
 
-#: Those that are waited for until a limit, side by side, and the one that takes longest.
+#: Players for which the engine waits until a limit: those that are tested side by side, and the slowest.
 STALLING, LONGEST = ["reads a byte at a time", "hangs in drain"], "never reads"
 
 

@@ -52,7 +52,7 @@ RATE = 450
 HELD = 20.0
 
 #: A library that never comes back from a sentence with a certain word in it, and never calls back either.
-#: The server it is for gives it up after some seconds without a sign of life.
+#: The server gives it up after some seconds without a sign of life.
 STUCK_SYNTHESIS = """
 from talkcli.engine import limits
 limits.HANG_AFTER = {limit}

@@ -24,7 +24,7 @@ class Census:
     processes: int  # the server and all below it
     descriptors: int  # of the server
     threads: int  # of the server
-    memory: int  # kB of all of them, shared pages divided by those who share them (Pss)
+    memory: int  # kB of all of them that each has written to and shares with nobody
 
     def __str__(self) -> str:
         return ", ".join(f"{each.name} {getattr(self, each.name)}" for each in fields(self))
@@ -37,7 +37,7 @@ def count(pid: int) -> Census:
         processes=1 + len(family),
         descriptors=len(os.listdir(f"/proc/{pid}/fd")),
         threads=len(os.listdir(f"/proc/{pid}/task")),
-        memory=sum(_pss(each) for each in (pid, *family)),
+        memory=sum(_own(each) for each in (pid, *family)),
     )
 
 
@@ -77,9 +77,9 @@ def _fits(now: Census, before: Census) -> bool:
     return now.processes <= before.processes and now.descriptors <= before.descriptors and now.threads <= before.threads
 
 
-def _pss(pid: int) -> int:
+def _own(pid: int) -> int:
     with contextlib.suppress(OSError), open(f"/proc/{pid}/smaps_rollup", encoding="utf-8") as file:
-        return next((int(each.split()[1]) for each in file if each.startswith("Pss:")), 0)
+        return next((int(each.split()[1]) for each in file if each.startswith("Private_Dirty:")), 0)
     return 0  # it has ended
 
 

@@ -39,6 +39,8 @@ _SLACK = 48
 _RUN = 32
 #: Samples by which a quarter of a second may come later, where a player ran dry before it.
 _NEARBY = RATE // 20
+#: Samples of silence that players that ran dry may put into one sentence.
+_DRY = RATE // 2
 #: Samples that the monitor may lose where a stream starts, and where a player ran dry: up to 217 were seen to be.
 _LOST = 256
 
@@ -127,7 +129,7 @@ def _exact(samples: Samples, wanted: Samples, start: int) -> Comparison | None:
     A player may have run dry: there zeros were put in, and the monitor may have lost some of what followed.
     """
     runs = _walk(samples, wanted, start)
-    if not runs or len(wanted) - runs[-1][1] - runs[-1][2] > _LOST:
+    if not runs or not _nearly_whole(runs, wanted):
         return None
     length = len(wanted) / RATE
     return Comparison(1.0, 1.0, runs[0][0] - runs[0][1], length, length, _places(runs))
@@ -152,6 +154,21 @@ def _walk(samples: Samples, wanted: Samples, place: int, ahead: int = 0) -> list
         length = _same_length(samples[sound:], wanted[own:])
         runs.append((sound, own, length))
         place, own = sound + length, own + length
+
+
+def _nearly_whole(runs: Sequence[tuple[int, int, int]], wanted: Samples) -> bool:
+    """Return whether what was lost and what was put in are what a busy machine does to a sentence, and no more."""
+    reached = [0, *(own + length for _, own, length in runs)]
+    begins = [*(own for _, own, _ in runs), len(wanted)]
+    lost = [int(np.count_nonzero(wanted[a:b])) for a, b in zip(reached, begins, strict=True)]
+    longer = runs[-1][0] - runs[0][0] - (runs[-1][1] - runs[0][1])
+    # Where no zeros are, samples are missing: none of a player that ran dry, and few of a monitor.
+    wet = [
+        missing
+        for missing, before, after in zip(lost[1:-1], runs, runs[1:], strict=False)
+        if missing and after[0] - before[0] - before[2] < _RUN
+    ]
+    return max(lost) <= _LOST and sum(lost) <= 3 * _LOST and len(wet) <= 1 and longer <= _DRY
 
 
 def _leading_zeros(samples: Samples) -> int:
@@ -230,8 +247,12 @@ def _ran_dry(first: Samples, second: Samples, wanted: Samples, twice: int) -> bo
         return False
     reached = runs[-1][1] + runs[-1][2]
     back = min(reached, twice + _SLACK)
-    runs = _walk(second, wanted[reached - back :], 0, ahead=back)
-    return bool(runs) and len(wanted) - (reached - back + runs[-1][1] + runs[-1][2]) <= _LOST
+    rest = _walk(second, wanted[reached - back :], 0, ahead=back)
+    if not rest or len(wanted) - (reached - back + rest[-1][1] + rest[-1][2]) > _LOST:
+        return False
+    # A stream that goes on loses nothing where it was held; one that was started again, or ran dry, may.
+    between = int(np.count_nonzero(wanted[reached : reached - back + rest[0][1]]))
+    return between <= (_LOST if twice or len(runs) + len(rest) > 2 else 2 * _SLACK)
 
 
 def _assert_parts(first: Samples, second: Samples, wanted: Samples, twice: float) -> None:

@@ -27,19 +27,22 @@ from typing import Any
 
 _KILLED_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 #: What belongs to the engine process alone, or writes files when it is run: no client and no server imports it.
-_LEFT_OUT = ("talkcli.__main__", "talkcli.cli.tabulate", "talkcli.engine.library", "talkcli.engine.process")
+_LEFT_OUT = {
+    f"talkcli.{each}" for each in ("__main__", "cli.tabulate", "engine.espeak", "engine.library", "engine.process")
+}
 
 
 def _import_talk() -> None:
     for package in ("talkcli", "talkcli.cli", "talkcli.client", "talkcli.doctor", "talkcli.engine", "talkcli.server"):
         for each in pkgutil.iter_modules(getattr(importlib.import_module(package), "__path__", ())):
             name = f"{package}.{each.name}"
-            if name not in _LEFT_OUT and name != "talkcli.engine.espeak":
+            if name not in _LEFT_OUT:
                 importlib.import_module(name)
 
 
 def _serve(channel: socket.socket) -> dict[str, Any]:
     """Fork a child for each request; return the request in the child, and never in the parent."""
+    own = os.getpid()
     ended: dict[int, tuple[int, int]] = {}  # by the child's pidfd: its id, and who is told of its end
     poll = select.poll()
     poll.register(channel, select.POLLIN)
@@ -54,7 +57,8 @@ def _serve(channel: socket.socket) -> dict[str, Any]:
             asked, given = _receive(channel)
             child = os.fork()
             if child == 0:
-                _become(asked, given)
+                channel.detach()
+                _become(asked, given, own)
                 return asked
             for each in given[:3]:
                 os.close(each)
@@ -74,7 +78,11 @@ def _receive(channel: socket.socket) -> tuple[dict[str, Any], list[int]]:
     length = struct.unpack("<q", head)[0]
     text = b""
     while len(text) < length:
-        text += channel.recv(length - len(text))
+        more = channel.recv(length - len(text))
+        if not more:
+            os._exit(0)
+        text += more
+    assert len(given) == 4
     return json.loads(text), list(given)
 
 
@@ -86,10 +94,10 @@ def _tell(told: int, status: int) -> None:
     os.close(told)
 
 
-def _become(asked: dict[str, Any], given: list[int]) -> None:
+def _become(asked: dict[str, Any], given: list[int], parent: int) -> None:
     """Make this child what a process is that was started with these words, environment, directory and descriptors."""
     ctypes.CDLL(None).prctl(_KILLED_WITH_PARENT, signal.SIGKILL)
-    if os.getppid() != asked["parent"]:
+    if os.getppid() != parent:
         os._exit(0)  # which had ended before
     if asked["session"]:
         os.setsid()

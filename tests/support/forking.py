@@ -2,7 +2,7 @@
 
 What runs is a process all the same, with its own environment, descriptors and session, killed with the tests, ended as
 Python ends. It differs in what can be seen of it from outside, its command line and first environment in /proc, and in
-what it no longer has to import. So whoever tests these, signals or limits of a start, streams that are closed or
+what it no longer has to import. A test of these, of signals or limits at a start, of streams that are closed or of
 another interpreter starts a program of its own; `forks()` tells what may be forked at all.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import array
 import atexit
+import contextlib
 import json
 import os
 import select
@@ -73,6 +74,8 @@ class Forked:
             for each in close:
                 os.close(each)
         self._lock = threading.Lock()
+        self._readers: list[threading.Thread] = []
+        self._found = ["", ""]
 
     def __enter__(self) -> Forked:
         return self
@@ -97,30 +100,30 @@ class Forked:
 
     def communicate(self, input: str | None = None, timeout: float | None = None) -> tuple[str, str]:  # noqa: A002
         """Send input, read all output, wait for the end."""
-        found = ["", ""]
-
-        def read(number: int, file: IO[str]) -> None:
-            found[number] += file.read()
-
-        files = [each for each in enumerate((self.stdout, self.stderr)) if each[1]]
-        readers = [threading.Thread(target=read, args=each, daemon=True) for each in files]
-        for each in readers:
-            each.start()
-        if self.stdin:
-            try:
-                self.stdin.write(input or "")
-                self.stdin.close()
-            except BrokenPipeError:
-                pass  # it did not want it
+        if not self._readers:  # else this is called again, after it had timed out
+            for number, file in enumerate((self.stdout, self.stderr)):
+                if file:
+                    reader = threading.Thread(target=self._read, args=(number, file), daemon=True)
+                    self._readers.append(reader)
+                    reader.start()
+            if self.stdin:
+                with contextlib.suppress(BrokenPipeError):  # it did not want it
+                    self.stdin.write(input or "")
+                    self.stdin.flush()
+                with contextlib.suppress(BrokenPipeError):
+                    self.stdin.close()
         self.wait(timeout)
-        for each in readers:
+        for each in self._readers:
             each.join(timeout)
             if each.is_alive():  # a child of its own has the pipe
                 raise subprocess.TimeoutExpired(self.args, timeout or 0)
-        for _, file in files:
+        for file in (self.stdout, self.stderr):
             if file:
                 file.close()
-        return found[0], found[1]
+        return self._found[0], self._found[1]
+
+    def _read(self, number: int, file: IO[str]) -> None:
+        self._found[number] += file.read()
 
     def send_signal(self, number: int) -> None:
         """Send a signal, if it runs."""
@@ -153,15 +156,15 @@ class Forked:
             with self._lock:
                 if self.returncode is None:  # no other thread was sooner
                     status = os.read(self._ended, 4)
-                    os.close(self._ended)
                     assert status, "what forks processes has ended"
+                    os.close(self._ended)
                     self.returncode = os.waitstatus_to_exitcode(struct.unpack("<i", status)[0])
         return self.returncode
 
 
 def forks(env: Mapping[str, str]) -> bool:
     """Return whether a process with this environment may be forked: what the interpreter is told is as ever."""
-    return sys.platform == "linux" and _told(env) == _told(clean_environment("/"))
+    return hasattr(os, "pidfd_open") and _told(env) == _told(clean_environment("/"))
 
 
 def _told(env: Mapping[str, str]) -> dict[str, str]:
@@ -180,8 +183,7 @@ class _Server:
         """Have a process forked, and return its id."""
         with self._lock:
             channel = self._channel or self._start()
-            assert self._process
-            asked |= {"parent": self._process.pid, "directory": os.getcwd()}
+            asked["directory"] = os.getcwd()
             text = json.dumps(asked).encode()
             rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", descriptors))]
             channel.sendmsg([struct.pack("<q", len(text))], rights)
@@ -198,6 +200,7 @@ class _Server:
                 [sys.executable, "-m", "tests.support.fork_server", str(theirs.fileno())],
                 cwd=os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))),
                 env=clean_environment(tempfile.gettempdir()),
+                stdin=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
                 start_new_session=True,
             )

@@ -63,6 +63,18 @@ def start_talk(words: Sequence[str], env: Mapping[str, str], stdin: int = subpro
     )
 
 
+def run_talk(words: Sequence[str], env: Mapping[str, str], timeout: float) -> tuple[int, str, str]:
+    """Run `talk` to its end; return its exit code and what it wrote. One that takes longer is killed."""
+    process = start_talk(words, env)
+    try:
+        out, err = process.communicate(timeout=timeout)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        raise
+    return process.wait(), out, err
+
+
 class Talk:
     """A server, started, greeted and watched from before its first goal; `stop()` ends it and asserts that all is well.
 
@@ -225,14 +237,17 @@ class Talk:
         """Let a frozen server go on (SIGCONT)."""
         os.kill(self.pid, signal.SIGCONT)
 
-    def kill(self, gone_within: float = 2.0) -> None:
-        """Kill the server outright and assert that nothing of it is left; goals then have no end on the wire."""
+    def kill(self) -> float:
+        """Kill the server outright; return the seconds until nothing of it is left. Its goals have no end then."""
         assert self._server
+        killed = time.monotonic()
         self._server.kill()
         self._server.wait()
         self.unfinished = True
-        assert_none_left(self._mark, gone_within)
+        assert_none_left(self._mark, 2.0)
+        gone = time.monotonic() - killed
         self.check()
+        return gone
 
     def stop(self, *, timeout: float = STOP_LIMIT, gone_within: float = 2.0) -> None:
         """End the server by SIGTERM; assert exit 0, its socket gone, no process left, and what the watcher saw."""

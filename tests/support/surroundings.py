@@ -75,7 +75,7 @@ def dying_with_parent(command: list[str]) -> list[str]:
     if sys.platform != "linux":
         return command
     needs("setpriv")
-    return ["setpriv", "--pdeathsig", "KILL", "--", *command]
+    return [shutil.which("setpriv") or "setpriv", "--pdeathsig", "KILL", "--", *command]
 
 
 def marked(mark: str) -> list[int]:

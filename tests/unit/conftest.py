@@ -1,6 +1,6 @@
 """Settings of the unit tests: no deadline for one example, and in CI the same examples each time.
 
-`HYPOTHESIS_PROFILE=deep pytest tests/unit` looks longer than every run can afford.
+`HYPOTHESIS_PROFILE=deep pytest -m '' tests/unit` looks longer than every run can afford.
 """
 
 from __future__ import annotations
