@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tests.conformance.hearing import QUICK
 from tests.support.compare import assert_begun, assert_heard, assert_silent, extent
 from tests.support.espeak import _Callback, load
 from tests.support.recording import LOUD
@@ -52,7 +53,7 @@ _RATE = 1
 
 
 def assert_heard_after_stop(
-    heard: Recording | Samples, stopped: str, following: Sequence[str], *, begun: bool = True, rate: int = 200
+    heard: Recording | Samples, stopped: str, following: Sequence[str], *, begun: bool = True, rate: int = QUICK
 ) -> list[Comparison]:
     """Assert that a beginning of a fresh engine's first sentence was heard, then the following ones whole.
 

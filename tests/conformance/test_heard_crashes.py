@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
@@ -42,9 +41,6 @@ if TYPE_CHECKING:
 #: Seconds that a text takes at most which is spelled instead of crashing the library.
 SPELLED = 90
 CRASHING = {"initials": "a." * 85, "abbreviations": "e.g. " * 60, "address": "http://" + "x." * 100}
-
-
-assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
 
 
 @pytest.fixture
@@ -144,7 +140,7 @@ def test_a_killed_player_aborts_its_goal_and_no_other(talk: Talk) -> None:
     assert ended["spoken"] != LONG
     assert talk.run("say", "--wait", "--", LOW).code == 0
     assert engine_process(talk) == engine
-    assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
 
 
 def test_a_frozen_engine_is_replaced_within_six_seconds(talk: Talk, sink: Sink) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -38,8 +37,6 @@ if TYPE_CHECKING:
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 STOPPED = ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
 NEVER = "never to be heard"
-
-assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
 
 
 @pytest.fixture
@@ -154,7 +151,7 @@ def test_row_38_a_first_one_that_was_aborted_throttles_nothing(talk: Talk) -> No
     assert_aborted(talk.goal(first), "audio_lost")
     second = send(talk, LOW, key="battery", throttle=60)
     end(talk, second)
-    assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
 
 
 def test_row_38_without_a_key_the_text_is_what_counts(talk: Talk) -> None:
@@ -210,7 +207,7 @@ def test_row_40_the_same_priority_interrupts(talk: Talk) -> None:
     newcomer = send(talk, LOW, preempt=True, priority=5)
     end(talk, newcomer)
     assert talk.watcher.states(long) == STOPPED
-    assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
 
 
 def test_flush_is_heard_alone(talk: Talk) -> None:
@@ -221,7 +218,7 @@ def test_flush_is_heard_alone(talk: Talk) -> None:
         assert_recalled(talk, each, "preempted", by=newcomer)
     end(talk, newcomer)
     assert talk.watcher.states(long) == STOPPED
-    assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
 
 
 # -- settings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from tests.conformance.hearing import (
     LONG,
     LOW,
     PRECISION,
-    QUICK,
     await_word,
     begin,
     heard,
@@ -47,8 +45,6 @@ SILENT = 0.15
 TWICE = 0.05
 #: Samples that the monitor may lose where a stream starts.
 SLACK = 256
-
-assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
 
 
 @pytest.fixture
@@ -163,7 +159,7 @@ def test_row_43_a_held_goal_is_cancelled_and_is_never_heard_again(talk: Talk, se
     assert_silent_since(talk, time.monotonic(), 0.3)
     resume(talk)
     assert talk.watcher.wait_for_terminal(after) == "SUCCEEDED"
-    assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
 
 
 def test_row_43_the_cancel_of_a_held_goal_is_answered_in_time(talk: Talk) -> None:
@@ -220,7 +216,7 @@ def test_row_43_a_goal_that_preempts_ends_the_held_one_and_waits(talk: Talk, how
     assert talk.goal(newcomer)["state"] == "PENDING"
     resume(talk)
     assert talk.watcher.wait_for_terminal(newcomer) == "SUCCEEDED"
-    assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
     assert_told_in_order(talk)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
@@ -39,9 +38,6 @@ ABORTED = ["PENDING", "ACTIVE", "ABORTED"]
 NO_CARD = "pcm.!default { type hw card 31 }\nctl.!default { type hw card 31 }\n"
 
 
-assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
-
-
 @pytest.fixture(scope="module")
 def broken() -> Iterator[list[Sink]]:
     """Sound servers that tests of this module have broken and brought back."""
@@ -73,7 +69,7 @@ def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
     assert aplay
     (tmp_path / "aplay").symlink_to(aplay)
     assert talk.run("say", "--wait", "--", HOME).code == 0
-    assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False)
+    stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False)
 
 
 def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
@@ -91,7 +87,7 @@ def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
         assert goal["spoken"] == ""
         shutil.copy(os.path.join(sink.directory, ".asoundrc"), configuration)
         assert talk.run("say", "--wait", "--", HOME).code == 0
-        assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False)
+        stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False)
         assert_within(done.seconds, 1, "`say --wait` without a device")
 
 
@@ -159,7 +155,7 @@ def test_row_41_a_sink_that_takes_no_sound_in_mid_sentence(
         assert goal["spoken"] != LONG
         assert talk.run("say", "--wait", "--", HOME).code == 0
         # What the sound server had when it was frozen is heard when it goes on, so all of it is looked at here.
-        assert_heard_after_stop(heard(talk), LONG, [HOME])
+        stopped.assert_heard_after_stop(heard(talk), LONG, [HOME])
         # 3 s after it took something the last time, which the engine sees within a tenth; and the end of the client.
         assert_within(ended - held, 3.3, "the end of a goal whose sink takes no sound")
 
@@ -185,4 +181,4 @@ def _heard_again(talk: Talk, sink: Sink, failed: str) -> None:
     """Assert that the next goal is heard whole, after the first one of a server failed."""
     with sink.record() as recording:
         assert talk.run("say", "--wait", "--", HOME).code == 0
-    assert_heard_after_stop(recording, failed, [HOME], begun=False)
+    stopped.assert_heard_after_stop(recording, failed, [HOME], begun=False)

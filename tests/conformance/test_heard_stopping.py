@@ -16,7 +16,6 @@ from tests.conformance.hearing import (
     LONG,
     LOW,
     PRECISION,
-    QUICK,
     await_word,
     begin,
     begin_with_client,
@@ -36,9 +35,6 @@ if TYPE_CHECKING:
 
 STOPPED = ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
-
-
-assert_heard_after_stop = partial(stopped.assert_heard_after_stop, rate=QUICK)
 
 
 @pytest.fixture
@@ -118,7 +114,7 @@ def test_row_24_a_newcomer_is_heard_when_the_one_before_it_is_silent(make_talk: 
     assert silent["n"] < talk.watcher.wait_for(second.id, "ACTIVE")["n"]
     ended = talk.goal(goal)
     assert (ended["reason"], ended["by"]) == ("preempted", {"goal": second.id})
-    assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
 
 
 def test_row_25_a_goal_that_preempts_goes_before_those_that_wait(talk: Talk) -> None:
@@ -129,7 +125,7 @@ def test_row_25_a_goal_that_preempts_goes_before_those_that_wait(talk: Talk) -> 
     assert talk.run("wait", *waiting).code == 0
     assert talk.watcher.states(first) == STOPPED
     assert all(talk.watcher.states(each) == SPOKEN for each in waiting)
-    assert_heard_after_stop(heard(talk), LONG, [HELP, LOW, HOME])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [HELP, LOW, HOME])
 
 
 @pytest.mark.parametrize("selection", [[], ["--current"]])
@@ -142,7 +138,7 @@ def test_row_27_a_goal_is_cancelled_without_preempt(talk: Talk, selection: list[
     assert "Talk preempted" in done.err
     assert talk.watcher.states(goal) == STOPPED
     assert talk.run("say", "--wait", "--", LOW).code == 0
-    assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
 
 
 def _has_goals(talk: Talk, number: int, _: Message) -> bool:

@@ -94,12 +94,9 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
             with self._changed:
                 self._taps.remove(recording)
 
-    def play(self, samples: npt.NDArray[np.int16], player: str = "aplay") -> None:
-        """Play samples to their end with `aplay` or `pacat`."""
-        command = {
-            "aplay": ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-r", str(RATE), "-c", "1", "-"],
-            "pacat": ["pacat", "--raw", "--format=s16le", f"--rate={RATE}", "--channels=1", "--latency-msec=30"],
-        }[player]
+    def play(self, samples: npt.NDArray[np.int16]) -> None:
+        """Play samples to their end."""
+        command = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-r", str(RATE), "-c", "1", "-"]
         subprocess.run(command, env=self._child(), input=samples.tobytes(), check=True, timeout=60)
 
     def suspend(self) -> None:
