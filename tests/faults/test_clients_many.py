@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -219,6 +220,16 @@ def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_t
     assert talk.watcher.wait_for_terminal(goal) == "PREEMPTED"
 
 
+@pytest.fixture
+def many_files() -> Iterator[None]:
+    """Let the tests open more files than a backlog has places: a user's limit is often as low as that."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.usefixtures("many_files")
 @pytest.mark.parametrize(
     "commands",
     [
