@@ -9,12 +9,14 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 from typing import TYPE_CHECKING
 
 import click
 import pytest
 
 import talkcli
+from talkcli.server import listener
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support import processes
 from tests.support.connection import Wire
@@ -111,6 +113,25 @@ def test_what_is_left_in_the_place_of_socket_and_lock_is_no_obstacle(home: str) 
         with serving(environment(home), "--socket", path) as server, Wire(path) as wire:
             assert wire.greeting["pid"] == server.process.pid
         assert not os.path.exists(path)
+
+
+def test_second_server_names_the_one_that_serves_and_never_the_one_before_it(home: str) -> None:
+    """The lock still has the number of a server that is gone when the next one has taken it and not yet written."""
+    with subprocess.Popen(["true"]) as gone:
+        gone.wait()
+    path = f"{home}/lock"
+    with open(path, "w+b", buffering=0) as lock:
+        lock.write(f"{gone.pid}\n".encode())
+        found: list[int | None] = []
+        reader = threading.Thread(target=lambda: found.append(listener._holder(lock.fileno())))
+        reader.start()
+        reader.join(0.1)
+        assert reader.is_alive(), f"it named {found}, which has ended"
+        lock.seek(0)
+        lock.truncate()
+        lock.write(f"{os.getpid()}\n".encode())
+        reader.join()
+    assert found == [os.getpid()]
 
 
 def test_socket_that_somebody_else_put_in_its_place_is_not_removed(home: str) -> None:

@@ -234,12 +234,25 @@ def _is_named(fd: int, name: str) -> bool:
     return _identity(name) == (status.st_dev, status.st_ino)
 
 
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass  # another user's
+    return True
+
+
 def _holder(fd: int) -> int | None:
-    """Return the process id that the holder wrote, which it may be about to; None if it doesn't."""
+    """Return the process id that the holder wrote, which it may be about to; None if it doesn't.
+
+    What is there until then may be the number of a server before it, which is gone.
+    """
     end = time.monotonic() + _LOCK_NAMES_HOLDER
     while True:
         words = os.pread(fd, 32, 0).decode(errors="replace")
-        if words.endswith("\n") and words.strip().isdecimal():
+        if words.endswith("\n") and words.strip().isdecimal() and _lives(int(words)):
             return int(words)
         if time.monotonic() > end:
             return None
