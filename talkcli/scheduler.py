@@ -3,8 +3,8 @@
 Pure: a request, an engine event or the time goes in, effects come out; no thread, socket or clock inside. A method
 either does all of its step or raises and has changed nothing. Effects are to be carried out in their order.
 
-What holds after every step: at most one goal is ACTIVE or PREEMPTING, and none starts before that one has ended, or
-while speech is paused; a goal ends once; the order in which goals wait is `pending`'s.
+What holds after every step: at most one goal is ACTIVE or PREEMPTING, and none starts before that one has ended, while
+speech is paused, or while there is no engine; a goal ends once; the order in which goals wait is `pending`'s.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ class Scheduler:
         self.active: Record | None = None
         #: whether nothing is to be spoken until `resume`
         self.paused = False
+        #: whether there is an engine to start the next goal; without one they wait
+        self.has_engine = True
         self._pending = Pending()
         self._by_id: dict[str, Record] = {}
         self._said = Said()
@@ -173,6 +175,26 @@ class Scheduler:
         return [Resume(self.active)]
 
     # -- what the engine says
+
+    def engine_lost(self) -> None:
+        """Start no goal until there is an engine again."""
+        self.has_engine = False
+
+    def engine_ready(self, now: Now) -> list[Effect]:
+        """Go on: there is an engine that takes the next goal."""
+        self.has_engine = True
+        return self._start_next(now)
+
+    def engine_missing(self, words: str, now: Now) -> list[Effect]:
+        """End the goal whose turn it is: an engine was waited for long enough, and once more none came."""
+        if self.active or self.paused or self.has_engine:
+            return []
+        effects = self._expire(now)
+        record = self._pending.first()
+        if record is None:
+            return effects
+        effects.append(self._activate(record, now))
+        return effects + self.failed(record.id, "engine_failed", words, None, now)
 
     def heard(self, goal_id: str, end: int) -> Record:
         """Note that the word that ends at this offset of the text is being heard."""
@@ -296,17 +318,20 @@ class Scheduler:
         return self.active.stop_since + SILENCE_LIMIT
 
     def _start_next(self, now: Now) -> list[Effect]:
-        if self.active or self.paused:
+        if self.active or self.paused or not self.has_engine:
             return []
         effects = self._expire(now)
         record = self._pending.first()
         if record is None:
             return effects
+        return [*effects, self._activate(record, now), Start(record)]
+
+    def _activate(self, record: Record, now: Now) -> Changed:
         record.become(State.ACTIVE)
         self._pending.remove(record)
         record.started_at, record.began = now.wall, now.monotonic
         self.active = record
-        return [*effects, Changed(record, State.ACTIVE), Start(record)]
+        return Changed(record, State.ACTIVE)
 
     def _recall(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
         self._pending.remove(record)

@@ -38,6 +38,9 @@ def ended(command: Callable[[], object], options: Common) -> int:
     except (OutputClosed, BrokenPipeError):
         _give_up_output()
         return EXIT_SIGPIPE
+    except MemoryError:
+        note(_without_memory())
+        return EXIT_ERROR
     except Exception as error:
         if isinstance(error, OSError) and error.errno in _OUTPUT_FULL:
             _give_up_output()
@@ -48,6 +51,12 @@ def ended(command: Callable[[], object], options: Common) -> int:
         note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
         return EXIT_ERROR
     return code if isinstance(code, int) else 0
+
+
+def _without_memory() -> str:
+    from talkcli import resources
+
+    return f"there is not enough memory for talk: {resources.limits()}"
 
 
 def _give_up_output() -> None:

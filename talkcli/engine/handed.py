@@ -17,6 +17,10 @@ class Handed:
     say: Say
     #: when the process last gave a sign of life for it; None while it waits for a process
     heard_at: float | None = None
+    #: whether the process said that it has begun with it
+    started: bool = False
+    #: whether a process that had it died before it began with it
+    again: bool = False
     #: when the process was told to stop it
     stop_at: float | None = None
     #: the number of the pause that it is to be held for, by the process that speaks it, else by the thread

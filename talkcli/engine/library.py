@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import os
 
 from talkcli.values import frozen
@@ -28,7 +29,7 @@ _DONT_EXIT = 0x8000
 
 
 class LibraryMissing(Exception):
-    """The library or its data is not there; the text names what to install."""
+    """The library or its data is not there; the text names what to install. It stays so until somebody does."""
 
 
 @frozen
@@ -44,7 +45,7 @@ class Library:
 
 
 def load() -> Library:
-    """Load and initialise the library, once a process; LibraryMissing if that is impossible."""
+    """Load and initialise the library, once a process; LibraryMissing, or OSError where it may be loaded later."""
     origin, data = _preload()
     from pyttsx3.drivers import _espeak
 
@@ -79,6 +80,8 @@ def _preload() -> tuple[str, bytes | None]:
     try:
         ctypes.CDLL(_LIBRARY)
     except OSError as missing:
+        if _passes(missing):
+            raise
         return _preload_wheel(missing)
     return "system", None
 
@@ -90,6 +93,16 @@ def _preload_wheel(missing: OSError) -> tuple[str, bytes]:
         # Global, as the binding asks for the name that the system's library would have, and gets the one that is there.
         ctypes.CDLL(espeakng_loader.get_library_path(), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError) as error:
+        if _passes(error):
+            raise
         text = "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader"
         raise LibraryMissing(f"{text} ({missing})") from error
     return "espeakng-loader", str(espeakng_loader.get_data_path()).encode()
+
+
+def _passes(error: Exception) -> bool:
+    """Tell whether a library that is there could not be loaded for want of memory or descriptors.
+
+    The loader has but words for it, which end in the system's.
+    """
+    return str(error).endswith(tuple(map(os.strerror, (errno.EMFILE, errno.ENFILE, errno.ENOMEM))))

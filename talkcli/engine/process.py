@@ -65,7 +65,7 @@ def _serve(channel: Channel, configure: protocol.Configure) -> None:
     try:
         started = start(configure.driver, configure.voice, outlet, session.wait, session.hold)
     except CannotStart as error:
-        channel.send(protocol.StartFailed(error.reason, str(error)))
+        channel.send(protocol.StartFailed(error.reason, str(error), error.lasting, error.usage))
         return
     session.open(started.engine, started.settings, started.pump)
     own = started.pump is None

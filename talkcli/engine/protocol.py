@@ -131,6 +131,8 @@ class StartFailed:
     kind: ClassVar[str] = "start_failed"
     reason: str  # "engine_failed" or "unknown_voice"
     message: str  # names what is missing and what to install
+    lasting: bool = True  # whether the next start will fail for it, too, if nobody changes something
+    usage: bool = False  # whether it was asked for by an option, and can't be had
 
 
 @frozen

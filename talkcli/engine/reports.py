@@ -14,6 +14,13 @@ class EngineDied:
 
 
 @frozen
+class EngineMissing:
+    """There has been no ready engine process for long, and one more start failed: the next goal ends for it."""
+
+    words: str
+
+
+@frozen
 class EngineSaid:
     """A line that the engine process wrote to standard error; for the log. It may hold what a goal's text says."""
 
@@ -27,4 +34,4 @@ class ThreadDied:
     words: str
 
 
-Report = protocol.Event | EngineDied | EngineSaid | ThreadDied
+Report = protocol.Event | EngineDied | EngineMissing | EngineSaid | ThreadDied

@@ -54,8 +54,8 @@ class EngineProcess:
     ) -> None:
         """`on_stderr` is called with what is read of its standard error, empty at the end."""
         self.ready = False
-        #: whether the process said itself why it cannot start
-        self.explained = False
+        #: what the process said itself of why it cannot start
+        self.failed: protocol.StartFailed | None = None
         # Held for a send that doesn't wait: the descriptor must not be closed, and be another's, in the middle of one.
         self._sending = threading.Lock()
         self._lines = LineSplitter(limit=None)

@@ -22,17 +22,23 @@ if TYPE_CHECKING:
 #: The drivers of macOS that speak in Apple's run loop, which somebody has to run.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
 
-
 #: What `talk`'s own driver is called by users: it stands in for pyttsx3's driver of that name.
 _OWN_NAME = "espeak"
 
 
 class CannotStart(Exception):
-    """The engine cannot start: `reason` is for programs, the text names what to install or to change."""
+    """The engine cannot start: `reason` is for programs, the text names what to install or to change.
 
-    def __init__(self, message: str, reason: str = "engine_failed") -> None:
+    `lasting` and `usage` as in `protocol.StartFailed`.
+    """
+
+    def __init__(
+        self, message: str, reason: str = "engine_failed", *, lasting: bool = True, usage: bool = False
+    ) -> None:
         super().__init__(message)
         self.reason = reason
+        self.lasting = lasting
+        self.usage = usage
 
 
 @frozen
@@ -51,7 +57,7 @@ def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait, hol
     """Build the engine, with its loop started; CannotStart."""
     try:
         import pyttsx3
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise CannotStart(f"pyttsx3 is missing: pip install pyttsx3 ({error})") from error
     own = is_own(driver)
     version = _register_own(outlet, wait, hold) if own else None
@@ -64,7 +70,8 @@ def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait, hol
     try:
         settings.set_voice(voice)
     except SettingFailed as error:
-        raise CannotStart(str(error), error.reason) from error
+        unknown = error.reason == "unknown_voice"
+        raise CannotStart(str(error), error.reason, lasting=unknown, usage=unknown) from error
     shown = _OWN_NAME if own else name
     return OpenEngine(engine, settings, shown, version, None if own else _pump(name))
 
@@ -91,10 +98,12 @@ def _init(pyttsx3: Any, name: str) -> Any:
         return pyttsx3.init(name)
     except ModuleNotFoundError as error:
         if error.name == f"pyttsx3.drivers.{name}":
-            raise CannotStart(f'unknown driver "{name}": there are {", ".join(_driver_names(pyttsx3))}') from error
-        raise CannotStart(f'the driver "{name}" cannot be loaded: {error}') from error
+            words = f'unknown driver "{name}": there are {", ".join(_driver_names(pyttsx3))}'
+            raise CannotStart(words, usage=True) from error
+        raise CannotStart(f'the driver "{name}" cannot be loaded: {error}', usage=True) from error
     except Exception as error:
-        raise CannotStart(f'the driver "{name}" cannot be started: {type(error).__name__}: {error}') from error
+        words = f'the driver "{name}" cannot be started: {type(error).__name__}: {error}'
+        raise CannotStart(words, lasting=False) from error
 
 
 def _start_loop(engine: Any, name: str) -> None:
@@ -104,7 +113,7 @@ def _start_loop(engine: Any, name: str) -> None:
         engine.iterate()
     except TypeError as error:
         text = f'the driver "{name}" cannot be stepped (its iterate() is no generator)'
-        raise CannotStart(f"{text}: leave --driver out") from error
+        raise CannotStart(f"{text}: leave --driver out", usage=True) from error
 
 
 def _driver_names(pyttsx3: Any) -> list[str]:

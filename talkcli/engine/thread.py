@@ -17,7 +17,7 @@ from talkcli.engine.handed import Handed
 from talkcli.engine.inbox import NEVER, Inbox
 from talkcli.engine.limits import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
 from talkcli.engine.murmur import Murmur
-from talkcli.engine.reports import EngineDied, EngineSaid, ThreadDied
+from talkcli.engine.reports import EngineDied, EngineMissing, EngineSaid, ThreadDied
 from talkcli.engine.restarts import Restarts
 from talkcli.values import replace
 
@@ -41,7 +41,7 @@ class EngineThread:
         #: the process that takes the next goal, from whichever thread; None where only this thread may decide
         self._open: spawn.EngineProcess | None = None
         self._started_at = 0.0
-        self._restarts = Restarts()
+        self._restarts = Restarts(time.monotonic())
         self._goal: Handed | None = None
         self._dying = Dying()
         self._murmur = Murmur()
@@ -68,7 +68,7 @@ class EngineThread:
             return
         self._inbox.leave(lambda: self._take(goal, process, now), by=now + HANG_AFTER)
         if not process.send(goal):
-            self._inbox.call(lambda: self._refused(process))
+            self._inbox.call(lambda: self._not_taken(goal.id, process))
 
     def stop(self, goal_id: str) -> None:
         """Make the goal end, silent."""
@@ -170,16 +170,25 @@ class EngineThread:
         else:
             self._hand_over()
 
+    def _not_taken(self, goal_id: str, process: spawn.EngineProcess) -> None:
+        """Let a goal wait for the next process: this one doesn't have it."""
+        if process is self._process:
+            if self._goal and self._goal.id == goal_id:
+                self._goal.heard_at = None
+            self._refused(process)
+
     def _refused(self, process: spawn.EngineProcess) -> None:
+        self._hear(process)  # where it is dead, it is known how it died
         if process is self._process:
             self._lose_process("the engine takes no commands", "engine_hung")
 
     def _hand_over(self) -> None:
-        goal = self._goal
+        goal, process = self._goal, self._process
         waits = goal and not (goal.spoken or goal.pause or goal.verdict)
-        if goal and waits and self._process and self._process.ready:
+        if goal and waits and process and process.ready:
             goal.heard_at = time.monotonic()
-            self._tell(goal.say)
+            if not process.send(goal.say):
+                self._not_taken(goal.id, process)
 
     def _tell(self, command: protocol.Command) -> None:
         if self._process and not self._process.send(command):
@@ -233,7 +242,9 @@ class EngineThread:
         try:
             process = spawn.EngineProcess(spawn.engine_command(), self._configure, self._murmured)
         except OSError as error:
-            self._start_failed(f"the engine process cannot be started: {error}", explained=True)
+            words = f"the engine process cannot be started: {error}"
+            self._post(EngineDied(words))
+            self._start_failed(words)
             return
         self._process = process
         for fd in (process.socket.fileno(), process.liveness, process.stderr):
@@ -263,7 +274,9 @@ class EngineThread:
             if goal is None or not goal.spoken or event.id != goal.id:
                 return  # of a goal that has ended already
             goal.heard_at = time.monotonic()
-            if isinstance(event, protocol.Ended):
+            if isinstance(event, protocol.Started):
+                goal.started = True
+            elif isinstance(event, protocol.Ended):
                 self._finish(event)
             elif isinstance(event, protocol.Word):
                 self._post(event)
@@ -273,11 +286,10 @@ class EngineThread:
             return
         if isinstance(event, protocol.Ready):
             process.ready = True
-            self._restarts.error = None
+            self._restarts.ready()
             self._open = process
         elif isinstance(event, protocol.StartFailed):
-            self._restarts.error = event.message
-            process.explained = True
+            process.failed = event
         elif isinstance(event, protocol.Voices):
             self._configure = replace(self._configure, list_voices=False)  # the next process need not
         self._post(event)
@@ -295,23 +307,40 @@ class EngineThread:
         goal = self._goal
         had_goal = goal is not None and goal.spoken
         if goal and had_goal:
-            failed = protocol.Ended(goal.id, protocol.FAILED, reason, words)
-            goal.verdict = failed if goal.stop_at is None else protocol.Ended(goal.id, protocol.STOPPED)
-            goal.verdict_on = process
-            goal.heard_at = goal.stop_at = goal.pause_at = None
-        if not (self._closing or process.explained):
+            self._take_back(goal, process, words, reason)
+        if not (self._closing or process.failed):
             self._post(EngineDied(words))
         if process.ready:
             self._restarts.died(now, age=now - self._started_at, had_goal=had_goal)
+        elif process.failed:
+            self._start_failed(process.failed.message, lasting=process.failed.lasting)
         else:
-            explained = self._restarts.error if process.explained else None
-            self._start_failed(explained or words, explained=process.explained)
+            self._start_failed(words)
 
-    def _start_failed(self, words: str, *, explained: bool) -> None:
-        """Plan another start; where goals need not wait for it, the one in hand doesn't either."""
-        self._restarts.failed(time.monotonic(), words, explained=explained)
-        if self._restarts.error is not None and self._goal and not self._goal.verdict:
-            self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "engine_failed", self._restarts.error))
+    def _take_back(self, goal: Handed, process: spawn.EngineProcess, words: str, reason: str) -> None:
+        """Decide what becomes of a goal whose process is lost.
+
+        One that died before it began with the goal, so that nothing of it was heard, leaves it to the next; not twice.
+        """
+        if reason == "engine_crashed" and goal.stop_at is None and not (goal.started or goal.again):
+            goal.again = True
+            if goal.pause is not None:
+                self._post(protocol.Paused(goal.id, goal.pause))
+        else:
+            failed = protocol.Ended(goal.id, protocol.FAILED, reason, words)
+            goal.verdict = failed if goal.stop_at is None else protocol.Ended(goal.id, protocol.STOPPED)
+            goal.verdict_on = process
+        goal.heard_at = goal.stop_at = goal.pause_at = None
+
+    def _start_failed(self, words: str, *, lasting: bool = False) -> None:
+        """Plan another start; where the one in hand need not wait for it, it ends."""
+        costs_a_goal = self._restarts.failed(time.monotonic(), self._started_at, words if lasting else None)
+        waits = self._goal if self._goal and not self._goal.verdict else None
+        if waits and (costs_a_goal or self._restarts.error is not None):
+            why = self._restarts.error or words
+            self._finish(protocol.Ended(waits.id, protocol.FAILED, "engine_failed", why))
+        elif costs_a_goal:
+            self._post(EngineMissing(words))
 
     def _bury(self, process: spawn.EngineProcess) -> None:
         """Process and player are gone: what was being spoken is silent."""

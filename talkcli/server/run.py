@@ -11,9 +11,10 @@ import signal
 import string
 from typing import TYPE_CHECKING
 
+from talkcli import resources
 from talkcli.engine import protocol
 from talkcli.engine.thread import EngineThread
-from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse
+from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
 from talkcli.messages import Sender
 from talkcli.requests import Say
 from talkcli.server import log
@@ -61,6 +62,10 @@ class _Server:
         self._service: Service
         self._supervisor: Supervisor
         self._acceptor: Acceptor
+        self._ended_by = [signal.SIGTERM]
+        # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
+        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+            self._ended_by.append(signal.SIGINT)
 
     async def run(self) -> None:
         loop = asyncio.get_running_loop()
@@ -72,23 +77,25 @@ class _Server:
         acceptor = self._acceptor = Acceptor(loop, lambda each: Connection(service, loop, each).begin(), service.failed)
         upkeep = Upkeep(loop, self._listener, self._moved, self._lost)
         loop.set_exception_handler(self._on_bug)
-        for number in (signal.SIGTERM, signal.SIGINT):
-            # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
-            if signal.getsignal(number) != signal.SIG_IGN:
-                loop.add_signal_handler(number, self._on_signal, number)
+        for number in self._ended_by:
+            loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the voice along
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # whoever started this may have had some of them blocked
         service.engine = EngineThread(
             protocol.Configure(
                 os.getpid(), settings.driver, settings.player, settings.device, settings.voice, settings.lead_in
             ),
             service.report,
         )
-        service.engine.start()
+        self._start(service.engine)
         try:
             acceptor.open(self._listener.socket)
             upkeep.begin()
-            supervisor.ready()
-            log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
+            if settings.voice or settings.driver:
+                await service.engine_known.wait()  # who asked for what can't be had is told so, and nothing else
+            if not service.fatal:
+                supervisor.ready()
+                log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
                 service.apply(service.scheduler.submit(Say(settings.greeting), _self(), service.now()).effects)
             await service.finished.wait()
@@ -98,10 +105,17 @@ class _Server:
             await self._say_goodbye()
         finally:
             service.engine.close()
-            await asyncio.to_thread(service.engine.join, _ENGINE_GOODBYE)
+            service.engine.join(_ENGINE_GOODBYE)
             supervisor.close()
         if service.fatal:
             raise service.fatal
+
+    @staticmethod
+    def _start(engine: EngineThread) -> None:
+        try:
+            engine.start()
+        except RuntimeError as error:  # all that Python says of a thread that it can't have
+            raise TalkError(f"the engine's thread cannot be started: {resources.limits()}") from error
 
     def _moved(self, former: socket.socket | None) -> None:
         """Take up connections where the listener is now; those that there are live on."""
@@ -128,10 +142,9 @@ class _Server:
 
     def _on_signal(self, number: signal.Signals) -> None:
         log.line(f"{signal.Signals(number).name}: ending")
-        for each in (signal.SIGTERM, signal.SIGINT):
-            if signal.getsignal(each) != signal.SIG_IGN:
-                # Not by the loop, which may have a long turn to finish: whoever asks twice wants no goodbye.
-                signal.signal(each, self._on_second_signal)
+        for each in self._ended_by:
+            # Not by the loop, which may have a long turn to finish: whoever asks twice wants no goodbye.
+            signal.signal(each, self._on_second_signal)
         self._supervisor.stopping()
         self._service.shut_down()
 

@@ -16,7 +16,7 @@ from talkcli import __version__, peers, wire
 from talkcli.admission import DEFAULT_VOICE
 from talkcli.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
 from talkcli.engine import protocol
-from talkcli.engine.reports import EngineDied, EngineSaid, Report, ThreadDied
+from talkcli.engine.reports import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.engine.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.messages import Sender
@@ -31,6 +31,7 @@ from talkcli.server.stream import Turn
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from typing import Any
 
     from talkcli.engine.thread import EngineThread
     from talkcli.messages import JsonObject
@@ -63,6 +64,7 @@ class Service:
             max_text=settings.max_text,
             ttl=settings.ttl,
         )
+        self.scheduler.engine_lost()  # none is ready yet
         self.connections: set[Connection] = set()
         #: set once everything has ended after `shut_down`
         self.finished = asyncio.Event()
@@ -75,6 +77,8 @@ class Service:
         self.voices: tuple[protocol.Voice, ...] | None = None
         #: how the engine is, in a few words
         self.engine_words = "starting"
+        #: set once the first engine process is ready, or has failed
+        self.engine_known = asyncio.Event()
         self.began = self._now()
         self._loop = asyncio.get_running_loop()
         self.audience = Audience(self._loop)
@@ -85,6 +89,18 @@ class Service:
         #: when the goals that were handed to the engine began, until their end is told: one, or for a moment two
         self._started: dict[str, float] = {}
         self._mailbox = Mailbox(self._loop, self._note, self.failed)
+        self._takes: dict[type[Report], Callable[[Any], None]] = {
+            protocol.Ready: self._ready,
+            protocol.StartFailed: self._start_failed,
+            protocol.Voices: self._voices_known,
+            protocol.Word: self._word,
+            protocol.Paused: lambda paused: self._answers.pauses.silent(paused.id, paused.number),
+            protocol.Ended: self._ended,
+            EngineSaid: lambda said: log.line(f"engine: {log.shown(said.words)}"),
+            EngineDied: self._died,
+            EngineMissing: self._missing,
+            ThreadDied: self._thread_died,
+        }
         self.turn = Turn(self._loop)
         #: whether the engine was told that a goal waits behind the one it has in hand
         self._followed = False
@@ -254,25 +270,20 @@ class Service:
         self._mailbox.post(report)
 
     def _note(self, report: Report) -> None:
-        if isinstance(report, protocol.Ended):
-            self._ended(report)
-        elif isinstance(report, protocol.Word):
-            self._word(report)
-        elif isinstance(report, protocol.Paused):
-            self._answers.pauses.silent(report.id, report.number)
-        elif isinstance(report, protocol.Voices):
-            self.voices = report.voices
-            self.later.voices_known()
-        elif isinstance(report, protocol.Ready):
-            self._ready(report)
-        elif isinstance(report, protocol.StartFailed):
-            self._start_failed(report)
-        elif isinstance(report, EngineDied):
-            self._engine_fails(report.words)
-        elif isinstance(report, EngineSaid):
-            log.line(f"engine: {log.shown(report.words)}")
-        elif isinstance(report, ThreadDied):
-            self._thread_died(report.words)
+        take = self._takes.get(type(report))
+        if take:  # what else the process says is for the engine thread alone
+            take(report)
+
+    def _voices_known(self, voices: protocol.Voices) -> None:
+        self.voices = voices.voices
+        self.later.voices_known()
+
+    def _died(self, died: EngineDied) -> None:
+        self.scheduler.engine_lost()
+        self._engine_fails(died.words)
+
+    def _missing(self, missing: EngineMissing) -> None:
+        self.apply(self.scheduler.engine_missing(missing.words, self.now()))
 
     def _ready(self, ready: protocol.Ready) -> None:
         if self.ready != ready:
@@ -281,23 +292,30 @@ class Service:
             hint = f": {unused} mean nothing to it" if unused else ""
             log.line(f"engine ready: driver {ready.driver}{version}, player {ready.player or 'its own'}{hint}")
         self.ready, self.engine_words = ready, "ready"
-        self.changed()
+        self.engine_known.set()
+        self.apply(self.scheduler.engine_ready(self.now()))
 
     def _start_failed(self, failed: protocol.StartFailed) -> None:
-        self._engine_fails(failed.message)
-        if failed.reason == "unknown_voice" and self.ready is None:
+        if failed.usage and self.ready is None:
             self.fatal = UsageError(failed.message)
+            self.engine_known.set()
             self.shut_down()
+            return
+        self._engine_fails(failed.message)
+        if failed.lasting:  # none will come: goals need not wait to be told
+            self.apply(self.scheduler.engine_ready(self.now()))
 
     def _engine_fails(self, words: str) -> None:
         if words != self.engine_words:
             log.line(log.shown(words))
         self.engine_words = words
+        self.engine_known.set()
         self.later.voices_known()
         self.changed()
 
-    def _thread_died(self, words: str) -> None:
+    def _thread_died(self, died: ThreadDied) -> None:
         """End: there is nothing left that could speak, and a supervisor will start another server."""
+        words = died.words
         self._engine_fails(words)
         self.fatal = TalkError(words)
         self.shut_down()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
 from typing import TYPE_CHECKING, cast
@@ -140,15 +141,36 @@ def test_a_goal_that_was_sent_to_a_process_that_is_lost_is_spoken_by_the_next(
     assert not any(isinstance(each, EngineDied) for each in thread.seen)
 
 
-def test_a_process_that_takes_no_goal_is_ended(start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_takes_no_goal_is_ended_and_the_goal_is_the_next_ones(
+    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
+) -> None:
     thread = start()
     thread.until(protocol.Ready)
     process = thread.engine._process
     assert process is not None
     monkeypatch.setattr(process, "send", lambda _: False)
     thread.say("yes")
+    assert thread.until(EngineDied).words == "the engine takes no commands"
+    assert thread.until(protocol.Ended) == protocol.Ended("g1", protocol.COMPLETED, duration=0.1)
+
+
+def test_a_goal_that_is_sent_to_a_process_in_its_death_is_spoken_by_the_next(start: Callable[[], Thread]) -> None:
+    thread = start()
+    thread.until(protocol.Ready)
+    for number in range(20):
+        process = thread.engine._process
+        assert process is not None
+        os.kill(process.pid, signal.SIGKILL)
+        thread.say("length=0.01", f"g{number}")
+        assert thread.until(protocol.Ended) == protocol.Ended(f"g{number}", protocol.COMPLETED, duration=0.01)
+
+
+def test_a_goal_for_which_two_processes_die_before_they_begin_with_it_ends(start: Callable[[], Thread]) -> None:
+    thread = start()
+    thread.say("silent-start length=0 crash")
     ended = thread.until(protocol.Ended)
-    assert (ended.reason, ended.message) == ("engine_hung", "the engine takes no commands")
+    assert (ended.outcome, ended.reason) == (protocol.FAILED, "engine_crashed")
+    assert sum(isinstance(each, EngineDied) for each in thread.seen) == 2
     thread.say("yes", "g2")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
 

@@ -9,47 +9,63 @@ import pytest
 
 from talkcli.engine.dying import Dying
 from talkcli.engine.murmur import LINES, LONGEST, WHILE, Murmur
-from talkcli.engine.restarts import BACK_OFF, SHORT_LIFE, Restarts
+from talkcli.engine.restarts import BACK_OFF, PATIENCE, SHORT_LIFE, Restarts
 
 if TYPE_CHECKING:
     from talkcli.engine.spawn import EngineProcess
 
 
+LACKING = "no library"
+
+
 def test_the_wait_grows_with_each_process_that_never_got_ready() -> None:
-    restarts, now = Restarts(), 100.0
+    restarts, now = Restarts(100.0), 100.0
     for wait in (*BACK_OFF, BACK_OFF[-1], BACK_OFF[-1]):
-        restarts.failed(now, "no library", explained=True)
+        restarts.failed(now, now, LACKING)
         assert restarts.due_at == now + wait
         now = restarts.due_at
 
 
 @pytest.mark.parametrize(("age", "had_goal"), [(SHORT_LIFE / 2, True), (SHORT_LIFE * 2, False)])
 def test_a_process_that_was_of_use_costs_no_wait_and_resets_it(age: float, had_goal: bool) -> None:
-    restarts = Restarts()
+    restarts = Restarts(100.0)
     for _ in range(4):
-        restarts.failed(100.0, "no library", explained=True)
+        restarts.failed(100.0, 100.0, None)
     restarts.died(200.0, age=age, had_goal=had_goal)
     assert restarts.due_at == 200.0
-    restarts.failed(200.0, "no library", explained=True)
+    restarts.failed(200.0, 200.0, None)
     assert restarts.due_at == 200.0 + BACK_OFF[0]
 
 
 def test_a_process_that_dies_as_soon_as_it_is_ready_is_waited_for_longer_and_longer() -> None:
-    restarts = Restarts()
+    restarts = Restarts(100.0)
     for wait in BACK_OFF:
         restarts.died(100.0, age=SHORT_LIFE / 2, had_goal=False)
         assert restarts.due_at == 100.0 + wait
 
 
-def test_only_the_first_start_that_nobody_can_explain_is_no_error_yet() -> None:
-    restarts = Restarts()
-    restarts.failed(100.0, "it was killed", explained=False)
+def test_what_is_known_to_stay_is_an_error_until_a_process_is_ready() -> None:
+    restarts = Restarts(100.0)
+    assert not restarts.failed(100.0, 100.0, LACKING)
+    assert restarts.error == LACKING
+    assert not restarts.failed(100.0 + 2 * PATIENCE, 100.0 + 2 * PATIENCE, None), (
+        "nothing waits: nothing is to be ended"
+    )
+    assert restarts.error == LACKING
+    restarts.ready()
     assert restarts.error is None
-    restarts.failed(100.0, "it was killed again", explained=False)
-    assert restarts.error == "it was killed again"
-    explained = Restarts()
-    explained.failed(100.0, "no library", explained=True)
-    assert explained.error == "no library"
+
+
+def test_a_start_costs_a_goal_only_where_it_began_long_after_there_was_a_process() -> None:
+    restarts = Restarts(100.0)
+    assert not restarts.failed(100.0 + PATIENCE + 5, 100.0 + PATIENCE - 0.1, None)
+    assert restarts.failed(100.0 + PATIENCE, 100.0 + PATIENCE, None)
+    assert restarts.failed(100.0 + PATIENCE + 10, 100.0 + PATIENCE + 10, None)
+    restarts.ready()
+    restarts.died(300.0, age=SHORT_LIFE * 2, had_goal=False)
+    assert not restarts.failed(300.0, 300.0, None)
+    assert restarts.failed(300.0 + PATIENCE, 300.0 + PATIENCE, None)
+    assert restarts.error is None
 
 
 def test_lines_are_passed_on_when_they_are_whole() -> None:

@@ -136,6 +136,22 @@ class SideBySide:
         self.model.tick()
         self.compare(self.real.tick(self.now))
 
+    def engine_lost(self) -> None:
+        self.begin()
+        self.model.engine_lost()
+        self.real.engine_lost()
+        self.compare([])
+
+    def engine_ready(self) -> None:
+        self.begin()
+        self.model.engine_ready()
+        self.compare(self.real.engine_ready(self.now))
+
+    def engine_missing(self) -> None:
+        self.begin()
+        self.model.engine_missing()
+        self.compare(self.real.engine_missing("no memory", self.now))
+
     def engine_says(self, event: str, goal: str, end: int = 1, reason: str = "", duration: float | None = None) -> None:
         self.begin()
         try:

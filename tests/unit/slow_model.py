@@ -38,6 +38,7 @@ class SlowModel:
         self.voice: list[SlowGoal] = []  # being spoken: none or one
         self.early: dict[str, tuple[float, str]] = {}  # cancels of ids to come: when, by whom
         self.paused = False
+        self.engine = True  # whether there is one that takes goals
         self.closed = False
         self.monotonic = 0.0
         self.wall = 0.0
@@ -225,6 +226,22 @@ class SlowModel:
 
     # The engine
 
+    def engine_lost(self) -> None:
+        self.engine = False
+
+    def engine_ready(self) -> None:
+        self.engine = True
+        self.speak_next()
+
+    def engine_missing(self) -> None:
+        """It costs the goal whose turn it would be, and no other."""
+        if self.voice or self.paused or self.engine:
+            return
+        self.recall_what_is_too_late()
+        if self.queue:
+            self.begin_with_the_first()
+            self.end(self.voice[0], "ABORTED", "engine_failed", None)
+
     def heard(self, goal_id: str, end: int) -> None:
         goal = self.spoken(goal_id)
         goal.spoken = max(goal.spoken, end)
@@ -277,15 +294,18 @@ class SlowModel:
 
     def speak_next(self) -> None:
         """Begin with the first that is not too late."""
-        if self.voice or self.paused:
+        if self.voice or self.paused or not self.engine:
             return
         self.recall_what_is_too_late()
         if self.queue:
-            goal, *self.queue = self.queue
-            self.voice = [goal]
-            goal.began_at, goal.times["started"] = self.monotonic, self.wall
-            self.change(goal, "ACTIVE")
-            self.orders.append(("start", goal.id))
+            self.begin_with_the_first()
+            self.orders.append(("start", self.voice[0].id))
+
+    def begin_with_the_first(self) -> None:
+        goal, *self.queue = self.queue
+        self.voice = [goal]
+        goal.began_at, goal.times["started"] = self.monotonic, self.wall
+        self.change(goal, "ACTIVE")
 
     def recall(self, goal: SlowGoal, reason: str, by: str | None) -> None:
         self.end(goal, "RECALLED", reason, by)

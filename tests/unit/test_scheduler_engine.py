@@ -6,6 +6,7 @@ import pytest
 
 from talkcli.effects import GiveUp, Now, Start, Stop
 from talkcli.messages import By
+from talkcli.requests import Say
 from talkcli.scheduler import SILENCE_LIMIT
 from talkcli.states import IllegalTransition, State
 from tests.unit.robot import DOOR, Robot, ending
@@ -135,3 +136,41 @@ def test_effects_of_the_last_resort_come_before_the_next_start() -> None:
     effects = robot.scheduler.tick(Now(robot.seconds + 2, 0))
     assert effects.index(GiveUp(goal)) < effects.index(Start(following))
     assert Stop(goal) not in effects
+
+
+# An engine that is not there
+
+
+def test_without_an_engine_goals_wait_and_their_time_runs() -> None:
+    robot = Robot()
+    robot.scheduler.engine_lost()
+    short, long = robot.asks(Say("door open", ttl=1.0)), robot.says()
+    assert (short.state, long.state) == (State.PENDING, State.PENDING)
+    robot.waits(1)
+    assert (short.state, short.reason, long.state) == (State.RECALLED, "expired", State.PENDING)
+    robot.see(robot.scheduler.engine_ready(robot.now))
+    assert long.state is State.ACTIVE
+
+
+def test_a_goal_that_is_spoken_may_end_after_its_engine_was_lost_and_the_next_waits() -> None:
+    robot = Robot()
+    goal, following = robot.says(), robot.says()
+    robot.scheduler.engine_lost()
+    robot.tells("failed", goal.id)
+    assert (goal.state, following.state) == (State.ABORTED, State.PENDING)
+
+
+def test_an_engine_that_does_not_come_costs_one_goal_each_time() -> None:
+    robot = Robot()
+    robot.scheduler.engine_lost()
+    goals = [robot.says() for _ in range(3)]
+    robot.see(robot.scheduler.engine_missing("no memory", robot.now))
+    assert [each.state for each in goals] == [State.ABORTED, State.PENDING, State.PENDING]
+    assert (goals[0].reason, goals[0].message) == ("engine_failed", "Talk aborted: no memory")
+    assert robot.seen[-2:] == ["1 ACTIVE", "1 ABORTED"], "nothing is started"
+    robot.pauses()
+    assert robot.scheduler.engine_missing("no memory", robot.now) == []
+    robot.resumes()
+    robot.see(robot.scheduler.engine_ready(robot.now))
+    assert robot.scheduler.engine_missing("it came at last", robot.now) == []
+    assert [each.state.name for each in goals] == ["ABORTED", "ACTIVE", "PENDING"]

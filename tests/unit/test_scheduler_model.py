@@ -196,6 +196,22 @@ class SchedulerMachine(RuleBasedStateMachine):
     def cannot_confirm_silence(self) -> None:
         self.tell("failed", reason="not_silent")
 
+    @rule()
+    def loses_its_process(self) -> None:
+        self.both.engine_lost()
+
+    @rule()
+    def gets_ready(self) -> None:
+        self.both.engine_ready()
+
+    @precondition(lambda self: not self.both.model.engine)
+    @rule(target=goals, says=st.lists(says_with("priority", "ttl"), max_size=3), step=steps, sender=clients)
+    def does_not_get_ready(self, says: list[Fields], step: float, sender: Sender) -> MultipleResults[str]:
+        sent = [self.both.submit(Say(**each), sender) for each in says]
+        self.time_goes_on_unseen(step, 0.0)
+        self.both.engine_missing()
+        return multiple(*sent)
+
     @rule(event=st.sampled_from(["heard", "completed", "failed", "stopped"]), goal=goals | any_ids)
     def says_anything(self, event: str, goal: str) -> None:
         """An event of any goal: one that waits, one that ended, one that never was, or by chance the right one."""
@@ -214,7 +230,7 @@ class SchedulerMachine(RuleBasedStateMachine):
     @invariant()
     def both_are_alike(self) -> None:
         real, model = self.both.real, self.both.model
-        assert real.paused == model.paused
+        assert (real.paused, real.has_engine) == (model.paused, model.engine)
         assert [each.id for each in real.pending()] == [each.id for each in model.queue]
         assert real.pending_count == len(model.queue)
         assert {each.id for each in real.unfinished()} == {each.id for each in model.voice + model.queue}
