@@ -21,6 +21,8 @@ import os
 import select
 import signal
 
+from talkcli.engine.holders import is_held, kill_holders
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,7 +64,7 @@ class Child:
     def status(self) -> int | None:
         """Return its exit status, below zero for the signal that killed it; None while it runs.
 
-        What it leaves behind must not go on without it.
+        What it leaves behind must not go on without it, in whatever group or session: until that is gone, it runs.
         """
         if self._status is None:
             if hasattr(os, "waitid"):  # not on macOS before Python 3.13
@@ -72,6 +74,10 @@ class Child:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             if pid:
                 self._status = os.waitstatus_to_exitcode(status)
+        if self._status is not None and self._leash is not None and is_held(self._leash):
+            kill_holders(self._leash)
+            if is_held(self._leash):
+                return None
         return self._status
 
     def kill(self) -> None:

@@ -17,6 +17,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
+from talkcli.engine.holders import kill_holders
 from talkcli.wire import LineSplitter
 
 if TYPE_CHECKING:
@@ -133,7 +134,8 @@ class EngineProcess:
     def kill(self) -> None:
         """Kill the process, its player, and what that has started.
 
-        The process isn't reaped yet, so its group and its session can't be anybody else's.
+        The process isn't reaped yet, so its group and its session can't be anybody else's. What left both is known by
+        the pipe that it holds.
         """
         if self._process.returncode is None:
             with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -141,6 +143,7 @@ class EngineProcess:
             for pid in _session(self._process.pid):
                 with contextlib.suppress(ProcessLookupError, PermissionError):
                     os.kill(pid, signal.SIGKILL)
+            kill_holders(self.liveness)
 
     def last_words(self) -> str:
         """Return how a process that closed its connection ended, for people; what it started is killed.

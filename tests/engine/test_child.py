@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -116,6 +117,45 @@ def test_it_is_killed_with_all_that_it_has_started() -> None:
     child.kill()
     assert _status(child) == -signal.SIGKILL
     assert os.read(reading, 1) == b"", "both have let go of it"
+    os.close(reading)
+
+
+#: Starts what it is told to, in a session of its own, and lives no longer itself.
+_LEAVES = """
+import os, sys, time
+os.write(2, b"%d" % os.getpid())
+if os.fork():
+    os._exit(0)
+os.setsid()
+{then}
+time.sleep(100)
+"""
+
+
+def _leaving(then: str, *inherited: int) -> Child:
+    return Child((sys.executable, "-S", "-c", _LEAVES.format(then=then)), inherited)
+
+
+def test_what_left_its_session_is_killed_too_before_it_counts_as_ended() -> None:
+    reading, writing = os.pipe()
+    child = _leaving("", writing)
+    os.close(writing)
+    assert _status(child) == 0
+    os.set_blocking(reading, False)
+    assert os.read(reading, 1) == b"", "nobody holds it"
+    os.close(reading)
+
+
+def test_what_left_its_session_and_closed_what_it_had_is_left_alone() -> None:
+    reading, writing = os.pipe()
+    child = _leaving(f"os.dup2({writing}, 1); os.closerange(2, 100); os.write(1, b'%d' % os.getpid())", writing)
+    os.close(writing)
+    assert _status(child) == 0
+    stranger = int(os.read(reading, 10))
+    os.set_blocking(reading, False)
+    with pytest.raises(BlockingIOError):
+        os.read(reading, 1)  # it lives, as it holds this
+    os.kill(stranger, signal.SIGKILL)
     os.close(reading)
 
 

@@ -202,6 +202,7 @@ def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_wh
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
     monkeypatch.setattr(engine_thread, "START_LIMIT", 0.3)
     monkeypatch.setattr(restarts, "PATIENCE", 0.5)
+    monkeypatch.setattr(restarts, "BACK_OFF", (0.0,))
     thread = start()
     began = time.monotonic()
     thread.say("battery low")

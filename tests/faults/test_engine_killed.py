@@ -23,7 +23,7 @@ from tests.faults.broken import (
 from tests.support import census
 from tests.support.compare import extent
 from tests.support.reference import render
-from tests.support.surroundings import command_line
+from tests.support.surroundings import MARK, command_line, needs, short_directory
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -170,6 +170,57 @@ def test_engine_process_frozen_in_its_start(make_talk: MakeTalk, sink: Sink, tmp
         told("the next goal after SIGSTOP in its start", seconds)
         assert seconds > limit
         assert_within(seconds, limit + 2 * CRASH, "the next goal after SIGSTOP in its start")
+
+
+#: A player whose sound is made by a process in a session of its own.
+APART = "setsid -w aplay -q -t raw -f S16_LE -c 1 -r {rate} --buffer-time=60000"
+#: A player that starts the sound server which it plays to.
+STARTS_A_SERVER = """
+unset {mark}
+export PULSE_RUNTIME_PATH={folder} PULSE_STATE_PATH={folder} PULSE_COOKIE={folder}/cookie HOME={folder}
+pulseaudio --check || pulseaudio -n --daemonize=yes --exit-idle-time=-1 -L module-null-sink \\
+    -L 'module-native-protocol-unix auth-anonymous=1 socket={folder}/pulse' 2>{folder}/said
+exec pacat --server=unix:{folder}/pulse --raw --format=s16le --channels=1 --rate=$1
+"""
+
+
+@pytest.mark.parametrize("ends", ["engine", "cancel"])
+def test_what_a_player_started_in_a_session_of_its_own_ends_with_it(make_talk: MakeTalk, sink: Sink, ends: str) -> None:
+    needs("setsid")
+    talk = make_talk("--player", APART, sink=sink)
+    with nothing_left(talk):
+        goal = begin(talk, LONG)
+        playing = [pid for pid in census.descendants(talk.pid) if command_line(pid).startswith("aplay")]
+        assert playing
+        following = send(talk, LOW, rate=RATE)
+        if ends == "engine":
+            os.kill(engine_process(talk), signal.SIGKILL)
+        else:
+            talk.request("cancel", ids=[goal])
+        assert await_end(talk, goal, HANG) == ("ABORTED" if ends == "engine" else "PREEMPTED")
+        assert not any("aplay" in command_line(pid) for pid in playing)
+        assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
+    if ends == "engine":
+        assert_aborted(talk.goal(goal), *SIGNALS[signal.SIGKILL][:2])
+
+
+def test_a_sound_server_that_a_player_has_started_is_left_alone(make_talk: MakeTalk, tmp_path: Path) -> None:
+    needs("pulseaudio", "pacat")
+    with short_directory() as folder:
+        player = write(tmp_path / "player", STARTS_A_SERVER.format(folder=folder, mark=MARK))
+        talk = make_talk("--player", f"sh {player} {{rate}}")
+        goal = begin(talk, LONG, number=1)
+        with open(f"{folder}/pid", encoding="ascii") as file:
+            server = int(file.read())
+        try:
+            os.kill(engine_process(talk), signal.SIGKILL)
+            _assert_lost(talk, goal, signal.SIGKILL)
+            talk.stop()
+            assert "pulseaudio" in command_line(server)
+        finally:
+            os.kill(server, signal.SIGTERM)
+            while command_line(server) != "ended":
+                time.sleep(0.005)  # it is nobody's child
 
 
 def _slow_start(folder: Path, more: str = "") -> dict[str, str]:

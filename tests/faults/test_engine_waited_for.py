@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conformance.hearing import LONG, engine_process, send
+from tests.conformance.hearing import LONG, begin, engine_process, send
 from tests.faults.broken import python_path, write
 from tests.support import census
 
@@ -58,8 +58,7 @@ def _await_engine(wire: Wire, words: str) -> None:
 def test_a_moment_without_descriptors_costs_the_goal_whose_engine_was_killed_and_no_other(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     assert talk.run("voices").code == 0
-    first = send(talk, LONG)
-    talk.watcher.wait_for(first, "ACTIVE")
+    first = begin(talk, LONG, number=1)
     goals = [send(talk, "yes", rate=450, volume=0) for _ in range(3)]
     brief = send(talk, "too late", ttl=0.3)
     with talk.connect() as wire:  # connected before: a new client would need a descriptor
@@ -74,13 +73,11 @@ def test_a_moment_without_descriptors_costs_the_goal_whose_engine_was_killed_and
     assert talk.log.count("cannot be started") == 1, talk.log
 
 
-def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(make_talk: MakeTalk, tmp_path: Path) -> None:
-    behaviour = write(tmp_path / "start", "")
-    talk = make_talk(scripted=True, env={"SCRIPTED_START_FILE": str(behaviour)})
-    first = send(talk, "never-ends")
-    talk.watcher.wait_for(first, "ACTIVE")
+def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted: Talk) -> None:
+    talk = scripted
+    first = begin(talk, "never-ends", number=1)
     goals = [send(talk, "length=0.01") for _ in range(WAITING)]
-    behaviour.write_text("hang")  # so that each start can be met in its middle
+    talk.script_start("hang")  # so that each start can be met in its middle
     (engine,) = census.descendants(talk.pid)
     for _ in range(3):
         os.kill(engine, signal.SIGKILL)
@@ -88,7 +85,7 @@ def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(make_tal
         while not (found := set(census.descendants(talk.pid)) - {known}):
             time.sleep(0.002)  # a process that is started is no event
         (engine,) = found
-    behaviour.write_text("")
+    talk.script_start("")
     os.kill(engine, signal.SIGKILL)
     assert _ends(talk, [first]) == [("ABORTED", "engine_crashed")]
     assert _ends(talk, goals) == [("SUCCEEDED", None)] * WAITING
@@ -106,19 +103,21 @@ def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(m
 def test_an_engine_that_does_not_come_for_long_costs_a_goal_each_time_it_is_tried(
     make_talk: MakeTalk, tmp_path: Path
 ) -> None:
-    behaviour = write(tmp_path / "start", "crash")
     write(tmp_path / "sitecustomize.py", HASTY.format(patience=0.5))
-    env = {"SCRIPTED_START_FILE": str(behaviour), **python_path(tmp_path)}
-    talk = make_talk(scripted=True, env=env)
+    talk = make_talk(scripted=True, env=python_path(tmp_path))
+    assert talk.run("voices").code == 0
+    talk.script_start("crash")
     began = time.monotonic()
-    goals = [send(talk, "length=0.01") for _ in range(4)]
+    (engine,) = census.descendants(talk.pid)
+    os.kill(engine, signal.SIGKILL)
+    goals = [send(talk, "length=0.5") for _ in range(4)]
     assert _ends(talk, goals[:2]) == [("ABORTED", "engine_failed")] * 2
     assert time.monotonic() - began >= 0.4, "it is waited for first"
     times = [talk.goal(each)["ended_at"] for each in goals[:2]]
     assert times[1] - times[0] >= 0.09, "one goal for one start"
     assert "the engine crashed: it was killed by SIGSEGV" in talk.goal(goals[0])["message"]
-    behaviour.write_text("")
-    assert _ends(talk, goals[2:])[-1] == ("SUCCEEDED", None)
+    talk.script_start("")
+    assert _ends(talk, goals)[-1] == ("SUCCEEDED", None)
 
 
 @pytest.mark.parametrize("option", [("--driver", "parrot"), ("--driver", "nsss"), ("--voice", "parrot")], ids=" ".join)

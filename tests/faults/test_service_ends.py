@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
+from tests.conformance.hearing import begin, engine_process, send
 from tests.support import processes
 from tests.support.connection import Wire
 from tests.support.surroundings import MARK, assert_none_left, dying_with_parent, short_directory
@@ -21,6 +23,9 @@ from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from tests.conftest import MakeTalk
 
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
 #: At the fastest rate there is, where what is said need not be long.
@@ -108,6 +113,43 @@ def test_storm_of_signals_is_survived(home: str, number: signal.Signals) -> None
                 assert_within(time.monotonic() - began, 0.1, "status in a storm of signals")
         assert wire.receive_event("result", timeout=10)["goal"]["id"] == goal["id"]
         assert wire.request("status", id=goal["id"])["goal"]["state"] == "SUCCEEDED"
+
+
+#: Whoever starts a server may have set its signals in some way.
+STARTED_BADLY = """
+import os, signal, sys
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+signal.signal(signal.SIGTERM, signal.{term})
+signal.pthread_sigmask(signal.SIG_BLOCK, set(signal.Signals) - {{signal.SIGKILL, signal.SIGSTOP}})
+os.execv(sys.executable, [sys.executable, "-m", "talkcli", "serve", *sys.argv[1:]])
+"""
+
+
+@pytest.mark.parametrize("term", ["SIG_DFL", "SIG_IGN"])
+def test_a_server_sets_the_signals_that_it_needs_whoever_starts_it(
+    make_talk: MakeTalk, tmp_path: Path, term: str
+) -> None:
+    program = tmp_path / "start.py"
+    program.write_text(STARTED_BADLY.format(term=term))
+    talk = make_talk("--player", "null", program=str(program))
+    goal = begin(talk, "a sentence that is long enough to be in the middle of it", number=1)
+    os.kill(engine_process(talk), signal.SIGKILL)
+    assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
+    assert talk.goal(goal)["message"] == "Talk aborted: the engine crashed: it was killed by SIGKILL"
+    following = send(talk, "yes", rate=450)
+    assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
+    talk.stop()
+
+
+def test_too_little_memory_for_a_server_is_told_in_words_that_name_the_limit(home: str) -> None:
+    """For its imports there is enough; for the stack of a thread there isn't, or just not enough for what it needs."""
+    kib = 22_000
+    command = ["sh", "-c", f'ulimit -d {kib}; exec "$@"', "sh", *TALK, "serve", "--player", "null"]
+    env = environment(home, TALK_SOCKET=f"{home}/s")
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=20, check=False)
+    what = "(the engine's thread cannot be started|there is not enough memory for talk)"
+    limit = re.escape(f"it is limited to {kib * 1024:,} bytes of memory (ulimit -d, LimitDATA=)")
+    assert (done.returncode, bool(re.fullmatch(f"talk: {what}: {limit}\n", done.stderr))) == (1, True), done.stderr
 
 
 @contextlib.contextmanager
