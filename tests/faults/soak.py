@@ -1,9 +1,10 @@
 """A soak: random goals from many clients and a fault every few seconds, for as long as one likes.
 
-    python -m tests.faults.soak --seconds 1800 [--seed N] [--every SECONDS] [--player aplay|pacat]
+    python -m tests.faults.soak --seconds 1800 [--seed N] [--every SECONDS | --kills] [--player aplay|pacat]
 
 Every goal has exactly one end, what SUCCEEDED was heard, and the server has nothing more at the end than at the
-beginning. What it takes is counted from outside; every random choice comes from the seed.
+beginning. With `--kills` the faults are deaths of the engine alone, two a second at times, and none costs more than one
+goal. What it takes is counted from outside; every random choice comes from the seed.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ CLIENTS = 8
 WARM_UP = 1_200
 #: kB that the server and its engine process may have grown by.
 GROWN = 8 * 1024
+#: Why a goal ends that was lost with its engine.
+_LOST_WITH_IT = frozenset({"engine_crashed", "engine_hung", "engine_failed", "not_silent"})
 #: Lines of the log that a fault may bring beside those of the goals that it ended.
 LINES_A_FAULT = 6
 
@@ -49,8 +52,17 @@ class Report:
     after: census.Census | None = None
     #: entries of the server's home and temporary directory
     files: tuple[int, int] = (0, 0)
+    #: engine processes that were killed, where nothing else was done
+    deaths: int | None = None
     log_lines: int = 0
     failures: list[str] = field(default_factory=list)
+
+    @property
+    def lost(self) -> int:
+        """Goals that the engine's deaths have cost."""
+        return sum(
+            count for (state, reason), count in self.ends.items() if state == "ABORTED" and reason in _LOST_WITH_IT
+        )
 
     def __str__(self) -> str:
         ends = ", ".join(
@@ -63,15 +75,17 @@ class Report:
                 f"{self.heard_whole} sentences heard whole at the sink; the narrator's goals: {_told(self.narrated)}",
                 f"before: {self.before}, {self.files[0]} files",
                 f"after:  {self.after}, {self.files[1]} files, {self.log_lines} lines in the log",
+                *([] if self.deaths is None else [f"{self.deaths} deaths of the engine cost {self.lost} goals"]),
                 *(f"FAILED: {each}" for each in self.failures),
             )
         )
 
 
-def soak(seconds: float, seed: int, every: float = 5.0, player: str = "aplay", least: int = 0) -> Report:
+def soak(seconds: float, seed: int, every: float | None = 5.0, player: str = "aplay", least: int = 0) -> Report:
     """Run a soak and return what it found; `failures` is empty if all was well.
 
-    It takes longer than `seconds` where there were not `least` faults by then: some take ten seconds each.
+    `every`: seconds between two faults; None for kills of the engine alone. It takes longer than `seconds` where there
+    were not `least` faults by then: some take ten seconds each.
     """
     report = Report(seed, seconds)
     with Sink() as sink, short_directory() as temporary:
@@ -87,7 +101,7 @@ def soak(seconds: float, seed: int, every: float = 5.0, player: str = "aplay", l
     return report
 
 
-def _run(talk: Talk, sink: Sink, report: Report, every: float, temporary: str, least: int) -> None:
+def _run(talk: Talk, sink: Sink, report: Report, every: float | None, temporary: str, least: int) -> None:
     witness = Witness(talk.socket)
     try:
         _warm_up(talk, witness, report)
@@ -96,6 +110,8 @@ def _run(talk: Talk, sink: Sink, report: Report, every: float, temporary: str, l
         known = witness.ended
         _disturb(talk, sink, report, every, least)
         report.goals, report.ends = witness.ended - known, witness.ends
+        if report.deaths is not None and report.lost > report.deaths:
+            report.failures.append("a death cost more than one goal")
         _settle(talk, witness, report)
         report.after = census.assert_as_before(talk.pid, report.before, memory=GROWN)
         report.files = files, _count_files(talk.directory, temporary)
@@ -120,13 +136,21 @@ def _warm_up(talk: Talk, witness: Witness, report: Report) -> None:
     _settle(talk, witness, report)
 
 
-def _disturb(talk: Talk, sink: Sink, report: Report, every: float, least: int) -> None:
+def _disturb(talk: Talk, sink: Sink, report: Report, every: float | None, least: int) -> None:
     chance = random.Random(f"{report.seed} faults")
-    faults = Faults(talk, sink, chance, every)
+    faults = Faults(talk, sink, chance, every or 0)
     narrator = Narrator(talk, sink, faults.calm_since, lambda: faults.last)
     senders = Senders(talk, CLIENTS, lambda number: random.Random(f"{report.seed} {number}"))
+
+    def enough() -> bool:
+        return bool(narrator.failures or senders.failures) or not talk.running
+
     try:
-        faults.run(report.seconds, least, lambda: bool(narrator.failures or senders.failures) or not talk.running)
+        if every is None:
+            faults.kill_engines(report.seconds, enough)
+            report.deaths = faults.deaths
+        else:
+            faults.run(report.seconds, least, enough)
     finally:
         for each in (narrator, senders):
             each.stop()
@@ -160,9 +184,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1800)
     parser.add_argument("--seed", type=int, default=int(time.time()))
     parser.add_argument("--every", type=float, default=5.0, help="seconds between two faults, on average")
+    parser.add_argument("--kills", action="store_true", help="kill the engine again and again, and nothing else")
     parser.add_argument("--player", choices=("aplay", "pacat"), default="aplay")
     options = parser.parse_args()
-    report = soak(options.seconds, options.seed, options.every, options.player)
+    report = soak(options.seconds, options.seed, None if options.kills else options.every, options.player)
     print(report)
     sys.exit(bool(report.failures))
 

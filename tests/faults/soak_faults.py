@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 #: Seconds after which a sink that was disturbed plays and is recorded as before.
 _WARM = 3.0
 
+#: Seconds between two kills of an engine process, and between two where the next one is to be met in its start.
+KILLS = (0.12, 5.0)
+_IN_ITS_START = (0.0, 0.08)
+
 
 class Faults:
     """Injects a fault every few seconds, in the thread that calls: what it starts would end with any other."""
@@ -41,6 +45,9 @@ class Faults:
         #: the last fault, for messages
         self.last = "none"
         self._disturbed_until = 0.0
+        self._hit = 0
+        #: engine processes that were killed, of which each may have cost a goal
+        self.deaths = 0
         self._kinds: list[Callable[[], None]] = [
             self.engine_killed,
             self.engine_segfaults,
@@ -82,6 +89,22 @@ class Faults:
             kind()
             self.done[kind.__name__] += 1
 
+    def kill_engines(self, seconds: float, enough: Callable[[], bool]) -> None:
+        """Do nothing else for so long but kill engine processes, those that are being started too."""
+        end = time.monotonic() + seconds
+        self.last, self._disturbed_until = "engines killed", float("inf")
+        while time.monotonic() < end and not enough():
+            time.sleep(self._chance.uniform(*KILLS))
+            self._kill_next("ready")
+            for _ in range(self._chance.choice((0, 0, 1, 2))):
+                time.sleep(self._chance.uniform(*_IN_ITS_START))
+                self._kill_next("soon after a kill")
+
+    def _kill_next(self, when: str) -> None:
+        self._signal("talkcli.engine", signal.SIGKILL)
+        self.done[f"engine killed {when}"] += 1
+        self.deaths += 1
+
     def calm_since(self, moment: float) -> bool:
         """Whether all that was said from this monotonic time on must have been heard as it was said."""
         return self._disturbed_until + _WARM < moment
@@ -104,14 +127,16 @@ class Faults:
         self._signal("aplay", signal.SIGSTOP)
 
     def _signal(self, name: str, number: signal.Signals) -> None:
-        """Send a signal to the process of that name, as soon as there is one."""
+        """Send a signal to the process of that name, as soon as there is one that did not have one before."""
         end = time.monotonic() + 20
         while time.monotonic() < end:
             for pid in descendants(self._talk.pid):
-                if name in command_line(pid):
+                if name in command_line(pid) and pid != self._hit:
                     with contextlib.suppress(ProcessLookupError):
                         os.kill(pid, number)
+                        self._hit = pid
                         return
+            time.sleep(0.001)  # a process that is started is no event
 
     # -- sound
 

@@ -21,3 +21,14 @@ def test_random_goals_with_a_fault_every_few_seconds() -> None:
     assert report.goals > 5 * SECONDS
     assert report.faults.total() > SECONDS / 12
     assert report.heard_whole > SECONDS / 30
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(int(SECONDS) + 400)
+def test_engines_that_are_killed_again_and_again_cost_no_more_than_a_goal_each() -> None:
+    report = soak(SECONDS, seed=random.randrange(1 << 30), every=None)
+    print(report)
+    assert not report.failures, str(report)
+    assert report.goals > SECONDS
+    assert report.deaths
+    assert report.lost <= report.deaths
