@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli import completion
 from talkcli.cli.commands import COMMANDS
 from tests.conformance.bareserve import TALK, environment, run
 from tests.conformance.rawsocket import GREETING, FakeServer
+from tests.readme.blocks import block
 from tests.support.connection import PATIENCE
 from tests.support.surroundings import needs, short_directory
 from tests.support.terminal import Terminal
@@ -31,22 +31,29 @@ if TYPE_CHECKING:
 CHECKED_IN = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "completions")
 #: A key with all that a shell or a format could stumble over.
 KEY = 'low battery, now: it\'s $5 "x" *\\ a;b|c&'
-#: Each shell, how it is told to complete and to write its command line to the file OUT when ^G is pressed.
+#: The file of each shell's script.
+FILES = {"bash": "talk.bash", "zsh": "_talk", "fish": "talk.fish"}
+#: Each shell, how it is kept from its start files, told to complete, and to write its command line to the file OUT when
+#: ^G is pressed.
 SHELLS = {
     "bash": (
-        ["bash", "--noprofile", "--norc", "-i"],
-        """source SCRIPTS/talk.bash; bind -x '"\\C-g": printf "%s\\n" "$READLINE_LINE" > OUT'; PS1='rea''dy> '\n""",
+        ["--noprofile", "--norc"],
+        "source SCRIPTS/talk.bash; ",
+        """bind -x '"\\C-g": printf "%s\\n" "$READLINE_LINE" > OUT'; PS1='rea''dy> '\n""",
     ),
     "zsh": (
-        ["zsh", "-f", "-i"],
-        "autoload -U compinit; compinit -u -D; source SCRIPTS/_talk; show() { print -r -- $BUFFER > OUT }; "
-        "zle -N show; bindkey '^G' show; PS1='rea''dy> '\n",
+        ["-f"],
+        "autoload -U compinit; compinit -u -D; source SCRIPTS/_talk; ",
+        "show() { print -r -- $BUFFER > OUT }; zle -N show; bindkey '^G' show; PS1='rea''dy> '\n",
     ),
     "fish": (
-        ["fish", "--no-config", "-i"],
-        "source SCRIPTS/talk.fish; bind \\cg 'commandline > OUT'; function fish_prompt; echo 'rea''dy> '; end\n",
+        ["--no-config"],
+        "source SCRIPTS/talk.fish; ",
+        "bind \\cg 'commandline > OUT'; function fish_prompt; echo 'rea''dy> '; end\n",
     ),
 }
+#: What loads completion in bash where it is installed; it takes `talk` for an older program.
+BASH_COMPLETION = "/usr/share/bash-completion/bash_completion"
 
 
 def offered(line: str, env: Mapping[str, str]) -> list[tuple[str, str]]:
@@ -84,15 +91,16 @@ def busy(make_talk: MakeTalk) -> tuple[Talk, list[str]]:
 # The scripts
 
 
-def test_scripts_that_are_checked_in_are_those_of_this_version(tmp_path: pathlib.Path) -> None:
-    completion.main(str(tmp_path))
-    assert sorted(os.listdir(CHECKED_IN)) == sorted(os.listdir(tmp_path)) == sorted(completion.FILES)
-    for name in completion.FILES:
-        with open(os.path.join(CHECKED_IN, name), encoding="utf-8") as file:
-            assert file.read() == (tmp_path / name).read_text("utf-8"), f"python -m talkcli.completion {CHECKED_IN}"
+@pytest.mark.parametrize("shell", FILES)
+def test_scripts_that_are_checked_in_are_what_the_command_prints(tmp_path: pathlib.Path, shell: str) -> None:
+    assert sorted(os.listdir(CHECKED_IN)) == sorted(FILES.values())
+    done = run([*TALK, "completion", shell], environment(str(tmp_path)))
+    assert (done.code, done.err) == (0, "")
+    with open(os.path.join(CHECKED_IN, FILES[shell]), encoding="utf-8") as file:
+        assert file.read() == done.out, f"talk completion {shell} > completions/{FILES[shell]}"
 
 
-@pytest.mark.parametrize(("shell", "name"), [("bash", "talk.bash"), ("zsh", "_talk"), ("fish", "talk.fish")])
+@pytest.mark.parametrize(("shell", "name"), FILES.items())
 def test_scripts_have_no_syntax_error(shell: str, name: str) -> None:
     needs(shell)
     done = run([shell, "-n", os.path.join(CHECKED_IN, name)], dict(os.environ))
@@ -113,6 +121,7 @@ def test_scripts_have_no_syntax_error(shell: str, name: str) -> None:
         ("talk serve --player=p", {"--player=pacat", "--player=pw-cat"}),
         ("talk --socket /etc/pa", {"file"}),
         ("talk say -o x", {"file"}),
+        ("talk completion ", set(FILES)),
         ("talk say ", set()),
         ("talk nonsense --x", set()),
         ("talk cancel --nonsense", set()),
@@ -223,10 +232,11 @@ def test_a_server_that_hangs_holds_nobody_up(scripted: Talk) -> None:
 class Shell:
     """An interactive shell that completes `talk`, in a terminal."""
 
-    def __init__(self, name: str, talk: Talk, stack: contextlib.ExitStack) -> None:
+    def __init__(self, name: str, talk: Talk, stack: contextlib.ExitStack, lines: str | None = None) -> None:
+        """`lines`: sh's commands that make its start files, which then load the script; None: it has none."""
         needs(name)
         directory = talk.directory
-        command, setup = SHELLS[name]
+        bare, load, setup = SHELLS[name]
         os.makedirs(f"{directory}/bin")
         with open(f"{directory}/bin/talk", "w", encoding="utf-8") as program:
             program.write(f'#!/bin/sh\nexec "{sys.executable}" -m talkcli "$@"\n')
@@ -235,6 +245,13 @@ class Shell:
         self._out = os.open(f"{directory}/out", os.O_RDWR)
         stack.callback(os.close, self._out)
         env = {**talk.env, "PATH": f"{directory}/bin:{os.environ['PATH']}", "TERM": "xterm", "HISTFILE": ""}
+        command = [name, *bare, "-i"]
+        if lines is None:
+            setup = load + setup
+        else:
+            env["HOME"] = directory
+            assert run(["sh", "-c", lines], env).code == 0
+            command = [name, "-i"]
         self.terminal = stack.enter_context(Terminal(command, env, 500))
         self.terminal.type(setup.replace("SCRIPTS", CHECKED_IN).replace("OUT", f"{directory}/out").encode())
         self.terminal.wait_for("ready> ", 20)
@@ -295,6 +312,22 @@ def test_shells_complete_what_is_there_and_quote_it(busy: tuple[Talk, list[str]]
     assert found == expected
     assert "Traceback" not in shell.terminal.text
     assert "Error" not in shell.terminal.text
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_start_files_of_the_readme_load_it(busy: tuple[Talk, list[str]], name: str) -> None:
+    """bash's loads bash-completion first, as it does on most machines."""
+    talk, _ = busy
+    if name == "bash" and not os.path.exists(BASH_COMPLETION):
+        needs("bash-completion")
+    before = f"mkdir -p ~/.config/fish; echo '. {BASH_COMPLETION}' > ~/.bashrc\n"
+    with contextlib.ExitStack() as stack:
+        shell = Shell(name, talk, stack, before + block("Completion"))
+        found = [shell.complete(line) for line in ("talk st", "talk cancel door:o")]
+        if name == "bash":  # by way of bash-completion
+            assert shell.complete("sudo talk cancel --before=door:") == "sudo talk cancel --before=door:open.1 "
+    assert found == ["talk status ", "talk cancel door:open.1 "]
+    assert "rror" not in shell.terminal.text
 
 
 @pytest.mark.parametrize("name", ["zsh", "fish"])

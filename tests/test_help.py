@@ -151,6 +151,8 @@ def test_the_examples_can_be_typed(name: str) -> None:
         (["say", "--priority", "high", "x"], "--priority: 'high' is not a "),
         (["say", "--key", "", "x"], "--key: empty; is the variable set that it comes from?"),
         (["say"], "TEXT is missing: what is to be said, or '-' for standard input"),
+        (["completion"], "SHELL is missing: one of bash, zsh, fish"),
+        (["completion", "ksh"], "SHELL: 'ksh' is not one of 'bash', 'zsh', 'fish'"),
         (["log", "5"], "'talk log' takes options alone: what is '5'?"),
         (["status", "1", "2"], "'talk status' takes nothing after [ID]: what is '2'?"),
         (["set", "--voice"], "option '--voice' requires an argument"),

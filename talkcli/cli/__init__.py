@@ -1,4 +1,4 @@
-"""The command line. Only this package and `completion` know click, and only here is anything printed or exited.
+"""The command line. Only this package knows click, and only here is anything printed or exited.
 
 Scripts call `say`, `wait`, `cancel` and `status` all the time, and importing click takes longer than a server takes to
 answer. So a plain command line of these is read, its request sent, and the rest of the program imported only then; any

@@ -33,6 +33,7 @@ COMMANDS = {
     "set": "Change the running server's settings, or print them.",
     "voices": "List the voices.",
     "doctor": "Check everything between a sentence and a loudspeaker.",
+    "completion": "Print the completion script of a shell.",
 }
 
 
@@ -40,7 +41,6 @@ _EXAMPLES = """
     talk serve &                      one server on the robot
     talk say --wait -- "battery low"  the exit code tells whether it was heard
     talk cancel                       silence, now
-    talk status                       what it says, will say, has said
     talk doctor                       silent? what to do next
 """
 #: All of them, as the README's table has them; each command's help says which are its own.

@@ -56,8 +56,9 @@ _ZSH = """\
 
 if [[ $zsh_eval_context[-1] == loadautofunc ]]; then
     %(complete_func)s "$@"  # from fpath
-else
-    compdef %(complete_func)s %(prog_name)s  # sourced
+else  # sourced
+    (( $+functions[compdef] )) || { autoload -U compinit && compinit }
+    compdef %(complete_func)s %(prog_name)s
 fi
 """
 
@@ -109,6 +110,8 @@ class Bash(_Line):
             return "file"
         typed, quote = _last_word(os.environ["COMP_WORDS"])
         replaced = os.environ["COMP_CWORD"]
+        if replaced in {":", "="}:
+            replaced = ""  # so bash-completion says, behind sudo for one, that nothing follows what bash cuts at
         stays = typed.removesuffix(replaced) if replaced else typed
         value = _whole(item.value, typed)
         kept = "".join(split_arg_string(stays))
@@ -143,9 +146,13 @@ class Fish(_Line):
         return f"plain,{_whole(item.value, typed)}{words}"
 
 
+#: Each of them by its shell's name.
+SHELLS: dict[str, type[ShellComplete]] = {"bash": Bash, "zsh": Zsh, "fish": Fish}
+
+
 def register() -> None:
     """Have click use these for their shells."""
-    for each in (Bash, Zsh, Fish):
+    for each in SHELLS.values():
         add_completion_class(each)
 
 

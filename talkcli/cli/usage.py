@@ -173,6 +173,8 @@ def told(error: click.ClickException) -> str:
         # Without the dashes, which make any two of them alike.
         near = nearest(error.option_name.lstrip("-"), [each.lstrip("-") for each in error.possibilities or ()])
         return f"no such option '{error.option_name}'" + (f": did you mean '--{near}'?" if near else "")
+    if isinstance(error, click.MissingParameter) and error.param and isinstance(error.param.type, click.Choice):
+        return f"{error.param.metavar} is missing: one of {', '.join(error.param.type.choices)}"
     words = error.format_message().rstrip(".")
     if isinstance(error, click.BadParameter):
         option, colon, wrong = words.removeprefix("Invalid value for ").partition(": ")

@@ -19,6 +19,7 @@ ELSEWHERE = {
     "The wire": "tests/wire/test_examples.py::test_line_of_socat_says_a_sentence",
     "Two clients": "tests/wire/test_examples.py::test_client_in_shell",
     "Two clients #2": "tests/wire/test_examples.py::test_client_in_plain_python",
+    "Completion": "tests/test_completion.py::test_start_files_of_the_readme_load_it",
     "Speed": "tests/bench/test_bench_rows.py::*",
 }
 for _path in Path(__file__).parent.glob("test_*.py"):

@@ -57,7 +57,7 @@ IMPURE = {
 #: What the package is made of, at its top: each a module, or a folder of them.
 PARTS = {
     *("engine", "engine.thread", "engine.process", "engine.espeak", "engine.players", "scheduler"),
-    *("server", "paths", "client", "output", "completion", "cli"),
+    *("server", "paths", "client", "output", "cli"),
 }
 #: What stands at the top of the project; beside it only files and folders whose names begin with a dot.
 TOP = {"pyproject.toml", "talkcli", "tests", "completions", "README.md", "LICENSE"}
@@ -67,7 +67,7 @@ LONGEST = 500
 ONLY = {
     "pyttsx3": {"engine"},
     "espeakng_loader": {"engine"},
-    "click": {"cli", "completion"},
+    "click": {"cli"},
     "asyncio": {"server"},
     "platformdirs": {"paths"},
 }
@@ -183,7 +183,7 @@ def test_every_module_says_what_it_is_and_is_no_longer_than_one_can_keep_in_mind
 def test_every_module_is_used() -> None:
     """By the command, by the engine process, or by a module that is itself run."""
     used: set[str] = set()
-    new = {"__main__", "engine.process", "completion", "cli.tabulate", *(f"cli.{each}" for each in COMMANDS)}
+    new = {"__main__", "engine.process", "cli.tabulate", *(f"cli.{each}" for each in COMMANDS)}
     while new:
         used |= new
         new = {name for module in new for name, _ in inside(module)} - used
@@ -193,7 +193,7 @@ def test_every_module_is_used() -> None:
 
 @pytest.mark.parametrize("name", CHAIN)
 def test_imports_point_one_way(name: str) -> None:
-    before = set(CHAIN[: CHAIN.index(name)]) | {"server", "engine", "completion"}
+    before = set(CHAIN[: CHAIN.index(name)]) | {"server", "engine"}
     if name == "cli":
         before = set()
     for module in sources():
