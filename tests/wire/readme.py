@@ -22,7 +22,8 @@ def tables(text: str) -> list[list[Row]]:
     """Return the tables of a text as rows of cells, headings first, the line under these left out."""
     found = []
     for table in re.findall(r"^(?:\|.*\|\n)+", text, re.MULTILINE):
-        rows = [tuple(cell.strip() for cell in row[1:-1].split("|")) for row in table.splitlines()]
+        lines = [re.split(r"(?<!\\)\|", row[1:-1]) for row in table.splitlines()]
+        rows = [tuple(cell.strip().replace("\\|", "|") for cell in line) for line in lines]
         assert {len(row) for row in rows} == {len(rows[0])}, f"cells are missing: {table}"
         found.append([rows[0], *rows[2:]])
     return found
