@@ -242,7 +242,7 @@ class EngineThread:
         try:
             process = spawn.EngineProcess(spawn.engine_command(), self._configure, self._murmured)
         except OSError as error:
-            words = f"the engine process cannot be started: {error}"
+            words = f"the engine process cannot be started: {error.strerror or error}"
             self._post(EngineDied(words))
             self._start_failed(words)
             return
