@@ -146,9 +146,9 @@ class _Table:
         """Return what stands after a goal's text, the longest form first."""
         if goal.state.terminal:
             return [] if goal.state is State.SUCCEEDED else why_forms(goal)
+        # The sender first: what does not fit is cut at its end.
         notes = _notes(goal, self._now)
-        forms = [", ".join([*notes, f"from {each}"]) for each in who_forms(goal.client)]
-        return [*forms, ", ".join(notes)] if notes else forms
+        return [", ".join([f"from {each}", *notes]) for each in who_forms(goal.client)]
 
 
 def _text(goal: Goal) -> str:

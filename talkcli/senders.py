@@ -37,15 +37,19 @@ def who(sender: Sender | None) -> str:
 
 
 def who_forms(sender: Sender | None) -> list[str]:
-    """Return who sent something, for a column: the longest form first."""
+    """Return who sent something, for a column: the longest form first.
+
+    What it calls itself, in quotes, as it is a claim, comes before what it is, and stays where there is room for one.
+    """
     if sender is None:
         return [_NOBODY]
     script = _script(sender)
-    claim = f' as "{printable(sender.name)}"' if sender.name else ""
     number = "" if sender.pid is None else f", pid {sender.pid}"
-    comma = "," if claim and number else ""
-    forms = [f"{each}{number}{comma}{claim}" for each in (_program(sender), script)]
-    return list(dict.fromkeys([*forms, f"{script}{claim}", script]))
+    forms = [f"{_program(sender)}{number}", f"{script}{number}", script]
+    if sender.name:
+        claim = f'"{printable(sender.name)}"'
+        forms = [*(f"{claim} ({each})" for each in forms), claim]
+    return list(dict.fromkeys(forms))
 
 
 def by_whom(by: By) -> str:
@@ -65,11 +69,13 @@ def why_forms(goal: Goal) -> list[str]:
         by = [printable(goal.by.goal)] if goal.by.goal is not None else who_forms(goal.by.client)
     forms = [f"{reason} by {each}" for each in by] or [reason]
     words = _words(goal)
+    # Who ended it is worth more than the reason, of which the state says something already.
+    shortest = f"by {by[-1]}" if by else reason
     if not words:
-        return [*forms, reason]
+        return [*forms, shortest]
     forms = [f"{each}: {words}" for each in forms]
     # What an engine or a player said is worth more than the reason alone, even if it is cut.
-    return forms if goal.state in {State.ABORTED, State.REJECTED} else [*forms, reason]
+    return forms if goal.state in {State.ABORTED, State.REJECTED} else [*forms, shortest]
 
 
 def _words(goal: Goal) -> str:

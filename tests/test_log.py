@@ -45,7 +45,7 @@ def test_a_line_tells_when_how_what_who_and_why(scripted: Talk, history: list[st
     assert [each.split()[1] for each in lines] == states
     assert all(re.match(r"\d\d:\d\d:\d\d  \w", each) for each in lines)
     script = re.escape(sys.executable.split("/")[-1][:6])
-    assert re.search(rf'"length=0" +\S*{script}.*, pid \d+, as "patrol"  0\.0 s$', lines[0])
+    assert re.search(rf'"length=0" +"patrol" \(\S*{script}.*, pid \d+\)  0\.0 s$', lines[0])
     assert re.search(r", pid \d+  audio_lost: no cable$", lines[1])
     assert re.search(r'"" .*, pid \d+ +invalid_text: the text is empty$', lines[2])
     assert re.search(rf'"waits" .*, pid \d+ +canceled by \S*{script}.*, pid \d+$', lines[3])
@@ -113,3 +113,28 @@ def test_without_a_server_it_is_3() -> None:
     with short_directory() as home:
         done = run([*TALK, "log"], environment(home, TALK_SOCKET=f"{home}/s"))
     assert (done.code, done.out) == (3, "")
+
+
+@pytest.mark.parametrize("command", ["log", "status"])
+def test_80_columns_have_who_sent_it_and_who_ended_it(scripted: Talk, command: str) -> None:
+    first = scripted.run("say", "--as", "patrol", "--", f"never-ends {LONG}").id
+    scripted.watcher.wait_for_word(first)
+    newest = scripted.run("say", "--preempt", "--as", "the door", "--", f"never-ends {LONG}").id
+    scripted.watcher.wait_for_word(newest)
+    scripted.run("say", "--as", "battery", "--priority", "7", "--key", "low", "--ttl", "90", "--", LONG)
+    scripted.run("say", "--as", "arm", "--id", "arm", "--", LONG)
+    scripted.run("cancel", "arm")
+    with Terminal([*TALK, command], {"TERM": "xterm", **scripted.env}, 80) as shown:
+        assert shown.finish() == 0
+    assert max(map(width, shown.lines)) <= 80
+    ended = [each for each in shown.lines if "PREEMPTED" in each]
+    assert f"by {newest}" in ended[0]
+    if command == "log":
+        assert '"patrol"' in ended[0]
+        return
+    speaking, waits, recalled = (
+        next(each for each in shown.lines if state in each) for state in ("ACTIVE", "PENDING", "RECALLED")
+    )
+    assert '"  from "the door"' in speaking
+    assert '"  from "battery", priority' in waits
+    assert re.search(r'"  (canceled )?by \S', recalled)

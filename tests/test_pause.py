@@ -77,7 +77,7 @@ def test_status_shows_what_is_held(scripted: Talk, held: str) -> None:
     status = scripted.run("status").out
     assert "paused   speech is held: talk resume\n" in status
     assert f"now      {held}  ACTIVE" in status
-    assert "  held, for " in status
+    assert ", held, for " in status
     assert "state    ACTIVE, paused\n" in scripted.run("status", held).out
     assert json.loads(scripted.run("--json", "status").out)["server"]["paused"] is True
     scripted.run("resume")

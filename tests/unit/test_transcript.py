@@ -175,11 +175,12 @@ def test_words_are_lines_where_they_are_wanted(words: bool, count: int) -> None:
 
 def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
     assert who_forms(PATROL) == [
-        '/bin/bash /home/robot/bin/patrol.sh --fast, pid 812, as "night watch"',
-        'patrol.sh, pid 812, as "night watch"',
-        'patrol.sh as "night watch"',
-        "patrol.sh",
+        '"night watch" (/bin/bash /home/robot/bin/patrol.sh --fast, pid 812)',
+        '"night watch" (patrol.sh, pid 812)',
+        '"night watch" (patrol.sh)',
+        '"night watch"',
     ]
+    assert who_forms(replace(PATROL, name=None))[1:] == ["patrol.sh, pid 812", "patrol.sh"]
     assert who_forms(None) == ["nobody known"]
     scripts = {
         "python3 -m robot": "python3",
@@ -200,7 +201,7 @@ def test_why_a_goal_ended() -> None:
     assert why(State.SUCCEEDED) == ["2.0 s"]
     assert why(State.PREEMPTED, "preempted", By("k3fz-8"), "Talk preempted")[0] == "preempted by k3fz-8"
     canceled = why(State.PREEMPTED, "canceled", By(client=PATROL), "Talk preempted")
-    assert canceled[-2:] == ["canceled by patrol.sh", "canceled"]
+    assert canceled[-2:] == ['canceled by "night watch"', 'by "night watch"']
     expired = why(State.RECALLED, "expired", None, "Talk recalled: its time was over")
     assert expired == ["expired: its time was over", "expired"]
     assert why(State.ABORTED, "audio_device", None, "Talk aborted: no: device") == ["audio_device: no: device"]
