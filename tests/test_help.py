@@ -205,12 +205,18 @@ def test_player_that_is_not_there_is_told_at_the_start(make_talk: MakeTalk) -> N
 def test_player_beside_a_driver_that_plays_by_itself_is_told(make_talk: MakeTalk) -> None:
     given = make_talk("--player", "aply", "--lead-in", "100", driver="dummy")
     assert given.run("say", "--wait", "hello").code == 0
-    assert "player its own: --player, --lead-in mean nothing to it\n" in given.log
+    assert "driver dummy, which plays by itself: --player and --lead-in have no effect\n" in given.log
     assert "not found" not in given.log
     plain = make_talk(driver="dummy")
     assert plain.run("say", "--wait", "hello").code == 0
-    assert "player its own\n" in plain.log
-    assert "mean nothing" not in plain.log
+    assert "driver dummy, which plays by itself\n" in plain.log
+
+
+def test_no_player_at_all_is_told_with_what_to_install(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
+    talk = make_talk(env={"PATH": str(tmp_path)}, watched=False)
+    talk.run("voices")  # the engine is ready before it lists them
+    said = "no player found: install alsa-utils (aplay), pulseaudio-utils (pacat) or pipewire-bin (pw-cat)\n"
+    assert next(each for each in talk.log.splitlines(True) if "engine ready" in each).endswith(f", {said}")
 
 
 def test_file_of_another_format_is_refused_and_not_written(tmp_path: pathlib.Path) -> None:
@@ -238,7 +244,9 @@ def test_language_may_be_meant_by_its_name(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     for given, meant in (("german", "de"), ("Englsh", "en"), ("en-gbb", "en-gb")):
         done = talk.run("voices", "--language", given)
-        assert (done.code, done.out) == (0, "")
+        assert (done.code, done.out) == (1, "")
         assert done.err == f"talk: no voice speaks '{given}': did you mean '{meant}'?\n"
         assert talk.run("voices", "--language", meant).out
-    assert "'talk voices' lists all" in talk.run("voices", "--language", "1234").err
+    quiet = talk.run("--json", "-q", "voices", "--language", "1234")
+    assert (quiet.code, quiet.out) == (1, "")
+    assert "'talk voices' lists all" in json.loads(quiet.err)["error"]["message"]

@@ -87,8 +87,8 @@ def voices(options: Common, language: str | None, opened: Opened | None = None) 
     if language:
         wanted = language.lower()
         found = [each for each in every if _language(each) == wanted or _language(each).startswith(f"{wanted}-")]
-        if not found and not options.quiet:
-            note(_no_voice(language, every))
+        if not found:
+            raise TalkError(_no_voice(language, every))
     if options.json:
         for voice in found:
             show_json(voice)

@@ -19,7 +19,7 @@ from talkcli.cli.usage import ASKING
     exit_codes={
         **ASKING,
         0: "listed",
-        1: "the engine can't list them",
+        1: "no voice speaks that language, or the engine can't list them",
     },
 )
 @click.option("--language", metavar="CODE", help="Only this language, with its variants: en, pt-br.")

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 #: Programs to try where none is named, in this order, and the package each comes in. `aplay` first: it opens the device
 #: before it reads, so that a failure is known before a sample is lost, and it is there on a robot without a desktop.
 PACKAGES = {"aplay": "alsa-utils", "pacat": "pulseaudio-utils", "pw-cat": "pipewire-bin"}
+*_OTHERS, _LAST = [f"{package} ({name})" for name, package in PACKAGES.items()]
+#: What is said where none of them is there.
+NO_PLAYER = f"no player found: install {', '.join(_OTHERS)} or {_LAST}"
 
 #: Milliseconds of sound that a player may hold. What it holds is heard late and is lost in a stall; with less than
 #: three periods of 20 ms a busy machine makes gaps.
@@ -56,8 +59,7 @@ def commands(
     if player is None:
         names = sorted((name for name in PACKAGES if found(name)), key=lambda name: name != last)
         if not names:
-            *others, last_one = [f"{package} ({name})" for name, package in PACKAGES.items()]
-            raise AudioFailed("no_player", f"no player found: install {', '.join(others)} or {last_one}")
+            raise AudioFailed("no_player", NO_PLAYER)
         return [_known(name, device, rate) for name in names]
     if player in PACKAGES:
         if not found(player):

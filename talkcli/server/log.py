@@ -11,10 +11,14 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from talkcli.engine.players import NO_PLAYER
 from talkcli.printable import printable
 from talkcli.states import State
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from talkcli.engine.protocol import Ready
     from talkcli.messages import By, Sender
     from talkcli.record import Record
 
@@ -73,6 +77,30 @@ def ended(record: Record, seconds: float | None) -> None:
         how += f" ({record.reason}{_by(record.by)})"
     text = shown(record.text or "")
     line(f'{how}: "{text}" from {who(record.sender)}{_detail(record)}')
+
+
+def ready(engine: Ready, for_player: Sequence[str]) -> None:
+    """Write the line of an engine that is ready; `for_player`: the options that were given for a player."""
+    version = f", {shown(engine.version)}" if engine.version else ""
+    words = f"engine ready: driver {engine.driver}{version}, {sound_of(engine)}"
+    if for_player and _plays_by_itself(engine):
+        words += f": {' and '.join(for_player)} {'has' if len(for_player) == 1 else 'have'} no effect"
+    line(words)
+
+
+def sound_of(engine: Ready) -> str:
+    """Return what plays, for people."""
+    if engine.player:
+        return f"player {engine.player}"
+    return "which plays by itself" if _plays_by_itself(engine) else NO_PLAYER
+
+
+def _plays_by_itself(engine: Ready) -> bool:
+    if engine.player:
+        return False
+    from talkcli.engine.start import is_own  # with half of the engine, for the few who need it
+
+    return not is_own(engine.driver)
 
 
 def shown(words: str) -> str:

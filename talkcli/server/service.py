@@ -160,7 +160,7 @@ class Service:
         else:
             doing = f"speaking {scheduler.active.id}" if scheduler.active else "idle"
         waiting = f", {scheduler.pending_count} waiting" if scheduler.pending_count else ""
-        voice = f"; {ready.version or ready.driver}, player {ready.player or 'its own'}" if ready else ""
+        voice = f"; {ready.version or ready.driver}, {log.sound_of(ready)}" if ready else ""
         return log.shown(doing + waiting + voice)
 
     # -- the scheduler's effects
@@ -287,10 +287,7 @@ class Service:
 
     def _ready(self, ready: protocol.Ready) -> None:
         if self.ready != ready:
-            version = f", {log.shown(ready.version)}" if ready.version else ""
-            unused = "" if ready.player else ", ".join(self.settings.for_player)
-            hint = f": {unused} mean nothing to it" if unused else ""
-            log.line(f"engine ready: driver {ready.driver}{version}, player {ready.player or 'its own'}{hint}")
+            log.ready(ready, self.settings.for_player)
         self.ready, self.engine_words = ready, "ready"
         self.engine_known.set()
         self.apply(self.scheduler.engine_ready(self.now()))
