@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,9 +15,20 @@ from talkcli import __version__
 from talkcli.cli.common import common_options
 from talkcli.cli.ends import OutputClosed, ended
 from talkcli.cli.show import Common, note, show_error
-from talkcli.cli.usage import told, unknown_command, write_examples, write_exit_codes, write_lines, write_options
+from talkcli.cli.usage import (
+    told,
+    unknown_command,
+    with_short_help,
+    write_examples,
+    write_exit_codes,
+    write_lines,
+    write_options,
+)
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, UsageError
 from talkcli.printable import printable
+
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
 
 #: The commands, in the order in which help lists them: what a newcomer needs first comes first.
 COMMANDS = {
@@ -86,6 +97,12 @@ class _Commands(click.Group):
             return None
         command: click.Command = importlib.import_module(f"talkcli.cli.{cmd_name}").command
         return command
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        from click.shell_completion import CompletionItem
+
+        named = [CompletionItem(name, help=words) for name, words in COMMANDS.items() if name.startswith(incomplete)]
+        return named + with_short_help(click.Command.shell_complete(self, ctx, incomplete))
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

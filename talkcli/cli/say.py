@@ -16,7 +16,7 @@ from talkcli.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
 from talkcli.cli import complete
 from talkcli.cli.common import common, common_options, filled, number, seconds, talk_command, timeout_option
 from talkcli.cli.outcome import rest
-from talkcli.cli.saying import GOAL_OPTIONS, say
+from talkcli.cli.saying import GOAL_OPTIONS, refuse, say
 from talkcli.cli.usage import ASKING, Command, Number, WholeNumber, told
 from talkcli.requests import Say
 
@@ -67,12 +67,12 @@ class _SayCommand(Command):
 )
 @click.argument("text", nargs=-1, metavar="TEXT...")
 @click.option("-w", "--wait", is_flag=True, help="Wait until it has ended; the exit code tells how.")
-@timeout_option("With --wait: cancel it after SEC seconds, time in the queue included; exit code 124.")
+@timeout_option("With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124.")
 @click.option("-f", "--feedback", is_flag=True, help="Show each word as it is heard; implies --wait.")
 @click.option(
     "--preempt/--queue",
     default=None,
-    help="Stop what is being spoken and go first, or wait in the queue. [default: as 'talk serve' was told]",
+    help="Stop what is spoken and go first, or wait in the queue. [default: as 'talk serve' was told]",
 )
 @click.option("--flush", is_flag=True, help="As --preempt, and drop what is in the queue.")
 @click.option(
@@ -102,7 +102,7 @@ class _SayCommand(Command):
     type=Number(0),
     callback=seconds,
     metavar="SEC",
-    help="Don't speak it if its key, or else its text, was spoken less than SEC seconds ago.",
+    help="Don't say the same again within SEC seconds; the same is its key, or else its text.",
 )
 @click.option("--id", metavar="ID", callback=filled, help="An id of your own: sent twice, it is spoken once.")
 @click.option(
@@ -155,9 +155,14 @@ def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> i
         return say_lines(options, given["name"], goal_options, given["wait"], given["feedback"], timeout)
     sentence = " ".join(text)
     if text == ("-",):
-        from talkcli.cli.stdin import read_text
+        from talkcli.cli.stdin import InputTooLong, read_text
 
-        sentence = read_text(end)
+        try:
+            sentence = read_text(end)
+        except InputTooLong as error:
+            if given["output"] is not None:
+                raise
+            return refuse(f"Talk rejected: {error}", error.code, options, feedback=given["feedback"])
     if given["output"] is not None:
         from talkcli.cli.rendering import render_to, settings
 

@@ -68,6 +68,18 @@ def say(
             return interrupts.exit_code
 
 
+def refuse(message: str, reason: str, options: Common, *, feedback: bool) -> int:
+    """Tell of a goal that is REJECTED before it is sent, as if a server had done so, and return the exit code."""
+    from talkcli.events import Result
+    from talkcli.messages import Goal
+
+    goal = Goal("", State.REJECTED, reason=reason, message=message)
+    shown = _feedback(options) if feedback else None
+    if shown and options.json:
+        shown.show(goal, Result(goal))
+    return report(goal, options, shown)
+
+
 def _feedback(options: Common) -> Feedback:
     from talkcli.cli.feedback import feedback
 

@@ -83,7 +83,7 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     default=0,
     show_default=True,
     metavar="SEC",
-    help="A goal that has not begun after SEC seconds is recalled, unless it brings its own --ttl; 0: no limit.",
+    help="A goal that has not begun after SEC seconds is recalled; it may bring its own --ttl; 0: no limit.",
 )
 @click.option(
     "--max-queue",
@@ -112,13 +112,14 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     envvar="TALK_PLAYER",
     show_envvar=True,
     shell_complete=complete.players,
-    help="One of aplay, pacat and pw-cat; null (silent, in real time); file:PATH.wav; or a command that reads 16-bit "
-    "mono PCM, with {rate} for its rate and {device} for the --device. [default: the first of the three that works]",
+    help="What plays the sound. One of aplay, pacat and pw-cat; null (silent, in real time); file:PATH.wav; or a "
+    "command that reads 16-bit mono PCM, with {rate} for its rate and {device} for the --device. [default: the first "
+    "of the three that works]",
 )
 @click.option(
     "--device",
     metavar="NAME",
-    help="Device, by the player's own name for it: for aplay one that 'aplay -L' lists, such as plughw:1,0; for pacat "
+    help="Device, by the player's own name for it. For aplay one that 'aplay -L' lists, such as plughw:1,0; for pacat "
     "one of 'pactl list short sinks'; for pw-cat the name of a node, as in 'pw-cli ls Node'. Name the --player, too.",
 )
 @click.option(
@@ -127,8 +128,8 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     default=0,
     show_default=True,
     metavar="MS",
-    help="Milliseconds of silence before a sentence, where the output was idle: HDMI, USB and Bluetooth outputs fall "
-    "asleep, and swallow what comes while they wake.",
+    help="Milliseconds of silence before a sentence; only where the output was idle: HDMI, USB and Bluetooth outputs "
+    "fall asleep, and swallow what comes while they wake.",
 )
 @click.option("--driver", metavar="NAME", help="A driver of pyttsx3's. [default: the one for this system]")
 @click.option(
@@ -144,8 +145,7 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     "--print-unit",
     type=click.Choice(list(units.UNITS)),
     metavar="UNIT",
-    help=f"Print a systemd unit that serves with these options, and end: {', '.join(units.UNITS)}. It says where it "
-    "goes.",
+    help=f"Print a systemd unit with these options, and end. One of {', '.join(units.UNITS)}; it says where it goes.",
 )
 @common_options
 @click.pass_context
@@ -191,6 +191,8 @@ def _warn_of_player(player: str, driver: object) -> None:
 
 
 def _print_unit(context: click.Context, name: str) -> None:
+    from talkcli.printable import printable
+
     given = {each.name: each for each in context.command.params if _is_given(context, each)}
     mode = context.params["socket_mode"] if "socket_mode" in given else None
     options = [_written(each, context.params[each.name or ""]) for each in given.values()]
@@ -198,9 +200,11 @@ def _print_unit(context: click.Context, name: str) -> None:
     show(units.UNITS[name](wanted).rstrip("\n"))
     hidden = units.hidden_from_others(wanted.files) if name == "system" else None
     if hidden:
+        file, directory = hidden
         note(
-            f"this talk is in {hidden}, where the service's own user can't get: install it for all, as with "
-            "'sudo python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in a checkout, then print the unit"
+            f"this talk needs {printable(file)}, and the service's own user can't pass {printable(directory)}: install "
+            "it for all, as with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in a "
+            "checkout, then print the unit"
         )
 
 

@@ -39,7 +39,7 @@ from talkcli.cli.usage import ASKING, Number, WholeNumber
 @click.option(
     "--preempt/--no-preempt",
     default=None,
-    help="Every goal stops the one before it, unless it says --queue; or goals queue.",
+    help="Every goal stops the one before it, or goals queue; one that says --queue stops none.",
 )
 @click.option(
     "--ttl",

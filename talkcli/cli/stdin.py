@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from talkcli.dial import Interrupted, ready
 from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
-from talkcli.text import MAX_BYTES
+from talkcli.states import EXIT_CODES, State
+from talkcli.text import MAX_BYTES, MAX_CHARACTERS
 from talkcli.values import frozen
 
 if TYPE_CHECKING:
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 #: Bytes that are read at once: what a pipe holds.
 _CHUNK = 65_536
+#: Bytes that are read of one text: the longest one, and the end of its line.
+_MOST = MAX_BYTES + len("\r\n")
 
 
 class InputLate(TalkError):
@@ -24,6 +27,13 @@ class InputLate(TalkError):
 
     code = "timeout"
     exit_code = EXIT_TIMEOUT
+
+
+class InputTooLong(TalkError):
+    """There is more on standard input than one text may have."""
+
+    code = "text_too_long"
+    exit_code = EXIT_CODES[State.REJECTED]
 
 
 @frozen
@@ -39,19 +49,22 @@ class Line:
 
 
 def read_text(end: float | None) -> str:
-    """Return standard input as one text: no more than a byte above the longest one, so that it can be refused.
+    """Return standard input as one text; InputTooLong for more than the longest one, which is not read to its end.
 
     `end`: the monotonic time by which it must have been read, else InputLate.
     """
     data = b""
-    while len(data) <= MAX_BYTES:
+    while len(data) <= _MOST:
         if not ready({0: select.POLLIN}, None if end is None else max(0.0, end - time.monotonic())):
             raise InputLate("standard input has not ended within the time: nothing was sent")
-        more = _read(MAX_BYTES + 1 - len(data))
+        more = _read(_MOST + 1 - len(data))
         if more == b"":
-            break
+            return _decoded(data)
         data += more or b""
-    return _decoded(data)
+    raise InputTooLong(
+        f"standard input has more than {MAX_BYTES:,} bytes, and a text at most {MAX_CHARACTERS:,} characters: "
+        "'talk say --lines' speaks it line by line"
+    )
 
 
 class LineReader:

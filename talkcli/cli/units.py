@@ -7,12 +7,15 @@ the server away from everything but sockets, the sound devices and what it needs
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import stat
 import sys
 from typing import TYPE_CHECKING
 
 from talkcli import paths
+from talkcli.errors import UsageError
+from talkcli.printable import printable
 from talkcli.values import frozen, replace
 
 if TYPE_CHECKING:
@@ -179,23 +182,25 @@ def _system(wanted: Wanted) -> str:
         hardening=_SYSTEM_HARDENING.format(group=GROUP, home=home),
         target="multi-user.target",
     )
-    return f"{_SYSTEM_HEAD.format(socket=wanted.socket or paths.SYSTEM_SOCKET, group=GROUP)}{service}"
+    return f"{_SYSTEM_HEAD.format(socket=printable(wanted.socket or paths.SYSTEM_SOCKET), group=GROUP)}{service}"
 
 
 def _user_socket(wanted: Wanted) -> str:
-    path = _escaped(wanted.socket) if wanted.socket else f"%t/talk/{paths.SOCKET}"
+    path = _place(wanted.socket) if wanted.socket else f"%t/talk/{paths.SOCKET}"
     mode = 0o600 if wanted.mode is None else wanted.mode
     return _USER_SOCKET_HEAD + _SOCKET.format(path=path, mode=f"{mode:04o}", extra="DirectoryMode=0700\n")
 
 
 def _system_socket(wanted: Wanted) -> str:
-    path = _escaped(wanted.socket or paths.SYSTEM_SOCKET)
+    path = _place(wanted.socket or paths.SYSTEM_SOCKET)
     mode = 0o660 if wanted.mode is None else wanted.mode
     return _SYSTEM_SOCKET_HEAD + _SOCKET.format(
         path=path, mode=f"{mode:04o}", extra=f"SocketGroup={GROUP}\nDirectoryMode=0755\n"
     )
 
 
+#: What would end a line of a unit, or is no UTF-8.
+_CONTROLS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
 #: What ProtectHome= hides.
 _HOMES = ("/home/", "/root/", "/run/user/")
 #: What --print-unit prints, by its name.
@@ -212,19 +217,19 @@ def wanted(started_as: str, options: Sequence[str], socket: str | None, mode: in
     beside = os.path.join(os.path.dirname(sys.executable), "talk")
     found = shutil.which(started_as if os.path.basename(started_as) == "talk" else beside)
     program = (os.path.abspath(found),) if found else (sys.executable, "-m", "talkcli")
-    files = (program[0], os.path.realpath(sys.executable), os.path.realpath(__file__))
+    files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
     path = os.path.abspath(socket) if socket else None
     return Wanted(program, files, (*([f"--socket={path}"] if path else []), *options), path, mode)
 
 
-def hidden_from_others(files: Sequence[str]) -> str | None:
-    """Return the first directory on the way to these files that other users can't pass; None if there is none."""
+def hidden_from_others(files: Sequence[str]) -> tuple[str, str] | None:
+    """Return the first of these files that other users can't get to, and the directory that they can't pass."""
     for path in files:
         steps = path.split(os.sep)
         for count in range(2, len(steps)):
             directory = os.sep.join(steps[:count])
             if not os.stat(directory).st_mode & stat.S_IXOTH:
-                return directory
+                return path, directory
     return None
 
 
@@ -238,8 +243,19 @@ def _quoted(word: str) -> str:
     plain = all(each.isalnum() or each in "/._-+=:,@%{}" for each in word)
     if word and plain:
         return word
-    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\t", "\\t")
-    return f'"{escaped}"'
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{re.sub(_CONTROLS, _as_bytes, escaped)}"'
+
+
+def _as_bytes(found: re.Match[str]) -> str:
+    return "".join(f"\\x{each:02x}" for each in os.fsencode(found[0]))
+
+
+def _place(path: str) -> str:
+    """Return a path as the value of a setting, which has no quotes; UsageError where it would be read as another."""
+    if re.search(_CONTROLS, path) or path.endswith(("\\", " ")):
+        raise UsageError(f"a socket's unit can't name {printable(path)}: name a path without such signs")
+    return _escaped(path)
 
 
 def _escaped(word: str) -> str:

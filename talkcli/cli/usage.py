@@ -5,6 +5,7 @@ It knows nothing of any one command: those bring their examples and exit codes a
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -13,6 +14,8 @@ from talkcli.cli.nearest import nearest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
+
+    from click.shell_completion import CompletionItem
 
     Codes = Mapping[int | str, str]
 
@@ -104,6 +107,9 @@ class Command(click.Command):
             raise click.UsageError(f"'{ctx.command_path}' takes {takes}: what is '{' '.join(rest)}'?", ctx)
         return rest
 
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        return with_short_help(super().shell_complete(ctx, incomplete))
+
     def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         super().format_help_text(ctx, formatter)
         write_examples(self.examples, formatter)
@@ -113,6 +119,13 @@ class Command(click.Command):
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         write_exit_codes(self.exit_codes, formatter)
+
+
+def with_short_help(options: list[CompletionItem]) -> list[CompletionItem]:
+    """Have a shell show of an option's help what it has room for beside it: what stands before its first stop."""
+    for each in options:
+        each.help = re.split(r"[.;](?:\s|$)", each.help or "", maxsplit=1)[0] + "."
+    return options
 
 
 def write_examples(examples: str, formatter: click.HelpFormatter) -> None:

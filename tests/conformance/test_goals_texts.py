@@ -92,6 +92,19 @@ def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_command_line(scrip
     bystanders.assert_only_these_were_active()
 
 
+def test_what_is_told_of_an_input_that_was_not_read_to_its_end_is_true(scripted: Talk) -> None:
+    longest = "😀" * 10_000
+    for text in (f"{longest}\n", f"{longest}\r\n"):
+        assert json.loads(scripted.run("--json", "say", "-", stdin=text).out)["text"] == longest
+    for text in (f"{longest}\nand more", "a" * 300_000):
+        done = scripted.run("say", "-", stdin=text)
+        assert (done.code, done.out) == (5, "")
+        assert "Talk rejected: standard input has more than 40,000 bytes, and a text at most 10,000 char" in done.err
+    done = scripted.run("--json", "say", "-f", "-", stdin="a" * 300_000)
+    (event,) = map(json.loads, done.out.splitlines())
+    assert (event["event"], event["goal"]["reason"], done.code) == ("result", "text_too_long", 5)
+
+
 def test_row_13_bytes_on_standard_input_that_are_no_utf8_are_rejected(scripted: Talk) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "talkcli", "--json", "say", "-"],

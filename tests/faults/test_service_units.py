@@ -113,6 +113,35 @@ def test_command_is_absolute_and_has_the_options_that_were_given(home: str, name
     assert command_of(printed(home, "user"))[-1] == "serve"
 
 
+@pytest.mark.parametrize("name", ["user", "system"])
+def test_controls_in_an_option_are_read_by_systemd_as_they_were_given(home: str, name: str) -> None:
+    needs("systemd-analyze")
+    greeting = 'one\rtwo\nthree\tfour \x01\x7f\x85\u2028 "five" \\\n'
+    unit = printed(home, name, "--greeting", greeting, "--socket", f"{home}/a\nb")
+    (line,) = values(unit, "ExecStart")
+    assert line.isprintable()
+    quoted = line.partition('"--greeting=')[2].removesuffix('"')
+    assert quoted.encode().decode("unicode_escape").encode("latin-1").decode() == greeting
+    assert f"{home}/a\\nb" in unit.partition("[Unit]")[0] or name == "user"
+    with open(f"{home}/talk.service", "w", encoding="utf-8") as file:
+        file.write(unit)
+    scope = ["--user"] if name == "user" else []
+    done = run(
+        ["systemd-analyze", *scope, "verify", "--man=no", f"{home}/talk.service"],
+        environment(home, XDG_RUNTIME_DIR=home),
+    )
+    assert (done.code, done.err) == (0, ""), done
+
+
+def test_socket_s_unit_refuses_a_path_that_it_cannot_name(home: str) -> None:
+    for path in ("a\nb", "a\rb", "a ", "a\\"):
+        for name in ("user-socket", "system-socket"):
+            done = run([*TALK, "serve", "--print-unit", name, "--socket", f"{home}/{path}"], environment(home))
+            assert (done.code, done.out) == (2, ""), path
+            assert "a socket's unit can't name" in done.err
+    assert f"ListenStream={home}/a b\n" in printed(home, "user-socket", "--socket", f"{home}/a b")
+
+
 def test_installed_script_is_what_runs_however_it_was_called(home: str) -> None:
     script = f"{home}/a place/talk"
     os.mkdir(f"{home}/a place")
@@ -162,11 +191,16 @@ def test_system_s_unit_warns_where_the_service_s_user_can_t_read_the_program(hom
         file.write(f"#!{sys.executable}\nfrom talkcli.cli import main\nmain()\n")
     os.chmod(script, 0o755)
     os.chmod(private, 0o700)
+    os.chmod(home, 0o755)
     done = run([script, "serve", "--print-unit", "system"], environment(home))
     assert done.code == 0
-    assert "install it for all" in done.err
+    assert f"this talk needs {script}, and the service's own user can't pass {private}: install it for all" in done.err
     assert done.out.count("[Service]") == 1  # what is printed is the unit alone
     assert run([script, "serve", "--print-unit", "user"], environment(home)).err == ""
+    os.mkdir(f"{home}/bin")
+    os.symlink(script, f"{home}/bin/talk")  # for all to see, and what it runs is not
+    done = run([f"{home}/bin/talk", "serve", "--print-unit", "system"], environment(home))
+    assert f"this talk needs {script}, and the service's own user can't pass {private}: " in done.err
 
 
 @pytest.mark.parametrize("name", UNITS)
