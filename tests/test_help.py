@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 from typing import TYPE_CHECKING
 
 import click
@@ -13,6 +14,7 @@ import pytest
 from talkcli import admission, errors, states
 from talkcli.cli import commands, serve, show
 from talkcli.cli.usage import Command
+from talkcli.engine import devices
 from tests.conformance.bareserve import TALK, environment, run
 from tests.support.surroundings import short_directory
 from tests.support.terminal import Terminal
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
 
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+#: The sentence is over sooner.
+FAST = ("--rate", "450")
 
 HEADINGS = ["Usage:", "Examples:", "Options:", "Options of every command:", "Exit codes:"]
 
@@ -200,6 +206,40 @@ def test_variable_with_a_wrong_value_is_named() -> None:
 def test_player_that_is_not_there_is_told_at_the_start(make_talk: MakeTalk) -> None:
     first = make_talk("--player", "aply").log.splitlines()[0]
     assert first == "talk: player \"aply\" not found: did you mean 'aplay'? nothing can be heard until it is there"
+
+
+def test_no_sound_device_is_told_at_the_start_and_one_that_comes_later_is_found(
+    make_talk: MakeTalk, sink: Sink
+) -> None:
+    talk = make_talk(*FAST, env={"PULSE_SERVER": ""}, forked=False)
+    first = talk.log.splitlines()[0]
+    assert first.startswith("talk: no sound device is here, ") == devices.nothing_sounds(talk.env)
+    if devices.nothing_sounds(talk.env):
+        assert "talk doctor" in first
+        assert "--player file:PATH.wav" in first
+        done = talk.run("say", "--wait", "hello")
+        assert done.code == 4
+        assert re.fullmatch(r"talk: \S+: Talk aborted: aplay: .*; see 'talk doctor'\n", done.err)
+    shutil.copy(f"{sink.directory}/.asoundrc", talk.directory)  # as a loudspeaker that is plugged in
+    assert talk.run("say", "--wait", "hello").code == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "env"),
+    [
+        (["--player", "null"], {}),
+        (["--player", "file:said.wav"], {}),
+        (["--player", "cat"], {}),
+        (["-q"], {}),
+        ([], {"PULSE_SERVER": "unix:/there"}),
+        (["--driver", "dummy"], {}),
+    ],
+)
+def test_no_sound_device_is_not_told_where_none_is_needed(
+    make_talk: MakeTalk, options: list[str], env: dict[str, str]
+) -> None:
+    talk = make_talk(*options, env={"PULSE_SERVER": "", **env}, watched=False)
+    assert "no sound device" not in talk.log
 
 
 def test_player_beside_a_driver_that_plays_by_itself_is_told(make_talk: MakeTalk) -> None:

@@ -145,7 +145,7 @@ def test_wait_tells_how_each_ended_and_the_first_failure(scripted: Talk) -> None
     done = scripted.run("say", "--lines", "--wait", stdin=text)
     assert done.code == 4
     ids = done.out.split()
-    assert f"talk: {ids[1]}: Talk aborted: no cable" in done.err.splitlines()
+    assert f"talk: {ids[1]}: Talk aborted: no cable; see 'talk doctor'" in done.err.splitlines()
     refused_first = scripted.run("say", "--lines", "--wait", stdin="\0\nfail=audio_lost\n")
     assert refused_first.code == 5
     assert scripted.run("say", "--lines", "--wait", stdin="length=0\nlength=0 b\n").code == 0

@@ -198,7 +198,7 @@ def test_own_id_that_has_ended_tells_its_end_without_waiting(scripted: Talk) -> 
     assert scripted.run("say", "--wait", "--id", "mine", "fail=audio_lost message=no_cable").code == 4
     again = scripted.run("say", "--id", "mine", "fail=audio_lost message=no_cable")
     assert (again.code, again.out) == (4, "mine\n")
-    assert again.err == "talk: mine: Talk aborted: no cable\n"
+    assert again.err == "talk: mine: Talk aborted: no cable; see 'talk doctor'\n"
     goal = json.loads(scripted.run("--json", "say", "--id", "mine", "fail=audio_lost message=no_cable").out)
     assert (goal["id"], goal["state"]) == ("mine", "ABORTED")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 
 from talkcli.cli.show import note, show_json
@@ -62,9 +61,10 @@ def report(goal: Goal, options: Common, shown: Feedback | None = None) -> int:
         from talkcli import output
 
         tell = shown.aside if shown else note
-        tell(output.ending(goal))
-        if goal.state is State.ABORTED and goal.reason != "nothing_to_say" and sys.stderr and sys.stderr.isatty():
-            tell("see 'talk doctor'")
+        words = output.ending(goal)
+        if goal.state is State.ABORTED and goal.reason != "nothing_to_say":
+            words += "; see 'talk doctor'"
+        tell(words)
     return exit_code(goal)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 
@@ -19,6 +20,13 @@ from talkcli.text import MAX_CHARACTERS
 RATES, VOLUMES, PITCHES = (80, 450), (0.0, 1.0), (0, 100)
 #: Milliseconds of silence before a sentence: no output needs longer to wake.
 MAX_LEAD_IN = 5000
+
+#: What is said at the start where nothing could sound.
+NO_DEVICE = (
+    "no sound device is here, and no PulseAudio or PipeWire: plug in a loudspeaker, or hand it to the container ('talk "
+    "doctor' says more); it is looked for with each sentence, which ends ABORTED until it is there; to speak without "
+    "one: '--player file:PATH.wav', '--player null'"
+)
 
 
 def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int:
@@ -163,25 +171,42 @@ def command(context: click.Context, /, print_unit: str | None, **options: object
         _print_unit(context, print_unit)
         return 0
     if not common(context).quiet:
-        _warn_of_player(player, options["driver"])
+        _warn_of_sound(player, options["driver"])
     from talkcli import paths
     from talkcli.server.run import serve
 
     return serve(Settings(socket=paths.named_socket(common(context).socket), **options))  # type: ignore[arg-type]
 
 
-def _warn_of_player(player: str, driver: object) -> None:
+def _warn_of_sound(player: str, driver: object) -> None:
+    """Tell what would be in the way of every sentence: no device, or a player that there isn't.
+
+    With a device and no player named it only looks at the names of files, so that the start is not kept waiting.
+    """
+    from talkcli.engine.devices import nothing_sounds
+
+    if player == "null" or player.startswith("file:"):
+        return
+    silent = player in {"", *complete.PLAYERS} and nothing_sounds(os.environ)
+    if not player and not silent:
+        return
+    from talkcli.engine.start import is_own
+
+    if not is_own(None if driver is None else str(driver)):
+        return  # it plays by itself, and the server says so
+    if silent:
+        note(NO_DEVICE)
+    if player:
+        _warn_of_player(player)
+
+
+def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
     from talkcli.cli.nearest import nearest
     from talkcli.engine.players import commands, on_path
     from talkcli.engine.sink import AudioFailed
-    from talkcli.engine.start import is_own
     from talkcli.printable import printable
 
-    if not player or player == "null" or player.startswith("file:"):
-        return
-    if not is_own(None if driver is None else str(driver)):
-        return  # it plays by itself, and the server says so
     try:
         commands(player, None, 0, on_path, None)
     except AudioFailed as error:

@@ -5,7 +5,6 @@ Each has a limit of time, and one that is missing is a fact. It judges nothing. 
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 from typing import TYPE_CHECKING
@@ -86,8 +85,10 @@ def _sinks(said: programs.Said) -> list[tuple[str, str]]:
 
 def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
     """Return the sound server that a player of this session finds."""
+    from talkcli.engine.devices import sound_servers
+
     named = env.get("PULSE_SERVER") or None
-    sockets = tuple(each for each in _sockets(env, session) if os.path.exists(each))
+    sockets = tuple(sound_servers(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else [])))
     pulse = programs.said("pactl", "info", env=env)
     if pulse.well:
         name = _field(pulse.out, "Server Name") or "PulseAudio"
@@ -100,17 +101,6 @@ def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
     return SoundServer(
         sockets=sockets, trouble=trouble, hangs=pulse.late or wire.late, askable=askable, named=named
     )  # fmt: skip
-
-
-def _sockets(env: Mapping[str, str], session: Session) -> list[str]:
-    """Return where sound servers of this user listen, and the machine's, and that of who called sudo."""
-    own = [env.get("XDG_RUNTIME_DIR"), session.usual_runtime]
-    if session.sudo_uid is not None:
-        own.append(f"/run/user/{session.sudo_uid}")
-    found = [f"{each}/{socket}" for each in own if each for socket in ("pulse/native", "pipewire-0")]
-    found += [f"{each}/native" for each in (env.get("PULSE_RUNTIME_PATH"), "/run/pulse") if each]
-    pipewire = env.get("PIPEWIRE_RUNTIME_DIR")
-    return list(dict.fromkeys([*found, *([f"{pipewire}/pipewire-0"] if pipewire else [])]))
 
 
 def _field(text: str, name: str) -> str | None:

@@ -6,7 +6,6 @@ It judges nothing, starts nothing and opens no device: that would wake it.
 from __future__ import annotations
 
 import contextlib
-import glob
 import grp
 import os
 import platform
@@ -145,9 +144,11 @@ def _parents(pid: int) -> Iterable[str]:
 
 def cards(session: Session, kernel: str = "/proc/asound", nodes: str = "/dev/snd") -> Cards:
     """Return the kernel's sound cards, and which of them this user may open."""
+    from talkcli.engine import devices
+
     # " 0 [Device         ]: USB-Audio - USB Audio Device", and a second line with its place
     names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _text(f"{kernel}/cards"), re.MULTILINE)
-    playing = sorted(glob.glob(f"{glob.escape(nodes)}/pcmC*D*p"))
+    playing = devices.playing(nodes)
     group = _AUDIO
     forbidden = []
     for each in playing:

@@ -12,8 +12,10 @@ import re
 import shutil
 import subprocess
 import sys
+import wave
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 from tests.readme.blocks import block, runs
@@ -119,6 +121,25 @@ def test_first_command_is_heard(newcomer: Shell, sink: Sink) -> None:
     assert_heard(recording, render([Sentence(text)]))
 
 
+@runs("Start #2")
+def test_first_command_without_sound_leaves_something_to_listen_to(tmp_path: pathlib.Path) -> None:
+    """It differs from the first one, which pip is tried with, in the player alone; on a machine that has none."""
+    command = block("Start #2")
+    assert command.replace(" --player file:ready.wav", "") == block("Start")
+    with short_directory() as place:
+        env = clean_environment(place, {"TALK_SOCKET": f"{place}/s", "PULSE_SERVER": "", "XDG_CONFIG_HOME": place})
+        with contextlib.closing(Shell(tmp_path, env)) as shell:
+            shell.stand_in("python3", "mkdir -p .venv/bin && : > .venv/bin/activate")
+            shell.stand_in("pip")
+            shell.stand_in("sleep", "until talk status > status.log 2>&1; do :; done")
+            done = shell.run(f"{command}code=$?; kill $!; wait $!; exit $code")
+    assert (done.returncode, shell.calls("pip"), shell.calls("sleep")) == (0, [["install", "."]], [["3"]]), done
+    assert "no sound device" not in done.stderr
+    with wave.open(f"{tmp_path}/ready.wav") as file:
+        said = np.frombuffer(file.readframes(file.getnframes()), np.int16)
+    assert_heard(said, render([Sentence("talk is ready")]))
+
+
 def _alsa_settings(shell: Shell, sink: Sink) -> str:
     """Return settings by which aplay finds the sink from another HOME."""
     path = shell.directory / "asound.conf"
@@ -178,7 +199,7 @@ def test_packages_are_debians() -> None:
     assert packages - known == set()
 
 
-@runs("Start #2")
+@runs("Start #3")
 def test_ci_runs_the_second_command() -> None:
     """It is what runs this test there: CI takes it from the README, in its own words, and the packages for it too.
 
@@ -188,8 +209,8 @@ def test_ci_runs_the_second_command() -> None:
     ci = (ROOT / ".ci/run").read_text(encoding="utf-8")
     finds = next(each for each in ci.splitlines() if each.startswith("test_command="))
     done = subprocess.run(["bash", "-c", f'{finds}; echo "$test_command"'], cwd=ROOT, capture_output=True, check=True)
-    assert done.stdout.decode() == block("Start #2")
+    assert done.stdout.decode() == block("Start #3")
     steps = [each for each in ci.splitlines() if each and not each.startswith("step ")]
     assert steps[-2:] == ['eval "$test_command"', '"$bin/pytest" -n 3 -m slow']
-    before = TEXT[: TEXT.index(block("Start #2"))].rpartition("passes the tests (")[2]
+    before = TEXT[: TEXT.index(block("Start #3"))].rpartition("passes the tests (")[2]
     assert "pulseaudio" in _packages(before) <= _packages(ci)
