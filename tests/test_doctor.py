@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import signal
@@ -13,11 +14,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import Client, dial
-from talkcli.doctor import reach, sentence
+from talkcli.doctor import look, reach, sentence
 from talkcli.states import State
 from tests.faults.broken import write
 from tests.support.compare import assert_silent, extent
-from tests.support.surroundings import needs
+from tests.support.processes import run_talk
+from tests.support.surroundings import clean_environment, needs
 from tests.test_doctor_alone import within
 
 if TYPE_CHECKING:
@@ -93,9 +95,107 @@ def test_silent_leaves_out_the_sound_and_nothing_else(make_talk: MakeTalk, sink:
     done, found = doctor(talk, "--silent")
     assert done.code == 0, done.out
     assert list(found) == CHECKS
-    assert "without sound" in found["sentence"]["message"]
-    assert logged(talk)[0]["state"] == "SUCCEEDED"
+    message = found["sentence"]["message"]
+    assert message.startswith("played to its end without sound by an engine of this command's own, aplay, 0.")
     assert_silent(talk.recording)
+
+
+def test_silent_waits_for_nobody_and_leaves_no_goal(make_talk: MakeTalk, sink: Sink) -> None:
+    """As from cron, every five minutes, whatever is being said."""
+    talk = make_talk("--rate", "80", sink=sink, forked=False)
+    with Client(talk.socket) as client:
+        first = client.say("this is a sentence that takes longer than all that is looked at meanwhile " * 3)
+        client.say("and one that waits")
+        done, found = doctor(talk, "--silent")
+        assert done.code == 0, done.out
+        assert found["sentence"]["state"] == "done"
+        status = client.status()
+        assert (status.active and status.active.id, len(status.pending)) == (first.id, 1)
+        assert (logged(talk), status.recent) == ([], ())
+        client.cancel()
+
+
+def test_silent_plays_zeros_by_the_server_s_player_to_its_device_in_its_surroundings(
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path
+) -> None:
+    script = f"""#!/bin/sh
+printf '%s ' "$@" "$PULSE_SERVER" >> {tmp_path}/called
+tee -a {tmp_path}/played | aplay -q -t raw -f S16_LE -c 1 -r "$1"
+"""
+    player = write(tmp_path / "player", script, 0o755)
+    talk = make_talk("--player", f"{player} {{rate}} {{device}}", "--device", "robot", sink=sink, forked=False)
+    elsewhere = clean_environment(str(tmp_path), {"TALK_SOCKET": talk.socket})
+    code, out, _ = run_talk(["doctor", "--silent"], elsewhere, LIMIT)
+    assert code == 0, out
+    assert (tmp_path / "called").read_text() == f"22050 robot {sink.env['PULSE_SERVER']} "
+    played = (tmp_path / "played").read_bytes()
+    assert len(played) > 22050 * 2 * 0.3
+    assert not any(played)
+
+
+@pytest.mark.parametrize(("options", "code"), [([], 0), (["--player", "aplay"], 4)])
+def test_silent_tries_the_players_that_the_server_would_try(
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path, options: list[str], code: int
+) -> None:
+    """The server names the first one; without --player that fails, and the sentence is heard by the next."""
+    write(tmp_path / "aplay", "#!/bin/sh\necho 'aplay: main:831: audio open error: No such card' >&2\nexit 1\n", 0o755)
+    talk = make_talk(*options, sink=sink, env={"PATH": f"{tmp_path}:{os.environ['PATH']}"}, forked=False)
+    done, found = doctor(talk, "--silent")
+    assert done.code == code
+    assert ("audio open error" in found["sentence"]["message"]) == bool(code)
+
+
+def test_silent_beside_another_user_s_server_says_as_whom_to_play(
+    make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs("aplay")
+    talk = make_talk(watched=False)
+    monkeypatch.setattr(look, "_environment", lambda _: None)  # it is not to be read
+    found = within({**talk.env, "ALSA_CONFIG_PATH": "/dev/null"}, monkeypatch, silent=True)
+    assert found["sentence"]["next"].endswith(f": sudo -u '#{os.getuid()}' talk doctor --silent")
+
+
+def test_silent_adds_nothing_to_a_file(make_talk: MakeTalk, tmp_path: Path) -> None:
+    talk = make_talk("--player", f"file:{tmp_path}/said.wav", *FAST, forked=False)
+    done, found = doctor(talk, "--silent")
+    assert (done.code, found["player"]["state"], found["sentence"]["state"]) == (4, "failed", "done")
+    assert not (tmp_path / "said.wav").exists()
+
+
+def test_a_device_that_the_server_speaks_with_is_no_fault_and_one_that_another_holds_is(
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path
+) -> None:
+    """A device that takes one player at a time, as a sound card does without a sound server."""
+    script = f"""#!/bin/sh
+exec 9> {tmp_path}/device
+flock -n 9 || {{ echo 'aplay: main:831: audio open error: Device or resource busy' >&2; exit 1; }}
+exec aplay -q -t raw -f S16_LE -c 1 -r 22050
+"""
+    player = write(tmp_path / "player", script, 0o755)
+    talk = make_talk("--player", str(player), "--rate", "80", sink=sink, forked=False)
+    with Client(talk.socket) as client:
+        goal = client.say("this is a sentence that takes longer than all that is looked at meanwhile " * 3)
+        talk.watcher.wait_for_word(goal.id)
+        done, found = doctor(talk, "--silent")
+        assert (done.code, found["sentence"]["state"]) == (0, "done")
+        assert "busy with what the server speaks" in found["sentence"]["message"]
+        client.cancel()
+    with open(tmp_path / "device", "w", encoding="utf-8") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        done, found = doctor(talk, "--silent")
+    assert (done.code, found["sentence"]["state"]) == (4, "failed")
+    assert "another program holds the device" in found["sentence"]["next"]
+
+
+@pytest.mark.parametrize("player", ["false", pytest.param("sleep 100", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("options", [(), ("--silent",)])
+def test_a_player_of_one_s_own_that_fails_is_what_is_to_be_looked_at(
+    make_talk: MakeTalk, player: str, options: tuple[str, ...]
+) -> None:
+    done, found = doctor(make_talk("--player", player, forked=False), *options)
+    assert done.code == 4
+    step = f"try the player by hand, with a second of silence: head -c 44100 /dev/zero | {player}"
+    assert found["sentence"]["next"] == step
 
 
 def test_for_people_it_is_a_line_a_finding_and_the_end_is_a_note(make_talk: MakeTalk, sink: Sink) -> None:
@@ -129,7 +229,7 @@ def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk, behind: st
         for number in range(3):
             client.say(f"number {number} never-ends")
         began = time.monotonic()
-        played = reach.speak(client, sentence.TEXT, None, 0.3)
+        played = reach.speak(client, sentence.TEXT, 0.3)
         assert time.monotonic() - began < 8
         assert (played.state, played.reason) == (State.RECALLED, "late")
         assert played.words == "it still waited behind 4 goals after 0.3 s, and was taken back"
@@ -140,7 +240,7 @@ def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk, behind: st
 
 def test_a_sentence_that_was_begun_and_is_not_over_in_time_is_cancelled(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
-        played = reach.speak(client, "sentence never-ends", None, 0.5)
+        played = reach.speak(client, "sentence never-ends", 0.5)
         assert (played.state, played.reason) == (State.PREEMPTED, "late")
         assert "begun and not over after 0.5 s" in str(played.words)
         assert client.status().active is None
@@ -150,7 +250,7 @@ def test_a_sentence_preempts_nothing(make_talk: MakeTalk) -> None:
     talk = make_talk("--preempt", scripted=True)
     with Client(talk.socket) as client:
         first = client.say("sentence length=0.5")
-        assert reach.speak(client, sentence.TEXT, None, 10).state is State.SUCCEEDED
+        assert reach.speak(client, sentence.TEXT, 10).state is State.SUCCEEDED
         assert first.wait(10).state is State.SUCCEEDED
 
 
@@ -254,7 +354,9 @@ def test_a_server_that_hangs_is_named(
     found = examined(talk, tmp_path, monkeypatch, limit)
     talk.thaw()
     assert found["socket"]["state"] == "failed"
+    assert f"{talk.socket}: a process listens that is stopped; " in found["socket"]["message"]
     assert f"does not answer; look at process {talk.pid}" in found["socket"]["message"]
+    assert found["socket"]["next"] == f"let it go on: kill -CONT {talk.pid}"
     assert "server" not in found
 
 
@@ -280,6 +382,8 @@ def test_sound_behind_a_forwarded_socket_is_not_looked_for_here(make_talk: MakeT
             assert forwarder.poll() is None
             time.sleep(0.01)  # it tells nobody
         done, found = doctor(talk, "--socket", forwarded)
+        goals = logged(talk)
+        silent, found_silently = doctor(talk, "--socket", forwarded, "--silent")
     finally:
         forwarder.kill()
         forwarder.wait()
@@ -288,3 +392,7 @@ def test_sound_behind_a_forwarded_socket_is_not_looked_for_here(make_talk: MakeT
     assert not found.keys() & {"player", "device", "cards", "group", "sound server", "loudness"}
     assert "through the server, aplay" in found["sentence"]["message"]
     assert extent(talk.recording.samples)
+    # Its player is out of reach, and no goal is sent: then nothing is proved.
+    assert (silent.code, found_silently["sentence"]["state"]) == (4, "failed")
+    assert "run talk doctor --silent there" in found_silently["sentence"]["next"]
+    assert logged(talk) == goals

@@ -37,7 +37,8 @@ def command(context: click.Context, silent: bool) -> int:
     """Check everything between a sentence and a loudspeaker, in order, and say the one thing to do next.
 
     Each check is a line: done, warning or failed. At last a sentence is played: by the server, where it waits its turn
-    (20 seconds at most), or without a server by an engine of this command's own, with TALK_PLAYER and TALK_VOICE.
+    (20 seconds at most), or without a server by an engine of this command's own, with TALK_PLAYER and TALK_VOICE. With
+    --silent it is always that engine, which plays zeros by the server's player: no goal waits, and none is in the log.
     """
     from talkcli.doctor.examine import Examination
     from talkcli.doctor.findings import heard

@@ -6,11 +6,10 @@ Each has a limit of time, and one that is missing is a fact. It judges nothing. 
 from __future__ import annotations
 
 import re
-import shlex
 from typing import TYPE_CHECKING
 
 from talkcli.doctor import level, programs
-from talkcli.doctor.sound import Devices, Players, SoundServer, is_silent
+from talkcli.doctor.sound import Devices, Players, SoundServer, is_silent, program_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -32,16 +31,9 @@ def players(env: Mapping[str, str], wanted: str | None, by: str | None) -> Playe
     found = tuple(each for each in PACKAGES if programs.path_of(each, env))
     runs = True
     if wanted is not None and not is_silent(wanted):
-        program = _program(wanted)
+        program = program_of(wanted)
         runs = bool(program and programs.path_of(program, env))
     return Players(dict(PACKAGES), found, wanted, by, runs)
-
-
-def _program(command: str) -> str | None:
-    try:
-        return next(iter(shlex.split(command)), None)
-    except ValueError:
-        return None
 
 
 def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> Devices | None:

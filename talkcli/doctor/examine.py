@@ -47,6 +47,10 @@ class Examination:
         self._server: JsonObject = {}
         self._log: list[Goal] = []
         self._found: list[Finding] = []
+        #: the server's process, where it runs here
+        self._process: int | None = None
+        #: its user, where that is another, from whose surroundings nothing can be played
+        self._owner: int | None = None
         #: why a server that was there said nothing of itself
         self._gone: str | None = None
         #: whether the sound server hangs: whoever asks it again waits again
@@ -81,8 +85,10 @@ class Examination:
         named = None if client else os.environ.get("TALK_VOICE") or None
         engine = probe.look(Setting(voice=named, interrupt=self._interrupt))
         yield from voice.judge(look.python(), engine, server=client is not None)
-        process = reach.process_here(client) if client else None
+        process = self._process = reach.process_here(client) if client else None
         here, env = look.surroundings(process)
+        if process is not None and here.server is None:
+            self._owner = look.owner(process)
         if client is not None and process is None:
             yield session.elsewhere()
             yield from sound.judge_setting(*self._player())
@@ -121,17 +127,43 @@ class Examination:
 
     def _sentence(self, client: Client | None, engine: Engine, env: Mapping[str, str]) -> Finding:
         wanted, _ = self._player()
-        if client is not None:
-            played = reach.speak(client, sentence.TEXT, 0.0 if self._silent else None, LIMIT)
+        by_server, speaking = client is not None and not self._silent, False
+        if client is not None and self._silent:
+            if self._process is None:
+                return sentence.elsewhere()
+            setting = self._setting_of_server(self._process, env)
+            played, speaking = reach.beside(client, lambda: probe.speak(sentence.SHORT, setting, 0.0, LIMIT))
+        elif client is not None:
+            played = reach.speak(client, sentence.TEXT, LIMIT)
             played = reach.with_player(played, self._server.get("player"))
         elif engine.reason is not None:
             played = Played(State.ABORTED, engine.reason, engine.words)
         else:
             setting = Setting(wanted, None, os.environ.get("TALK_VOICE") or None, self._interrupt)
             played = probe.speak(sentence.TEXT, setting, 0.0 if self._silent else 1.0, LIMIT)
-        asleep = ask.suspended(env) if played.reason == "audio_stalled" and not self._hangs else ()
-        quiet = self._silent or sound.is_silent(wanted)
-        step = findings.behind(self._found)
+        custom = sound.is_custom(wanted)
+        behind = findings.behind(self._found, custom=custom)
+        if self._silent and self._owner is not None:
+            behind = sentence.as_owner(self._owner)
+        stalled = played.reason == "audio_stalled" and not (self._hangs or custom)
         return sentence.judge(
-            played, silent=quiet, server=client is not None, suspended=asleep, behind=step, hangs=self._hangs
+            played,
+            silent=self._silent or sound.is_silent(wanted),
+            server=by_server,
+            suspended=ask.suspended(env) if stalled else (),
+            behind=behind,
+            hangs=self._hangs,
+            speaking=speaking,
         )
+
+    def _setting_of_server(self, process: int, env: Mapping[str, str]) -> Setting:
+        """Return what the server speaks with, for a process that does as it does, without a sound."""
+        told = {
+            name: str(self._server[name]) for name in ("player", "device", "voice", "driver") if self._server.get(name)
+        }
+        player = told.get("player")
+        if sound.is_silent(player):
+            player = sound.SILENT  # a file would get a sentence more, perhaps in the middle of one of the server's
+        elif player in sound.NAMED and not look.names_a_player(process, env):
+            player = None  # that one is the first that the server tries, and not the only one
+        return Setting(player, told.get("device"), told.get("voice"), self._interrupt, told.get("driver"), env)

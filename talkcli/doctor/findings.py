@@ -54,10 +54,13 @@ def heard(findings: Sequence[Finding]) -> bool:
     return any(each.check == SENTENCE for each in findings) and all(each.state != FAILED for each in findings)
 
 
-def behind(findings: Sequence[Finding]) -> str | None:
-    """Return the next step for what lies behind the engine, where something there is not as it should be."""
+def behind(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
+    """Return the next step for what lies behind the engine, where something there is not as it should be.
+
+    `custom`: whether the player is a command of the user's own, of which nobody here knows what it needs.
+    """
     steps = {each.check: each.next for each in findings}
-    return next((steps[check] for check in _BEHIND if steps.get(check) is not None), None)
+    return next((steps[check] for check in _BEHIND[: 1 if custom else None] if steps.get(check) is not None), None)
 
 
 def next_step(findings: Sequence[Finding]) -> str | None:

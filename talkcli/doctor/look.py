@@ -58,6 +58,20 @@ def surroundings(server: int | None) -> tuple[Session, Mapping[str, str]]:
     return _session(os.environ, None), dict(os.environ)
 
 
+def names_a_player(server: int, env: Mapping[str, str]) -> bool:
+    """Whether a server was told its player, so that it tries no other; `env`: its environment."""
+    words = _text(f"/proc/{server}/cmdline").split("\0")
+    named = any(each == "--player" or each.startswith("--player=") for each in words)
+    return named or bool(env.get("TALK_PLAYER"))
+
+
+def owner(pid: int) -> int | None:
+    """Return the user of a process; None where it is gone."""
+    with contextlib.suppress(OSError):
+        return os.stat(f"/proc/{pid}").st_uid
+    return None
+
+
 def _environment(pid: int) -> dict[str, str] | None:
     """Return the environment of a process of the same user; None for another's, whose sound server shuts us out."""
     try:

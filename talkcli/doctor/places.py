@@ -8,7 +8,9 @@ from talkcli.values import frozen
 
 #: What is found at a place, beside what `found_at` finds where nobody can be reached.
 FOREIGN = "another user's server"
-MUTE = "something answers"
+#: A connection proves no more: the kernel takes it, whatever the process does.
+MUTE = "something listens"
+STOPPED = "a process listens that is stopped"
 SERVER = "the server"
 
 #: What to do where a server answers and takes no client, by the code of the client's error.
@@ -30,6 +32,8 @@ class Place:
     what: str
     #: who owns what is there: the uid of a server or of a file
     uid: int | None = None
+    #: the process that listens, where that is known
+    pid: int | None = None
 
 
 @frozen
@@ -84,6 +88,8 @@ def _step(found: Places) -> str:
     if FOREIGN in by_what:
         place = by_what[FOREIGN]
         return f"remove it, and: talk serve; or if you trust uid {place.uid}: talk --socket {place.path} doctor"
+    if STOPPED in by_what:
+        return f"let it go on: kill -CONT {by_what[STOPPED].pid}"
     if MUTE in by_what:
         step = _ANSWERS.get(found.code or "")
         return step or f"restart the server on {by_what[MUTE].path}; if it is none of talk's, remove that"

@@ -16,13 +16,15 @@ from talkcli.doctor.voice import Engine
 from talkcli.values import frozen
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from talkcli.engine import protocol
     from talkcli.engine.spawn import EngineProcess
 
 _ID = "doctor"
 _ENGINE_FAILED = "engine_failed"
+#: Words per minute, of what is heard and of what nobody hears: that holds the device no longer than it must.
+_RATE, _SILENT_RATE = 200, 450
 
 
 @frozen
@@ -34,6 +36,9 @@ class Setting:
     voice: str | None = None
     #: a descriptor that ends any waiting with Interrupted
     interrupt: int | None = None
+    driver: str | None = None
+    #: the environment in which it is to run; None for this process's
+    env: Mapping[str, str] | None = None
 
 
 class _Broken(Exception):
@@ -73,7 +78,8 @@ def speak(text: str, setting: Setting, volume: float, limit: float) -> Played:
             for event in talked.events():
                 if isinstance(event, protocol.Ready):
                     player = event.player
-                    talked.process.send(protocol.Say(_ID, text, 200, volume, setting.voice, 50))
+                    rate = _RATE if volume else _SILENT_RATE
+                    talked.process.send(protocol.Say(_ID, text, rate, volume, setting.voice, 50))
                 elif isinstance(event, protocol.Ended):
                     if event.outcome == protocol.COMPLETED:
                         return Played(State.SUCCEEDED, duration=event.duration, player=player)
@@ -96,9 +102,9 @@ class _Talked:
         from talkcli.engine import protocol, spawn
 
         one = self._setting
-        configure = protocol.Configure(os.getpid(), None, one.player, one.device, one.voice, list_voices=True)
+        configure = protocol.Configure(os.getpid(), one.driver, one.player, one.device, one.voice, list_voices=True)
         try:
-            self.process: EngineProcess = spawn.EngineProcess(spawn.engine_command(), configure)
+            self.process: EngineProcess = spawn.EngineProcess(spawn.engine_command(), configure, env=one.env)
         except OSError as error:
             raise _Broken(_ENGINE_FAILED, f"the engine process cannot be started: {error}") from error
         return self

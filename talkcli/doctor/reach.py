@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING
 from talkcli import paths, peers
 from talkcli.client import Client
 from talkcli.dial import Interrupted
-from talkcli.doctor.places import FOREIGN, MUTE, SERVER, Place, Places
+from talkcli.doctor.places import FOREIGN, MUTE, SERVER, STOPPED, Place, Places
 from talkcli.doctor.sentence import Played
 from talkcli.errors import TalkError
 from talkcli.states import State
 from talkcli.values import replace
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from talkcli.handle import GoalHandle
     from talkcli.messages import Goal
 
@@ -50,7 +52,7 @@ def _trouble(lines: list[str], found: tuple[Place, ...]) -> str | None:
     """Return what an error says beyond the places: all of it, or why one that answers takes nobody."""
     if not lines[0].startswith(_NO_SERVER):
         return lines[0]
-    answering = [f"{each.path}: " for each in found if each.what == MUTE]
+    answering = [f"{each.path}: " for each in found if each.what in {MUTE, STOPPED}]
     told = (line.strip() for line in lines[1:])
     return next((line.removeprefix(each) for line in told for each in answering if line.startswith(each)), None)
 
@@ -69,8 +71,20 @@ def _place(path: str, *, trusted: bool) -> Place:
             return Place(path, MUTE, _owner(path))
         except OSError as error:
             return Place(path, paths.found_at(path, error), _owner(path))
-        _, uid = peers.credentials(probe)
-    return Place(path, MUTE if trusted or uid in {os.getuid(), 0} else FOREIGN, uid)
+        pid, uid = peers.credentials(probe)
+    if not (trusted or uid in {os.getuid(), 0}):
+        return Place(path, FOREIGN, uid, pid)
+    return Place(path, STOPPED if _is_stopped(pid) else MUTE, uid, pid)
+
+
+def _is_stopped(pid: int | None) -> bool:
+    """Whether a process was stopped, by Ctrl-Z for one."""
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            # The name in brackets may hold anything, brackets too; then the state.
+            return file.read().rpartition(b")")[2].split()[0] == b"T"
+    except OSError:
+        return False
 
 
 def _owner(path: str) -> int | None:
@@ -102,13 +116,10 @@ def process_here(client: Client) -> int | None:
     return client.server_pid if here else None
 
 
-def speak(client: Client, text: str, volume: float | None, limit: float) -> Played:
-    """Send a sentence that waits its turn, and return how it ended; after `limit` seconds it is taken back.
-
-    `volume`: None for the server's own.
-    """
+def speak(client: Client, text: str, limit: float) -> Played:
+    """Send a sentence that waits its turn, and return how it ended; after `limit` seconds it is taken back."""
     try:
-        goal = client.say(text, preempt=False, ttl=0, volume=volume)
+        goal = client.say(text, preempt=False, ttl=0)
     except TalkError as error:
         return Played(State.LOST, "lost", error.message)
     try:
@@ -123,6 +134,18 @@ def speak(client: Client, text: str, volume: float | None, limit: float) -> Play
     except Interrupted:
         goal.request_cancel()
         raise
+
+
+def beside(client: Client, play: Callable[[], Played]) -> tuple[Played, bool]:
+    """Play without the server, and return how that went, and whether the server spoke meanwhile."""
+    try:
+        before = client.status()
+        played = play()
+        after = client.status()
+    except TalkError as error:
+        return Played(State.LOST, "lost", error.message), False
+    spoken = {each.id for each in after.recent if each.state in {State.SUCCEEDED, State.PREEMPTED}}
+    return played, bool(before.active or after.active or spoken - {each.id for each in before.recent})
 
 
 def _taken_back(client: Client, goal: GoalHandle, limit: float) -> Played:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from talkcli.doctor.findings import SENTENCE, Finding, done, failed
+from talkcli.doctor.sound import is_custom
 from talkcli.doctor.voice import INSTALL_LIBRARY
 from talkcli.states import State
 from talkcli.values import frozen
 
 #: What is said; short, and worth hearing.
 TEXT = "If you hear this, talk works."
+#: What is played beside a server where nobody hears it: short, as a device that takes one player has no place for the
+#: server's meanwhile, and long enough to see that a player doesn't just swallow it.
+SHORT = "talk works well"
 
 #: What to do about a reason. What isn't here is told by `reason` and message alone.
 REMEDIES = {
@@ -29,7 +33,8 @@ REMEDIES = {
     "paused": "talk resume",
 }
 _BUSY = "another program holds the device: close it, or play through a sound server (PipeWire, PulseAudio)"
-_OF_SOUND = frozenset({"no_player", "audio_device", "audio_lost", "audio_stalled"})
+_OF_PLAYER = frozenset({"audio_device", "audio_lost", "audio_stalled"})
+_OF_SOUND = _OF_PLAYER | {"no_player"}
 _OF_START = frozenset({"engine_failed", "engine_hung"})
 _AGAIN = "somebody else ended it: run talk doctor again"
 
@@ -47,14 +52,32 @@ class Played:
     player: str | None = None
 
 
-def remedy(reason: str | None, words: str | None = None) -> str:
-    """Return what to do about a goal that ended for this reason."""
-    if reason == "audio_device" and words and "busy" in words.lower():
+def elsewhere() -> Finding:
+    """Return what is to be said where a server's player is out of reach for a process of this command's own."""
+    words = "not played: the server runs on another machine or in a container, and so does its player"
+    return failed(SENTENCE, words, "run talk doctor --silent there; or here without --silent, so that the server plays")
+
+
+def as_owner(uid: int) -> str:
+    """Return what to do where a server's player failed by another user than the server's."""
+    return f"play as the server's own user, who may have another sound: sudo -u '#{uid}' talk doctor --silent"
+
+
+def _is_busy(reason: str | None, words: str | None) -> bool:
+    return reason == "audio_device" and "busy" in (words or "").lower()
+
+
+def remedy(reason: str | None, words: str | None = None, player: str | None = None) -> str:
+    """Return what to do about a goal that ended for this reason; `player`: what has played it, if that is known."""
+    if _is_busy(reason, words):
         return _BUSY
     if reason == "audio_device" and words and ("denied" in words.lower() or "not permitted" in words.lower()):
         return "sudo usermod -aG audio USER for the user who serves, log in again, and start the server again"
     if reason == "engine_failed" and words and "libespeak-ng" in words:
         return INSTALL_LIBRARY
+    if reason in _OF_PLAYER and player and is_custom(player):
+        command = player.replace("{rate}", "22050").replace("{device}", "default")
+        return f"try the player by hand, with a second of silence: head -c 44100 /dev/zero | {command}"
     return REMEDIES.get(reason or "", _AGAIN)
 
 
@@ -66,11 +89,13 @@ def judge(
     suspended: tuple[str, ...] = (),
     behind: str | None = None,
     hangs: bool = False,
+    speaking: bool = False,
 ) -> Finding:
     """Judge the sentence; `silent`: whether it made no sound; `server`: whether a server has played it.
 
     `suspended`: sinks that took no data when it had ended; `behind`: what is to be done about player and device;
-    `hangs`: whether the sound server does, for which engines wait at their start.
+    `hangs`: whether the sound server does, for which engines wait at their start; `speaking`: whether a server spoke
+    with the same device meanwhile.
     """
     how = "through the server" if server else "by an engine of this command's own"
     if played.state is State.SUCCEEDED:
@@ -81,11 +106,13 @@ def judge(
     if played.reason in {"late", "paused"}:
         return failed(SENTENCE, f"not spoken: {played.words}", remedy(played.reason))
     words = (played.words or "it ended without a reason").removeprefix(f"Talk {played.state.name.lower()}: ")
+    if speaking and _is_busy(played.reason, words):
+        return done(SENTENCE, f"the device is busy with what the server speaks at this moment ({words})")
     label = f"{played.state.name}, {played.reason}" if played.reason else played.state.name
     if played.reason == "audio_stalled" and suspended:
         words = f"{words}; suspended: {', '.join(suspended)}"
         return failed(SENTENCE, f"{label}: {words}", f"pactl suspend-sink {suspended[0]} 0")
-    step = remedy(played.reason, words)
+    step = remedy(played.reason, words, played.player)
     # Player and device have been looked at from nearer before, unless the player itself names the cause.
     causes = _OF_SOUND | _OF_START if hangs else _OF_SOUND
     if played.reason in causes and behind is not None and step != _BUSY:

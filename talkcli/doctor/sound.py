@@ -5,10 +5,14 @@ Only a sentence proves that there is sound: what may be in its way is a warning 
 
 from __future__ import annotations
 
+import shlex
+
 from talkcli.doctor.findings import Finding, done, failed, warning
 from talkcli.doctor.session import Session, seen_from
 from talkcli.values import frozen
 
+#: Players by name: what they need is known; of a command that is another program, only its user knows.
+NAMED = frozenset({"aplay", "pacat", "pw-cat"})
 #: Players that need no device.
 SILENT = "null"
 FILE = "file:"
@@ -85,6 +89,20 @@ class SoundServer:
 def is_silent(player: str | None) -> bool:
     """Tell whether a player makes no sound by its nature."""
     return player is not None and (player == SILENT or player.startswith(FILE))
+
+
+def is_custom(player: str | None) -> bool:
+    """Tell whether a player is a command of the user's own, with a program that isn't known here."""
+    program = program_of(player) if player and not is_silent(player) else None
+    return program is not None and program.rpartition("/")[2] not in NAMED
+
+
+def program_of(command: str) -> str | None:
+    """Return the program of a player's command line; None where that can't be read."""
+    try:
+        return next(iter(shlex.split(command)), None)
+    except ValueError:
+        return None
 
 
 def judge_setting(wanted: str | None, by: str | None) -> list[Finding]:

@@ -21,7 +21,7 @@ from talkcli.engine.holders import kill_holders
 from talkcli.wire import LineSplitter
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
 #: The variable that tells the engine process which descriptor its player has to inherit.
 LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
@@ -52,8 +52,9 @@ class EngineProcess:
         command: list[str],
         configure: protocol.Configure,
         on_stderr: Callable[[bytes], None] = lambda _: None,
+        env: Mapping[str, str] | None = None,
     ) -> None:
-        """`on_stderr` is called with what is read of its standard error, empty at the end."""
+        """`on_stderr` is called with what is read of its standard error, empty at the end; `env`: if not this one's."""
         self.ready = False
         #: what the process said itself of why it cannot start
         self.failed: protocol.StartFailed | None = None
@@ -62,7 +63,7 @@ class EngineProcess:
         self._lines = LineSplitter(limit=None)
         self._stderr_tail = b""
         self._on_stderr = on_stderr
-        environment = {name: value for name, value in os.environ.items() if name not in _NOT_INHERITED}
+        environment = {name: value for name, value in (env or os.environ).items() if name not in _NOT_INHERITED}
         with contextlib.ExitStack() as kept, contextlib.ExitStack() as handed_over:
             self.socket, theirs = socket.socketpair()
             kept.callback(self.socket.close)

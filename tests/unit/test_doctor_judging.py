@@ -59,6 +59,30 @@ def test_a_sentence_that_found_no_device_is_cured_where_the_device_was_looked_at
     assert "talk set --voice" in str(cure("nothing_to_say", "nothing"))
 
 
+def test_a_player_of_one_s_own_is_cured_by_itself_unless_it_names_a_cause() -> None:
+    cards = warning("cards", "none in this container", "start the container with --device /dev/snd")
+    missing = warning("player", "it is not there", "name a program that is there")
+    assert behind([cards], custom=True) is None
+    assert behind([cards, missing], custom=True) == "name a program that is there"
+
+    def cure(reason: str, words: str, player: str) -> str | None:
+        played = Played(State.ABORTED, reason, words, player=player)
+        return sentence.judge(played, silent=False, server=True).next
+
+    by_hand = "try the player by hand, with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d default"
+    assert cure("audio_stalled", "it took no sound for 5 s", "sox -r {rate} -d {device}") == by_hand
+    assert cure("audio_stalled", "it took no sound for 5 s", "aplay -r {rate}") == sentence.REMEDIES["audio_stalled"]
+    assert "another program" in str(cure("audio_device", "Device or resource busy", "sox"))
+
+
+def test_a_device_that_is_busy_is_heard_where_the_server_speaks() -> None:
+    busy = Played(State.ABORTED, "audio_device", "aplay: audio open error: Device or resource busy")
+    assert sentence.judge(busy, silent=True, server=False, speaking=True).state == DONE
+    assert sentence.judge(busy, silent=True, server=False).state == FAILED
+    gone = Played(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
+    assert sentence.judge(gone, silent=True, server=False, speaking=True).state == FAILED
+
+
 def test_text_of_others_is_escaped_in_every_finding() -> None:
     found = failed("device", "aplay: \x1b[2Jred", "remove \u202e it\n")
     assert found.to_json() == {
@@ -120,6 +144,7 @@ PATH = "/run/user/1000/talk/talk.sock"
         (Places((Place("/x", ABSENT),), "TALK_SOCKET", elsewhere=PATH), "/x", f"a server is on {PATH}"),
         (Places((Place(PATH, places.MUTE),), None, None, "it does not answer"), "it does not answer", "restart"),
         (Places((Place(PATH, places.MUTE),), None, None, "busy", "busy"), "busy", "--max-clients"),
+        (Places((Place(PATH, places.STOPPED, 0, 7),), None, None, "it does not answer"), "stopped; it", "kill -CONT 7"),
         (Places((Place(PATH, ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
     ],
 )

@@ -8,6 +8,7 @@ from talkcli.doctor import level, session, sound
 from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding
 from talkcli.doctor.session import Session
 from talkcli.doctor.sound import Cards, Devices, Players, SoundServer
+from talkcli.engine import players
 from talkcli.values import replace
 
 PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)
@@ -61,6 +62,12 @@ def test_a_player_without_sound_is_not_heard(player: str) -> None:
     assert [each.state for each in found] == [FAILED]
     assert found == sound.judge_setting(player, "the server's")
     assert sound.judge_setting("aplay", "the server's") == []
+
+
+def test_players_that_are_known_by_name_are_those_that_there_are() -> None:
+    assert players.PACKAGES.keys() == sound.NAMED
+    assert all(map(sound.is_custom, ("sleep 100", "/opt/bin/play -x", "false")))
+    assert not any(map(sound.is_custom, ("/usr/bin/aplay -q", "pacat", "null", "file:a.wav", "'", "", None)))
 
 
 def test_a_device_is_looked_for_among_those_that_the_player_lists() -> None:
