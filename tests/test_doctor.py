@@ -258,7 +258,7 @@ def test_a_sentence_that_somebody_else_cancels_says_so(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
         client.say("sentence never-ends")
         talk_doctor = scripted.start("doctor", "--json")
-        while not client.status().pending:
+        while (status := client.status()).active is None or not status.pending:
             time.sleep(0.01)  # no event tells a client of another's goal but a watch
         client.cancel()
         done = scripted.finish(talk_doctor, LIMIT)
@@ -273,7 +273,7 @@ def test_a_signal_takes_its_goal_along(scripted: Talk, number: signal.Signals) -
     with Client(scripted.socket) as client:
         client.say("sentence never-ends")
         process = scripted.start("doctor")
-        while not client.status().pending:
+        while (status := client.status()).active is None or not status.pending:
             time.sleep(0.01)  # as above
         process.send_signal(number)
         done = scripted.finish(process, 10)
