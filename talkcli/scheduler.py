@@ -19,7 +19,7 @@ from talkcli.messages import By
 from talkcli.pending import Pending
 from talkcli.recent import EarlyCancels, Said, throttling
 from talkcli.record import Record
-from talkcli.selection import outdone, select
+from talkcli.selection import making_way, select
 from talkcli.states import IllegalTransition, State
 
 if TYPE_CHECKING:
@@ -87,10 +87,15 @@ class Scheduler:
         """Return the goals with this key that have not ended."""
         return [each for each in (self.active, self._pending.with_key(key)) if each and each.key == key is not None]
 
-    def lacks_room(self, say: Say) -> bool:
+    def lacks_room(self, say: Say, now: Now) -> bool:
         """Whether this goal would be REJECTED for no other reason than that the queue is full."""
+        early = self._early.find(say.id, now.monotonic)
+        return not (early or self.has_room(say)) and self._refuse(say, None, None) is None
+
+    def has_room(self, say: Say) -> bool:
+        """Whether a goal that lacked nothing but room need wait no longer."""
         attaches = say.id is not None and self.find(say.id) is not None
-        return not attaches and self._room_fault(say) is not None and self._refuse(say, None, None) is None
+        return self._closing or attaches or self._way(say) is not None
 
     def unfinished(self) -> list[Record]:
         """Return the active goal and the pending ones."""
@@ -98,19 +103,24 @@ class Scheduler:
 
     # -- what clients ask for
 
-    def submit(self, say: Say, sender: Sender, now: Now, fault: tuple[str, str] | None = None) -> Submitted:
+    def submit(
+        self, say: Say, sender: Sender, now: Now, fault: tuple[str, str] | None = None, canceled: By | None = None
+    ) -> Submitted:
         """Accept or reject a goal. Admission is one step: a goal that is REJECTED has done nothing to the others.
 
-        `fault`: reason and words, where something was found wrong with it that can't be known here.
+        `fault`: reason and words, where something was found wrong with it that can't be known here; `canceled`: who
+        cancelled it while it waited for room, so that it is RECALLED at once.
         """
         first = self.find(say.id) if say.id is not None and is_clients_id(say.id) else None
         if first is not None and first.has_text(say.text):
             return Submitted(first, [], attached=True)
         self._count += 1
         record = self._record(say, sender, now)
-        early = self._early.find(say.id, now.monotonic)
-        refused = self._refuse(say, fault, first) or self._throttle(say, record, now)
-        refused = refused or (None if early else self._room_fault(say))
+        by = canceled or self._early.find(say.id, now.monotonic)
+        refused = self._refuse(say, fault, first) or (None if canceled else self._throttle(say, record, now))
+        way = self._way(say)
+        if way is None and not (by or refused):
+            refused = "queue_full", f"{len(self._pending)} goals are waiting already (`talk serve --max-queue`)"
         if refused:
             record.reason, words = refused
             record.state, record.message, record.ended_at = State.REJECTED, f"Talk rejected: {words}", now.wall
@@ -119,11 +129,10 @@ class Scheduler:
         record.id = say.id or record.id
         self._by_id[record.id] = record
         effects: list[Effect] = [Changed(record, State.PENDING)]
-        if early:
-            record.become(State.RECALLING)
-            words = "Talk recalled: canceled before it arrived"
-            return Submitted(record, effects + self._close(record, State.RECALLED, "canceled", words, early, now))
-        effects += self._make_way(record, say, now)
+        if by:
+            words = "canceled before it was spoken" if canceled else "canceled before it arrived"
+            return Submitted(record, effects + self._recalled(record, "canceled", words, by, now))
+        effects += self._make_way(record, way or [], now)
         return Submitted(record, effects + self._start_next(now))
 
     def cancel(self, selection: Cancel, sender: Sender | None, now: Now) -> Cancelled:
@@ -271,24 +280,15 @@ class Scheduler:
         record.by = By(goal=found[0])
         return "throttled", f"the same {found[1]}"
 
-    def _room_fault(self, say: Say) -> tuple[str, str] | None:
+    def _way(self, say: Say) -> list[tuple[Record, str]] | None:
         # There never are more goals in the queue than may be: one that will be recalled makes room enough.
-        if len(self._pending) < self.max_queue or outdone(say, self._pending, preempts=self._preempts(say)):
-            return None
-        lowest = self._pending.newest_of_lowest()
-        if lowest is not None and lowest.priority < say.priority:
-            return None
-        return "queue_full", f"{len(self._pending)} goals are waiting already (`talk serve --max-queue`)"
+        return making_way(say, self._pending, self.max_queue, preempts=self._preempts(say))
 
     def _preempts(self, say: Say) -> bool:
         return say.flush or (self.preempt if say.preempt is None else say.preempt)
 
-    def _make_way(self, record: Record, say: Say, now: Now) -> list[Effect]:
+    def _make_way(self, record: Record, ended: list[tuple[Record, str]], now: Now) -> list[Effect]:
         """Queue a goal that was accepted, and end what it replaces, preempts or displaces."""
-        ended = outdone(say, self._pending, preempts=record.preempt)
-        lowest = self._pending.newest_of_lowest()
-        if not ended and lowest is not None and len(self._pending) >= self.max_queue:
-            ended = [(lowest, "displaced")]
         by = By(goal=record.id)
         effects: list[Effect] = []
         queued = False

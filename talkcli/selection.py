@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from talkcli.effects import Cancelled
     from talkcli.pending import Pending
@@ -32,8 +32,34 @@ def select(selection: Cancel, goals: Scheduler, done: Cancelled) -> list[Record]
     return sorted(once, key=lambda each: (each is goals.active, each.number))
 
 
-def outdone(say: Say, pending: Pending, *, preempts: bool) -> list[tuple[Record, str]]:
-    """Return the pending goals that this one recalls, whether there is room or not, and the reason."""
+def select_waiting(selection: Cancel, waiting: Sequence[Say]) -> list[int]:
+    """Return which of the goals that wait for room are selected: their places in the order in which they came.
+
+    None of them is accepted yet: `before` selects them only where it names one of them, by its sender's id.
+    """
+    ids = set(selection.ids or ())
+    last = max((place for place, say in enumerate(waiting) if say.id == selection.before), default=-1)
+    return [
+        place
+        for place, say in enumerate(waiting)
+        if selection.everything
+        or (selection.before is not None and place <= last)
+        or (say.id is not None and say.id in ids)
+        or (say.key is not None and say.key == selection.key)
+    ]
+
+
+def making_way(say: Say, pending: Pending, max_queue: int, *, preempts: bool) -> list[tuple[Record, str]] | None:
+    """Return the pending goals that this one recalls, and the reason; None if it has no room even so."""
+    ended = _outdone(say, pending, preempts=preempts)
+    if ended or len(pending) < max_queue:
+        return ended
+    lowest = pending.newest_of_lowest()
+    return [(lowest, "displaced")] if lowest is not None and lowest.priority < say.priority else None
+
+
+def _outdone(say: Say, pending: Pending, *, preempts: bool) -> list[tuple[Record, str]]:
+    """Return the goals that it recalls whether there is room or not."""
     replaced = pending.with_key(say.key)
     others: Iterable[Record] = ()
     if say.flush:

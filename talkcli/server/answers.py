@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 from talkcli import __version__, wire
 from talkcli.admission import DEFAULT_VOICE, bad_setting
 from talkcli.errors import UnknownGoal
+from talkcli.messages import By
 from talkcli.requests import Cancel, Log, Pause, Request, Resume, Say, Set, Status, Voices, Wait, Watch
 from talkcli.server import log
+from talkcli.server.later import MAX_WAITING
 from talkcli.server.pauses import Pauses
 from talkcli.states import State
 from talkcli.values import replace
@@ -18,14 +20,16 @@ from talkcli.values import replace
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from talkcli.effects import Cancelled
-    from talkcli.messages import JsonObject
+    from talkcli.effects import Cancelled, Submitted
+    from talkcli.messages import JsonObject, Sender
     from talkcli.record import Record
     from talkcli.server.connection import Connection
     from talkcli.server.service import Service
 
 #: Ended goals that `status` lists.
 RECENT = 10
+#: Why a goal is REJECTED of whose client as many requests wait as may: reason and words.
+TOO_MANY = "queue_full", f"{MAX_WAITING:,} requests of this connection are waiting already"
 
 
 class Answers:
@@ -52,10 +56,18 @@ class Answers:
 
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
         """Carry out a request, and answer it now or later."""
-        try:
-            self._by_kind[type(request)](connection, seq, request)
-        except UnknownGoal as error:
-            connection.reply(wire.failure(seq, error.code, str(error)))
+        later = self._service.later
+        if isinstance(request, Cancel) or (isinstance(request, Pause) and later.holds(connection)):
+            later.voices_known()  # silence waits for nothing; what was asked for before it comes before it
+        elif later.holds(connection) or self._awaits_voices(request):
+            if not later.is_full(connection):
+                later.until_voices(connection, lambda: self._carry_out(connection, seq, request))
+                return
+            if isinstance(request, Say):
+                self._submit(connection, seq, request, connection.sender, TOO_MANY)
+                return
+            later.voices_known()
+        self._carry_out(connection, seq, request)
 
     def left(self, connection: Connection) -> None:
         """Owe a connection that is gone nothing more."""
@@ -74,25 +86,49 @@ class Answers:
 
     # -- one method a request
 
+    def _carry_out(self, connection: Connection, seq: int | None, request: Request) -> None:
+        try:
+            self._by_kind[type(request)](connection, seq, request)
+        except UnknownGoal as error:
+            connection.reply(wire.failure(seq, error.code, str(error)))
+
+    def _awaits_voices(self, request: Request) -> bool:
+        """Whether it can't be carried out yet: the voices are needed, or a goal that came before it needs them."""
+        if isinstance(request, Voices):
+            return self._voices_awaited()
+        if isinstance(request, Set):
+            return request.voice is not None and self._voices_awaited() and not bad_setting(request)
+        if isinstance(request, Say):
+            return self._service.later.awaits_voices or (request.voice is not None and self._voices_awaited())
+        return False
+
     def _say(self, connection: Connection, seq: int | None, request: Say) -> None:
-        def submit() -> None:
-            self._submit(connection, seq, request)
-
-        def submit_in_time() -> None:
-            if request.patient and self._scheduler.lacks_room(request):
-                later.until_room(connection, submit, lambda: not self._scheduler.lacks_room(request))
-            else:
-                submit()
-
-        later = self._service.later
-        if later.awaits_voices or (request.voice is not None and self._voices_awaited()):
-            later.until_voices(connection, submit_in_time)
-        else:
-            submit_in_time()
-
-    def _submit(self, connection: Connection, seq: int | None, request: Say) -> None:
+        later, sender = self._service.later, connection.sender
         now = self._service.now()
-        submitted = self._scheduler.submit(request, connection.sender, now, self._service.voice_fault(request.voice))
+        later.look_now()
+        if not (request.patient and self._scheduler.lacks_room(request, now)):
+            self._submit(connection, seq, request, sender)
+        elif later.is_full(connection):
+            self._submit(connection, seq, request, sender, TOO_MANY)
+        else:
+            later.until_room(
+                connection,
+                request,
+                lambda canceled: self._submit(connection, seq, request, sender, canceled=canceled),
+            )
+
+    def _submit(
+        self,
+        connection: Connection,
+        seq: int | None,
+        request: Say,
+        sender: Sender,
+        fault: tuple[str, str] | None = None,
+        canceled: By | None = None,
+    ) -> Submitted:
+        now = self._service.now()
+        fault = fault or self._service.voice_fault(request.voice)
+        submitted = self._scheduler.submit(request, sender, now, fault, canceled)
         record = submitted.record
         extra: JsonObject = {"paused": True} if self._scheduler.paused else {}
         if submitted.attached:
@@ -109,6 +145,7 @@ class Answers:
         if ended and (request.wait or request.feedback):
             connection.publish(wire.encode({"event": "result", "goal": goal}))
         self._service.apply(submitted.effects)
+        return submitted
 
     def _wait(self, connection: Connection, seq: int | None, request: Wait) -> None:
         if request.ids is None:
@@ -125,8 +162,10 @@ class Answers:
                 connection.publish(wire.encode({"event": "result", "goal": goal}))
 
     def _cancel(self, connection: Connection, seq: int | None, request: Cancel) -> None:
-        self._service.later.voices_known()  # goals that wait for them came before it
+        recalled = self._service.later.cancel(request, By(client=connection.sender))
         done = self._scheduler.cancel(request, connection.sender, self._service.now())
+        done.ended = [each for each in done.ended if each not in recalled]
+        done.recalled += recalled
         self._service.apply(done.effects)
         if done.stopping is None or done.stopping.state.terminal:
             self._report_cancel(connection, seq, done)
@@ -145,10 +184,7 @@ class Answers:
         self._service.audience.watch(connection)
 
     def _voices(self, connection: Connection, seq: int | None, _: Voices) -> None:
-        if self._voices_awaited():
-            self._service.later.until_voices(connection, lambda: self._send_voices(connection, seq))
-        else:
-            self._send_voices(connection, seq)
+        self._send_voices(connection, seq)
 
     def _voices_awaited(self) -> bool:
         return self._service.voices is None and self._service.engine_words in {"starting", "ready"}
@@ -162,8 +198,6 @@ class Answers:
         words = bad_setting(request)
         if words:
             connection.reply(wire.failure(seq, "bad_option", words))
-        elif request.voice is not None and self._voices_awaited():
-            self._service.later.until_voices(connection, lambda: self._change_settings(connection, seq, request))
         else:
             self._change_settings(connection, seq, request)
 

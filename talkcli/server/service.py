@@ -82,7 +82,7 @@ class Service:
         self.began = self._now()
         self._loop = asyncio.get_running_loop()
         self.audience = Audience(self._loop)
-        self.later = Later(self._loop, self.audience, self.failed)
+        self.later = Later(self._loop, self.audience, self.scheduler.has_room, self.failed)
         self._answers = Answers(self)
         self._closing = False
         self._timer: asyncio.TimerHandle | None = None

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import contextlib
+import json
+import os
+import time
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from tests.conformance.told import assert_recalled, assert_rejected, assert_told_in_order, submit
 from tests.conformance.witness import states
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
@@ -146,6 +151,129 @@ def test_a_patient_goal_that_is_refused_for_another_reason_does_not_wait(make_ta
     queue(talk, 0)
     assert_rejected(submit(talk, "", patient=True), "invalid_text")
     assert_rejected(submit(talk, "length=0", patient=True, volume=2), "bad_option")
+    assert talk.request("cancel")["count"] == 2
+
+
+def test_a_goal_that_comes_later_does_not_take_the_room_of_one_that_waits(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "1", scripted=True)
+    begin(talk)
+    (waiting,) = queue(talk, 0)
+    with talk.connect() as wire:
+        wire.send({"seq": 1, "request": "say", "text": "length=0 patient", "patient": True})
+        cancel = {"seq": 2, "request": "cancel", "ids": [waiting]}
+        late = {"seq": 3, "request": "say", "text": "length=0 late"}
+        # In one piece: they are taken one after the other, before anything else happens.
+        wire.send_raw(b"".join(json.dumps(each).encode() + b"\n" for each in (cancel, late)))
+        replies = {each["seq"]: each for each in (wire.receive() for _ in range(4)) if "ok" in each}
+    assert replies[2]["count"] == 1
+    assert replies[1]["goal"]["state"] == "PENDING"
+    assert_rejected(replies[3]["goal"], "queue_full")
+    assert pending(talk) == [replies[1]["goal"]["id"]]
+    assert talk.request("cancel")["count"] == 2
+    assert_told_in_order(talk)
+
+
+def test_a_thousand_goals_of_one_connection_wait_for_room_and_no_more(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "1", scripted=True)
+    begin(talk)
+    queue(talk, 0)
+    lines = [
+        json.dumps({"seq": number, "request": "say", "text": f"length=0 line {number}", "patient": True, "wait": True})
+        for number in range(5_001, 6_003)
+    ]
+    with talk.connect() as wire, talk.connect() as other, limits():
+        wire.send_raw("\n".join(lines).encode() + b"\n")
+        # It is read from all the while; and another connection's goals may wait, too.
+        began = time.monotonic()
+        assert wire.request("status")["server"]["pending"] == 1
+        refused = [each for each in wire.items if each.get("ok")]
+        assert [each["seq"] for each in refused] == [6_001, 6_002]
+        for each in refused:
+            assert_rejected(each["goal"], "queue_full", "1,000 ")
+        waits(other, "another's")
+        assert_within(time.monotonic() - began, 0.5, "answers to who sends more than has room")
+        wire.items.clear()
+        wire.events.clear()
+        assert wire.request("cancel")["count"] == 1_003
+        assert other.receive_event("result")["goal"]["state"] == "RECALLED"
+        replies = [each["seq"] for each in wire.items if each.get("ok")]
+        ends = [each["goal"]["text"] for each in wire.events if each["event"] == "result"]
+    assert replies == list(range(5_001, 6_001))
+    assert ends == [f"length=0 line {number}" for number in replies]
+    assert len(spoken(talk)) == 1
+    assert_told_in_order(talk)
+
+
+# -- a cancel ends what waits for room, too
+
+
+def waits(wire: Wire, text: str, **fields: object) -> None:
+    """Send a goal that waits for room, and return when the server has taken it."""
+    wire.send({"request": "say", "text": f"length=0 {text}", "patient": True, "wait": True, **fields})
+    assert wire.request("hello")["ok"]
+
+
+@pytest.mark.parametrize(
+    ("selection", "chosen"),
+    [
+        ({}, ["one", "two", "three"]),
+        ({"ids": ["two", "seven"]}, ["two"]),
+        ({"key": "door"}, ["one", "two"]),
+        ({"before": "two"}, ["one", "two"]),
+        ({"before": "early"}, []),
+        ({"current": True}, []),
+        ({"ids": []}, []),
+    ],
+    ids=str,
+)
+def test_cancel_ends_the_goals_that_wait_for_room_and_are_selected(
+    make_talk: MakeTalk, selection: dict[str, Any], chosen: list[str]
+) -> None:
+    """One whose room comes with the cancel itself is not spoken after it, whoever sent it."""
+    talk = make_talk("--max-queue", "1", scripted=True)
+    active = begin(talk, id="early")
+    (queued,) = queue(talk, 0)
+    with contextlib.ExitStack() as stack:
+        one, two, three, canceling = (stack.enter_context(talk.connect()) for _ in range(4))
+        wires = {"one": one, "two": two, "three": three}
+        waits(one, "one", key="door")
+        waits(two, "two", id="two", key="door")
+        waits(three, "three")
+        reply = canceling.request("cancel", **selection)
+        assert reply["ok"] == ("seven" not in selection.get("ids", ()))
+        ended = [each["canceled"]["text"].split()[-1] for each in canceling.items if "canceled" in each]
+        assert [each for each in ended if each in wires] == chosen
+        assert not [each for each in canceling.items if "ended" in each]
+        for name in chosen:
+            goal = wires[name].receive_event("result")["goal"]
+            assert (goal["state"], goal["reason"], goal["started_at"]) == ("RECALLED", "canceled", None)
+            assert goal["by"]["client"]["pid"] == os.getpid()
+            assert states(talk, goal["id"]) == ["PENDING", "RECALLED"]
+        if "two" in chosen:  # as of any goal that has ended, whoever sends it again is told how
+            assert submit(talk, "length=0 two", id="two")["state"] == "RECALLED"
+        talk.request("cancel", ids=[active, queued])
+        for name in wires.keys() - chosen:
+            assert wires[name].receive_event("result")["goal"]["reason"] != "canceled"
+    assert_told_in_order(talk)
+
+
+def test_goals_that_wait_for_room_are_told_of_the_server_s_end(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "1", scripted=True)
+    begin(talk)
+    queue(talk, 0)
+    with talk.connect() as wire:
+        waits(wire, "patient")
+        talk.stop()
+        assert_rejected(wire.receive()["goal"], "shutdown")
+
+
+def test_an_id_that_was_cancelled_before_its_goal_came_does_not_wait_for_room(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "1", scripted=True)
+    begin(talk)
+    queue(talk, 0)
+    assert talk.request("cancel", ids=["door"])["error"]["code"] == "unknown_goal"
+    assert submit(talk, "length=0 the door", id="door", patient=True)["id"] == "door"
+    assert states(talk, "door") == ["PENDING", "RECALLED"]
     assert talk.request("cancel")["count"] == 2
 
 

@@ -15,6 +15,7 @@ from tests.conformance.witness import await_ends
 from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
     from tests.support.connection import Message
     from tests.support.processes import Talk
 
@@ -145,6 +146,51 @@ def test_replies_that_are_owed_reach_a_client_that_has_closed_its_half(scripted:
         raw.half_close()
         replies = [each["seq"] for each in raw.receive_all() if "ok" in each]
     assert sorted(replies) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("behind", ["nothing", "cancel"])
+def test_requests_that_wait_for_the_voices_keep_their_order(make_talk: MakeTalk, behind: str) -> None:
+    """A goal with a voice waits at the start until the voices are known, and what comes after it waits with it."""
+    count = 150
+    talk = make_talk("--max-queue", str(2 * count), scripted=True, env={"SCRIPTED_START": "slow=0.5"})
+    with talk.connect() as wire:
+        boot = wire.greeting["boot"]
+        for number in range(5_000, 5_000 + count):
+            wire.send(
+                {"seq": number, "request": "say", "text": "length=0", **({} if number % 3 else {"voice": "default"})}
+            )
+        wire.send({"seq": 6_000, "request": "say", "text": "length=0", "voice": "default", "id": "last"})
+        wire.send({"seq": 6_001, "request": "wait", "ids": ["last"]})
+        wire.send({"seq": 6_002, "request": "set", "rate": 100})
+        if behind == "cancel":
+            assert wire.request("cancel")["ok"]
+        else:
+            assert wire.request("status")["ok"]
+        told = [(each["seq"], each) for each in wire.items if "ok" in each]
+    assert [seq for seq, _ in told] == [*range(5_000, 5_000 + count), 6_000, 6_001, 6_002]
+    assert all(each["ok"] for _, each in told)
+    assert [each["goal"]["id"] for _, each in told[:count]] == [f"{boot}-{number + 1}" for number in range(count)]
+    await_ends(talk, talk.watcher.goals())
+    spoken = [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"]
+    expected = [f"{boot}-{number + 1}" for number in range(count)]
+    assert spoken == ([*expected, "last"] if behind == "nothing" else expected[:1] * len(spoken))
+
+
+def test_past_a_thousand_requests_that_wait_for_the_voices_goals_are_rejected(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-queue", "5000", scripted=True, env={"SCRIPTED_START": "slow=2"})
+    with talk.connect() as wire:
+        wire.send_raw(
+            b"".join(
+                line(seq=number, request="say", text="length=0", voice="default") for number in range(5_000, 6_001)
+            )
+        )
+        first = wire.receive()
+        assert (first["seq"], first["goal"]["reason"]) == (6_000, "queue_full")
+        assert "1,000 " in first["goal"]["message"]
+        wire.send({"seq": 7_000, "request": "voices"})  # the one behind them; it can't be rejected
+        wire.items.clear()
+        assert wire.request("cancel")["ok"]
+        assert [each["seq"] for each in wire.items if "ok" in each] == [*range(5_000, 6_000), 7_000]
 
 
 def test_one_line_of_socat_says_a_sentence(scripted: Talk) -> None:

@@ -52,6 +52,9 @@ class Robot:
     def says(self, text: str = "door open", *, preempt: bool | None = None, priority: int = 0) -> Record:
         return self.asks(Say(text, preempt=preempt, priority=priority))
 
+    def lacks_room(self, say: Say) -> bool:
+        return self.scheduler.lacks_room(say, self.now)
+
     def cancels(self, *ids: str, current: bool = False, before: str | None = None, key: str | None = None) -> Cancelled:
         done = self.scheduler.cancel(Cancel(ids or None, current, before, key), DOOR, self.now)
         self.see(done.effects)

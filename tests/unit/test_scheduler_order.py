@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from talkcli.effects import Changed
 from talkcli.messages import By
-from talkcli.requests import Say
+from talkcli.requests import Cancel, Say
+from talkcli.selection import select_waiting
 from talkcli.states import State
-from tests.unit.robot import Robot, ending
+from tests.unit.robot import ARM, DOOR, Robot, ending
 
 # Priority
 
@@ -202,15 +204,60 @@ def test_a_goal_that_is_rejected_replaces_flushes_and_interrupts_nothing() -> No
 
 def test_a_goal_that_could_wait_for_room_is_known() -> None:
     robot = Robot(max_queue=1)
-    assert not robot.scheduler.lacks_room(Say("x"))
+    assert not robot.lacks_room(Say("x"))
     robot.says()
-    assert not robot.scheduler.lacks_room(Say("x"))
+    assert not robot.lacks_room(Say("x"))
     waiting = robot.asks(Say("y", key="face", id="mine"))
-    assert robot.scheduler.lacks_room(Say("x"))
-    assert robot.scheduler.lacks_room(Say("x", preempt=True))
+    assert robot.lacks_room(Say("x"))
+    assert robot.lacks_room(Say("x", preempt=True))
     for fits in (Say("x", priority=1), Say("x", flush=True), Say("x", key="face")):
-        assert not robot.scheduler.lacks_room(fits)
+        assert not robot.lacks_room(fits)
     for would_not_help in (Say(""), Say("x", rate=1), Say("y", id="mine"), Say("z", id="mine")):
-        assert not robot.scheduler.lacks_room(would_not_help)
+        assert not robot.lacks_room(would_not_help)
+    robot.cancels("early")
+    assert not robot.lacks_room(Say("x", id="early")), "it is RECALLED at once"
     robot.cancels(waiting.id)
-    assert not robot.scheduler.lacks_room(Say("x"))
+    assert not robot.lacks_room(Say("x"))
+
+
+def test_a_goal_that_waits_for_room_goes_on_when_it_has_it_or_never_will() -> None:
+    robot = Robot(max_queue=1)
+    robot.says()
+    robot.says()
+    assert not robot.scheduler.has_room(Say("x"))
+    assert robot.scheduler.has_room(Say("x", priority=1))
+    robot.shuts_down()
+    assert robot.asks(Say("x")).reason == "shutdown"
+    assert robot.scheduler.has_room(Say("x"))
+
+
+@pytest.mark.parametrize(
+    "say", [Say("x"), Say("x", flush=True), Say("door open", throttle=60)], ids=lambda each: each.text
+)
+def test_a_goal_cancelled_while_it_waited_for_room_is_recalled_and_stops_nothing(say: Say) -> None:
+    robot = Robot(max_queue=1)
+    spoken, waiting = robot.says(), robot.says()
+    by = By(client=DOOR)
+    done = robot.scheduler.submit(say, ARM, robot.now, None, by)
+    assert ending(done.record) == (State.RECALLED, "canceled", by)
+    assert [each.state for each in done.effects if isinstance(each, Changed)] == [State.PENDING, State.RECALLED]
+    assert (spoken.state, waiting.state) == (State.ACTIVE, State.PENDING)
+
+
+@pytest.mark.parametrize(
+    ("selection", "chosen"),
+    [
+        (Cancel(), [0, 1, 2, 3]),
+        (Cancel(ids=()), []),
+        (Cancel(ids=("b", "7", "c")), [1, 2]),
+        (Cancel(key="k"), [0, 1]),
+        (Cancel(current=True), []),
+        (Cancel(before="b"), [0, 1]),
+        (Cancel(before="nobody's"), []),
+        (Cancel(ids=("c",), before="b", current=True), [0, 1, 2]),
+    ],
+    ids=str,
+)
+def test_which_of_those_that_wait_for_room_a_cancel_selects(selection: Cancel, chosen: list[int]) -> None:
+    waiting = [Say("1", key="k"), Say("2", id="b", key="k"), Say("3", id="c"), Say("4")]
+    assert select_waiting(selection, waiting) == chosen

@@ -17,6 +17,7 @@ from talkcli.messages import Goal
 from talkcli.requests import KINDS, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
 from talkcli.server import connection
 from talkcli.server.answers import RECENT
+from talkcli.server.later import MAX_WAITING
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
 from talkcli.states import State
 from tests.wire.readme import ROOT, examples, first_column, section, tables, words
@@ -177,6 +178,7 @@ def test_limits_are_those_of_the_code() -> None:
     assert f"{connection.HARD_OUTPUT // 2**20} MiB" in read
     assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
     assert limits["queue"].startswith(f"{MAX_QUEUE} ")
+    assert limits["requests that wait"].startswith(f"{MAX_WAITING:,} ")
 
 
 def test_goal_has_the_keys_of_the_table() -> None:
