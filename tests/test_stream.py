@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.server.stream import Stream, Turn
+from talkcli.server import stream
+from talkcli.server.stream import Stream, Streams
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -70,7 +71,7 @@ class Pair:
             each.setblocking(False)
         self.told = Told()
         loop = asyncio.get_running_loop()
-        self.stream = Stream(loop, Turn(loop), self.socket, self.told, HIGH)
+        self.stream = Stream(loop, Streams(loop), self.socket, self.told, HIGH)
 
     def receive(self) -> bytes:
         """Return what has come at the client's end by now."""
@@ -269,12 +270,12 @@ def test_one_callback_sends_what_all_streams_were_given_in_a_turn() -> None:
     async def play() -> None:
         loop = asyncio.get_running_loop()
         calls = []
-        turn_of_all = Turn(loop)
+        streams = Streams(loop)
         call = loop.call_soon
         async with paired() as first, paired() as second:
             pairs = [first, second]
             for pair in pairs:
-                pair.stream = Stream(loop, turn_of_all, pair.socket, pair.told, HIGH)
+                pair.stream = Stream(loop, streams, pair.socket, pair.told, HIGH)
             loop.call_soon = lambda *values, **named: calls.append(call(*values, **named))  # type: ignore[assignment, method-assign]
             for _ in range(3):
                 for pair in pairs:
@@ -283,5 +284,35 @@ def test_one_callback_sends_what_all_streams_were_given_in_a_turn() -> None:
             assert len(calls) == 1
             await turn()
             assert [pair.receive() for pair in pairs] == [b"word\n" * 3] * 2
+
+    asyncio.run(play())
+
+
+def test_past_what_may_wait_for_all_the_one_that_holds_most_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def play() -> None:
+        loop = asyncio.get_running_loop()
+        streams = Streams(loop)
+        async with contextlib.AsyncExitStack() as stack:
+            pairs = [await stack.enter_async_context(paired()) for _ in range(3)]
+            for pair in pairs:
+                pair.stream = Stream(loop, streams, pair.socket, pair.told, HIGH)
+                pair.stream.write(b"x" * 1_000_000)  # more than the system takes
+            taken = 1_000_000 - pairs[0].stream.size
+            monkeypatch.setattr(stream, "ALL_OUTPUT", streams.waiting + 3_000)
+            pairs[0].stream.write(b"x" * 1_000)
+            pairs[1].stream.hold(1_500)  # behind a list that it doesn't read either
+            pairs[1].stream.hold(500)
+            assert not any(each.stream.closing for each in pairs)
+            pairs[2].stream.write(b"x" * 1_000)
+            await until_lost(pairs[1])
+            assert [each.stream.closing for each in pairs] == [False, True, False]
+            assert streams.waiting == 2 * (1_000_000 - taken) + 2_000
+            pairs[1].stream.hold(-2_000)  # it hears of the end later
+            assert len(pairs[0].receive()) == taken
+            await turn()
+            assert streams.waiting == pairs[0].stream.size + pairs[2].stream.size
+            for pair in (pairs[0], pairs[2]):
+                pair.stream.abort()
+            assert (streams.waiting, streams.open) == (0, set())
 
     asyncio.run(play())

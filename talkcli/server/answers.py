@@ -156,10 +156,10 @@ class Answers:
             if not record.state.terminal:
                 self._service.audience.await_result(record.id, connection, feedback=request.feedback)
         goals = [record.snapshot().to_json() for record in records]
-        connection.stream((wire.item(seq, goal=each) for each in goals), wire.ok(seq, count=len(goals)))
-        for record, goal in zip(records, goals, strict=True):
-            if record.state.terminal:
-                connection.publish(wire.encode({"event": "result", "goal": goal}))
+        # Of those that have ended, whose results are told here and not by the audience, there may be a thousand.
+        ended = [goal for record, goal in zip(records, goals, strict=True) if record.state.terminal]
+        results: Iterator[JsonObject] = ({"event": "result", "goal": each} for each in ended)
+        connection.stream((wire.item(seq, goal=each) for each in goals), wire.ok(seq, count=len(goals)), results)
 
     def _cancel(self, connection: Connection, seq: int | None, request: Cancel) -> None:
         recalled = self._service.later.cancel(request, By(client=connection.sender))

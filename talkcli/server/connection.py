@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from talkcli.messages import JsonObject, Sender
-    from talkcli.server.stream import Turn
+    from talkcli.server.stream import Streams
 
 #: Bytes that may wait for a client before feedback for it is dropped, and before its requests are left unread.
 SOFT_OUTPUT = 256 * 1024
@@ -48,7 +48,7 @@ class Handler(Protocol):
     """What a connection needs of the server."""
 
     #: shared by all its connections
-    turn: Turn
+    streams: Streams
 
     def greeting(self) -> JsonObject:
         """Return the first line for a client that is let in."""
@@ -78,11 +78,11 @@ class Connection:
         self.owed = 0
         self._handler = handler
         self._loop = loop
-        self._stream = Stream(loop, handler.turn, connected, self, SOFT_OUTPUT)
+        self._stream = Stream(loop, handler.streams, connected, self, SOFT_OUTPUT)
         self._splitter = wire.LineSplitter()
         self._lines: deque[bytes] = deque()
         #: what has to be sent in its order while a list is on its way: lists, and what came after them
-        self._outbox: deque[Iterator[JsonObject | bytes]] = deque()
+        self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
         self._newest: bytes | None = None
         self._congested = self._half_closed = self._turn_is_due = False
         self._bad_lines = 0
@@ -155,9 +155,9 @@ class Connection:
         """Answer a request."""
         self._send(message)
 
-    def stream(self, items: Iterable[JsonObject], reply: JsonObject) -> None:
-        """Send a list, as fast as the client reads, and its reply; what comes after it waits."""
-        self._outbox.append(chain(items, [reply]))
+    def stream(self, items: Iterable[JsonObject], reply: JsonObject, events: Iterable[JsonObject] = ()) -> None:
+        """Send a list, as fast as the client reads, its reply, and events that belong to it; what comes after waits."""
+        self._outbox.append(chain(items, [reply], events))
         self._ask_for_a_turn()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
@@ -207,7 +207,9 @@ class Connection:
         if not self._outbox:
             self._write(message)
         elif len(self._outbox) < MAX_HELD:
-            self._outbox.append(iter((message,)))
+            line = message if isinstance(message, bytes) else wire.encode(message)
+            self._outbox.append(line)
+            self._stream.hold(len(line))
         else:
             self.drop()
 
@@ -272,8 +274,12 @@ class Connection:
 
     def _step(self) -> bool:
         if self._outbox:
-            message = next(self._outbox[0], None)
-            if message is None:
+            first = self._outbox[0]
+            if isinstance(first, bytes):
+                self._outbox.popleft()
+                self._stream.hold(-len(first))
+                self._write(first)
+            elif (message := next(first, None)) is None:
                 self._outbox.popleft()
             else:
                 self._write(message)

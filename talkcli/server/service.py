@@ -27,7 +27,7 @@ from talkcli.server.audience import Audience
 from talkcli.server.clock import LOOK_EVERY, elapsed
 from talkcli.server.later import Later
 from talkcli.server.mailbox import Mailbox
-from talkcli.server.stream import Turn
+from talkcli.server.stream import Streams
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -101,7 +101,7 @@ class Service:
             EngineMissing: self._missing,
             ThreadDied: self._thread_died,
         }
-        self.turn = Turn(self._loop)
+        self.streams = Streams(self._loop)
         #: whether the engine was told that a goal waits behind the one it has in hand
         self._followed = False
 

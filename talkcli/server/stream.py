@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
+from talkcli.server import log
+
 if TYPE_CHECKING:
     import asyncio
     import socket
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
 _READ = 64 * 1024
 #: Bytes after which what was written is sent before the turn ends.
 _PIECE = 64 * 1024
+#: Bytes that may wait for all clients together: 250 that don't read would hold a gigabyte within the limit of each.
+ALL_OUTPUT = 64 * 1024 * 1024
 #: Clients after which it is: the first of a thousand can read their result while that of the others is written.
 _CROWD = 128
 
@@ -41,8 +45,8 @@ class Receiver(Protocol):
         """Take note of the end, in a turn of its own; `error`: what the system said, where it broke."""
 
 
-class Turn:
-    """The streams of one event loop that were written to in this turn of it: what waits is sent at its end.
+class Streams:
+    """The streams of one event loop: what was written in a turn of it is sent at its end, and how much may wait in all.
 
     One callback for all: one for each would make a word that fifty watchers are told of half as dear again.
     """
@@ -50,6 +54,17 @@ class Turn:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._due: list[Stream] = []
+        #: those that have not ended
+        self.open: set[Stream] = set()
+        #: bytes that wait in all of them
+        self.waiting = 0
+
+    def relieve(self) -> None:
+        """Let the clients go for which most waits, until no more waits for all of them than may."""
+        while self.waiting > ALL_OUTPUT and self.open:
+            most = max(self.open, key=lambda each: each.size + each.held)
+            most.abort()
+            log.seldom("output", f"a client that doesn't read is let go: {ALL_OUTPUT >> 20} MiB wait for all together")
 
     def add(self, stream: Stream) -> None:
         """Have `end_turn` called at the end of this turn."""
@@ -73,15 +88,18 @@ class Stream:
     """The socket of one client; it is closed at the end, and not before the receiver has been told."""
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, turn: Turn, connected: socket.socket, receiver: Receiver, high: int
+        self, loop: asyncio.AbstractEventLoop, streams: Streams, connected: socket.socket, receiver: Receiver, high: int
     ) -> None:
-        """`turn`: that of all streams of this loop; `high`: bytes that may wait before the receiver is told so."""
+        """`streams`: all of this loop; `high`: bytes that may wait before the receiver is told so."""
         self.socket = connected
         self._loop = loop
-        self._turn = turn
+        self._streams = streams
+        streams.open.add(self)
         self._receiver = receiver
         self._high = high
         self._waiting = bytearray()
+        #: bytes that wait elsewhere, to be written when the client has read what was sent before them
+        self.held = 0
         #: whether what waits will be sent at the end of this turn, and whether it waits for the client to read
         self._due = self._blocked = False
         self._congested = self._reading = self._eof = False
@@ -143,18 +161,28 @@ class Stream:
         """Whether nothing more can be written."""
         return self._closing
 
+    def hold(self, size: int) -> None:
+        """Count bytes that wait elsewhere; with a negative size, that they do no more."""
+        if self._ended:
+            return
+        self.held += size
+        self._streams.waiting += size
+        self._streams.relieve()
+
     def write(self, data: bytes) -> None:
         """Send this at the end of this turn, or as soon as the client has read what was sent before it."""
         if self._closing:
             return
         self._waiting += data
+        self._streams.waiting += len(data)
         if self._blocked:
             self._tell_congestion()
         elif len(self._waiting) >= _PIECE:
             self._send()
         elif not self._due:
             self._due = True
-            self._turn.add(self)
+            self._streams.add(self)
+        self._streams.relieve()
 
     def end_turn(self) -> None:
         """Send what was written in this turn."""
@@ -188,6 +216,7 @@ class Stream:
             self._end(error)
             return
         del self._waiting[:sent]
+        self._streams.waiting -= sent
         if not (self._waiting or self._blocked or self._closing or self._congested):
             return  # as nearly always
         if self._blocked != bool(self._waiting):
@@ -220,6 +249,9 @@ class Stream:
         self.pause_reading()
         if self._blocked:
             self._loop.remove_writer(self.socket)
+        self._streams.open.discard(self)
+        self._streams.waiting -= len(self._waiting) + self.held
+        self.held = 0
         self._waiting.clear()
         self._loop.call_soon(self._tell_end, error)
 

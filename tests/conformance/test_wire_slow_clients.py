@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.conformance.rawsocket import Raw
+from tests.conformance.told import assert_told_in_order
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -162,6 +163,25 @@ def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None
     for goal_id in ids:
         states = [each["state"] for each in seen if each["id"] == goal_id and each["event"] == "state"]
         assert states == ["PENDING", "ACTIVE", "SUCCEEDED"]
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the memory of a process is not told here")
+def test_what_waits_for_all_clients_together_has_a_limit(scripted: Talk) -> None:
+    text = "length=0 " + "🤖" * 9_900
+    goals = 12
+    with scripted.connect() as reading, contextlib.ExitStack() as stack:
+        before = peak_memory(scripted.pid)
+        for _ in range(200):
+            stack.enter_context(Raw(scripted.socket)).send(b'{"request": "watch"}\n')
+        for _ in range(goals):
+            assert reading.request("say", text=text, wait=True)["ok"]
+            assert reading.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+        grown = (peak_memory(scripted.pid) - before) / 1024
+        clients = reading.request("status")["server"]["clients"]
+    # A megabyte for each of 200; beyond the limit there is only what a buffer that grows is given in advance.
+    assert grown < 128, f"{grown:.0f} MiB"
+    assert 20 < clients < 100, "those for which there is room stay, and no more"
+    assert_told_in_order(scripted)  # to who reads
 
 
 def test_slow_clients_are_closed_by_limits_of_a_tenth(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:

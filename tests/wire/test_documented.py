@@ -15,7 +15,7 @@ from talkcli.cli import commands
 from talkcli.history import MAX_ENDED, MAX_REJECTED
 from talkcli.messages import Goal
 from talkcli.requests import KINDS, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
-from talkcli.server import connection
+from talkcli.server import connection, stream
 from talkcli.server.answers import RECENT
 from talkcli.server.later import MAX_WAITING
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
@@ -176,6 +176,7 @@ def test_limits_are_those_of_the_code() -> None:
     read = limits["a client that doesn't read"]
     assert f"{connection.SOFT_OUTPUT // 1024} KiB" in read
     assert f"{connection.HARD_OUTPUT // 2**20} MiB" in read
+    assert f"past {stream.ALL_OUTPUT // 2**20} MiB for all" in limits["clients that don't read"]
     assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
     assert limits["queue"].startswith(f"{MAX_QUEUE} ")
     assert limits["requests that wait"].startswith(f"{MAX_WAITING:,} ")
