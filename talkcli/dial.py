@@ -15,7 +15,7 @@ from talkcli import paths, peers, wire
 from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
 from talkcli.printable import printable
 from talkcli.requests import Hello, write_request
-from talkcli.unreachable import DIRECTORY, FORBIDDEN
+from talkcli.unreachable import DIRECTORY, FILE, FORBIDDEN
 from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
@@ -27,6 +27,10 @@ ANSWER_LIMIT = 5.0
 #: that were turned away together don't come back together.
 BUSY_LIMIT = 5.0
 _BUSY_PAUSE = (0.02, 0.2)
+#: What to do next where nobody answers.
+_START = "start one with: talk serve"
+_LET_IN = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
+_OWN = "or start your own with: talk serve"
 
 
 @frozen
@@ -109,7 +113,8 @@ def _await(connected: _socket.socket | None, timeout: float, interrupt: int | No
 
 
 def _try_all(named: str | None, hello: Hello, version: str, patience: float, interrupt: int | None) -> Line:
-    failures = []
+    failures: list[str] = []
+    found: str = ""
     denied = False
     for path in paths.client_sockets(named):
         try:
@@ -117,7 +122,7 @@ def _try_all(named: str | None, hello: Hello, version: str, patience: float, int
         except OSError as error:
             found = paths.found_at(path, error)
             denied = denied or found == FORBIDDEN
-            hint = f": name the one in it, {path.rstrip('/')}/{paths.SOCKET}" if found == DIRECTORY else ""
+            hint = f": name the one in it, {_inside(path)}" if found == DIRECTORY else ""
             failures.append(f"{path}: {found}{hint}")
             continue
         try:
@@ -130,7 +135,7 @@ def _try_all(named: str | None, hello: Hello, version: str, patience: float, int
         except BaseException:
             connected.close()
             raise
-    raise _nobody(failures, denied, named)
+    raise _nobody(failures, named, found, denied=denied)
 
 
 def _connect(path: str) -> _socket.socket:
@@ -209,18 +214,35 @@ def _next_step(connected: _socket.socket) -> str:
     return f"look at process {pid}, and restart it if it hangs"
 
 
-def _nobody(failures: list[str], denied: bool, named: str | None) -> TalkError:
-    import shlex  # it loads `re`
-
+def _nobody(failures: list[str], named: str | None, found: str, *, denied: bool) -> TalkError:
+    """Return the error; `found`: what is at the last place, the only one where one was named."""
     tried = "\n".join(f"  {each}" for each in failures)
+    step = _named_step(named, found, denied=denied) if named else f"{_LET_IN}\n{_OWN}" if denied else _START
     hint = paths.sudo_hint()
-    step = "start one with: talk serve"
-    if named and named == os.environ.get("TALK_SOCKET"):
-        step += "\nor unset TALK_SOCKET, which names this place: no other was tried"
-    elif named:
-        step += f" --socket {shlex.quote(printable(named))}"
     if hint and not os.environ.get("TALK_SOCKET"):
         step += f"\nthe server of the user who called sudo would be reached with: talk --socket {hint}"
     if denied:
         return AccessDenied(f"no server that may be used, tried:\n{tried}\n{step}")
     return ServerUnavailable(f"no server, tried:\n{tried}\n{step}")
+
+
+def _named_step(named: str, found: str, *, denied: bool) -> str:
+    """Return what to do next where the only place was one that the user named."""
+    import shlex  # it loads `re`
+
+    by_variable = named == os.environ.get("TALK_SOCKET")
+    place = shlex.quote(printable(_inside(named) if found == DIRECTORY else named))
+    if denied:
+        step = _LET_IN if by_variable else f"{_LET_IN}\n{_OWN}"
+    elif found == FILE:
+        step = "name a socket" if by_variable else "name a socket, or leave out --socket"
+    elif by_variable:
+        step = f"set TALK_SOCKET to {place}" if found == DIRECTORY else _START
+    else:
+        step = f"{_START} --socket {place}"
+    return f"{step}\nor unset TALK_SOCKET, which names this place: no other was tried" if by_variable else step
+
+
+def _inside(directory: str) -> str:
+    """Return the socket in a directory that was named in its place."""
+    return f"{directory.rstrip('/')}/{paths.SOCKET}"

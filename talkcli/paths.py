@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 import sys
 
 from talkcli.unreachable import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
@@ -38,7 +39,7 @@ def found_at(path: str, error: OSError) -> str:
     """Return what is at a place where a connection failed: a constant of `unreachable`, else the system's words."""
     if os.path.isdir(path):
         return DIRECTORY
-    if os.path.isfile(path):
+    if os.path.exists(path) and not stat.S_ISSOCK(os.stat(path).st_mode):
         return FILE
     if error.errno in {errno.ENOENT, errno.ENOTDIR}:
         return ABSENT
@@ -72,7 +73,13 @@ def sudo_hint() -> str | None:
 def server_socket(named: str | None) -> str:
     """Return where a server listens, with its directory made; AddressInUse where that directory is not safe."""
     if named:
-        return os.path.abspath(named)
+        try:
+            return os.path.abspath(named)
+        except FileNotFoundError as error:
+            from talkcli.errors import AddressInUse
+
+            words = f"the working directory is gone, and the socket {named} would be in it: name its whole path"
+            raise AddressInUse(words) from error
     given = os.environ.get("RUNTIME_DIRECTORY")
     if given:
         return os.path.join(given.split(":")[0], SOCKET)

@@ -278,13 +278,23 @@ def test_a_place_that_is_no_socket_is_told_from_what_a_server_left_there(tmp_pat
     place.mkdir()
     file = tmp_path / "file"
     file.touch()
-    for named, words in (
-        (place, f"a directory, and no socket: name the one in it, {place}/talk.sock"),
-        (file, "a file"),
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    leave_out = "name a socket, or leave out --socket"
+    inside = f"{place}/talk.sock"
+    for named, words, by_variable_do, by_option_do in (
+        (
+            place,
+            f"a directory, and no socket: name the one in it, {inside}",
+            f"set TALK_SOCKET to {inside}",
+            f"start one with: talk serve --socket {inside}",
+        ),
+        (file, "a file", "name a socket", leave_out),
+        (pipe, "a file", "name a socket", leave_out),
     ):
         by_variable, by_option = alone("status", TALK_SOCKET=str(named)), alone("--socket", str(named), "status")
         assert (by_variable.code, by_option.code) == (3, 3)
         assert f"{named}: {words}" in by_variable.err
         assert f"{named}: {words}" in by_option.err
-        assert "or unset TALK_SOCKET" in by_variable.err
-        assert f"talk serve --socket {named}" in by_option.err
+        assert f"\n{by_variable_do}\nor unset TALK_SOCKET" in by_variable.err
+        assert by_option.err.endswith(f"\n{by_option_do}\n")

@@ -16,14 +16,14 @@ import click
 import pytest
 
 import talkcli
-from talkcli.server import listener
+from talkcli.server import lock
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support import processes
 from tests.support.connection import Wire
 from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 NOBODY = 65534
 as_root = pytest.mark.skipif(
@@ -120,16 +120,16 @@ def test_second_server_names_the_one_that_serves_and_never_the_one_before_it(hom
     with subprocess.Popen(["true"]) as gone:
         gone.wait()
     path = f"{home}/lock"
-    with open(path, "w+b", buffering=0) as lock:
-        lock.write(f"{gone.pid}\n".encode())
+    with open(path, "w+b", buffering=0) as file:
+        file.write(f"{gone.pid}\n".encode())
         found: list[int | None] = []
-        reader = threading.Thread(target=lambda: found.append(listener._holder(lock.fileno())))
+        reader = threading.Thread(target=lambda: found.append(lock._holder(file.fileno())))
         reader.start()
         reader.join(0.1)
         assert reader.is_alive(), f"it named {found}, which has ended"
-        lock.seek(0)
-        lock.truncate()
-        lock.write(f"{os.getpid()}\n".encode())
+        file.seek(0)
+        file.truncate()
+        file.write(f"{os.getpid()}\n".encode())
         reader.join()
     assert found == [os.getpid()]
 
@@ -147,9 +147,63 @@ def test_file_in_the_place_of_the_socket_is_not_removed(home: str) -> None:
     path = f"{home}/s"
     with open(path, "w", encoding="utf-8") as file:
         file.write("precious")
-    assert "is no socket" in refused(home, "--socket", path)
+    assert "is no socket: remove it" in refused(home, "--socket", path)
     with open(path, encoding="utf-8") as file:
         assert file.read() == "precious"
+    assert f"a directory: name one in it, --socket {home}/talk.sock" in refused(home, "--socket", home)
+    os.mkfifo(f"{home}/pipe")
+    assert "is no socket: name another one" in refused(home, TALK_SOCKET=f"{home}/pipe")
+
+
+def test_server_that_is_refused_leaves_no_lock(home: str) -> None:
+    os.mkdir(f"{home}/directory")
+    os.mkfifo(f"{home}/pipe")
+    too_long = "s" * (100 - len(home))  # the lock's name is none too long for a file, the socket's for a socket
+    for name in ("directory", "pipe", too_long + "s" * 20):
+        refused(home, "--socket", f"{home}/{name}")
+    assert sorted(os.listdir(home)) == ["directory", "pipe"]
+    with open(f"{home}/{too_long}{'s' * 20}.lock", "w", encoding="utf-8"):
+        pass
+    refused(home, "--socket", f"{home}/{too_long}{'s' * 20}")
+    assert len(os.listdir(home)) == 3, "a lock that was there is not its own to remove"
+
+
+def link(path: str) -> None:
+    os.symlink("precious", path)
+
+
+def hard_link(path: str) -> None:
+    os.link(f"{os.path.dirname(path)}/precious", path)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (os.mkfifo, "is no regular file"),
+        (os.mkdir, "is no regular file"),
+        (link, "is a symbolic link"),
+        (hard_link, "is a hard link"),
+    ],
+    ids=lambda each: getattr(each, "__name__", ""),
+)
+def test_lock_that_is_none_is_told_and_not_written_to(home: str, make: Callable[[str], None], words: str) -> None:
+    with open(f"{home}/precious", "w", encoding="utf-8") as file:
+        file.write("precious")
+    make(f"{home}/s.lock")
+    said = refused(home, "--socket", f"{home}/s")
+    assert f"the lock {home}/s.lock {words}" in said
+    assert "remove it" in said
+    with open(f"{home}/precious", encoding="utf-8") as file:
+        assert file.read() == "precious"
+    assert sorted(os.listdir(home)) == ["precious", "s.lock"]
+
+
+def test_socket_without_its_whole_path_is_refused_where_the_working_directory_is_gone(home: str) -> None:
+    command = ["sh", "-c", 'mkdir gone && cd gone && rmdir ../gone && exec "$@"', "sh", *SERVE, "--socket", "s"]
+    done = run(command, environment(home), cwd=home)
+    assert (done.code, done.out) == (11, "")
+    assert "the working directory is gone" in done.err
+    assert "Traceback" not in done.err
 
 
 def test_directory_that_is_not_safe_is_refused(home: str) -> None:
@@ -223,6 +277,11 @@ def test_client_of_another_user_ends_with_10(home: str) -> None:
                 done = run([*client, "--socket", path, *words], theirs)
                 assert (done.code, done.out) == (10, ""), done
                 assert "Traceback" not in done.err
+                assert "have its owner let you in, with `talk serve --socket-mode 0660`" in done.err
+                assert done.err.endswith("or start your own with: talk serve\n")
+        done = run([*client, "status"], {**theirs, "TALK_SOCKET": path})
+        assert done.err.endswith("or unset TALK_SOCKET, which names this place: no other was tried\n")
+        assert "talk serve\n" not in done.err, "it would be at that place, too"
     with serving(environment(home), "--socket", path, "--socket-mode", "0666"):
         # a server of another user is trusted where it was named, root's everywhere
         assert run([*client, "--socket", path, "say", "--wait", "hello"], theirs).code == 0

@@ -1,28 +1,23 @@
 """The listening socket: who may serve at a path, and how its file comes and goes.
 
-A lock that is held for life decides who serves; only its holder removes a socket that an ended server left. The file
-of the lock stays: removing it would let two servers hold two locks of one name. Where somebody else has removed it, the
-server that comes first to lock a new one goes on, and the other ends.
+A lock that is held for life decides who serves; only its holder removes a socket that an ended server left.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import socket
 import stat
 import sys
-import time
 
 from talkcli import __version__, dial, paths, peers
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
 from talkcli.requests import Hello
+from talkcli.server.lock import Lock, identity, serves_already
 
 #: Connections that may wait to be accepted; the system's own limit applies too (net.core.somaxconn).
 BACKLOG = 1024
-#: Seconds in which the holder of the lock has written its process id.
-_LOCK_NAMES_HOLDER = 1.0
 #: The first descriptor that systemd passes (SD_LISTEN_FDS_START).
 _FIRST_PASSED = 3
 _RESTART_SOCKET = "restart the socket's unit (systemctl restart talk.socket)"
@@ -36,23 +31,25 @@ class Listener:
 
     def __init__(self, named: str | None, mode: int) -> None:
         """`named`: the path that the user named; `mode`: who may connect, as the mode of the socket's file."""
-        self._named = named
         self.mode = mode
         self.path = paths.server_socket(named)
+        #: absolute: the directory that it was relative to may be gone when it is bound again
+        self._named = self.path if named else None
         _check_directory(os.path.dirname(self.path))
-        _refuse_second_server(named)
-        self._lock = _lock(self.path)
+        _refuse_other_file(self.path)
+        _refuse_second_server(self._named)
+        self._lock = Lock(self.path)
         try:
             self.socket = _bind(self.path, mode)
         except BaseException:
-            os.close(self._lock)
+            self._lock.undo()
             raise
-        self._identity = _identity(self.path)
+        self._identity = identity(self.path)
 
     def in_place(self) -> bool:
         """Whether the files of socket and lock are the ones that were made."""
         # Neither inode can be another's meanwhile: an open socket, and an open file, keep theirs.
-        return _identity(self.path) == self._identity and _is_named(self._lock, _lock_name(self.path))
+        return identity(self.path) == self._identity and self._lock.in_place(self.path)
 
     def bind_again(self) -> socket.socket | None:
         """Make anew what is not in place, by the rules of the start: directory, lock, socket.
@@ -62,31 +59,31 @@ class Listener:
         """
         path = paths.server_socket(self._named)
         _check_directory(os.path.dirname(path))
-        keeps_lock = _is_named(self._lock, _lock_name(path))
-        lock = self._lock if keeps_lock else _lock(path)
+        keeps_lock = self._lock.in_place(path)
+        lock = self._lock if keeps_lock else Lock(path)
         former = None
         try:
-            if _identity(path) != self._identity:
+            if identity(path) != self._identity:
                 _refuse_live_socket(path)
                 bound = _bind(path, self.mode)
                 former = self.socket
-                self.socket, self.path, self._identity = bound, path, _identity(path)
+                self.socket, self.path, self._identity = bound, path, identity(path)
         except BaseException:
             if not keeps_lock:
-                os.close(lock)
+                lock.undo()
             raise
         if not keeps_lock:
-            os.close(self._lock)
+            self._lock.close()
             self._lock = lock
         return former
 
     def close(self) -> None:
         """Remove the socket's file, if it is still this one, and let the lock go."""
-        if self._identity is not None and _identity(self.path) == self._identity:
+        if self._identity is not None and identity(self.path) == self._identity:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(self.path)
         self.socket.close()
-        os.close(self._lock)
+        self._lock.close()
 
 
 class InheritedListener:
@@ -100,7 +97,7 @@ class InheritedListener:
         try:
             _check_passed(self.socket)
             self.path = self.socket.getsockname()
-            self._identity = _identity(self.path)
+            self._identity = identity(self.path)
             if self._identity is None:
                 raise AddressInUse(f"the passed socket's file {self.path} is gone: {_RESTART_SOCKET}")
             self.mode = stat.S_IMODE(os.lstat(self.path).st_mode)
@@ -111,7 +108,7 @@ class InheritedListener:
 
     def in_place(self) -> bool:
         """Whether the socket's file is the one that was there at the start."""
-        return _identity(self.path) == self._identity
+        return identity(self.path) == self._identity
 
     def bind_again(self) -> socket.socket | None:
         """Say what to do: whoever passed the socket would pass the old one again."""
@@ -140,7 +137,7 @@ def listen(named: str | None, mode: int) -> Listener | InheritedListener:
         if passed != "1":
             raise UsageError(f"{passed} sockets were passed (LISTEN_FDS), talk serves one")
         inherited = InheritedListener(_FIRST_PASSED)
-        if not named or os.path.abspath(named) == inherited.path:
+        if not named or paths.server_socket(named) == inherited.path:
             return inherited
         inherited.close()
     return Listener(named, mode)
@@ -156,14 +153,7 @@ def _refuse_second_server(named: str | None) -> None:
         raise AddressInUse(f"a server is there already: {error}") from error
     here, _ = peers.credentials(found.socket)  # behind a socket that ssh forwards it is a process of another machine's
     found.socket.close()
-    raise _serves_already(found.pid, found.path, here=here == found.pid)
-
-
-def _serves_already(pid: int | None, path: str, *, here: bool) -> AddressInUse:
-    """Return the error; `here`: whether that process is one of this machine."""
-    name = "unknown" if pid is None else pid
-    how = f" (kill {pid})" if here else ""
-    return AddressInUse(f"a server (pid {name}) serves {path} already: use it, or end it first{how}")
+    raise serves_already(found.pid, found.path, here=here == found.pid)
 
 
 def _refuse_live_socket(path: str) -> None:
@@ -201,68 +191,23 @@ def _check_directory(directory: str) -> None:
         )
 
 
-def _lock_name(path: str) -> str:
-    return f"{path}.lock"
-
-
-def _lock(path: str) -> int:
-    """Return the descriptor of the lock, held; AddressInUse, naming the holder, if another server holds it."""
-    name = _lock_name(path)
-    while True:
-        try:
-            fd = os.open(name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-        except OSError as error:
-            raise AddressInUse(f"the lock {name} can't be opened: {error.strerror}") from error
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            holder = _holder(fd)
-            os.close(fd)
-            raise _serves_already(holder, path, here=holder is not None) from None
-        if _is_named(fd, name):
-            break
-        os.close(fd)  # it was removed between the two steps: who locks the next one serves
-    os.ftruncate(fd, 0)
-    with contextlib.suppress(OSError):  # a full disk: the lock holds without the number, which is for people
-        os.write(fd, f"{os.getpid()}\n".encode())
-    return fd
-
-
-def _is_named(fd: int, name: str) -> bool:
-    """Whether the open file is still the one of this name."""
-    status = os.fstat(fd)
-    return _identity(name) == (status.st_dev, status.st_ino)
-
-
-def _lives(pid: int) -> bool:
+def _refuse_other_file(path: str) -> None:
+    """Refuse where something is that no server has made."""
     try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass  # another user's
-    return True
-
-
-def _holder(fd: int) -> int | None:
-    """Return the process id that the holder wrote, which it may be about to; None if it doesn't.
-
-    What is there until then may be the number of a server before it, which is gone.
-    """
-    end = time.monotonic() + _LOCK_NAMES_HOLDER
-    while True:
-        words = os.pread(fd, 32, 0).decode(errors="replace")
-        if words.endswith("\n") and words.strip().isdecimal() and _lives(int(words)):
-            return int(words)
-        if time.monotonic() > end:
-            return None
-        time.sleep(0.01)
+        mode = os.lstat(path).st_mode
+    except OSError:
+        return
+    if stat.S_ISDIR(mode):
+        inside = os.path.join(path, paths.SOCKET)
+        raise AddressInUse(f"{path} exists and is no socket but a directory: name one in it, --socket {inside}")
+    if not stat.S_ISSOCK(mode):
+        step = "remove it, or name another one" if stat.S_ISREG(mode) or stat.S_ISLNK(mode) else "name another one"
+        raise AddressInUse(f"{path} exists and is no socket: {step}")
 
 
 def _bind(path: str, mode: int) -> socket.socket:
+    _refuse_other_file(path)
     try:
-        if not stat.S_ISSOCK(os.lstat(path).st_mode):
-            raise AddressInUse(f"{path} exists and is no socket: remove it, or name another one")
         os.unlink(path)  # the lock is ours, so whoever bound it is gone
     except FileNotFoundError:
         pass
@@ -288,12 +233,3 @@ def _bind(path: str, mode: int) -> socket.socket:
         listening.close()
         raise AddressInUse(f"cannot listen at {path}: {error.strerror or error}") from error
     return listening
-
-
-def _identity(path: str) -> tuple[int, int] | None:
-    """Return what tells a file from another of its name; None if there is none, or it can't be seen."""
-    try:
-        status = os.lstat(path)
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino

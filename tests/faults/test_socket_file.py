@@ -117,6 +117,19 @@ def test_socket_that_was_removed_or_replaced_is_bound_again(home: str, fault: Ca
     assert server.log.count("bound again") == 2
 
 
+def test_socket_named_from_the_working_directory_is_bound_again_where_that_was(home: str) -> None:
+    """The directory is gone when it is, and with it the place from which its name was to be read."""
+    path = f"{home}/here/s"
+    os.mkdir(f"{home}/here", 0o700)
+    command = ["sh", "-c", 'cd "$0" && exec "$@"', f"{home}/here", *HASTY]
+    with serving(environment(home, TALK_SOCKET="s"), command=command) as server:
+        remove_directory(path)
+        found_again(path, server.process.pid)
+        with Wire(path) as wire:
+            assert wire.request("status")["server"]["socket"] == path
+    assert "a bug" not in server.log
+
+
 def test_lock_alone_that_was_removed_is_made_again(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
