@@ -27,8 +27,9 @@ MAX_KEY = 64
 #: What stands for the driver's own voice, where a voice is named.
 DEFAULT_VOICE = "default"
 
-_ID = re.compile(rf"[A-Za-z0-9._:][A-Za-z0-9._:-]{{0,{MAX_ID - 1}}}")
-_SERVERS_ID = re.compile(r"[a-z0-9]{4}-[0-9]+")
+_ID = re.compile(rf"[A-Za-z0-9._:/][A-Za-z0-9._:/-]{{0,{MAX_ID - 1}}}")
+#: A boot id and a number. Digits first and third: so nobody names a goal (`goal-1`, `2024-12`).
+_SERVERS_ID = re.compile(r"[0-9][a-z][0-9][a-z]-[0-9]+")
 
 
 def is_clients_id(goal_id: str) -> bool:
@@ -49,8 +50,8 @@ def bad_option(say: Say) -> str | None:
         return f"a key has 1 to {MAX_KEY} characters, this one has {len(say.key)}"
     if say.id is not None and not is_clients_id(say.id):
         return (
-            f"the id {say.id[:MAX_ID]!a} is not one that a sender may choose: 1 to {MAX_ID} of A-Z a-z 0-9 . _ : -, "
-            "not digits alone, not four characters, '-' and digits, and no '-' in front"
+            f"the id {say.id[:MAX_ID]!a} is not one that a sender may choose: 1 to {MAX_ID} of A-Z a-z 0-9 . _ : / -, "
+            "no '-' in front, not digits alone, and not of the form of a server's own, 4k7f-12"
         )
     return _bad_seconds("throttle", say.throttle) or bad_setting(say)
 

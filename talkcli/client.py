@@ -135,7 +135,7 @@ class Client:
         all that is pending of the same or a lower priority; `priority`: higher goes first; `ttl`: seconds in which it
         must have begun, else it is RECALLED, 0 for no limit, None leaves that to the server; `key`: 1 to 64 characters,
         replaces the pending goal with the same key; `throttle`: REJECTED where a goal of that key, or else of that
-        text, began less than so many seconds ago; `id`: 1 to 64 of A-Z a-z 0-9 . _ : - of the sender's choice: said
+        text, began less than so many seconds ago; `id`: 1 to 64 of A-Z a-z 0-9 . _ : / - of the sender's choice: said
         again with the same id it is not spoken twice, the handle is `attached` to the first.
 
         `rate`: 80 to 450 words per minute; `volume`: 0 to 1; `voice`: id, name or language; `pitch`: 0 to 100; None

@@ -37,7 +37,7 @@ PREEMPTED_MESSAGE = "Talk preempted"
 
 
 class Scheduler:
-    """Goals of one server. `boot` makes their ids: four random characters a server start."""
+    """Goals of one server. `boot` makes their ids: four characters a server start."""
 
     def __init__(
         self,

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from talkcli.messages import JsonObject
     from tests.support.processes import Talk
 
-GOAL = Goal("k3fz-7", State.ACTIVE, "moving back", client=Sender(7, 0, "talk", "sh", "patrol"), queued_at=1.5)
+GOAL = Goal("4k7f-7", State.ACTIVE, "moving back", client=Sender(7, 0, "talk", "sh", "patrol"), queued_at=1.5)
 EVENTS: list[Event] = [
-    StateChanged("k3fz-7", State.ACTIVE, 2.5, 42),
-    StateChanged("k3fz-7", State.SUCCEEDED, 2.5, 42, GOAL),
-    WordHeard("k3fz-7", "back", 7, 11, 2, 0.25, 2.5, 43),
-    PausedChanged(True, "k3fz-7", By(client=Sender(7, 0)), 2.5, 44),
+    StateChanged("4k7f-7", State.ACTIVE, 2.5, 42),
+    StateChanged("4k7f-7", State.SUCCEEDED, 2.5, 42, GOAL),
+    WordHeard("4k7f-7", "back", 7, 11, 2, 0.25, 2.5, 43),
+    PausedChanged(True, "4k7f-7", By(client=Sender(7, 0)), 2.5, 44),
     PausedChanged(False, None, None, 2.5, 45),
     Result(GOAL),
     Snapshot(ServerStatus({"pid": 1}, GOAL, (GOAL,), (GOAL, GOAL))),

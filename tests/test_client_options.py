@@ -124,7 +124,7 @@ def test_same_id_again_attaches(client: Client, scripted: Talk) -> None:
         {"key": "k" * 65},
         {"id": ""},
         {"id": "17"},
-        {"id": "k3fz-1"},
+        {"id": "4k7f-1"},
         {"id": "-x"},
         {"id": "a b"},
         {"id": "é"},

@@ -44,7 +44,7 @@ def _word(line: dict[str, Any]) -> str:
 @contextlib.contextmanager
 def server_for(clients: int) -> Iterator[Callable[[bytes], Client]]:
     """Give what connects a client, which has said something already, to a server with so many places."""
-    served = Service("k3fz", Settings(max_clients=clients), "unused", 0o600)
+    served = Service("4k7f", Settings(max_clients=clients), "unused", 0o600)
     made: list[Client] = []
 
     def connect(says: bytes = b"") -> Client:

@@ -44,7 +44,7 @@ def test_words_that_come_all_at_once_leave_the_clients_their_turns() -> None:
         mailbox = Mailbox(loop, taken.append, lambda *_: None)
         call = loop.call_soon_threadsafe
         loop.call_soon_threadsafe = lambda *values: wakes.append(call(*values))  # type: ignore[assignment, method-assign]
-        words = [protocol.Word("k3fz-1", 0, 1, number, 0.0) for number in range(COUNT)]
+        words = [protocol.Word("4k7f-1", 0, 1, number, 0.0) for number in range(COUNT)]
 
         def post_all() -> None:
             for each in words:
@@ -77,7 +77,7 @@ def test_report_that_meets_a_bug_takes_no_other_with_it() -> None:
 
         mailbox = Mailbox(asyncio.get_running_loop(), take, lambda what, error: failed.append((what, type(error))))  # type: ignore[arg-type]
         for number in range(3):
-            mailbox.post(protocol.Alive(f"k3fz-{number}"))
+            mailbox.post(protocol.Alive(f"4k7f-{number}"))
         await asyncio.sleep(0)
         assert len(taken) == 3
         assert failed == [("a report of the engine", ZeroDivisionError)]
@@ -88,7 +88,7 @@ def test_report_that_meets_a_bug_takes_no_other_with_it() -> None:
 def test_the_engine_gets_to_work_before_clients_are_told() -> None:
     async def play() -> None:
         written: list[str] = []
-        served = Service("k3fz", Settings(), "unused", 0o600)
+        served = Service("4k7f", Settings(), "unused", 0o600)
         served.engine = _Written(written)  # type: ignore[assignment]
 
         def changed(record: Record, state: State, _: float) -> None:
@@ -97,7 +97,7 @@ def test_the_engine_gets_to_work_before_clients_are_told() -> None:
         served.audience.changed = changed  # type: ignore[assignment, method-assign]
         for text, preempt in (("first", False), ("second", True)):
             served.apply(served.scheduler.submit(Say(text, preempt=preempt), Sender(), served.now()).effects)
-        served.report(protocol.Ended("k3fz-1", protocol.STOPPED))
+        served.report(protocol.Ended("4k7f-1", protocol.STOPPED))
         await asyncio.sleep(0)
         assert written == [
             *("say first", "PENDING first", "ACTIVE first"),

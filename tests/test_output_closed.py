@@ -74,5 +74,5 @@ def test_a_goal_is_spoken_whatever_becomes_of_its_id(scripted: Talk) -> None:
 
 
 def test_closed_standard_error_changes_no_exit_code(scripted: Talk) -> None:
-    done = bash(scripted, "talk status k3fz-99 2>&-; echo $?; talk say -w fail=audio_lost 2>&-; echo $?")
+    done = bash(scripted, "talk status 4k7f-99 2>&-; echo $?; talk say -w fail=audio_lost 2>&-; echo $?")
     assert [each for each in done.stdout.splitlines() if "-" not in each] == ["8", "4"]

@@ -74,7 +74,7 @@ def busy(talk: Talk) -> str:
         (["--priority", "1000001", "hello"], ["priority"]),
         (["--priority", "high", "hello"], ["--priority"]),
         (["--id", "12", "hello"], ["id '12'"]),
-        (["--id", "k3fz-7", "hello"], ["k3fz-7"]),
+        (["--id", "4k7f-7", "hello"], ["4k7f-7"]),
         (["--id", "a b", "hello"], ["a b"]),
         (["--id", "", "hello"], ["--id"]),
     ],

@@ -44,7 +44,7 @@ class _Clock:
 
 
 async def _queued_behind_another(ttl: float) -> Service:
-    served = Service("k3fz", Settings(ttl=ttl), "unused", 0o600)
+    served = Service("4k7f", Settings(ttl=ttl), "unused", 0o600)
     served.engine = _BusyEngine()  # type: ignore[assignment]
     for text in ("a long sentence", "the door is open"):
         served.apply(served.scheduler.submit(Say(text), Sender(), served.now()).effects)
@@ -72,7 +72,7 @@ def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine_wakes
         served = await _queued_behind_another(ttl=600)
         await asyncio.sleep(0)  # the loop's own timer for the ten minutes is set
         slept.ahead += 3_600
-        await _until(served, "k3fz-2", State.RECALLED, clock.LOOK_EVERY + 1)
+        await _until(served, "4k7f-2", State.RECALLED, clock.LOOK_EVERY + 1)
 
     asyncio.run(scenario())
 

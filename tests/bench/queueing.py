@@ -39,7 +39,7 @@ class Crowd:
     """A scheduler that is saying something while so many goals wait, and the steps whose cost is measured."""
 
     def __init__(self, size: int) -> None:
-        self.scheduler = Scheduler("k3fz", preempt=False, max_queue=size + TIMES + 1)
+        self.scheduler = Scheduler("4k7f", preempt=False, max_queue=size + TIMES + 1)
         self._names = count()
         self._ids: list[str] = []
         self.enqueue()  # it is being spoken

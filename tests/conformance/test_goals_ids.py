@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -148,8 +149,27 @@ def test_row_22_a_sender_that_attached_and_leaves_ends_nothing(scripted: Talk) -
         assert one.receive_event("result")["goal"]["state"] == "SUCCEEDED"
 
 
-@pytest.mark.parametrize("own", ["7", "k3fz-12", "-door", "door 1", "d" * 65, "", "dörr"])
+@pytest.mark.parametrize("own", ["7", "4k7f-12", "-door", "door 1", "d" * 65, "", "dörr"])
 def test_ids_that_a_sender_may_not_choose_are_rejected(scripted: Talk, own: str) -> None:
     goal = submit(scripted, TEXT, id=own, flush=True)
     assert_rejected(goal, "bad_option")
     assert goal["id"] != own
+
+
+@pytest.mark.parametrize("own", ["goal-1", "task-2", "2024-12", "/patrol/goal-1-1712.25"])
+def test_ids_that_programs_give_their_goals_are_taken(scripted: Talk, own: str) -> None:
+    """Four characters and a number, too; and ROS's, which have slashes."""
+    done = scripted.run("say", "--wait", "--id", own, "--", SHORT)
+    assert (done.code, done.id) == (0, own), done
+    assert scripted.request("say", text=SHORT, id=own)["attached"]
+    assert scripted.run("wait", own).code == 0
+    assert scripted.run("cancel", own).code == 0
+    assert scripted.run("cancel", f"{own}.later").code == 8
+    assert scripted.run("say", "--wait", "--id", f"{own}.later", "--", SHORT).code == 6
+    assert_told_in_order(scripted)
+
+
+def test_ids_of_a_server_are_of_a_form_that_nobody_types(scripted: Talk) -> None:
+    goal = submit(scripted, SHORT)["id"]
+    assert re.fullmatch("[0-9][a-z][0-9][a-z]-1", goal)
+    assert scripted.run("wait", "1").code == 0

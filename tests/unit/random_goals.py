@@ -7,7 +7,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-BOOT = "k3fz"
+BOOT = "4k7f"
 MAX_TEXT = 20
 Fields = dict[str, Any]
 

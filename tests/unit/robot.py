@@ -29,7 +29,7 @@ class Robot:
     seen: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.scheduler = Scheduler("k3fz", preempt=self.preempt, max_queue=self.max_queue, ttl=self.ttl)
+        self.scheduler = Scheduler("4k7f", preempt=self.preempt, max_queue=self.max_queue, ttl=self.ttl)
 
     @property
     def now(self) -> Now:

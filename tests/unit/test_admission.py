@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from talkcli.admission import MAX_KEY, MAX_PRIORITY, bad_option, bad_setting, is_clients_id
 from talkcli.requests import Say, Set
+from talkcli.server import run
 
 NO_SECONDS: list[object] = [-1, -0.001, math.nan, math.inf, -math.inf, 10**400, -(10**400)]
 GOOD: list[tuple[str, list[object]]] = [
@@ -35,26 +36,14 @@ BAD: list[tuple[str, list[object]]] = [
 ]
 SETTINGS = {"rate", "volume", "pitch", "voice", "ttl"}
 OWN_IDS = [
-    "a",
-    "A",
-    ".",
-    "_",
-    ":",
-    "a" * 64,
-    "arm-1",
-    "K3FZ-1",
-    "k3fz-",
-    "k3fz-x",
-    "k3f-1",
-    "k3fzz-1",
-    "1.",
-    "1-1",
-    "_-_",
+    *("a", "A", ".", "_", ":", "/", "a" * 64, "1.", "1-1", "_-_", "a/b", "/patrol/goal-1", "/arm-1-1712.5"),
+    *("arm-1", "goal-1", "task-2", "move-10", "wp01-3", "2024-12", "k3fz-12"),  # of four characters and a number
+    *("4K7F-1", "4k7f-", "4k7f-x", "4k7f", "4k7-1", "4k7ff-1", "4k7f-1-1", "a4k7f-1", "44k7-1", "4k77-1", "4kf7-1"),
 ]
 OTHER_IDS = [
-    *("", "1", "007", "k3fz-1", "0000-0", "abcd-00012", "-", "-a", "-1", "a" * 65),
-    *("a b", "a\n", "a/b", "é", "a\0", "１", "٣", "ａ", "a,b", "\ud800"),
-]  # fmt: skip
+    *("", "1", "007", "4k7f-1", "0a0a-0", "9z9z-00012", "-", "-a", "-1", "a" * 65),
+    *("a b", "a\n", "4k7f-1\n", "é", "a\0", "１", "٣", "ａ", "a,b", "a\\b", "\ud800"),
+]
 
 
 def short(value: object) -> str:
@@ -100,8 +89,15 @@ def test_no_other_format_than_text(format_: str) -> None:
     assert len(words) < 200
 
 
-@given(st.text(alphabet=st.sampled_from("aZ09._:-") | st.characters(), max_size=70))
+@given(
+    st.text(alphabet=st.sampled_from("aZ09._:/-") | st.characters(), max_size=70)
+    | st.from_regex(r"[0-9a-z]{4}-[0-9]{1,3}", fullmatch=True)
+)
 def test_an_id_is_the_servers_or_a_clients_and_never_both(goal_id: str) -> None:
-    plain = re.fullmatch(r"[A-Za-z0-9._:-]{1,64}", goal_id) is not None and not goal_id.startswith("-")
-    servers = re.fullmatch(r"[a-z0-9]{4}-[0-9]+|[0-9]+", goal_id) is not None
+    plain = re.fullmatch(r"[A-Za-z0-9._:/-]{1,64}", goal_id) is not None and not goal_id.startswith("-")
+    servers = re.fullmatch(r"[0-9][a-z][0-9][a-z]-[0-9]+|[0-9]+", goal_id) is not None
     assert is_clients_id(goal_id) == (plain and not servers)
+
+
+def test_an_id_of_a_server_is_no_client_s() -> None:
+    assert not [boot for boot in (run._boot() for _ in range(1_000)) if is_clients_id(f"{boot}-1")]

@@ -17,7 +17,7 @@ from talkcli.unreachable import ABSENT, FORBIDDEN, STALE
 
 PYTHON = Python("3.11.2", "/usr/bin/python3", "2.99")
 ENGINE = Engine("espeak", "eSpeak NG 1.51 (system)", 141)
-SPOKEN = Goal("k3fz-1", State.SUCCEEDED, text="x")
+SPOKEN = Goal("4k7f-1", State.SUCCEEDED, text="x")
 SERVER: dict[str, object] = {
     "pid": 4711, "version": __version__, "engine": "ready", "player": "aplay", "uptime": 100.0, "rate": 200,
     "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None, "paused": False, "pending": 0,
@@ -186,11 +186,11 @@ def test_a_server_is_judged_by_what_it_says_of_itself(
 
 def test_the_last_failures_are_counted_and_the_last_one_told() -> None:
     aborted = Goal(
-        "k3fz-2", State.ABORTED, reason="audio_device", ended_at=0.0, message="Talk aborted: aplay: device is busy"
+        "4k7f-2", State.ABORTED, reason="audio_device", ended_at=0.0, message="Talk aborted: aplay: device is busy"
     )
     found = of(serving.judge(SERVER, [SPOKEN, aborted], 600.0), "failures")
     assert found.state == WARNING
-    assert "1 of the last 2 goals ABORTED, last k3fz-2, 10 min ago" in found.message
+    assert "1 of the last 2 goals ABORTED, last 4k7f-2, 10 min ago" in found.message
     assert "audio_device: aplay: device is busy" in found.message
     assert "another program holds the device" in str(found.next)
     found = of(serving.judge(SERVER, [aborted, SPOKEN], 600.0), "failures")

@@ -14,7 +14,7 @@ from talkcli.states import State
 
 
 def ended(number: int, state: State = State.SUCCEEDED, text: str = "door open") -> Record:
-    record = Record(f"k3fz-{number}", number, text, Sender(), 1.0)
+    record = Record(f"4k7f-{number}", number, text, Sender(), 1.0)
     record.state = state
     record.reason = "canceled"
     return record
@@ -25,7 +25,7 @@ def test_the_last_thousand_results_are_kept() -> None:
     records = [ended(number) for number in range(1_001)]
     for record in records:
         history.add(record)
-    assert history.find("k3fz-0") is None
+    assert history.find("4k7f-0") is None
     assert all(history.find(each.id) is each for each in records[1:])
 
 
@@ -87,7 +87,7 @@ def test_an_id_that_was_forgotten_may_come_again() -> None:
 
 
 def test_an_unknown_id_is_not_found() -> None:
-    assert History().find("k3fz-1") is None
+    assert History().find("4k7f-1") is None
 
 
 def test_texts_take_eight_mebibytes_and_the_oldest_goes_first_but_its_result_stays() -> None:

@@ -63,9 +63,9 @@ def test_a_goal_has_all_its_keys_and_no_other(goal: Goal) -> None:
 
 
 def test_what_is_not_known_of_a_goal_is_null() -> None:
-    message = Goal("k3fz-1", State.PENDING).to_json()
+    message = Goal("4k7f-1", State.PENDING).to_json()
     assert message == dict.fromkeys(KEYS) | {
-        "id": "k3fz-1", "state": "PENDING", "status": 0, "format": "text", "priority": 0, "paused": False
+        "id": "4k7f-1", "state": "PENDING", "status": 0, "format": "text", "priority": 0, "paused": False
     }  # fmt: skip
 
 
@@ -75,7 +75,7 @@ def test_a_goal_goes_there_and_back(goal: Goal) -> None:
 
 
 def test_a_goal_without_a_client_has_none_there_and_back() -> None:
-    assert Goal.from_json(Goal("k3fz-1", State.REJECTED).to_json()).client is None
+    assert Goal.from_json(Goal("4k7f-1", State.REJECTED).to_json()).client is None
 
 
 @given(goals, st.dictionaries(st.text().filter(lambda key: key not in KEYS), values, max_size=3))
@@ -117,16 +117,16 @@ def test_a_goal_with_one_wrong_field_is_a_goal_or_a_value_error(goal: Goal, name
     [
         None,
         [],
-        "k3fz-1",
+        "4k7f-1",
         7,
         {},
-        {"id": "k3fz-1"},
+        {"id": "4k7f-1"},
         {"state": "ACTIVE"},
         {"id": 1, "state": "ACTIVE"},
-        {"id": "k3fz-1", "state": 1},
-        {"id": "k3fz-1", "state": "DANCING"},
-        {"id": "k3fz-1", "state": "active"},
-        {"id": "k3fz-1", "state": None},
+        {"id": "4k7f-1", "state": 1},
+        {"id": "4k7f-1", "state": "DANCING"},
+        {"id": "4k7f-1", "state": "active"},
+        {"id": "4k7f-1", "state": None},
     ],
 )
 def test_what_has_no_id_and_no_state_that_is_known_is_no_goal(value: object) -> None:
@@ -147,7 +147,7 @@ def test_any_json_value_for_a_sender_is_a_sender(value: object) -> None:
 
 def test_by_names_a_goal_or_a_client_never_both() -> None:
     sender = Sender(pid=7, uid=1000, command="talk", parent="bash patrol.sh", name="patrol")
-    assert By(goal="k3fz-2").to_json() == {"goal": "k3fz-2"}
+    assert By(goal="4k7f-2").to_json() == {"goal": "4k7f-2"}
     assert By(client=sender).to_json() == {
         "client": {"pid": 7, "uid": 1000, "command": "talk", "parent": "bash patrol.sh", "name": "patrol"}
     }

@@ -23,7 +23,7 @@ steps = st.lists(
 
 
 def goal(number: int, priority: int = 0, *, preempt: bool = False, key: str | None = None) -> Record:
-    record = Record(f"k3fz-{number}", number, f"text {number % 3}", Sender(), 1.0)
+    record = Record(f"4k7f-{number}", number, f"text {number % 3}", Sender(), 1.0)
     record.priority, record.preempt, record.key = priority, preempt, key
     return record
 

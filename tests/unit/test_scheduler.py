@@ -173,7 +173,7 @@ def test_no_id_is_used_twice_and_each_is_the_boots() -> None:
     robot = Robot(max_queue=1)
     ids = [robot.says(text).id for text in ("a", "b", "c", "", "d")]
     assert len(set(ids)) == 5
-    assert all(each.startswith("k3fz-") for each in ids)
+    assert all(each.startswith("4k7f-") for each in ids)
 
 
 # Cancel
@@ -223,9 +223,9 @@ def test_cancel_of_ended_and_unknown_ids_says_so_and_does_the_rest() -> None:
     before = ended.snapshot()
     robot.says()
     pending = robot.says()
-    done = robot.cancels(ended.id, "k3fz-99", pending.id, pending.id, before="mine")
+    done = robot.cancels(ended.id, "4k7f-99", pending.id, pending.id, before="mine")
     assert (done.ended, sorted(done.unknown), done.recalled, done.stopping) == (
-        [ended], ["k3fz-99", "mine"], [pending], None
+        [ended], ["4k7f-99", "mine"], [pending], None
     )  # fmt: skip
     assert ended.snapshot() == before
 
@@ -261,4 +261,4 @@ def test_results_are_found_after_the_end() -> None:
     robot.cancels()
     robot.tells("stopped", goals[0].id)
     assert [robot.scheduler.find(each.id) for each in goals] == list(goals)
-    assert robot.scheduler.find("k3fz-4") is None
+    assert robot.scheduler.find("4k7f-4") is None

@@ -30,7 +30,7 @@ def test_engine_event_of_a_goal_that_is_not_spoken_is_refused_and_changes_nothin
     robot.cancels(goals["recalled"])
     goals["rejected"] = robot.says("").id
     goals["pending"] = robot.says().id
-    goals["unknown"] = "k3fz-99"
+    goals["unknown"] = "4k7f-99"
     known = [record for each in goals.values() if (record := robot.scheduler.find(each))]
     before = [each.snapshot() for each in known], robot.waiting(), list(robot.seen), robot.scheduler.deadline()
     with pytest.raises(IllegalTransition):

@@ -43,7 +43,7 @@ PAIRS = list(itertools.product(NUMBERS, repeat=2))
 
 
 def record_in(state: State) -> Record:
-    record = Record("k3fz-1", 1, "door open", Sender(), 1.0)
+    record = Record("4k7f-1", 1, "door open", Sender(), 1.0)
     record.state = state
     return record
 

@@ -21,8 +21,8 @@ from talkcli.values import replace
 
 PATROL = Sender(812, 1000, "talk", "/bin/bash /home/robot/bin/patrol.sh --fast", "night watch")
 NOON = time.mktime((2024, 5, 17, 12, 0, 0, 0, 0, -1))
-GOAL = Goal("k3fz-7", State.PENDING, "battery low", client=PATROL, queued_at=NOON)
-SERVER = {"pid": 1, "socket": "/run/talk/talk.sock", "boot": "k3fz"}
+GOAL = Goal("4k7f-7", State.PENDING, "battery low", client=PATROL, queued_at=NOON)
+SERVER = {"pid": 1, "socket": "/run/talk/talk.sock", "boot": "4k7f"}
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=80)
 NAMES = st.none() | TEXTS
@@ -34,10 +34,10 @@ SENDERS = st.none() | st.builds(
     NAMES,
     NAMES.map(lambda each: each or None),
 )
-BYS = st.none() | st.builds(By, goal=st.sampled_from(["k3fz-1", "x" * 64])) | st.builds(By, client=SENDERS)
+BYS = st.none() | st.builds(By, goal=st.sampled_from(["4k7f-1", "x" * 64])) | st.builds(By, client=SENDERS)
 GOALS = st.builds(
     Goal,
-    id=st.sampled_from(["k3fz-1", "k3fz-123456", "i" * 64, "door:open"]),
+    id=st.sampled_from(["4k7f-1", "4k7f-123456", "i" * 64, "door:open"]),
     state=st.sampled_from([each for each in State if each.terminal]),
     text=NAMES,
     reason=st.sampled_from([None, "canceled", "audio_device"]),
@@ -162,15 +162,15 @@ def test_what_waits_behind_another_is_shown() -> None:
 
 
 def test_an_event_of_a_goal_that_is_not_known_is_shown_all_the_same() -> None:
-    lines = Transcript(full=True, words=False).lines(StateChanged("k3fz-9", State.ACTIVE, NOON), Screen(), NOON)
-    assert lines == ["12:00:00  ACTIVE      k3fz-9"]
+    lines = Transcript(full=True, words=False).lines(StateChanged("4k7f-9", State.ACTIVE, NOON), Screen(), NOON)
+    assert lines == ["12:00:00  ACTIVE      4k7f-9"]
 
 
 @pytest.mark.parametrize(("words", "count"), [(True, 1), (False, 0)])
 def test_words_are_lines_where_they_are_wanted(words: bool, count: int) -> None:
-    event = WordHeard("k3fz-7", "low", 8, 11, 2, 0.51, NOON)
+    event = WordHeard("4k7f-7", "low", 8, 11, 2, 0.51, NOON)
     lines = Transcript(full=False, words=words).lines(event, Screen(80), NOON)
-    assert lines == ["12:00:00  word        k3fz-7    low  0.51 s"] * count
+    assert lines == ["12:00:00  word        4k7f-7    low  0.51 s"] * count
 
 
 def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
@@ -199,14 +199,14 @@ def test_why_a_goal_ended() -> None:
         return why_forms(replace(GOAL, state=state, reason=reason, by=by, message=message, duration=2.04))
 
     assert why(State.SUCCEEDED) == ["2.0 s"]
-    assert why(State.PREEMPTED, "preempted", By("k3fz-8"), "Talk preempted")[0] == "preempted by k3fz-8"
+    assert why(State.PREEMPTED, "preempted", By("4k7f-8"), "Talk preempted")[0] == "preempted by 4k7f-8"
     canceled = why(State.PREEMPTED, "canceled", By(client=PATROL), "Talk preempted")
     assert canceled[-2:] == ['canceled by "night watch"', 'by "night watch"']
     expired = why(State.RECALLED, "expired", None, "Talk recalled: its time was over")
     assert expired == ["expired: its time was over", "expired"]
     assert why(State.ABORTED, "audio_device", None, "Talk aborted: no: device") == ["audio_device: no: device"]
-    throttled = why(State.REJECTED, "throttled", By("k3fz-1"), "Talk rejected: the same text")
-    assert throttled == ["throttled by k3fz-1: the same text"]
+    throttled = why(State.REJECTED, "throttled", By("4k7f-1"), "Talk rejected: the same text")
+    assert throttled == ["throttled by 4k7f-1: the same text"]
     assert why(State.PREEMPTED, None) == ["preempted", "preempted"]
 
 

@@ -257,8 +257,8 @@ def test_a_trusted_servers_line_has_no_limit() -> None:
 
 
 def test_greeting_says_protocol_version_process_and_boot() -> None:
-    message = greeting("1.2.3", 4711, "k3fz")
-    assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "k3fz", "features": []}
+    message = greeting("1.2.3", 4711, "4k7f")
+    assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "4k7f", "features": []}
     assert PROTOCOL == 1
     check_greeting(decode(encode(message)), "0.9")
 
@@ -273,7 +273,7 @@ def test_greeting_with_features_and_fields_of_the_future_is_accepted() -> None:
 )
 def test_another_protocol_is_a_mismatch_that_says_which_side_to_upgrade(theirs: int, side: str) -> None:
     with pytest.raises(ProtocolMismatch, match=side) as mismatch:
-        check_greeting({**greeting("3.0", 1, "k3fz"), "talk": theirs}, "0.1")
+        check_greeting({**greeting("3.0", 1, "4k7f"), "talk": theirs}, "0.1")
     assert mismatch.value.exit_code == 9
     assert "0.1" in mismatch.value.message
     assert "3.0" in mismatch.value.message
