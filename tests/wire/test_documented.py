@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 from functools import cache
 from typing import TYPE_CHECKING
@@ -10,11 +11,11 @@ from typing import TYPE_CHECKING
 import click
 import pytest
 
-from talkcli import admission, errors, states, text, wire
+from talkcli import admission, errors, paths, states, text, wire
 from talkcli.cli import commands
 from talkcli.history import MAX_ENDED, MAX_REJECTED
 from talkcli.messages import Goal
-from talkcli.requests import KINDS, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
+from talkcli.requests import KINDS, MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
 from talkcli.server import connection, stream
 from talkcli.server.answers import RECENT
 from talkcli.server.later import MAX_WAITING
@@ -159,6 +160,7 @@ def test_ranges_are_those_of_the_code() -> None:
     assert f"1 to {MAX_ID} of" in say["id"][2]
     assert f"{text.MAX_CHARACTERS:,} characters and {text.MAX_BYTES:,} bytes" in say["text"][2]
     assert f"1 to {MAX_NAME} characters" in requests_table()["hello"]["name"][2]
+    assert f"{MAX_DATA:,} bytes" in say["data"][2]
     assert f"to {MAX_IDS:,} ids" in requests_table()["cancel"]["ids"][2]
     assert f"1 to {MAX_LOG:,}" in requests_table()["log"]["count"][2]
     assert requests_table()["log"]["count"][3] == str(Log().count)
@@ -180,6 +182,18 @@ def test_limits_are_those_of_the_code() -> None:
     assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
     assert limits["queue"].startswith(f"{MAX_QUEUE} ")
     assert limits["requests that wait"].startswith(f"{MAX_WAITING:,} ")
+
+
+def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    variables = {"XDG_RUNTIME_DIR": "/own/run", "TMPDIR": "/own/tmpdir", "TEMP": "/own/temp", "TMP": "/own/tmp"}
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("sys.platform", "linux")
+    (paragraph,) = re.findall(r"^\*\*Connecting\..*?\n\n", section("The wire"), re.MULTILINE | re.DOTALL)
+    places = [each for each in words(paragraph) if each.endswith(".sock")]
+    for name, value in variables.items():
+        places = [each.replace(f"${name}/", f"{value}/") for each in places]
+    assert [each.replace("UID", str(os.getuid())) for each in places] == paths.client_sockets(None)
 
 
 def test_goal_has_the_keys_of_the_table() -> None:
