@@ -81,7 +81,7 @@ def busy(make_talk: MakeTalk) -> tuple[Talk, list[str]]:
         scripted.stop()
         scripted = make_talk(scripted=True)
     ended = scripted.run("say", "--wait", "--key", "over", "length=0").id
-    active = scripted.request("say", text="moving, slowly: never-ends\t\x1b[31m", key=KEY, id="door:open.1")["goal"][
+    active = scripted.request("say", text="moving, slowly: never-ends\t\x1b[31m", key=KEY, id="/door:open/1")["goal"][
         "id"
     ]
     scripted.watcher.wait_for_word(active)
@@ -156,7 +156,7 @@ def test_ids_of_goals_are_offered_with_their_texts(busy: tuple[Talk, list[str]])
     for line in ("talk cancel ", "talk wait ", "talk cancel --before ", f"talk wait {pending} "):
         assert values(line, talk) == [active, pending]
     assert values("talk status ", talk) == [active, pending, ended]
-    assert values("talk cancel --before=do", talk) == ["--before=door:open.1"]
+    assert values("talk cancel --before=/do", talk) == ["--before=/door:open/1"]
     helps = dict(offered("talk status ", talk.env))
     assert helps[active] == r"ACTIVE moving, slowly: never-ends\t\x1b[31m"
     assert helps[pending] == "PENDING battery low"
@@ -290,8 +290,8 @@ def test_shells_complete_what_is_there_and_quote_it(busy: tuple[Talk, list[str]]
     number = pending.partition("-")[2]
     expected = {
         "talk st": "talk status ",
-        "talk cancel 'door:o": "talk cancel 'door:open.1' ",
-        "talk cancel --before=door:": "talk cancel --before=door:open.1 ",
+        "talk cancel '/door:o": "talk cancel '/door:open/1' ",
+        "talk cancel --before=/door:": "talk cancel --before=/door:open/1 ",
         f"talk wait {number}": f"talk wait {number} ",
         "talk cancel --key lo": f"talk cancel --key {ESCAPED} ",
         "talk cancel --key 'low b": f"talk cancel --key {in_single} ",
@@ -301,8 +301,8 @@ def test_shells_complete_what_is_there_and_quote_it(busy: tuple[Talk, list[str]]
     if whole:
         expected |= {
             "talk say --fl": "talk say --flush ",
-            "talk cancel door": "talk cancel door:open.1 ",
-            "talk cancel door:o": "talk cancel door:open.1 ",
+            "talk cancel /door": "talk cancel /door:open/1 ",
+            "talk cancel /door:o": "talk cancel /door:open/1 ",
             f"talk wait {pending[:3]}": f"talk wait {pending} ",
             "talk cancel --key p": "talk cancel --key plain ",
             "talk cancel --key=p": "talk cancel --key=plain ",
@@ -310,9 +310,9 @@ def test_shells_complete_what_is_there_and_quote_it(busy: tuple[Talk, list[str]]
             "talk cancel --key=lo": f"talk cancel --key={ESCAPED} ",
             "talk serve --player=pa": "talk serve --player=pacat ",
             f"talk --socket {talk.directory}/bin/t": f"talk --socket {talk.directory}/bin/talk ",
-            "talk --socket /nowhere cancel door": "talk --socket /nowhere cancel door",
+            "talk --socket /nowhere cancel /door": "talk --socket /nowhere cancel /door",
             "talk nonsense x": "talk nonsense x",
-            "~/bin/talk cancel door": "~/bin/talk cancel door:open.1 ",
+            "~/bin/talk cancel /door": "~/bin/talk cancel /door:open/1 ",
         }
     with contextlib.ExitStack() as stack:
         shell = Shell(name, talk, stack)
