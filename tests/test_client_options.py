@@ -190,7 +190,9 @@ def test_patient_goal_whose_sender_hangs_up_is_not_spoken(make_talk: MakeTalk, t
     program.write_text(ALIVE.format(root=str(Path(__file__).parents[1]), every=every), encoding="utf-8")
     talk = make_talk("--max-queue", "1", program=str(program))
     with Client(talk.socket) as client:
-        active, pending = client.say("never-ends"), client.say("length=0")
+        active = client.say("never-ends")
+        talk.watcher.wait_for(active.id, "ACTIVE")
+        pending = client.say("length=0")
         with talk.connect() as wire:
             wire.send({"seq": 1, "request": "say", "text": "length=0 never heard", "patient": True})
             wire.request("hello")  # it was taken

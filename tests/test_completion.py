@@ -331,10 +331,10 @@ def test_start_files_of_the_readme_load_it(busy: tuple[Talk, list[str]], name: s
     before = f"mkdir -p ~/.config/fish; echo '. {BASH_COMPLETION}' > ~/.bashrc\n"
     with contextlib.ExitStack() as stack:
         shell = Shell(name, talk, stack, before + block("Completion"))
-        found = [shell.complete(line) for line in ("talk st", "talk cancel door:o")]
+        found = [shell.complete(line) for line in ("talk st", "talk cancel /door:o")]
         if name == "bash":  # by way of bash-completion
-            assert shell.complete("sudo talk cancel --before=door:") == "sudo talk cancel --before=door:open.1 "
-    assert found == ["talk status ", "talk cancel door:open.1 "]
+            assert shell.complete("sudo talk cancel --before=/door:") == "sudo talk cancel --before=/door:open/1 "
+    assert found == ["talk status ", "talk cancel /door:open/1 "]
     assert "rror" not in shell.terminal.text
 
 

@@ -90,6 +90,7 @@ def test_the_engine_gets_to_work_before_clients_are_told() -> None:
         written: list[str] = []
         served = Service("4k7f", Settings(), "unused", 0o600)
         served.engine = _Written(written)  # type: ignore[assignment]
+        served.scheduler.engine_ready(served.now())
 
         def changed(record: Record, state: State, _: float) -> None:
             written.append(f"{state.name} {record.text}")

@@ -46,6 +46,7 @@ class _Clock:
 async def _queued_behind_another(ttl: float) -> Service:
     served = Service("4k7f", Settings(ttl=ttl), "unused", 0o600)
     served.engine = _BusyEngine()  # type: ignore[assignment]
+    served.scheduler.engine_ready(served.now())
     for text in ("a long sentence", "the door is open"):
         served.apply(served.scheduler.submit(Say(text), Sender(), served.now()).effects)
     return served

@@ -96,6 +96,7 @@ def test_socket_that_was_removed_or_replaced_is_bound_again(home: str, fault: Ca
     env = environment(home, TALK_SOCKET=path)
     with serving(env, "--socket-mode", "0660", command=HASTY) as server, Wire(path) as old:
         goal = old.request("say", text="never-ends", wait=True)["goal"]
+        old.receive_event("state", state="ACTIVE")
         fault(path)
         found_again(path, server.process.pid)
         assert stat.S_IMODE(os.stat(path).st_mode) == 0o660

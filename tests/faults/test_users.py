@@ -141,6 +141,7 @@ def test_whoever_may_connect_may_silence_everybody_and_the_log_says_who(home: st
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=group_server()) as server, Wire(path) as wire:
         goal = wire.request("say", text="never-ends", wait=True)["goal"]
+        wire.receive_event("state", state="ACTIVE")
         pending = wire.request("say", text="waits")["goal"]
         told = replies(stranger(path, {"seq": 1, "request": "cancel"}, groups=[GROUP]))
         assert {each["canceled"]["id"] for each in told if "canceled" in each} == {goal["id"], pending["id"]}

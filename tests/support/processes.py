@@ -150,7 +150,10 @@ class Talk:
         return self._watcher
 
     def start_server(self) -> None:
-        """Start the server and wait for its greeting; again after it has ended, then with a new watcher."""
+        """Start the server and wait for its greeting; again after it has ended, then with a new watcher.
+
+        The scripted engine is ready then, the real one may not be yet.
+        """
         env = self._environment(self._mark)
         with open(f"{self.directory}/log", "ab") as log:
             if self._forked and forks(env):
@@ -171,6 +174,10 @@ class Talk:
             self._watcher.close()
             self.unfinished = False
         self._watcher = Watcher(self.socket) if self._watched else None
+        if self._program == SCRIPTED and "SCRIPTED_START" not in self._extra:
+            self.request(
+                "voices"
+            )  # so that the first goal is ACTIVE at once, as it is on a robot but for its first moment
 
     def script_start(self, behaviour: str) -> None:
         """Tell the scripted engine how each of its next starts goes: see `script`; "" for a plain one."""
