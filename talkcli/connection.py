@@ -145,14 +145,15 @@ class Connection:
         deadline: Callable[[], float | None],
         silence: float | None = None,
         *,
+        since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
         """Read until `done()`, and return True; False at the deadline (monotonic), or once the connection ended.
 
         `done` is called under `changed`, and no more once it was true; `silence`: seconds without a line from the
-        server after which the connection counts as ended.
+        server after which the connection counts as ended, counted from this call on, or from `since` (monotonic).
         """
-        began = time.monotonic()
+        began = time.monotonic() if since is None else since
         last = False
         while True:
             with self.changed:
@@ -163,10 +164,10 @@ class Connection:
                 now = time.monotonic()
                 limit = deadline()
                 quiet = None if silence is None else max(began, self._heard) + silence
-                if last and limit is not None and now >= limit:
-                    return False
-                if last and quiet is not None and now >= quiet:
+                if last and quiet is not None and now >= quiet and (limit is None or quiet < limit):
                     self.ended = f"it has said nothing for {silence:g} s"
+                    return False
+                if last and limit is not None and now >= limit:
                     return False
                 rest = min((each - now for each in (limit, quiet) if each is not None), default=None)
                 # What has arrived by the deadline counts: one more look, that doesn't wait.

@@ -11,6 +11,7 @@ import time
 from talkcli import events
 from talkcli.backlog import Backlog
 from talkcli.connection import SILENCE_LIMIT
+from talkcli.errors import UsageError
 from talkcli.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.requests import Cancel
 from talkcli.states import State
@@ -28,9 +29,9 @@ if TYPE_CHECKING:
 class GoalHandle:
     """A goal that was sent, or is followed. Any number of threads may use it.
 
-    Its events are kept until somebody takes them, the last 5,000 words of them: `events` and `feedback` take from the
-    same store, each event is handed out once, and who breaks off and calls again goes on where it was. An iterator is
-    for one thread; another calls for its own.
+    Its events are kept until somebody takes them, the last 5,000 words of them: `events`, `feedback` and `poll` take
+    from the same store, each event is handed out once, and who breaks off and calls again goes on where it was. An
+    iterator is for one thread; another calls for its own.
     """
 
     def __init__(self, client: Client, goal: Goal) -> None:
@@ -45,7 +46,11 @@ class GoalHandle:
         self._followed = False
         #: … and each word
         self._fed = False
+        #: since when the server has said that it is alive, by the monotonic clock
+        self._followed_at = 0.0
         self._backlog = Backlog()
+        #: whether its Result has been handed out
+        self._told = False
 
     @property
     def id(self) -> str:
@@ -89,6 +94,28 @@ class GoalHandle:
         end = _end(timeout)
         self._follow(feedback=True)
         return (each for each in self._events(end, timeout) if isinstance(each, WordHeard))
+
+    def poll(self) -> Event | None:
+        """Return the next event that has come, as `events` has them, else None; the last is the Result. Never waits.
+
+        For a loop that must not: it reads what the server has said meanwhile, so it has to be called again and again.
+        UsageError for a goal that was sent with `follow=False`, of which nothing comes until `wait` or `events` asks.
+        """
+        event: Event | None = None
+
+        def arrived() -> bool:
+            nonlocal event
+            event = self._backlog.take()
+            return event is not None or self.state.terminal
+
+        if not (self._followed or self.state.terminal):
+            raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
+        connection, now = self._client._connection, time.monotonic()
+        if not connection.wait_until(arrived, lambda: now, SILENCE_LIMIT, since=self._followed_at, interruptible=False):
+            self._lose()
+        if event is None and self.state.terminal and not self._told:
+            event = self._result()
+        return event
 
     def request_cancel(self) -> None:
         """Ask for the goal to be cancelled, without waiting for it: `wait` tells how it ended."""
@@ -149,9 +176,13 @@ class GoalHandle:
             if not found:
                 self._give_up(timeout)
             if event is None:
-                yield Result(self.goal)
+                yield self._result()
                 return
             yield event
+
+    def _result(self) -> Result:
+        self._told = True
+        return Result(self.goal)
 
     def _follow(self, *, feedback: bool) -> None:
         """Have this connection told of the goal, if it isn't yet."""
@@ -160,11 +191,16 @@ class GoalHandle:
 
     def _give_up(self, timeout: float | None) -> None:
         """Conclude that the goal is lost, where nothing more can be heard of it; else raise TimeoutError."""
-        ended = self._client._connection.ended
-        if ended is None:
+        if not self._lose():
             raise TimeoutError(f"{self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
-        words = f"Talk lost: {ended}; it may still be spoken"
-        self._settle(replace(self.goal, state=State.LOST, reason="lost", message=words))
+
+    def _lose(self) -> bool:
+        """Conclude that the goal is lost, and return True, where nothing more can be heard of it."""
+        ended = self._client._connection.ended
+        if ended is not None:
+            words = f"Talk lost: {ended}; it may still be spoken"
+            self._settle(replace(self.goal, state=State.LOST, reason="lost", message=words))
+        return ended is not None
 
 
 class Followed:
@@ -179,6 +215,7 @@ class Followed:
         handle._fed = handle._fed or feedback
         if not (handle._followed or handle.state.terminal):
             self._handles.setdefault(handle.id, []).append(handle)
+            handle._followed_at = time.monotonic()
         handle._followed = True
 
     def watch(self, backlog: Backlog) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,10 +12,11 @@ import pytest
 import talkcli
 from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard, events
 from talkcli.backlog import MAX_FEEDBACK, MAX_STATES, Backlog
-from talkcli.errors import Lost, UnknownGoal
+from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.messages import By, Goal, Sender
 from talkcli.replies import ServerStatus
 from tests.support.connection import PATIENCE
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -240,6 +242,89 @@ def test_goal_is_lost_with_its_server(client: Client, scripted: Talk) -> None:
 def test_late_feedback_of_an_unknown_goal_is_an_error(client: Client) -> None:
     with pytest.raises(UnknownGoal):
         GoalHandle(client, Goal("none-1", State.ACTIVE)).feedback(1)
+
+
+# Polled
+
+
+def polled(handle: GoalHandle) -> list[Event]:
+    """Return what a handle gives until its result, asked again and again."""
+    found: list[Event] = []
+    end = time.monotonic() + PATIENCE
+    while not (found and isinstance(found[-1], Result)):
+        assert time.monotonic() < end, found
+        event = handle.poll()
+        if event is None:
+            time.sleep(0.002)  # as a robot's loop, which has other things to do
+        else:
+            found.append(event)
+    return found
+
+
+def test_poll_gives_each_event_once_then_the_result_then_nothing(client: Client) -> None:
+    handle = client.say("length=0.2 one", feedback=True)
+    found = polled(handle)
+    assert told(found) == [State.PENDING, State.ACTIVE, "length=0.2", "one", State.SUCCEEDED, Result]
+    assert found[-1] == Result(handle.goal)
+    assert [handle.poll(), handle.poll()] == [None, None]
+    assert list(handle.events()) == [Result(handle.goal)]
+    heard = client.say("length=0")
+    assert told(list(heard.events(5)))[-1] is Result
+    assert heard.poll() is None  # its result was handed out
+
+
+def test_poll_never_waits(client: Client, scripted: Talk) -> None:
+    handle = client.say("never-ends words=1", feedback=True)
+    scripted.watcher.wait_for_word(handle.id)
+    waiting = threading.Thread(target=handle.wait)
+    with limits():
+        began = time.monotonic()
+        found = [handle.poll() for _ in range(100)]
+        assert_within(time.monotonic() - began, 0.1, "100 polls of a goal that goes on")
+        waiting.start()  # it reads for all now
+        began = time.monotonic()
+        found += [handle.poll() for _ in range(100)]
+        assert_within(time.monotonic() - began, 0.1, "100 polls beside a thread that waits")
+    assert told([each for each in found if each]) == [State.PENDING, State.ACTIVE, "never-ends"]
+    client.cancel([handle.id])
+    assert told(polled(handle)) == [State.PREEMPTING, State.PREEMPTED, Result]
+    waiting.join(5)
+
+
+def test_poll_of_a_goal_that_was_rejected_or_had_ended(client: Client) -> None:
+    ended = client.say("length=0", id="mine").wait(5)
+    for handle in (client.say(""), client.say("a" * 100_000), client.say("length=0", id="mine")):
+        assert [handle.poll(), handle.poll()] == [Result(handle.goal), None]
+    assert handle.goal == ended
+
+
+def test_poll_of_a_goal_that_nothing_is_heard_of_says_so(client: Client) -> None:
+    handle = client.say("length=0.1", follow=False)
+    with pytest.raises(UsageError, match=rf"{handle.id}.*follow=False"):
+        handle.poll()
+    handle.events()
+    assert told(polled(handle))[-1] is Result
+
+
+def test_poll_tells_that_the_goal_is_lost_with_its_server(client: Client, scripted: Talk) -> None:
+    handle = client.say("never-ends words=1")
+    scripted.kill()
+    assert told(polled(handle))[-1] is Result
+    assert (handle.state, handle.goal.reason, handle.poll()) == (State.LOST, "lost", None)
+
+
+def test_poll_tells_that_the_goal_is_lost_where_the_server_says_nothing_any_more(
+    client: Client, scripted: Talk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    handle = client.say("never-ends words=1")
+    monkeypatch.setattr("talkcli.handle.SILENCE_LIMIT", 0.3)
+    scripted.freeze()
+    began = time.monotonic()
+    assert told(polled(handle))[-1] is Result
+    assert time.monotonic() - began >= 0.2
+    assert (handle.state, "nothing for 0.3 s" in (handle.goal.message or "")) == (State.LOST, True)
+    scripted.thaw()
+    scripted.run("cancel")
 
 
 # All events
