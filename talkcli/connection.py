@@ -8,6 +8,7 @@ whose `done` looks at several things sees them together.
 from __future__ import annotations
 
 import itertools
+import os
 import select
 import threading
 import time
@@ -68,6 +69,7 @@ class Connection:
         opened: Opened | None = None,
     ) -> None:
         self.line = dial(socket, hello, version, patience, interrupt, opened)
+        self._process = os.getpid()
         # The beginning of the first line to be sent, if that was sent before there was this connection.
         self._sent_early = opened.sent if opened else b""
         self._patience = patience
@@ -89,7 +91,12 @@ class Connection:
         self.ended: str | None = None
 
     def close(self) -> None:
-        """Close the connection; goals that were sent are spoken all the same."""
+        """Close the connection; goals that were sent are spoken all the same. A forked child closes its copy alone."""
+        if os.getpid() != self._process:
+            # To shut it down would cut the parent's; and a thread of the parent's may have held the lock at the fork.
+            self.ended = self.ended or "the connection was closed"
+            self.line.socket.close()
+            return
         with self.changed:
             self.ended = self.ended or "the connection was closed"
             self._closing = True

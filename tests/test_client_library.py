@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -196,6 +198,36 @@ def test_close_ends_the_wait_of_another_thread(client: Client) -> None:
     client.close()
     thread.join(1)
     assert states == [State.LOST], "it still waits"
+
+
+#: A program that speaks, and has a forked child close its copy of the client, in the way that is its argument.
+FORKS = """
+import os, sys, threading
+from talkcli import Client
+with Client(sys.argv[1]) as client:
+    goal = client.say("never-ends words=1", feedback=True)
+    next(goal.feedback(5))
+    waiting = threading.Thread(target=goal.wait)
+    if sys.argv[2] == "while a thread reads":
+        waiting.start()
+    child = os.fork()
+    if child == 0:
+        client.close()
+        client.close()
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    assert client.status().active.id == goal.id
+    print(goal.cancel().state.name)
+    if waiting.ident:
+        waiting.join(5)
+"""
+
+
+@pytest.mark.parametrize("when", ["alone", "while a thread reads"])
+def test_a_forked_child_closes_its_copy_and_leaves_its_parents_connection(scripted: Talk, when: str) -> None:
+    program = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", FORKS, scripted.socket, when]
+    done = subprocess.run(program, env=scripted.env, capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "PREEMPTED\n", "")
 
 
 def test_threads_share_a_client(client: Client) -> None:
