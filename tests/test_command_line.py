@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli import __version__, cli
+from talkcli import Client, __version__, cli
 from talkcli.cli.commands import COMMANDS
 from tests.conformance.bareserve import TALK, environment, run
 from tests.conformance.rawsocket import GREETING, FakeServer
@@ -156,6 +156,38 @@ def test_options_before_and_after_the_command(scripted: Talk) -> None:
         assert done.code == 0, done.err
         assert f"pid {scripted.pid}" in done.out
     assert run([*TALK, "status"], {**scripted.env, "TALK_SOCKET": "/nowhere"}).code == 3
+
+
+@pytest.fixture
+def local(scripted: Talk, tmp_path: Path) -> dict[str, str]:
+    """The environment of a user who has this server in the usual place."""
+    (tmp_path / "talk").mkdir()
+    (tmp_path / "talk" / "talk.sock").symlink_to(scripted.socket)
+    return {**scripted.env, "TALK_SOCKET": "", "XDG_RUNTIME_DIR": str(tmp_path)}
+
+
+@pytest.mark.parametrize("command", [["status"], ["say", "hello"], ["cancel"], ["watch"], ["doctor"], ["serve"]])
+def test_a_socket_from_a_variable_that_is_not_set_is_not_the_local_one(
+    scripted: Talk, local: dict[str, str], command: list[str]
+) -> None:
+    for words in (["--socket", "", *command], ["--socket=", *command], [*command, "--socket", ""]):
+        done = run([*TALK, *words], local)
+        assert (done.code, done.out) == (2, ""), words
+        assert "--socket: empty; is the variable set that it comes from?" in done.err
+    assert scripted.watcher.goals() == []
+
+
+def test_variables_that_are_empty_count_as_not_set(scripted: Talk, local: dict[str, str]) -> None:
+    for words in (["say", "length=0"], ["say", "--lines"], ["wait"], ["status"], ["voices"]):
+        done = run([*TALK, *words], {**local, "TALK_NAME": ""})
+        assert done.code == 0, done
+    assert scripted.goal(scripted.watcher.goals()[0])["client"]["name"] is None
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("TALK_SOCKET", "XDG_RUNTIME_DIR"):
+            patch.setenv(name, local[name])
+        patch.setenv("TALK_NAME", "")
+        with Client() as client:
+            assert client.server_pid == scripted.pid
 
 
 def test_standard_output_that_is_closed_is_141(scripted: Talk) -> None:

@@ -77,6 +77,8 @@ def busy(talk: Talk) -> str:
         (["--id", "4k7f-7", "hello"], ["4k7f-7"]),
         (["--id", "a b", "hello"], ["a b"]),
         (["--id", "", "hello"], ["--id"]),
+        (["--as", "", "hello"], ["--as", "variable"]),
+        (["--as=", "-o", "x.wav", "hello"], ["--as", "variable"]),
     ],
 )
 def test_contradictions_and_values_out_of_range_are_usage_errors(words: list[str], hints: list[str]) -> None:

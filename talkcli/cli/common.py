@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from talkcli.cli.usage import Codes
 
 _F = TypeVar("_F", bound="Callable[..., Any]")
+_T = TypeVar("_T")
 
 
 def talk_command(
@@ -32,6 +33,8 @@ def common(context: click.Context) -> Common:
 
 
 def _store(context: click.Context, parameter: click.Parameter, value: object) -> None:
+    if parameter.name == "socket":
+        filled(context, parameter, value)
     if value:
         setattr(common(context), parameter.name or "", value)
 
@@ -83,7 +86,7 @@ def seconds(context: click.Context, parameter: click.Parameter, value: float | N
     return number(context, parameter, value)
 
 
-def filled(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+def filled(context: click.Context, parameter: click.Parameter, value: _T) -> _T:
     """Refuse an empty word: it comes from a variable that isn't set, and selects nothing."""
     if value == "":
         raise click.BadParameter("empty; is the variable set that it comes from?", context, parameter)

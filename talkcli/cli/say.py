@@ -106,7 +106,13 @@ class _SayCommand(Command):
 )
 @click.option("--id", metavar="ID", callback=filled, help="An id of your own: sent twice, it is spoken once.")
 @click.option(
-    "--as", "name", metavar="NAME", envvar="TALK_NAME", show_envvar=True, help="What the sender calls itself."
+    "--as",
+    "name",
+    metavar="NAME",
+    callback=filled,
+    envvar="TALK_NAME",
+    show_envvar=True,
+    help="What the sender calls itself.",
 )
 @click.option("--rate", type=WholeNumber(*RATES), metavar="N", help="Words per minute.  [env var, with -o: TALK_RATE]")
 @click.option(
