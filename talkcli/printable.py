@@ -18,6 +18,19 @@ def printable(text: str, limit: int | None = None) -> str:
     return cut if limit is None or len(text) <= limit else f"{cut}…"
 
 
+def printable_json(line: str) -> str:
+    """Return a line of JSON, which stays the same JSON, with everything that isn't plainly visible escaped."""
+    return line if line.isascii() and line.isprintable() else "".join(map(_escaped, line))
+
+
+def _escaped(character: str) -> str:
+    """Return a character of a JSON line as it is, or as JSON escapes it: none of those stands outside of a string."""
+    if unicodedata.category(character) not in _ESCAPED:
+        return character
+    units = character.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[at]:02x}{units[at + 1]:02x}" for at in range(0, len(units), 2))
+
+
 def _shown(character: str) -> str:
     if character in _SHORT:
         return _SHORT[character]

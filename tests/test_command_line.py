@@ -19,6 +19,7 @@ from talkcli.cli.commands import COMMANDS
 from tests.conformance.bareserve import TALK, environment, run
 from tests.conformance.rawsocket import GREETING, FakeServer
 from tests.support.surroundings import clean_environment, short_directory
+from tests.support.terminal import Terminal
 
 if TYPE_CHECKING:
     from tests.support.processes import Talk
@@ -215,6 +216,37 @@ def test_text_of_others_never_reaches_a_terminal_raw(scripted: Talk) -> None:
         assert not RAW.search(text), repr(text)
         assert not re.search("(?m)^fake line", text), repr(text)
     assert r"a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end" in shown[0]
+
+
+@pytest.mark.parametrize(
+    "command", [["status"], ["log"], ["watch"], ["wait", "theirs"], ["say", "--id", "theirs", "-w"]]
+)
+def test_json_on_a_terminal_escapes_what_plain_output_does_and_is_the_same_json(
+    scripted: Talk, command: list[str]
+) -> None:
+    text = f'length=0 {HOSTILE} \x9b31m \x7f \ue000 \U000e0001 "quoted" \\ Grüße 日本 👩'
+    scripted.run("say", "--wait", "--id", "theirs", "--as", "\u202epatrol", "--", text)
+    words = ["--json", *command, *(["--", text] if command[0] == "say" else [])]
+    with Terminal([*TALK, *words], scripted.env) as shown:
+        shown.wait_for("\n")
+        if command == ["watch"]:
+            shown.type(b"\x03")
+        shown.finish()
+        line = shown.raw.decode().split("\r\n")[0]
+    assert not RAW.search(line), repr(line)
+    assert all(each in line for each in (r"\u009b31m \u007f \ue000 \udb40\udc01", "Grüße 日本 👩", r"\u202epatrol"))
+    assert text in _strings(json.loads(line))
+    if command != ["watch"]:  # a program gets what was said, as ever
+        assert json.loads(scripted.run(*words).out)
+        assert "\x9b31m \x7f" in scripted.run(*words).out
+
+
+def _strings(found: Any) -> set[str]:
+    """Return all strings in an object of JSON."""
+    if isinstance(found, str):
+        return {found}
+    parts = found.values() if isinstance(found, dict) else found if isinstance(found, list) else ()
+    return {each for part in parts for each in _strings(part)}
 
 
 def test_no_colour_but_on_a_terminal(scripted: Talk) -> None:

@@ -49,7 +49,10 @@ def show(line: str) -> None:
 
 
 def show_json(message: JsonObject) -> None:
-    """Write an object as a line of JSON, in UTF-8 whatever the locale is; BrokenPipeError as `show`."""
+    """Write an object as a line of JSON, in UTF-8 whatever the locale is; BrokenPipeError as `show`.
+
+    On a terminal what isn't plainly visible is escaped, as it is in all that is shown there.
+    """
     if sys.stdout is None:
         raise BrokenPipeError("standard output is closed")
     _write_json(sys.stdout, message)
@@ -58,8 +61,13 @@ def show_json(message: JsonObject) -> None:
 def _write_json(stream: TextIO, message: JsonObject) -> None:
     from talkcli import wire  # help and completion have nothing to do with JSON
 
+    line = wire.encode(message)
+    if stream.isatty():
+        from talkcli.printable import printable_json
+
+        line = printable_json(line.decode()[:-1]).encode() + b"\n"
     stream.flush()
-    stream.buffer.write(wire.encode(message))
+    stream.buffer.write(line)
     stream.buffer.flush()
 
 
