@@ -25,11 +25,12 @@ def fault(text: str, max_characters: int = MAX_CHARACTERS) -> tuple[str, str] | 
     try:
         size = len(text.encode())
     except UnicodeEncodeError as error:
-        return "invalid_text", f"character {error.start} of the text is half of a surrogate pair: it is not valid UTF-8"
+        words = f"character {error.start + 1} of the text is half of a surrogate pair: it is not valid UTF-8"
+        return "invalid_text", words
     if size > MAX_BYTES:
         return "text_too_long", f"the text has {size:,} bytes, the longest allowed is {MAX_BYTES:,}"
     if "\0" in text:
-        return "invalid_text", f"character {text.index(chr(0))} of the text is NUL"
+        return "invalid_text", f"character {text.index(chr(0)) + 1} of the text is NUL"
     if all(unicodedata.category(each) in _SILENT for each in text):
         return "invalid_text", "the text is empty" if not text.strip() else "the text has nothing that can be seen"
     return None

@@ -117,9 +117,19 @@ def test_a_line_that_is_refused_is_reported_by_its_number_and_the_rest_goes_on(s
         assert "300,000 bytes" in notes[2]
     quiet = scripted.run("-q", "say", "--lines", stdin=text)
     assert (quiet.code, quiet.out, quiet.err) == (5, "", "")
-    invalid = run_bytes(scripted, b"length=0 one\n\xff\xfe\nlength=0 two\n")
-    assert (invalid.returncode, len(invalid.stdout.split())) == (5, 2)
-    assert b"line 2: " in invalid.stderr
+
+
+def test_bytes_that_are_no_utf8_are_left_out_and_their_line_is_spoken(scripted: Talk) -> None:
+    data = b"length=0 one\n\nlength=0 t\xffw\xfeo\n\xff\nlength=0 three\xc3"
+    done = run_bytes(scripted, data, "--wait")
+    assert (done.returncode, len(done.stdout.split())) == (0, 4)
+    assert done.stderr.decode().splitlines() == [
+        "talk: line 3, column 11: the byte 0xff is not UTF-8, and is not spoken (the first of 2)",
+        "talk: line 4, column 1: the byte 0xff is not UTF-8, and is not spoken",
+        "talk: line 5, column 15: the byte 0xc3 is not UTF-8, and is not spoken",
+    ]
+    assert texts(scripted, "ACTIVE") == ["length=0 one", "length=0 t\ufffdw\ufffdo", "\ufffd", "length=0 three\ufffd"]
+    assert run_bytes(scripted, data, "-q").stderr == b""
 
 
 def run_bytes(talk: Talk, data: bytes, *words: str) -> subprocess.CompletedProcess[bytes]:

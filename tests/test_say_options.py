@@ -242,6 +242,14 @@ def test_output_writes_a_file_without_a_server(tmp_path: Path) -> None:
     assert told["seconds"] == pytest.approx(seconds, abs=0.05)
 
 
+def test_output_leaves_out_bytes_that_are_no_utf8_and_names_them(tmp_path: Path) -> None:
+    for name, text in (("said.wav", "battery \udcfflow"), ("meant.wav", "battery  low")):
+        done = alone("say", "-o", str(tmp_path / name), "--", text)
+        assert (done.code, done.out) == (0, "")
+        assert ("line 1, column 9: the byte 0xff is not UTF-8, and is not spoken\n" in done.err) == ("said" in name)
+    assert (tmp_path / "said.wav").read_bytes() == (tmp_path / "meant.wav").read_bytes()
+
+
 def _seconds_of(tmp_path: Path, *words: str, **env: str) -> float:
     done = alone("--json", "say", "-o", str(tmp_path / "x.wav"), *words, "one two three four five six", **env)
     assert done.code == 0, done.err

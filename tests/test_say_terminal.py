@@ -216,7 +216,7 @@ def test_lines_that_are_typed_light_up_one_after_the_other(
     terminal.type(b"length=0.5 words=1 one\n")
     terminal.wait_until(lambda screen: screen.marked(LIT) == "length=0.5")
     terminal.resize(90)
-    terminal.type(b"\xff\nlength=0.1 two\n\x04")
+    terminal.type(b"\0\nlength=0.1 two\n\x04")
     assert terminal.finish() == 5
     first, second = (each for each in scripted.watcher.goals() if "ACTIVE" in scripted.watcher.states(each))
     lines = terminal.screen.lines

@@ -16,6 +16,7 @@ from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import SILENCE, SPEECH_IS_PAUSED, exit_code, report, until_ended
 from talkcli.cli.show import note, show, show_error, show_json
 from talkcli.cli.stdin import LineReader
+from talkcli.cli.utf8 import readable
 from talkcli.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
 from talkcli.messages import Goal
@@ -105,7 +106,10 @@ class _Lines:
             if line.text is None:
                 self._refuse(line, _too_long(line))
             else:
-                self._send(line, line.text)
+                text, unreadable = readable(line.text, line.number)
+                if unreadable and not self._options.quiet:
+                    self._tell(unreadable)
+                self._send(line, text)
             self._sending = None
 
     def _send(self, line: Line, text: str) -> None:

@@ -9,6 +9,7 @@ import click
 
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, show_json
+from talkcli.cli.utf8 import readable
 from talkcli.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
 
@@ -40,6 +41,9 @@ def render_to(path: str, text: str, chosen: JsonObject, timeout: float | None, o
     """Write the text into the file, and return the exit code; what goes wrong is raised."""
     from talkcli.engine.render import render
 
+    text, unreadable = readable(text)
+    if unreadable and not options.quiet:
+        note(unreadable)
     with Interrupts() as interrupts:
         try:
             seconds = render(text, path, timeout=timeout, interrupt=interrupts.descriptor, **chosen)  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ import time
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import SPEECH_IS_PAUSED, give_up, report, rest, until_ended
 from talkcli.cli.show import note, show, show_error, show_json
+from talkcli.cli.utf8 import readable
 from talkcli.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost
 from talkcli.states import State
@@ -41,6 +42,9 @@ def say(
     `given`: the options, by their names, GOAL_OPTIONS and `wait`, `feedback`, `name`, `timeout`; `end`: when it is
     given up, by the monotonic clock; `opened`: the connection, where it has been begun; `held`: signals that wait.
     """
+    text, unreadable = readable(text)
+    if unreadable and not options.quiet:
+        note(unreadable)
     with Interrupts(held=held) as interrupts:
         try:
             patience = min(ANSWER_LIMIT, given["timeout"] or ANSWER_LIMIT)

@@ -120,5 +120,5 @@ def _read(count: int) -> bytes | None:
 
 
 def _decoded(data: bytes) -> str:
-    # What is not UTF-8 stays recognisable, so that it is refused as such.
+    # What is not UTF-8 stays recognisable, as in arguments: see `utf8`.
     return data.decode(errors="surrogateescape").rstrip("\r\n")

@@ -17,8 +17,9 @@ import re
 import unicodedata
 
 #: Control characters: 0x01 starts a command to the library (another pitch, voice, punctuation), 0x02 behind a "["
-#: phonemes, NUL ends its text. Tab, newline and return are blanks to it already.
-_BLANKED = {code: " " for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\t\n\r"}
+#: phonemes, NUL ends its text. Tab, newline and return are blanks to it already. U+FFFD, for what could not be read, is
+#: as silent to it as a blank, but it would report that as a word, and not the one behind it.
+_BLANKED = {code: " " for code in (*range(0x20), *range(0x7F, 0xA0), 0xFFFD) if chr(code) not in "\t\n\r"}
 
 #: Bytes for letters with dots, "U.S.A.", where they are looked up: each letter and a dot, then the word behind the last
 #: dot whole (N_WORD_BYTES, 160, less its end). 'a.' * 85 and 'a.' + 'b' * 170 are more.

@@ -32,8 +32,8 @@ def test_ordinary_text_stays_what_it_is(text: str) -> None:
     assert guarded(text) == text
 
 
-@pytest.mark.parametrize("code", [*range(1, 9), 0x0B, 0x0C, *range(0x0E, 0x20), 0x7F, 0x80, 0x85, 0x9F])
-def test_a_control_character_becomes_a_blank(code: int) -> None:
+@pytest.mark.parametrize("code", [*range(1, 9), 0x0B, 0x0C, *range(0x0E, 0x20), 0x7F, 0x80, 0x85, 0x9F, 0xFFFD])
+def test_a_control_character_or_one_that_could_not_be_read_becomes_a_blank(code: int) -> None:
     assert guarded(f"a{chr(code)}5Sb") == "a 5Sb"
 
 

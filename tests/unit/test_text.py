@@ -55,6 +55,13 @@ def test_text_without_anything_to_say_or_that_is_no_text_is_invalid(text: str) -
     assert found[1]
 
 
+def test_what_is_wrong_is_counted_from_1() -> None:
+    for text, place in (("\ud83d low", "character 1 of"), ("door \0", "character 6 of"), ("a\udc00", "character 2 of")):
+        found = fault(text)
+        assert found is not None
+        assert found[1].startswith(place)
+
+
 @pytest.mark.parametrize("text", SPOKEN)
 def test_text_of_any_kind_is_taken(text: str) -> None:
     assert fault(text) is None
