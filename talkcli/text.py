@@ -18,16 +18,19 @@ MAX_BYTES = 40_000
 _SILENT = frozenset({"Zs", "Zl", "Zp", "Cc", "Cf", "Cn", "Co"})
 
 
-def fault(text: str, max_characters: int = MAX_CHARACTERS) -> tuple[str, str] | None:
-    """Return the reason and the words for people why this text can't be a goal, or None if it can."""
-    if len(text) > max_characters:
+def fault(text: str, max_characters: int | None = MAX_CHARACTERS) -> tuple[str, str] | None:
+    """Return the reason and the words for people why this text can't be a goal, or None if it can.
+
+    `max_characters`: None for one that is no goal, and may have any length.
+    """
+    if max_characters is not None and len(text) > max_characters:
         return "text_too_long", f"the text has {len(text):,} characters, the longest allowed is {max_characters:,}"
     try:
         size = len(text.encode())
     except UnicodeEncodeError as error:
         words = f"character {error.start + 1} of the text is half of a surrogate pair: it is not valid UTF-8"
         return "invalid_text", words
-    if size > MAX_BYTES:
+    if max_characters is not None and size > MAX_BYTES:
         return "text_too_long", f"the text has {size:,} bytes, the longest allowed is {MAX_BYTES:,}"
     if "\0" in text:
         return "invalid_text", f"character {text.index(chr(0)) + 1} of the text is NUL"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.conformance.bareserve import TALK, environment, run
-from tests.support.surroundings import short_directory
+from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -254,6 +254,51 @@ def _seconds_of(tmp_path: Path, *words: str, **env: str) -> float:
     done = alone("--json", "say", "-o", str(tmp_path / "x.wav"), *words, "one two three four five six", **env)
     assert done.code == 0, done.err
     return float(json.loads(done.out)["seconds"])
+
+
+def test_output_goes_to_standard_output(tmp_path: Path) -> None:
+    needs("aplay")
+    # The device "null" takes everything at once.
+    script = 'printf "battery low" | "$@" say -o - - | tee said.wav | aplay -q -D null && "$@" say -o - x > x.wav'
+    with short_directory() as home:
+        env = environment(home, TALK_SOCKET=f"{home}/s")
+        piped = ["bash", "-c", f"set -o pipefail; {script}", "bash", *TALK]
+        done = subprocess.run(piped, env=env, cwd=tmp_path, capture_output=True, text=True, timeout=30, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+        gone = run(["bash", "-c", '"$@" say -o - one two three | true; echo ${PIPESTATUS[0]}', "bash", *TALK], env)
+        assert (gone.out, gone.err) == ("141\n", "")
+        closed = run(["bash", "-c", '"$@" say -o - one >&-', "bash", *TALK], env)
+        assert (closed.code, closed.err) == (141, "")
+        full = run(["bash", "-c", '"$@" say -o - one > /dev/full', "bash", *TALK], env)
+        assert (full.code, full.err) == (1, "talk: standard output cannot be written: No space left on device\n")
+    said = (tmp_path / "said.wav").read_bytes()
+    assert alone("say", "-o", str(tmp_path / "file.wav"), "battery low").code == 0
+    assert said[44:] == (tmp_path / "file.wav").read_bytes()[44:]
+    both = alone("--json", "say", "-o", "-", "x")
+    assert (both.code, both.out) == (2, "")
+    assert "standard output" in both.err
+
+
+def test_output_takes_a_text_of_any_length(tmp_path: Path) -> None:
+    text = f"one {' ' * 45_000} two"  # more than a goal may have of characters, and of bytes
+    words = ["--json", "say", "-o", str(tmp_path / "x.wav"), "--rate", "450"]
+    with short_directory() as home:
+        by_input = subprocess.run(
+            [*TALK, *words, "-"], input=text, env=environment(home), capture_output=True, text=True, check=False
+        )
+    told = json.loads(by_input.stdout)
+    assert (by_input.returncode, told["text"]) == (0, text)
+    with wave.open(str(tmp_path / "x.wav")) as found:
+        assert found.getnframes() / found.getframerate() == pytest.approx(told["seconds"], abs=0.01)
+
+
+def test_a_text_that_is_too_long_is_told_what_takes_any(scripted: Talk) -> None:
+    for words, typed in ((["-"], "one two. " * 2000), (["-w", "-"], "x" * 50_000), (["-w", "x" * 10_001], None)):
+        done = scripted.run("say", *words, stdin=typed)
+        assert (done.code, done.out) == (5, "")
+        assert "too long" in done.err or "longest" in done.err
+        assert "talk say --lines" in done.err
+    assert scripted.run("-q", "say", "-", stdin="x" * 50_000).err == ""
 
 
 def test_output_takes_settings_from_options_then_from_the_environment(tmp_path: Path) -> None:

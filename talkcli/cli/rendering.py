@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,7 +12,7 @@ from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, show_json
 from talkcli.cli.utf8 import readable
 from talkcli.dial import Interrupted
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, UsageError
 
 if TYPE_CHECKING:
     from talkcli.cli.show import Common
@@ -38,9 +39,14 @@ def settings(context: click.Context, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def render_to(path: str, text: str, chosen: JsonObject, timeout: float | None, options: Common) -> int:
-    """Write the text into the file, and return the exit code; what goes wrong is raised."""
-    from talkcli.engine.render import render
+    """Write the text into the file, "-" for standard output, and return the exit code; what goes wrong is raised."""
+    from talkcli.engine.render import STANDARD_OUTPUT, render
 
+    if path in STANDARD_OUTPUT:
+        if options.json:
+            raise UsageError("--json prints to standard output, where the sound goes: leave one of them out")
+        if sys.stdout is None:
+            raise BrokenPipeError("standard output is closed")
     text, unreadable = readable(text)
     if unreadable and not options.quiet:
         note(unreadable)

@@ -52,6 +52,7 @@ class _SayCommand(Command):
         fortune | talk say -
         tail -n 0 -F log | talk say --lines --ttl 10
         talk say -o hello.wav "hello"           needs no server
+        talk say -o - "hello" | aplay
     """,
     exit_codes={
         **ASKING,
@@ -136,7 +137,7 @@ class _SayCommand(Command):
     "--output",
     type=click.Path(dir_okay=False),
     metavar="FILE.wav",
-    help="Write it into a file instead of speaking it; needs no server.",
+    help="Write it into a file instead of speaking it, '-' for standard output; needs no server.",
 )
 @common_options
 @click.pass_context
@@ -164,10 +165,8 @@ def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> i
         from talkcli.cli.stdin import InputTooLong, read_text
 
         try:
-            sentence = read_text(end)
+            sentence = read_text(end, whole=given["output"] is not None)
         except InputTooLong as error:
-            if given["output"] is not None:
-                raise
             return refuse(f"Talk rejected: {error}", error.code, options, feedback=given["feedback"])
     if given["output"] is not None:
         from talkcli.cli.rendering import render_to, settings

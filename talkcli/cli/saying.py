@@ -95,7 +95,10 @@ def _tell(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
     if goal.state is State.REJECTED:
         if shown and options.json:
             until_ended(goal, None, shown)
-        return report(goal.goal, options, shown)
+        code = report(goal.goal, options, shown)
+        if goal.goal.reason == "text_too_long" and not options.quiet:
+            note("'talk say --lines' speaks standard input line by line, each line a goal of its own")
+        return code
     _introduce(goal, options, shown)
     if goal.state.terminal:
         return report(goal.goal, options)

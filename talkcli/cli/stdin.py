@@ -48,18 +48,18 @@ class Line:
     size: int
 
 
-def read_text(end: float | None) -> str:
+def read_text(end: float | None, *, whole: bool = False) -> str:
     """Return standard input as one text; InputTooLong for more than the longest one, which is not read to its end.
 
-    `end`: the monotonic time by which it must have been read, else InputLate.
+    `end`: the monotonic time by which it must have been read, else InputLate; `whole`: read all of it, for no goal.
     """
-    data = b""
-    while len(data) <= _MOST:
+    data = bytearray()
+    while whole or len(data) <= _MOST:
         if not ready({0: select.POLLIN}, None if end is None else max(0.0, end - time.monotonic())):
             raise InputLate("standard input has not ended within the time: nothing was sent")
-        more = _read(_MOST + 1 - len(data))
+        more = _read(_CHUNK if whole else _MOST + 1 - len(data))
         if more == b"":
-            return _decoded(data)
+            return _decoded(bytes(data))
         data += more or b""
     raise InputTooLong(
         f"standard input has more than {MAX_BYTES:,} bytes, and a text at most {MAX_CHARACTERS:,} characters: "

@@ -14,6 +14,7 @@ from talkcli.engine.pipe import PlayerPipe
 from talkcli.engine.players import commands, on_path
 from talkcli.engine.sink import AudioFailed
 from talkcli.engine.wavefile import WavFile
+from talkcli.engine.wavestream import WavStream
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -34,13 +35,23 @@ class Outlet:
     """The player setting of one engine process."""
 
     def __init__(
-        self, player: str | None, device: str | None, inherited: Sequence[int] = (), lead_in: float = 0.0
+        self,
+        player: str | None,
+        device: str | None,
+        inherited: Sequence[int] = (),
+        lead_in: float = 0.0,
+        output: int | None = None,
     ) -> None:
-        """`inherited` are descriptors that every player program gets, `lead_in` seconds for a device that slept."""
+        """`inherited` are descriptors that every player program gets, `lead_in` seconds for a device that slept.
+
+        `output`: a descriptor that gets a WAV file of all sentences, instead of any player.
+        """
         self._player = player
         self._device = device
         self._inherited = inherited
         self._lead_in = lead_in
+        self._output = output
+        self._streaming = False
         #: what lies between two sentences
         self.changeover = Changeover()
         self._worked: str | None = None
@@ -49,10 +60,12 @@ class Outlet:
     @property
     def is_program(self) -> bool:
         """Whether what plays is a program, which takes a while to start."""
-        return self._player != _NULL and not (self._player or "").startswith(_FILE)
+        return self._output is None and self._player != _NULL and not (self._player or "").startswith(_FILE)
 
     def candidates(self, rate: int) -> list[Callable[[], Sink]]:
         """Return what opens the sinks to try for a sentence, best first; AudioFailed if there is none."""
+        if self._output is not None:
+            return [partial(self._stream, self._output, rate)]
         if self._player == _NULL:
             return [partial(NullSink, rate)]
         if self._player is not None and self._player.startswith(_FILE):
@@ -75,9 +88,15 @@ class Outlet:
 
     def first(self) -> str | None:
         """Return the name of what is tried first, for people; None if nothing is found."""
+        if self._output is not None:
+            return WavStream.name
         if self._player is not None:
             return self._player
         try:
             return commands(None, None, 1, on_path, self._worked)[0].name
         except AudioFailed:
             return None
+
+    def _stream(self, output: int, rate: int) -> WavStream:
+        first, self._streaming = not self._streaming, True
+        return WavStream(output, rate, first=first)

@@ -201,8 +201,9 @@ class Playback:
             if taken:
                 continue
             limit = FIRST_WITHIN if feed.taken == 0 else STALLED_AFTER
-            self._wait_for(feed, feed.progress_at + limit)
-            if time.monotonic() >= feed.progress_at + limit and not self._hold.asked and not self._offer(feed):
+            due = feed.progress_at + limit if feed.sink.real_time else None  # else it takes as long as its reader does
+            self._wait_for(feed, due)
+            if due and time.monotonic() >= due and not self._hold.asked and not self._offer(feed):
                 raise AudioFailed("audio_stalled", f"{feed.sink.name} took no sound for {limit:g} s")
 
     def _drain(self, feed: Feed) -> bool:
@@ -322,7 +323,7 @@ class Playback:
             self._wait((), None)
             self._check_stopped()
 
-    def _wait_for(self, feed: Feed, until: float) -> None:
+    def _wait_for(self, feed: Feed, until: float | None) -> None:
         sink, now = feed.sink, time.monotonic()
         moments = [until, sink.wake_at(), self._clock.next_due() if sink.proven else None]
         full = self._full(feed)
@@ -330,7 +331,7 @@ class Playback:
             moments[1] = now + PIECE
         if feed.taken < feed.written:  # a player that takes a part of what waits wakes nobody
             moments.append(now + LOOK_EVERY)
-        self._wait(feed.interests(full), min(moment for moment in moments if moment is not None))
+        self._wait(feed.interests(full), min((moment for moment in moments if moment is not None), default=None))
         self._check_stopped()
 
     def _check_stopped(self) -> None:

@@ -60,7 +60,7 @@ def _serve(channel: Channel, configure: protocol.Configure) -> None:
     from talkcli.engine.sink import CannotEnd
     from talkcli.engine.start import CannotStart, start
 
-    outlet = Outlet(configure.player, configure.device, _inherited(), configure.lead_in / 1000)
+    outlet = Outlet(configure.player, configure.device, _inherited(), configure.lead_in / 1000, configure.output)
     session = Session(channel, outlet.changeover)
     try:
         started = start(configure.driver, configure.voice, outlet, session.wait, session.hold)

@@ -48,6 +48,8 @@ class Configure:
     lead_in: int = 0
     #: whether the server doesn't know the voices yet: `Voices` then comes right after `Ready`, else never.
     list_voices: bool = True
+    #: a descriptor that the process inherits: it gets a WAV file of all sentences, and nothing is played.
+    output: int | None = None
 
 
 @frozen

@@ -1,13 +1,15 @@
 """Renders one text into a WAV file, in an engine process of its own: what `say -o` does, with or without a server.
 
-It is no goal: nothing is queued, nobody else sees it. FILE appears whole or not at all: the engine writes beside it,
-under a hidden name, and only what it says it has completed is renamed. It must leave neither that hidden file nor a
-process behind, whatever interrupts it; one that is killed outright leaves the hidden file at most.
+It is no goal: nothing is queued, nobody else sees it, and the text may have any length. FILE appears whole or not at
+all: the engine writes beside it, under a hidden name, and only what it says it has completed is renamed. It must leave
+neither that hidden file nor a process behind, whatever interrupts it; one that is killed outright leaves the hidden
+file at most. Standard output, a named pipe, a device get the sound as it is made.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import select
 import stat
@@ -18,6 +20,8 @@ from talkcli import text as texts
 from talkcli.dial import Interrupted, ready
 from talkcli.engine import protocol, spawn
 from talkcli.engine.limits import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
+from talkcli.engine.pieces import pieces
+from talkcli.engine.wavestream import WavStream
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 
 if TYPE_CHECKING:
@@ -25,11 +29,13 @@ if TYPE_CHECKING:
 
 #: The exit codes of a goal that is REJECTED or ABORTED, for the same reasons here.
 _EXIT_REJECTED, _EXIT_ABORTED = 5, 4
-_REJECTED = frozenset({"invalid_text", "text_too_long", "unknown_voice", "bad_option"})
+_REJECTED = frozenset({"invalid_text", "unknown_voice", "bad_option"})
 #: Reasons that come from the player; the only one here is the file.
 _FROM_FILE = frozenset({"audio_device", "audio_lost"})
-#: The name of the one sentence.
-_ID = "output"
+#: What stands for standard output, which is written to as it is: the shell has opened it.
+STANDARD_OUTPUT = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
+#: Seconds between two looks whether somebody has opened a named pipe to read it: nothing tells of that.
+_READER_LOOK = 0.05
 
 
 class RenderFailed(TalkError):
@@ -61,27 +67,79 @@ def render(
     timeout: float | None = None,
     interrupt: int | None = None,
 ) -> float:
-    """Render the text into the file at `path` and return the seconds of audio.
+    """Render the text into the file at `path` and return the seconds of audio; "-" is standard output.
 
     The settings are those of a goal. `timeout`: seconds in which it must be done, else TimeoutError; `interrupt`: a
-    descriptor that ends it with `Interrupted` as soon as it is readable. RenderFailed; UsageError for a driver that
-    writes no file.
+    descriptor that ends it with `Interrupted` as soon as it is readable. RenderFailed; BrokenPipeError where whoever
+    reads standard output is gone; UsageError for a driver that writes no file, or for a terminal.
     """
     deadline = None if timeout is None else time.monotonic() + timeout
-    fault = texts.fault(text)
+    fault = texts.fault(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
-    target = _target(path)
-    say = protocol.Say(_ID, text, rate, volume, voice, pitch)
-    with _beside(target, path) as hidden:
-        seconds = _speak_into(hidden, path, say, driver, deadline, interrupt)
-        _put_in_place(hidden, target, path)
-    return seconds
+    says = [protocol.Say(f"{n}", each, rate, volume, voice, pitch) for n, each in enumerate(pieces(text), 1)]
+    if path not in STANDARD_OUTPUT and not _is_stream(path):
+        target = _target(path)
+        with _beside(target, path) as hidden:
+            seconds = _speak_into(_to_file(driver, hidden), hidden, path, says, deadline, interrupt)
+            _put_in_place(hidden, target, path)
+        return seconds
+    with _stream(path, deadline, interrupt) as output:
+        configure = protocol.Configure(os.getpid(), driver, None, None, None, list_voices=False, output=output)
+        try:
+            return _speak_into(configure, WavStream.name, _named(path), says, deadline, interrupt)
+        except CannotWrite as error:
+            if path in STANDARD_OUTPUT and ready({output: 0}, 0.0):
+                raise BrokenPipeError(errno.EPIPE, "the reader of standard output is gone") from error
+            raise
+
+
+def _named(path: str) -> str:
+    return "standard output" if path in STANDARD_OUTPUT else path
+
+
+def _is_stream(path: str) -> bool:
+    """Whether the path is that of a named pipe or of a device that takes characters, which nothing is renamed over."""
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return False
+    return stat.S_ISFIFO(mode) or stat.S_ISCHR(mode)
+
+
+@contextlib.contextmanager
+def _stream(path: str, deadline: float | None, interrupt: int | None) -> Iterator[int]:
+    """Give a descriptor of standard output, a named pipe or a device, open for writing."""
+    output = os.dup(1) if path in STANDARD_OUTPUT else _open_stream(path, deadline, interrupt)
+    try:
+        if os.isatty(output):
+            raise UsageError(
+                f"{_named(path)} is a terminal, and sound is no text: name a file, or a program that reads it, as in: "
+                "talk say -o - TEXT | aplay"
+            )
+        yield output
+    finally:
+        os.close(output)
+
+
+def _open_stream(path: str, deadline: float | None, interrupt: int | None) -> int:
+    """Open a device, or a named pipe once somebody reads it."""
+    while True:
+        try:
+            return os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        except OSError as error:
+            if error.errno != errno.ENXIO or not stat.S_ISFIFO(os.stat(path).st_mode):
+                raise _unwritable(path, error) from error
+        left = _READER_LOOK if deadline is None else min(_READER_LOOK, deadline - time.monotonic())
+        if left <= 0:
+            raise TimeoutError(f"nobody has opened {path} to read it within the time")
+        if ready({} if interrupt is None else {interrupt: select.POLLIN}, left):
+            raise Interrupted
 
 
 def _target(path: str) -> str:
     """Return the file to rename over, which is what a link points to; CannotWrite if it can't be one."""
-    if path in {"", "-"} or path.endswith(os.sep) or "\0" in path:
+    if not path or path.endswith(os.sep) or "\0" in path:
         raise CannotWrite(repr(path), "is no name of a file: a rendering needs one, as in speech.wav")
     target = os.path.realpath(path)
     try:
@@ -92,7 +150,7 @@ def _target(path: str) -> str:
         raise _unwritable(path, error) from error
     if stat.S_ISDIR(found.st_mode):
         raise CannotWrite(path, "is a directory: name a file in it")
-    # What is open without a name any more has a link, /dev/stdout for one, but no place.
+    # What is open without a name any more has a link, in /proc, but no place.
     placed = os.path.exists(target) and os.path.samefile(path, target)
     if not stat.S_ISREG(found.st_mode) or not placed or _is_our_output(found):
         raise CannotWrite(path, "is no file that can be replaced: name another, as in speech.wav")
@@ -102,7 +160,7 @@ def _target(path: str) -> str:
 
 
 def _is_our_output(found: os.stat_result) -> bool:
-    """Tell whether this is /dev/stdout by any name: the shell has it open, so it can be replaced by nobody."""
+    """Tell whether the shell has it open for our output, under its own name: then it can be replaced by nobody."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):  # it is closed
             if os.path.samestat(found, os.fstat(descriptor)):
@@ -151,26 +209,49 @@ def _unwritable(path: str, error: OSError) -> CannotWrite:
     return CannotWrite(path, f"cannot be written: {error.strerror}")
 
 
+def _to_file(driver: str | None, file: str) -> protocol.Configure:
+    return protocol.Configure(os.getpid(), driver, f"file:{file}", None, None, list_voices=False)
+
+
 def _speak_into(
-    hidden: str, path: str, say: protocol.Say, driver: str | None, deadline: float | None, interrupt: int | None
+    configure: protocol.Configure,
+    name: str,
+    path: str,
+    says: list[protocol.Say],
+    deadline: float | None,
+    interrupt: int | None,
 ) -> float:
-    configure = protocol.Configure(os.getpid(), driver, f"file:{hidden}", None, None, list_voices=False)
+    """Speak all pieces, and return the seconds of audio. What the engine calls `name` is `path` to the user."""
     try:
         process = spawn.EngineProcess(spawn.engine_command(), configure)
     except OSError as error:
         raise RenderFailed("engine_failed", f"the engine process cannot be started: {error}") from error
+    conversation = _Conversation(process, deadline, interrupt)
+    seconds = 0.0
+    silent = None
     try:
-        ended = _Conversation(process, say, deadline, interrupt).run()
+        for say in says:
+            ended = conversation.speak(say)
+            if ended.outcome == protocol.COMPLETED and ended.duration is not None:
+                seconds += ended.duration
+            elif ended.reason == "nothing_to_say":  # a piece of a long text may be rows of dots
+                silent = ended
+            else:
+                raise _failure(ended, name, path)
     finally:
         _end(process)
-    if ended.outcome == protocol.COMPLETED and ended.duration is not None:
-        return ended.duration
+    if silent and not seconds:
+        raise _failure(silent, name, path)
+    return seconds
+
+
+def _failure(ended: protocol.Ended, name: str, path: str) -> RenderFailed:
     reason = ended.reason or "engine_failed"
-    message = (ended.message or "the engine did not complete the text").replace(hidden, path)
+    message = (ended.message or "the engine did not complete the text").replace(name, path)
     if reason in _FROM_FILE:
         why = message.removeprefix(path)
-        raise CannotWrite(path, f"cannot be written{why}" if why.startswith(": ") else why.strip())
-    raise RenderFailed(reason, message)
+        return CannotWrite(path, f"cannot be written{why}" if why.startswith(": ") else why.strip())
+    return RenderFailed(reason, message)
 
 
 def _end(process: spawn.EngineProcess) -> None:
@@ -182,20 +263,22 @@ def _end(process: spawn.EngineProcess) -> None:
 
 
 class _Conversation:
-    """What is said to the engine process and heard of it, up to the end of the text; it has the thread's limits."""
+    """What is said to the engine process and heard of it, piece by piece; it has the thread's limits."""
 
-    def __init__(
-        self, process: spawn.EngineProcess, say: protocol.Say, deadline: float | None, interrupt: int | None
-    ) -> None:
+    def __init__(self, process: spawn.EngineProcess, deadline: float | None, interrupt: int | None) -> None:
         self._process = process
-        self._say = say
+        self._say: protocol.Say | None = None
         self._deadline = deadline
         self._interrupt = interrupt
         self._heard_at = time.monotonic()
         self._ended: protocol.Ended | None = None
 
-    def run(self) -> protocol.Ended:
-        """Return how it ended; RenderFailed, TimeoutError, Interrupted, UsageError."""
+    def speak(self, say: protocol.Say) -> protocol.Ended:
+        """Have a piece spoken, and return how that ended; RenderFailed, TimeoutError, Interrupted, UsageError."""
+        self._say, self._ended = say, None
+        if self._process.ready:
+            self._heard_at = time.monotonic()
+            self._send(say)
         watched = {self._process.socket.fileno(): select.POLLIN, self._process.stderr: select.POLLIN}
         if self._interrupt is not None:
             watched[self._interrupt] = select.POLLIN
@@ -246,5 +329,9 @@ class _Conversation:
         if event.player is None:
             raise UsageError(f'the driver "{event.driver}" cannot write a file: leave --driver out, on Linux')
         self._process.ready = True
-        if not self._process.send(self._say):
+        if self._say is not None:
+            self._send(self._say)
+
+    def _send(self, say: protocol.Say) -> None:
+        if not self._process.send(say):
             raise RenderFailed("engine_hung", "the engine takes no commands")

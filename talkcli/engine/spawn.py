@@ -83,7 +83,7 @@ class EngineProcess:
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,
                 env={**environment, LIVENESS_VARIABLE: str(liveness)},
-                pass_fds=[liveness],
+                pass_fds=[liveness] if configure.output is None else [liveness, configure.output],
                 # Ctrl-C in the server's terminal must not reach it, and one kill reaches all of its group.
                 start_new_session=True,
             )

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 _HEADER = struct.Struct("<4sI4s4sIHHIIHH4sI")
 #: The header's two lengths are 32 bits wide.
-_LONGEST = 0xFFFFFFFF - _HEADER.size
+_UNKNOWN = 0xFFFFFFFF
+_LONGEST = _UNKNOWN - _HEADER.size
 
 
 class WavFile:
@@ -126,6 +127,13 @@ def _header(rate: int, length: int) -> bytes:
     size = _HEADER.size - 8 + length
     return _HEADER.pack(
         b"RIFF", size, b"WAVE", b"fmt ", 16, 1, 1, rate, rate * SAMPLE, SAMPLE, 8 * SAMPLE, b"data", length
+    )
+
+
+def endless_header(rate: int) -> bytes:
+    """Return the header of a file whose length nobody knows yet: both of its lengths are the greatest there are."""
+    return _HEADER.pack(
+        b"RIFF", _UNKNOWN, b"WAVE", b"fmt ", 16, 1, 1, rate, rate * SAMPLE, SAMPLE, 8 * SAMPLE, b"data", _UNKNOWN
     )
 
 

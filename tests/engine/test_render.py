@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import os
+import socket
 import stat
+import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import uuid
 import wave
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from talkcli.dial import Interrupted
 from talkcli.engine import render as rendering
 from talkcli.engine import spawn
+from talkcli.engine.pieces import pieces
 from talkcli.engine.render import CannotWrite, RenderFailed, render
 from talkcli.errors import TalkError, UsageError
 from tests.support.reference import RATE, Sentence
@@ -77,6 +83,35 @@ def test_settings_are_those_of_a_goal(tmp_path: Path) -> None:
     assert samples(path) == expected.tobytes()
 
 
+def test_a_text_longer_than_a_goal_may_be_is_rendered_as_if_it_were_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.wav"
+    monkeypatch.setattr("talkcli.engine.pieces.LONGEST", 500)
+    sentences = [f"This is number {number}, and so on." for number in range(20)]
+    text = f"{' '.join(sentences)}\n\n{'... ' * 200}"  # and what is silent is no failure
+    first, second, *rest = pieces(text)
+    assert first + second + "".join(rest) == text
+    assert first.endswith("so on. ")
+    seconds = render(text, str(path), rate=450)
+    spoken = reference([Sentence(first, 450), Sentence(second, 450)])
+    assert samples(path) == b"".join(each.tobytes() for each in spoken)
+    assert seconds == pytest.approx(len(samples(path)) / RATE / 2, abs=1e-3)
+    monkeypatch.setattr("talkcli.engine.pieces.LONGEST", 10_000)
+    assert seconds == pytest.approx(render(first + second, str(path), rate=450), abs=0.02)
+
+
+@given(
+    st.lists(st.sampled_from([". ", "\n\n", "word", " ", "日本。", "x" * 5_000, "“Mr. X.”  "]), max_size=40).map(
+        "".join
+    )
+)
+def test_pieces_are_the_text_and_none_is_too_long(text: str) -> None:
+    found = list(pieces(text))
+    assert "".join(found) == text
+    assert max(map(len, found)) <= 10_000
+
+
 def test_the_longest_text_is_rendered(tmp_path: Path) -> None:
     path = tmp_path / "x.wav"
     seconds = render(LONGEST, str(path))
@@ -121,16 +156,13 @@ def test_what_a_link_points_to_is_replaced_and_the_link_stays(tmp_path: Path) ->
     ("name", "words"),
     [
         ("", "'' is no name of a file"),
-        ("-", "'-' is no name of a file"),
         ("{0}/", "is no name of a file"),
         ("{0}/a\0b", "is no name of a file"),
         ("{0}", "{0} is a directory: name a file in it"),
         ("{0}/missing/x.wav", "{0}/missing/x.wav cannot be written: there is no directory {0}/missing"),
         ("{0}/file/x.wav", "{0}/file/x.wav cannot be written: Not a directory"),
-        ("{0}/pipe", "{0}/pipe is no file that can be replaced"),
+        ("{0}/socket", "{0}/socket is no file that can be replaced"),
         ("{0}/loop", "{0}/loop cannot be written: Too many levels of symbolic links"),
-        ("/dev/null", "/dev/null is no file that can be replaced"),
-        ("/dev/stdout", "/dev/stdout is no file that can be replaced"),
         ("{0}/" + "n" * 256, "cannot be written: File name too long"),
     ],
 )
@@ -139,7 +171,9 @@ def test_what_cannot_be_written_is_told_before_anything_is_started(
 ) -> None:
     monkeypatch.setattr(spawn, "EngineProcess", None)  # calling it would be a TypeError
     (tmp_path / "file").touch()
-    os.mkfifo(tmp_path / "pipe")
+    with socket.socket(socket.AF_UNIX) as listening, monkeypatch.context() as there:
+        there.chdir(tmp_path)
+        listening.bind("socket")
     (tmp_path / "loop").symlink_to("loop")
     error = failed("yes", name.format(tmp_path))
     assert isinstance(error, CannotWrite)
@@ -147,23 +181,115 @@ def test_what_cannot_be_written_is_told_before_anything_is_started(
     assert (error.code, error.exit_code) == ("cannot_write", 1)
 
 
+#: A program that renders "yes" to what is its argument.
+RENDERS = "import sys; sys.path[:] = {path!r}; from talkcli.engine.render import render; render('yes', sys.argv[1])"
+
+
+def renders(path: str, stdout: IO[bytes] | int) -> subprocess.Popen[bytes]:
+    code = RENDERS.format(path=sys.path)
+    return subprocess.Popen([sys.executable, "-c", code, path], stdout=stdout, stderr=subprocess.PIPE)
+
+
+def streamed(data: bytes) -> bytes:
+    """Return the samples of a WAV file whose lengths are not known."""
+    assert (data[:8], data[8:16]) == (b"RIFF\xff\xff\xff\xff", b"WAVEfmt ")
+    assert struct.unpack("<HHIIHH", data[20:36]) == (1, 1, RATE, 2 * RATE, 2, 16)
+    assert data[36:44] == b"data\xff\xff\xff\xff"
+    return data[44:]
+
+
+@pytest.mark.parametrize("path", ["-", "/dev/stdout", "/dev/fd/1"])
+def test_standard_output_gets_it_as_it_is_made(tmp_path: Path, path: str) -> None:
+    (expected,) = reference(["yes"])
+    with renders(path, subprocess.PIPE) as process:
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, streamed(out), err) == (0, expected.tobytes(), b"")
+    with (tmp_path / "out").open("wb") as file:
+        file.write(b"before")
+        file.flush()
+        with renders(path, file) as process:
+            assert process.communicate(timeout=60)[1] == b""
+        os.lseek(file.fileno(), 0, os.SEEK_END)
+        file.write(b"after")
+    data = (tmp_path / "out").read_bytes()
+    assert (data[:6], streamed(data[6:-5]), data[-5:]) == (b"before", expected.tobytes(), b"after")
+
+
+def test_a_reader_that_takes_its_time_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More than a pipe holds, and it is read later than a player that is stuck would be given up."""
+    limits = "from talkcli.engine import playback; playback.FIRST_WITHIN = playback.STALLED_AFTER = 0.1"
+    interpreter, option, code = spawn.engine_command()
+    path, rest = code.split("; from ", 1)
+    monkeypatch.setattr(spawn, "engine_command", lambda: [interpreter, option, f"{path}\n{limits}\nfrom {rest}"])
+    text = TEXT * 4
+    (expected,) = reference([text])
+    assert len(expected) * 2 > 3 * 65536
+    os.mkfifo(tmp_path / "pipe")
+    found: list[float] = []
+    thread = threading.Thread(target=lambda: found.append(render(text, str(tmp_path / "pipe"))))
+    thread.start()
+    with (tmp_path / "pipe").open("rb") as pipe:
+        head = pipe.read(44)
+        time.sleep(0.4)
+        assert streamed(head + pipe.read()) == expected.tobytes()
+    thread.join(10)
+    assert found == [pytest.approx(len(expected) / RATE, abs=1e-5)]
+
+
+def test_a_named_pipe_that_nobody_reads_is_waited_for_as_long_as_is_asked(tmp_path: Path) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    with pytest.raises(TimeoutError, match="nobody has opened"):
+        render("yes", str(path), timeout=0.1)
+    reader, writer = os.pipe()
+    os.write(writer, b"x")
+    with pytest.raises(Interrupted):
+        render("yes", str(path), interrupt=reader)
+    os.close(reader)
+    os.close(writer)
+
+
+def test_a_reader_that_goes_away_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    failures: list[TalkError] = []
+    thread = threading.Thread(target=lambda: failures.append(failed(LONGEST, path)))
+    thread.start()
+    with path.open("rb") as pipe:
+        pipe.read(44)
+    thread.join(10)
+    assert [(str(each), each.exit_code) for each in failures] == [(f"{path} cannot be written: Broken pipe", 1)]
+    with renders("-", subprocess.PIPE) as process:
+        assert process.stdout
+        process.stdout.close()
+        assert process.stderr
+        assert b"BrokenPipeError: " in process.stderr.read().splitlines()[-1]
+
+
+def test_a_device_is_written_to_and_a_terminal_is_not() -> None:
+    assert render("yes", "/dev/null") > 0.3
+    full = failed("yes", "/dev/full")
+    assert (str(full), full.exit_code) == ("/dev/full cannot be written: No space left on device", 1)
+    ours, theirs = os.openpty()
+    for name in ("-", os.ttyname(theirs)):
+        with renders(name, theirs) as process:
+            _, err = process.communicate(timeout=60)
+        assert b"UsageError: " in err
+        assert b"is a terminal" in err
+    os.set_blocking(ours, False)
+    with pytest.raises(BlockingIOError):
+        os.read(ours, 1)
+    os.close(ours)
+    os.close(theirs)
+
+
 def test_a_file_that_the_shell_has_open_for_our_output_is_not_replaced(tmp_path: Path) -> None:
-    code = (
-        f"import sys; sys.path[:] = {sys.path!r}; from talkcli.engine.render import render; render('yes', sys.argv[1])"
-    )
-    for path in ("/dev/stdout", str(tmp_path / "out")):
-        with (tmp_path / "out").open("wb") as out:
-            done = subprocess.run(
-                [sys.executable, "-c", code, path],
-                stdout=out,
-                stderr=subprocess.PIPE,
-                text=True,
-                timeout=60,
-                check=False,
-            )
-        assert done.returncode == 1
-        assert f"{path} is no file that can be replaced" in done.stderr
-        assert (tmp_path / "out").read_bytes() == b""
+    path = tmp_path / "out"
+    with path.open("wb") as out, renders(str(path), out) as process:
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert f"{path} is no file that can be replaced" in err.decode()
+    assert path.read_bytes() == b""
 
 
 #: A program that has no right to write there: root, who may write everywhere, becomes nobody first.
@@ -229,7 +355,6 @@ def test_a_full_disk_is_told_and_what_was_there_is_left(small_disk: Path) -> Non
     [
         ("", {}, "invalid_text", 5, "the text is empty"),
         ("a\0b", {}, "invalid_text", 5, "NUL"),
-        ("a" * 10_001, {}, "text_too_long", 5, "10,001 characters"),
         ("yes", {"voice": "en-uss"}, "unknown_voice", 5, "did you mean 'en-us'"),
         ("yes", {"voice": "en+nosuch"}, "unknown_voice", 5, 'unknown voice "en+nosuch"'),
         ("yes", {"driver": "parrot"}, "engine_failed", 4, 'unknown driver "parrot"'),
