@@ -13,6 +13,7 @@ It imports neither click nor asyncio nor pyttsx3, starts no thread, and may be u
 from __future__ import annotations
 
 import os
+import select
 
 from talkcli import __version__
 from talkcli.backlog import MAX_STATES, Backlog
@@ -43,7 +44,7 @@ from talkcli.states import State
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping
     from types import TracebackType
 
     from talkcli.events import Event
@@ -61,7 +62,7 @@ class Client:
         socket: str | None = None,
         *,
         name: str | None = None,
-        interrupt: int | None = None,
+        interrupt: int | Mapping[int, int] | None = None,
         patience: float = ANSWER_LIMIT,
         urgent: bool = False,
         opened: Opened | None = None,
@@ -70,9 +71,10 @@ class Client:
 
         `socket`: path of the server's socket, default TALK_SOCKET, then the usual places; `name`: what this sender
         calls itself in `talk status` and the log, default TALK_NAME; `interrupt`: a descriptor that ends any waiting
-        with talkcli.dial.Interrupted as soon as it is readable; `patience`: seconds in which the server must
-        greet; `urgent`: for status and cancel alone, for which a full server keeps some places; `opened`: a connection
-        that talkcli.opening has begun, with the first request that this client will send.
+        with talkcli.dial.Interrupted as soon as it is readable, or several, each with the events of poll that do so
+        (broken and hung up always do); `patience`: seconds in which the server must greet; `urgent`: for status and
+        cancel alone, for which a full server keeps some places; `opened`: a connection that talkcli.opening has begun,
+        with the first request that this client will send.
 
         UsageError for a name that is too long; ServerUnavailable, AccessDenied, Busy or ProtocolMismatch where there is
         no server to be had: nothing was sent then.
@@ -83,6 +85,8 @@ class Client:
         name = name or os.environ.get("TALK_NAME") or None
         if name and len(name) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
+        if isinstance(interrupt, int):
+            interrupt = {interrupt: select.POLLIN}
         hello = Hello(name, urgent)
         self._connection = Connection(
             paths.named_socket(socket), hello, __version__, self._followed.hear, interrupt, patience, opened

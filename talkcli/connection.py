@@ -17,13 +17,15 @@ from collections import deque
 from collections.abc import Callable
 
 from talkcli import wire
-from talkcli.dial import ANSWER_LIMIT, Interrupted, dial, ready
+from talkcli.dial import ANSWER_LIMIT, dial, ready
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
 from talkcli.printable import printable
 from talkcli.requests import Say, write_request
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from talkcli.messages import JsonObject
     from talkcli.opening import Opened
     from talkcli.requests import Hello, Request
@@ -64,7 +66,7 @@ class Connection:
         hello: Hello,
         version: str,
         on_event: Callable[[JsonObject], None],
-        interrupt: int | None = None,
+        interrupt: Mapping[int, int] | None = None,
         patience: float = ANSWER_LIMIT,
         opened: Opened | None = None,
     ) -> None:
@@ -206,14 +208,9 @@ class Connection:
                 return
 
     def _fill(self, timeout: float | None, interruptible: bool) -> bool:
-        watched = {self.line.socket.fileno(): select.POLLIN}
-        if self._interrupt is not None and interruptible:
-            watched[self._interrupt] = select.POLLIN
         try:
-            readable = ready(watched, timeout)
-            if self._interrupt in readable:
-                raise Interrupted
-            if not readable:
+            watched = {self.line.socket.fileno(): select.POLLIN}
+            if not ready(watched, timeout, self._interrupt if interruptible else None):
                 return False
             data = self.line.socket.recv(262144)
         except BlockingIOError:

@@ -19,6 +19,8 @@ from talkcli.unreachable import DIRECTORY, FILE, FORBIDDEN
 from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from talkcli.opening import Opened
 
 #: Seconds in which a server greets, and answers each request.
@@ -50,7 +52,7 @@ class Line:
 
 
 class Interrupted(Exception):
-    """The caller's own interrupt descriptor became readable while the server was awaited."""
+    """One of the caller's own descriptors became ready while something was awaited."""
 
 
 class _BacklogFull(ServerUnavailable):
@@ -62,13 +64,13 @@ def dial(
     hello: Hello,
     version: str,
     patience: float = ANSWER_LIMIT,
-    interrupt: int | None = None,
+    interrupt: Mapping[int, int] | None = None,
     opened: Opened | None = None,
 ) -> Line:
     """Return a connection to the first server that answers.
 
     `named`: the only socket to try, or None for the list; `hello`: what is said to it; `version`: the client's own;
-    `patience`: seconds in which the server must greet; `interrupt`: a descriptor that ends it with Interrupted;
+    `patience`: seconds in which the server must greet; `interrupt`: what ends it with Interrupted, as in `ready`;
     `opened`: a connection on which `hello` was sent already.
 
     ServerUnavailable, AccessDenied, ProtocolMismatch or Busy where there is none.
@@ -90,29 +92,30 @@ def dial(
                 raise
             import random
 
-            _await(None, random.uniform(*_BUSY_PAUSE), interrupt)
+            ready({}, random.uniform(*_BUSY_PAUSE), interrupt)
 
 
-def ready(watched: dict[int, int], timeout: float | None) -> set[int]:
-    """Return the descriptors that are ready for what they are watched for, waiting at most `timeout` seconds."""
+def ready(watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None) -> set[int]:
+    """Return the descriptors that are ready for what they are watched for, waiting at most `timeout` seconds.
+
+    Each comes with poll's events; that it is broken or hung up counts in any case. `interrupt`: others, of which
+    each ends it with Interrupted as soon as it is ready.
+    """
+    interrupt = interrupt or {}
     poll = select.poll()  # not select(), which fails in a program that has more than 1,024 descriptors
-    for fd, events in watched.items():
+    for fd, events in (*watched.items(), *interrupt.items()):
         poll.register(fd, events)
     # poll takes a C int of milliseconds, 24 days at most: whoever waits that long is woken, and looks again
     milliseconds = None if timeout is None else math.ceil(min(max(0.0, timeout * 1000), 2**31 - 1))
-    return {fd for fd, _ in poll.poll(milliseconds)}
-
-
-def _await(connected: _socket.socket | None, timeout: float, interrupt: int | None) -> bool:
-    """Wait until the server has said something; False after `timeout` seconds."""
-    watched = {fd: select.POLLIN for fd in (connected.fileno() if connected else None, interrupt) if fd is not None}
-    found = ready(watched, timeout)
-    if interrupt in found:
+    found = {fd for fd, _ in poll.poll(milliseconds)}
+    if not found.isdisjoint(interrupt):
         raise Interrupted
-    return bool(found)
+    return found
 
 
-def _try_all(named: str | None, hello: Hello, version: str, patience: float, interrupt: int | None) -> Line:
+def _try_all(
+    named: str | None, hello: Hello, version: str, patience: float, interrupt: Mapping[int, int] | None
+) -> Line:
     failures: list[str] = []
     found: str = ""
     denied = False
@@ -166,7 +169,7 @@ def _greet(
     hello: Hello | None,
     version: str,
     patience: float,
-    interrupt: int | None,
+    interrupt: Mapping[int, int] | None,
     received: bytes = b"",
 ) -> Line:
     """Greet, unless that has been done, and be greeted; `received`: what has been read of that."""
@@ -180,7 +183,7 @@ def _greet(
             pass  # it has hung up already, but it may have said why
         end = time.monotonic() + patience
         while not lines:
-            if not _await(connected, end - time.monotonic(), interrupt):
+            if not ready({connected.fileno(): select.POLLIN}, end - time.monotonic(), interrupt):
                 raise ServerUnavailable(f"the server at {path} does not answer; {_next_step(connected)}")
             data = connected.recv(65536)
             if not data:

@@ -40,8 +40,9 @@ class MakeTalk(Protocol):
 
 @pytest.fixture(scope="session", autouse=True)
 def _interruptible() -> None:
-    """Start clients with SIGINT as a terminal would: what runs the tests in its background may have it ignored."""
+    """Start clients with signals as a terminal would: what runs the tests in its background may have these ignored."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def pytest_configure() -> None:

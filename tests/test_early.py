@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_before_the_client_is_whole_cancels_the_goal_that_was_sent(number: signal.Signals) -> None:
     def play(peer: Peer) -> None:
         asked = peer.receive("say")

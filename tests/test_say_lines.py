@@ -8,11 +8,12 @@ import re
 import signal
 import subprocess
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.conformance.bareserve import TALK, environment
+from tests.support.forking import Forked
 from tests.support.surroundings import short_directory
 from tests.support.timing import assert_within, limits
 
@@ -237,7 +238,7 @@ def test_a_line_without_an_end_is_read_in_bounded_memory(scripted: Talk) -> None
 # Ends before the input's
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signal_cancels_what_is_its_own_and_nothing_else(make_talk: MakeTalk, number: signal.Signals) -> None:
     talk = make_talk("--max-queue", "4", scripted=True)
     theirs = talk.run("say", "--priority", "-1", "length=0 theirs").id
@@ -330,24 +331,53 @@ def test_no_server_is_told_before_anything_is_read() -> None:
         assert b"talk serve" in err
 
 
-@pytest.mark.parametrize("words", [[], ["--json"], ["--wait", "--json"], ["-f"]])
-def test_closed_standard_output_is_141(scripted: Talk, words: list[str]) -> None:
+def piped(talk: Talk, *words: str) -> tuple[Forked, int]:
+    """Start `say --lines` with its output in a pipe; return it, and the end to read."""
     reader, writer = os.pipe()
+    client = Forked(["say", "--lines", *words], talk.env, stdin=subprocess.PIPE, stdout=writer, stderr=subprocess.PIPE)
+    os.close(writer)
+    return client, reader
+
+
+@pytest.mark.parametrize("words", [[], ["--json"], ["--wait", "--json"], ["-f"]])
+def test_standard_output_that_was_closed_from_the_start_matters_to_nothing(scripted: Talk, words: list[str]) -> None:
+    client, reader = piped(scripted, *words)
     os.close(reader)
-    with os.fdopen(writer, "wb") as closed:
-        client: Any = subprocess.Popen(
-            [*TALK, "say", "--lines", *words],
-            env=scripted.env,
-            stdin=subprocess.PIPE,
-            stdout=closed,
-            stderr=subprocess.PIPE,
-        )
-    client.stdin.write(b"length=0 a\n")
-    client.stdin.flush()  # and stays open: that output is closed ends it all the same
-    assert client.wait(10) == 141
-    assert client.stderr.read() == b""
-    client.stdin.close()
-    client.stderr.close()
+    assert client.communicate("length=0 a\n\0\nlength=0 b\n", 10)[1].startswith("talk: line 2: ")
+    assert client.returncode == 5
+    scripted.watcher.wait_until(lambda _: texts(scripted, "SUCCEEDED") == ["length=0 a", "length=0 b"])
+
+
+@pytest.mark.parametrize("words", [["--wait"], ["--wait", "--json"], ["-f"]])
+@pytest.mark.parametrize("ended", [False, True], ids=["while lines come", "after the last line"])
+def test_reader_that_goes_away_while_it_waits_cancels_what_is_its_own(
+    scripted: Talk, words: list[str], ended: bool
+) -> None:
+    client, reader = piped(scripted, *words)
+    with client:
+        assert client.stdin
+        client.stdin.write(f"{ENDLESS}second\n")
+        client.stdin.flush()
+        second = scripted.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
+        first = scripted.watcher.goals()[0]
+        scripted.watcher.wait_for_word(first)
+        if ended:
+            client.stdin.close()
+        os.close(reader)
+        assert client.wait(10) == 141
+    assert [scripted.watcher.wait_for_terminal(each) for each in (first, second["id"])] == ["PREEMPTED", "RECALLED"]
+
+
+def test_reader_that_goes_away_stops_no_lines_that_nobody_waits_for(scripted: Talk) -> None:
+    client, reader = piped(scripted)
+    assert client.stdin
+    client.stdin.write("length=0 a\n")
+    client.stdin.flush()
+    with open(reader, encoding="utf-8") as lines:
+        scripted.watcher.wait_for_terminal(lines.readline().strip())
+    assert client.communicate("length=0 b\nlength=0 c\n", 10) == ("", "")
+    assert client.returncode == 0
+    scripted.watcher.wait_until(lambda _: texts(scripted, "SUCCEEDED") == [f"length=0 {each}" for each in "abc"])
 
 
 def test_standard_input_that_cannot_be_read_is_told(scripted: Talk) -> None:

@@ -82,7 +82,7 @@ def carry_out(plain: Plain, arguments: list[str]) -> int:
 
     def hold() -> None:
         # A goal that is on its way is this command's to cancel: a signal waits until there is somebody to do so.
-        asked = {_signal.SIGINT, _signal.SIGTERM} if plain.command == "say" else set()
+        asked = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if plain.command == "say" else set()
         held.update(asked - _signal.pthread_sigmask(_signal.SIG_BLOCK, asked))
 
     named = plain.common.get("socket") or os.environ.get("TALK_SOCKET") or None

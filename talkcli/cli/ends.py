@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 
 from talkcli import __version__
-from talkcli.cli.show import note, show_error
+from talkcli.cli.show import OUTPUT_FULL, give_up_output, note, output_failed, show_error
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, TalkError
 from talkcli.values import TYPE_CHECKING
 
@@ -15,9 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from talkcli.cli.show import Common
-
-#: What writing says where there is no room, or the terminal is gone.
-_OUTPUT_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 
 
 class OutputClosed(Exception):
@@ -36,15 +32,14 @@ def ended(command: Callable[[], object], options: Common) -> int:
     except KeyboardInterrupt:
         return EXIT_SIGINT
     except (OutputClosed, BrokenPipeError):
-        _give_up_output()
+        give_up_output()
         return EXIT_SIGPIPE
     except MemoryError:
         note(_without_memory())
         return EXIT_ERROR
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in _OUTPUT_FULL:
-            _give_up_output()
-            note(f"standard output can't be written: {error.strerror}")
+        if isinstance(error, OSError) and error.errno in OUTPUT_FULL:
+            output_failed(error)
             return EXIT_ERROR
         if os.environ.get("TALK_DEBUG"):
             raise
@@ -57,8 +52,3 @@ def _without_memory() -> str:
     from talkcli import resources
 
     return f"there is not enough memory for talk: {resources.limits()}"
-
-
-def _give_up_output() -> None:
-    """Write nothing more to standard output, which takes nothing; not even at the interpreter's end."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

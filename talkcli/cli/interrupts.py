@@ -1,27 +1,57 @@
-"""What ends a client's waiting: signals, a timeout, another thread.
+"""What ends a client's waiting: signals, a timeout, another thread, a reader of standard output that goes away.
 
-All of them become a descriptor that is readable then, so that they never cut a read or a write in two.
+The first three become a descriptor that is readable then, so that they never cut a read or a write in two. The last is
+seen at standard output itself, which is waited for together with that.
 """
 
 from __future__ import annotations
 
 import os
+import select
 import signal
+import sys
 
-from talkcli.errors import EXIT_SIGNAL, EXIT_TIMEOUT
+from talkcli.cli.show import give_up_output
+from talkcli.errors import EXIT_SIGNAL, EXIT_SIGPIPE, EXIT_TIMEOUT
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from types import FrameType, TracebackType
 
-_CAUGHT = (signal.SIGINT, signal.SIGTERM)
+_CAUGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: Three years: what the system's timer is sure to take.
 _LONGEST = 1e8
 
 
+#: Standard output's descriptor.
+_OUTPUT = 1
+
+
+def give_up_unread() -> None:
+    """Have nothing shown on a standard output that nobody could read from the start: that matters to nothing."""
+    if not has_reader():
+        give_up_output()
+
+
+def has_reader() -> bool:
+    """Whether standard output is open, and whatever it leads to has not gone away."""
+    # Not POLLNVAL, which is what macOS says of a terminal.
+    return sys.stdout is not None and not _condition() & (select.POLLERR | select.POLLHUP)
+
+
+def _condition() -> int:
+    """Return what poll says of standard output, unasked; 0 for nothing, as it always does of a file."""
+    poll = select.poll()
+    poll.register(_OUTPUT, 0)
+    return next((found for _, found in poll.poll(0)), 0)
+
+
 class Interrupts:
-    """Catches SIGINT and SIGTERM: `descriptor` becomes readable, `number` is the signal. A second one ends at once."""
+    """Catches SIGINT, SIGTERM and SIGHUP: `number` is the signal then. A second one ends the process at once.
+
+    `descriptor` becomes readable. `watched` has all that there is to wait for, as `dial.ready` takes it; it may change.
+    """
 
     def __init__(self, timeout: float | None = None, held: Iterable[int] = ()) -> None:
         """`timeout`: seconds after which it becomes readable by itself, and `late` true; counted from the `with`.
@@ -30,17 +60,22 @@ class Interrupts:
         """
         self.number: int | None = None
         self.late = False
+        #: whether the reader of standard output has gone away
+        self.gone = False
         self._timeout = timeout
         self._held = held
 
     @property
     def exit_code(self) -> int:
         """The exit code for what has happened: the signal's, if there was one."""
-        return EXIT_TIMEOUT if self.number is None else EXIT_SIGNAL + self.number
+        if self.number is not None:
+            return EXIT_SIGNAL + self.number
+        return EXIT_SIGPIPE if self.gone else EXIT_TIMEOUT
 
     def __enter__(self) -> Interrupts:
         self.descriptor, self._write = os.pipe()
         os.set_blocking(self._write, False)
+        self.watched = {self.descriptor: select.POLLIN}
         # A shell starts background commands with SIGINT ignored: what is ignored stays so.
         self._before = {
             each: signal.signal(each, self._caught) for each in _CAUGHT if signal.getsignal(each) != signal.SIG_IGN
@@ -62,8 +97,19 @@ class Interrupts:
         os.close(self.descriptor)
         os.close(self._write)
 
+    def watch_output(self) -> None:
+        """Have a reader of standard output that goes away from now on end the waiting, too."""
+        if not _condition() & select.POLLNVAL:  # which would end it at once
+            self.watched[_OUTPUT] = 0
+
+    def look(self) -> None:
+        """Find out whether it was the reader of standard output that has ended the waiting."""
+        self.gone = self.gone or (_OUTPUT in self.watched and not has_reader())
+
     def clear(self) -> None:
-        """Make the descriptor wait for another signal; there is none, a second one ends the process."""
+        """Have nothing end the waiting that has; there is no other signal, a second one ends the process."""
+        self.look()
+        self.watched.pop(_OUTPUT, None)
         os.set_blocking(self.descriptor, False)
         try:
             os.read(self.descriptor, 16)

@@ -12,9 +12,16 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from talkcli import output
-from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.outcome import SILENCE, SPEECH_IS_PAUSED, exit_code, report, until_ended
-from talkcli.cli.show import note, show, show_error, show_json
+from talkcli.cli.interrupts import Interrupts, give_up_unread
+from talkcli.cli.outcome import (
+    SILENCE,
+    SPEECH_IS_PAUSED,
+    exit_code,
+    reader_is_gone,
+    report,
+    until_ended,
+)
+from talkcli.cli.show import give_up_output, note, show, show_error, show_json
 from talkcli.cli.stdin import LineReader
 from talkcli.cli.utf8 import readable
 from talkcli.dial import ANSWER_LIMIT, Interrupted
@@ -25,6 +32,8 @@ from talkcli.states import State
 from talkcli.text import MAX_BYTES
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from talkcli.cli.feedback import Feedback
     from talkcli.cli.show import Common
     from talkcli.cli.stdin import Line
@@ -43,12 +52,16 @@ def say_lines(
         from talkcli.cli.feedback import feedback as feedback_for
 
         shown = feedback_for(options)
+    give_up_unread()
     with Interrupts(timeout) as interrupts:
+        if wait:
+            interrupts.watch_output()
         patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
         try:
-            with options.connect(name=name, interrupt=interrupts.descriptor, patience=patience) as client:
+            with options.connect(name=name, interrupt=interrupts.watched, patience=patience) as client:
                 return _Lines(client, interrupts, options, chosen, wait, shown).run()
         except Interrupted:  # while it connected
+            interrupts.look()
             return interrupts.exit_code
         finally:
             if shown:
@@ -92,14 +105,17 @@ class _Lines:
             return self._interrupted()
         except TalkError as error:
             return self._lost(error)
-        except BaseException:
+        except BaseException as error:
+            if self._tally and isinstance(error, OSError) and reader_is_gone(error):
+                self._interrupts.gone = True
+                return self._interrupted()
             if self._tally:
                 self._tally.stop()
             raise
         return self._tally.code if self._tally else self._refused
 
     def _send_all(self) -> None:
-        for line in LineReader(self._interrupts.descriptor).lines():
+        for line in LineReader(self._interrupts.watched).lines():
             if line.text is not None and not line.text.strip():
                 continue
             self._sending = line
@@ -120,9 +136,9 @@ class _Lines:
             return
         if self._options.json:
             if not wait:
-                show_json(handle.goal.to_json())
+                self._print(lambda: show_json(handle.goal.to_json()))
         elif not self._options.quiet and self._shown is None:
-            show(handle.id)
+            self._print(lambda: show(handle.id))
         if handle.speech_paused and not (self._options.quiet or self._told_of_pause):
             self._tell(SPEECH_IS_PAUSED)
         self._told_of_pause = handle.speech_paused
@@ -132,10 +148,7 @@ class _Lines:
     def _refuse(self, line: Line, goal: Goal) -> None:
         """Tell of a line that is no goal, and go on."""
         if self._options.json:
-            if self._shown:
-                self._show(goal)
-            else:
-                show_json(goal.to_json())
+            self._print(lambda: self._show(goal) if self._shown else show_json(goal.to_json()))
         if not self._options.quiet:
             self._tell(f"line {line.number}: {output.ending(goal)}")
         code = exit_code(goal)
@@ -143,9 +156,26 @@ class _Lines:
         if self._tally:
             self._tally.add(code)
 
+    def _print(self, put: Callable[[], None]) -> None:
+        """Show something; where its reader is gone, who waits ends as by a signal, and who doesn't goes on without."""
+        try:
+            put()
+        except OSError as error:
+            if not reader_is_gone(error):
+                raise
+            if self._tally:
+                self._interrupts.gone = True
+                raise Interrupted from error
+            give_up_output()
+
     def _interrupted(self) -> int:
-        """End before the input does: by a signal, by the timeout, or because the tally can't go on."""
-        if self._tally and self._interrupts.number is None and not self._interrupts.late:
+        """End before the input does: by a signal, by the timeout, because its output has no reader any more or the
+        tally can't go on.
+        """
+        self._interrupts.look()
+        if self._interrupts.gone:
+            give_up_output()
+        elif self._tally and self._interrupts.number is None and not self._interrupts.late:
             self._tally.finish()
             self._tell_of_the_rest()
             return self._tally.code
@@ -161,7 +191,7 @@ class _Lines:
     def _cancel(self, ids: list[str]) -> None:
         """Cancel what was sent and has not ended, and tell how it ended."""
         try:
-            with self._options.connect(interrupt=self._interrupts.descriptor, patience=SILENCE, urgent=True) as client:
+            with self._options.connect(interrupt=self._interrupts.watched, patience=SILENCE, urgent=True) as client:
                 # With the one that was accepted in the moment in which this command hung up, if there was one.
                 ids = list(dict.fromkeys([*ids, *_own(client)]))
                 if not ids:

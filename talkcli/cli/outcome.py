@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import sys
 import time
 
-from talkcli.cli.show import note, show_json
+from talkcli.cli.show import give_up_output, note, show_json
 from talkcli.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.states import EXIT_CODES, State
@@ -28,6 +30,11 @@ def rest(end: float | None) -> float | None:
     return None if end is None else max(0.0, end - time.monotonic())
 
 
+def reader_is_gone(error: OSError) -> bool:
+    """Whether that is why something couldn't be shown: a pipe that nobody reads, a terminal that is gone."""
+    return error.errno in (errno.EPIPE, errno.EIO)
+
+
 def until_ended(goal: GoalHandle, timeout: float | None, shown: Feedback | None) -> None:
     """Wait until a goal has ended, and show what happens meanwhile; TimeoutError, Interrupted."""
     if shown is None:
@@ -43,7 +50,11 @@ def give_up(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) ->
     tell = shown.aside if shown else note
     try:
         goal.request_cancel()
-        until_ended(goal, SILENCE, shown)
+        try:
+            until_ended(goal, SILENCE, shown)
+        except BrokenPipeError:  # Ctrl-C has ended the reader, too
+            give_up_output()
+            until_ended(goal, SILENCE, shown)
     except TimeoutError:
         tell(f"{goal.id}: cancelled, but the server did not confirm within {SILENCE:g} s that it is silent")
     except (Interrupted, ServerUnavailable) as error:

@@ -63,7 +63,7 @@ class _SayCommand(Command):
         7: "preempted: stopped while it was spoken",
         12: "lost: it was sent, then the server went away; it may still be spoken",
         124: "timed out, and cancelled",
-        "128+n": "ended by signal n, and cancelled",
+        "128+n": "ended by signal n, and cancelled; 141: whoever read its output went away",
     },
 )
 @click.argument("text", nargs=-1, metavar="TEXT...")
@@ -145,7 +145,8 @@ def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> i
     """Speak TEXT: its words, joined by blanks; or standard input, as one sentence, where TEXT is '-'.
 
     Prints the goal's id. Without --wait it returns as soon as the goal is accepted. With --wait it owns the goal:
-    Ctrl-C and SIGTERM cancel it. With --lines its exit code is that of the first line that did not succeed.
+    Ctrl-C, SIGTERM and SIGHUP cancel it, and so does a reader of its output that goes away, as ssh does. With --lines
+    its exit code is that of the first line that did not succeed.
     """
     began = time.monotonic()
     given["wait"] = given["wait"] or given["feedback"]

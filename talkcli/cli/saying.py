@@ -7,12 +7,19 @@ from __future__ import annotations
 
 import time
 
-from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.outcome import SPEECH_IS_PAUSED, give_up, report, rest, until_ended
-from talkcli.cli.show import note, show, show_error, show_json
-from talkcli.cli.utf8 import readable
+from talkcli.cli.interrupts import Interrupts, give_up_unread
+from talkcli.cli.outcome import (
+    SPEECH_IS_PAUSED,
+    exit_code,
+    give_up,
+    reader_is_gone,
+    report,
+    rest,
+    until_ended,
+)
+from talkcli.cli.show import OUTPUT_FULL, give_up_output, note, output_failed, show, show_error, show_json
 from talkcli.dial import ANSWER_LIMIT, Interrupted
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost
+from talkcli.errors import EXIT_ERROR, EXIT_OK, EXIT_TIMEOUT, Lost
 from talkcli.states import State
 from talkcli.values import TYPE_CHECKING
 
@@ -42,14 +49,20 @@ def say(
     `given`: the options, by their names, GOAL_OPTIONS and `wait`, `feedback`, `name`, `timeout`; `end`: when it is
     given up, by the monotonic clock; `opened`: the connection, where it has been begun; `held`: signals that wait.
     """
-    text, unreadable = readable(text)
-    if unreadable and not options.quiet:
-        note(unreadable)
+    if not text.isascii():
+        from talkcli.cli.utf8 import readable
+
+        text, unreadable = readable(text)
+        if unreadable and not options.quiet:
+            note(unreadable)
+    give_up_unread()
     with Interrupts(held=held) as interrupts:
+        if given["wait"]:
+            interrupts.watch_output()
         try:
             patience = min(ANSWER_LIMIT, given["timeout"] or ANSWER_LIMIT)
             with options.connect(
-                name=given["name"], interrupt=interrupts.descriptor, patience=patience, opened=opened
+                name=given["name"], interrupt=interrupts.watched, patience=patience, opened=opened
             ) as client:
                 if interrupts.number is not None and not (opened and opened.sent):
                     raise Interrupted  # what has been sent is cancelled, once its id is known
@@ -64,6 +77,7 @@ def say(
                     return _tell(goal, options, shown)
                 return _wait(goal, interrupts, end, options, shown)
         except Interrupted:
+            interrupts.look()
             return interrupts.exit_code
         except Lost as error:
             if interrupts.number is None and (end is None or time.monotonic() < end):
@@ -91,7 +105,17 @@ def _feedback(options: Common) -> Feedback:
 
 
 def _tell(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
-    """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
+    """Tell of a goal that is not waited for: its id, or how it ended, if it has. What can't be shown is not."""
+    try:
+        return _shown(goal, options, shown)
+    except OSError as error:
+        if not reader_is_gone(error):
+            raise
+        give_up_output()
+        return exit_code(goal.goal) if goal.state.terminal else EXIT_OK
+
+
+def _shown(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
     if goal.state is State.REJECTED:
         if shown and options.json:
             until_ended(goal, None, shown)
@@ -121,29 +145,49 @@ def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: 
     """Wait for a goal. It is this command's own: where it can't wait any longer, the goal ends too; unless another
     `say` had sent it before, with the same id.
     """
-    _introduce(goal, options, shown)
     try:
-        if shown:
-            shown.begin([goal.goal])
-        until_ended(goal, rest(end), shown)
-    except (Interrupted, TimeoutError):
-        timed_out = interrupts.number is None
+        failed = _follow(goal, end, options, shown)
+    except (Interrupted, OSError) as error:
+        if isinstance(error, OSError) and not isinstance(error, TimeoutError):
+            if not reader_is_gone(error):
+                raise
+            interrupts.gone = True
+        interrupts.look()
+        timed_out = interrupts.number is None and not interrupts.gone
+        if interrupts.gone:
+            give_up_output()
         if goal.attached:
             return _leave(goal, interrupts, shown)
         give_up(goal, interrupts, shown)
         code = report(goal.goal, options, shown)
-        if interrupts.number is not None and not timed_out:
+        if not timed_out:
             return interrupts.exit_code
         return code if goal.state is State.SUCCEEDED else EXIT_TIMEOUT
     finally:
         if shown:
             shown.close()
-    return report(goal.goal, options, shown)
+    return report(goal.goal, options, shown) or failed
+
+
+def _follow(goal: GoalHandle, end: float | None, options: Common, shown: Feedback | None) -> int:
+    """Show a goal until it has ended; EXIT_ERROR where there was no room for that: it is waited for all the same."""
+    try:
+        _introduce(goal, options, shown)
+        if shown:
+            shown.begin([goal.goal])
+        until_ended(goal, rest(end), shown)
+    except OSError as error:
+        if error.errno not in OUTPUT_FULL or reader_is_gone(error):
+            raise
+        output_failed(error)
+        until_ended(goal, rest(end), None)
+        return EXIT_ERROR
+    return EXIT_OK
 
 
 def _leave(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> int:
     """Stop watching a goal that is another's, which goes on."""
-    if interrupts.number is None:
+    if interrupts.number is None and not interrupts.gone:
         tell = shown.aside if shown else note
         tell(f"{goal.id} has not ended within the time, and goes on: it was sent before")
     return interrupts.exit_code

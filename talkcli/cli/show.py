@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from talkcli.errors import TalkError
     from talkcli.messages import JsonObject
 
+#: What writing says where there is no room, or the terminal is gone.
+OUTPUT_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 #: Columns of a terminal that doesn't say how many it has.
 _USUAL_WIDTH = 80
 #: Columns into which what is said always goes; a terminal that says it has fewer is not believed.
@@ -38,6 +41,23 @@ class Common:
         from talkcli.client import Client
 
         return Client(self.socket, **options)
+
+
+def give_up_output() -> None:
+    """Write nothing more to standard output, which takes nothing; not even at the interpreter's end."""
+    _discard(1)
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", closefd=False, encoding="utf-8")  # noqa: SIM115 - it is open as long as the process
+
+
+def _discard(descriptor: int) -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
+
+
+def output_failed(error: OSError) -> None:
+    """Tell why standard output can't be written, and write nothing more to it."""
+    give_up_output()
+    note(f"standard output can't be written: {error.strerror}")
 
 
 def show(line: str) -> None:
@@ -72,13 +92,18 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 
 
 def note(words: str) -> None:
-    """Write something for people to standard error; a terminal's lines end between two words."""
+    """Write something for people to standard error, if they are there; a terminal's lines end between two words."""
     if sys.stderr is not None:
         lines = f"talk: {words}"
         if len(lines) > _NARROWEST and sys.stderr.isatty():
             lines = _folded(lines)
-        sys.stderr.write(f"{lines}\n")
-        sys.stderr.flush()
+        try:
+            sys.stderr.write(f"{lines}\n")
+            sys.stderr.flush()
+        except (
+            OSError
+        ):  # whoever read it has gone, and may have taken standard output along: what is to be done is done
+            _discard(2)
 
 
 def _folded(text: str) -> str:
@@ -106,7 +131,10 @@ def show_error(error: TalkError, *, json: bool) -> None:
         note(error.message)
     elif sys.stderr is not None:
         fields: JsonObject = {"code": error.code, "exit": error.exit_code, "message": error.message}
-        _write_json(sys.stderr, {"error": fields})
+        try:
+            _write_json(sys.stderr, {"error": fields})
+        except OSError:
+            _discard(2)  # as in `note`
 
 
 def colourful() -> bool:

@@ -7,14 +7,14 @@ import select
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.dial import Interrupted, ready
+from talkcli.dial import ready
 from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.states import EXIT_CODES, State
 from talkcli.text import MAX_BYTES, MAX_CHARACTERS
 from talkcli.values import frozen
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 #: Bytes that are read at once: what a pipe holds.
 _CHUNK = 65_536
@@ -70,8 +70,8 @@ def read_text(end: float | None, *, whole: bool = False) -> str:
 class LineReader:
     """Cuts standard input into lines. A line that is too long is read to its end, counted and not kept."""
 
-    def __init__(self, interrupt: int) -> None:
-        """`interrupt`: a descriptor that ends the reading with Interrupted as soon as it is readable."""
+    def __init__(self, interrupt: Mapping[int, int]) -> None:
+        """`interrupt`: what ends the reading with Interrupted, as in `dial.ready`."""
         self._interrupt = interrupt
         self._begun = bytearray()
         self._size = 0
@@ -80,8 +80,7 @@ class LineReader:
     def lines(self) -> Iterator[Line]:
         """Iterate over the lines, each as soon as its newline has come; the last one may lack it."""
         while True:
-            if self._interrupt in ready({0: select.POLLIN, self._interrupt: select.POLLIN}, None):
-                raise Interrupted
+            ready({0: select.POLLIN}, None, self._interrupt)
             data = _read(_CHUNK)
             if data is None:
                 continue

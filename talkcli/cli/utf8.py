@@ -13,8 +13,6 @@ def readable(text: str, line: int = 1) -> tuple[str, str | None]:
 
     `line`: the number of its first line.
     """
-    if text.isascii():
-        return text, None
     found = [place for place, each in enumerate(text) if _FIRST <= each <= _LAST]
     if not found:
         return text, None

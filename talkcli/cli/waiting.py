@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from talkcli.cli.interrupts import Interrupts
+from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.outcome import report, rest
 from talkcli.cli.show import note
 from talkcli.dial import ANSWER_LIMIT, Interrupted
@@ -22,13 +22,16 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None, *, feedba
     """Wait until these goals have ended, or all that have not, and return the exit code; `timeout` in seconds."""
     end = None if timeout is None else time.monotonic() + timeout
     patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
+    give_up_unread()
     with Interrupts() as interrupts:
+        interrupts.watch_output()
         try:
-            with options.connect(interrupt=interrupts.descriptor, patience=patience) as client:
+            with options.connect(interrupt=interrupts.watched, patience=patience) as client:
                 goals = client.follow(ids or None, feedback=feedback)
                 shown = _show(goals, end, options) if feedback else None
                 return _wait(goals, end, options, shown, named=bool(ids))
         except Interrupted:
+            interrupts.look()
             return interrupts.exit_code
         except TimeoutError as error:
             note(str(error))

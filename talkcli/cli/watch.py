@@ -5,22 +5,20 @@ What a line says is in `transcript`.
 
 from __future__ import annotations
 
-import contextlib
-import os
-import select
-import signal
-import sys
-import threading
+from typing import TYPE_CHECKING
 
 import click
 
 from talkcli.cli.common import common, common_options, talk_command
-from talkcli.cli.interrupts import Interrupts
+from talkcli.cli.interrupts import Interrupts, has_reader
 from talkcli.cli.show import Common, screen, show, show_json
 from talkcli.cli.usage import ASKING
 from talkcli.dial import Interrupted
-from talkcli.errors import EXIT_SIGNAL
+from talkcli.errors import EXIT_SIGPIPE
 from talkcli.transcript import Transcript
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 
 @talk_command(
@@ -47,14 +45,18 @@ def command(context: click.Context, words: bool) -> int:
 
     With --json each event is an object a line, words included; the first is {"event": "snapshot", ...}.
     """
-    options = common(context)
-    _end_with_reader()
-    with Interrupts() as interrupts, contextlib.suppress(Interrupted):
-        _watch(options, interrupts.descriptor, words=words)
+    if not has_reader():
+        return EXIT_SIGPIPE
+    with Interrupts() as interrupts:
+        interrupts.watch_output()  # in `talk watch | head`, the next event may be far
+        try:
+            _watch(common(context), interrupts.watched, words=words)
+        except Interrupted:
+            interrupts.look()
     return interrupts.exit_code
 
 
-def _watch(options: Common, interrupt: int, *, words: bool) -> None:
+def _watch(options: Common, interrupt: Mapping[int, int], *, words: bool) -> None:
     transcript = Transcript(full=screen().width is None, words=words)
     with options.connect(interrupt=interrupt) as client:
         for event in client.events():
@@ -63,18 +65,3 @@ def _watch(options: Common, interrupt: int, *, words: bool) -> None:
                 continue
             for line in transcript.lines(event, screen()):
                 show(line)
-
-
-def _end_with_reader() -> None:
-    """End the process when whoever reads standard output goes: in `talk watch | head`, the next event may be far."""
-    if sys.stdout is None:
-        return
-    poll = select.poll()
-    poll.register(sys.stdout.fileno(), 0)  # nothing but errors and hang-ups, which a file never has
-
-    def wait() -> None:
-        (_, found), *_ = poll.poll()
-        if found & (select.POLLERR | select.POLLHUP):  # and not POLLNVAL, which is what macOS says of a terminal
-            os._exit(EXIT_SIGNAL + signal.SIGPIPE)  # nothing is left to be written or tidied up
-
-    threading.Thread(target=wait, daemon=True).start()

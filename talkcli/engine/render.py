@@ -17,7 +17,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli import text as texts
-from talkcli.dial import Interrupted, ready
+from talkcli.dial import ready
 from talkcli.engine import protocol, spawn
 from talkcli.engine.limits import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
 from talkcli.engine.pieces import pieces
@@ -25,7 +25,7 @@ from talkcli.engine.wavestream import WavStream
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 #: The exit codes of a goal that is REJECTED or ABORTED, for the same reasons here.
 _EXIT_REJECTED, _EXIT_ABORTED = 5, 4
@@ -74,6 +74,7 @@ def render(
     reads standard output is gone; UsageError for a driver that writes no file, or for a terminal.
     """
     deadline = None if timeout is None else time.monotonic() + timeout
+    ends = None if interrupt is None else {interrupt: select.POLLIN}
     fault = texts.fault(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
@@ -81,13 +82,13 @@ def render(
     if path not in STANDARD_OUTPUT and not _is_stream(path):
         target = _target(path)
         with _beside(target, path) as hidden:
-            seconds = _speak_into(_to_file(driver, hidden), hidden, path, says, deadline, interrupt)
+            seconds = _speak_into(_to_file(driver, hidden), hidden, path, says, deadline, ends)
             _put_in_place(hidden, target, path)
         return seconds
-    with _stream(path, deadline, interrupt) as output:
+    with _stream(path, deadline, ends) as output:
         configure = protocol.Configure(os.getpid(), driver, None, None, None, list_voices=False, output=output)
         try:
-            return _speak_into(configure, WavStream.name, _named(path), says, deadline, interrupt)
+            return _speak_into(configure, WavStream.name, _named(path), says, deadline, ends)
         except CannotWrite as error:
             if path in STANDARD_OUTPUT and ready({output: 0}, 0.0):
                 raise BrokenPipeError(errno.EPIPE, "the reader of standard output is gone") from error
@@ -108,7 +109,7 @@ def _is_stream(path: str) -> bool:
 
 
 @contextlib.contextmanager
-def _stream(path: str, deadline: float | None, interrupt: int | None) -> Iterator[int]:
+def _stream(path: str, deadline: float | None, interrupt: Mapping[int, int] | None) -> Iterator[int]:
     """Give a descriptor of standard output, a named pipe or a device, open for writing."""
     output = os.dup(1) if path in STANDARD_OUTPUT else _open_stream(path, deadline, interrupt)
     try:
@@ -122,7 +123,7 @@ def _stream(path: str, deadline: float | None, interrupt: int | None) -> Iterato
         os.close(output)
 
 
-def _open_stream(path: str, deadline: float | None, interrupt: int | None) -> int:
+def _open_stream(path: str, deadline: float | None, interrupt: Mapping[int, int] | None) -> int:
     """Open a device, or a named pipe once somebody reads it."""
     while True:
         try:
@@ -133,8 +134,7 @@ def _open_stream(path: str, deadline: float | None, interrupt: int | None) -> in
         left = _READER_LOOK if deadline is None else min(_READER_LOOK, deadline - time.monotonic())
         if left <= 0:
             raise TimeoutError(f"nobody has opened {path} to read it within the time")
-        if ready({} if interrupt is None else {interrupt: select.POLLIN}, left):
-            raise Interrupted
+        ready({}, left, interrupt)
 
 
 def _target(path: str) -> str:
@@ -219,7 +219,7 @@ def _speak_into(
     path: str,
     says: list[protocol.Say],
     deadline: float | None,
-    interrupt: int | None,
+    interrupt: Mapping[int, int] | None,
 ) -> float:
     """Speak all pieces, and return the seconds of audio. What the engine calls `name` is `path` to the user."""
     try:
@@ -265,7 +265,9 @@ def _end(process: spawn.EngineProcess) -> None:
 class _Conversation:
     """What is said to the engine process and heard of it, piece by piece; it has the thread's limits."""
 
-    def __init__(self, process: spawn.EngineProcess, deadline: float | None, interrupt: int | None) -> None:
+    def __init__(
+        self, process: spawn.EngineProcess, deadline: float | None, interrupt: Mapping[int, int] | None
+    ) -> None:
         self._process = process
         self._say: protocol.Say | None = None
         self._deadline = deadline
@@ -280,12 +282,8 @@ class _Conversation:
             self._heard_at = time.monotonic()
             self._send(say)
         watched = {self._process.socket.fileno(): select.POLLIN, self._process.stderr: select.POLLIN}
-        if self._interrupt is not None:
-            watched[self._interrupt] = select.POLLIN
         while True:
-            found = ready(watched, self._wait())
-            if self._interrupt in found:
-                raise Interrupted
+            found = ready(watched, self._wait(), self._interrupt)
             if self._process.stderr in found and not self._process.read_stderr():
                 del watched[self._process.stderr]
             # Before the limits: who was stopped by Ctrl-Z finds all that was said meanwhile, and the limits long past.
