@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import sys
 import time
 
 from talkcli.cli.show import give_up_output, note, show_json
