@@ -137,7 +137,7 @@ class _SayCommand(Command):
     "--output",
     type=click.Path(dir_okay=False),
     metavar="FILE.wav",
-    help="Write it into a file instead of speaking it, '-' for standard output; needs no server.",
+    help="Write it into a file instead; '-' is standard output. Needs no server.",
 )
 @common_options
 @click.pass_context
