@@ -215,6 +215,8 @@ class Connection:
             data = self.line.socket.recv(262144)
         except BlockingIOError:
             return False
+        except ConnectionResetError:  # it left without having read all that was sent
+            data = b""
         except (OSError, ValueError) as error:  # ValueError: another thread closed it meanwhile
             data = b""
             self.ended = self.ended or f"the connection broke: {error}"
