@@ -30,7 +30,7 @@ _NOT_HEARD = EXIT_CODES[State.ABORTED]
         "128+n": "ended by signal n",
     },
 )
-@click.option("--silent", is_flag=True, help="Play the test sentence without sound; all else is checked as ever.")
+@click.option("--silent", is_flag=True, help="Play half a second of zeros, which is no goal and no sound.")
 @common_options
 @click.pass_context
 def command(context: click.Context, silent: bool) -> int:

@@ -154,6 +154,7 @@ class Examination:
             behind=behind,
             hangs=self._hangs,
             speaking=speaking,
+            device=self._server.get("device"),
         )
 
     def _setting_of_server(self, process: int, env: Mapping[str, str]) -> Setting:

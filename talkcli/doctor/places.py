@@ -67,7 +67,7 @@ def judge(found: Places) -> Finding:
         return done("socket", words)
     tried = "; ".join(map(_shown, found.places))
     words = f"no server; {'named by ' + found.named if found.named else 'tried'}: {tried}"
-    if found.trouble is not None:
+    if found.trouble is not None and not any(each.what == STOPPED for each in found.places):
         words = f"{words}; {found.trouble}"
     return failed("socket", words, _step(found))
 

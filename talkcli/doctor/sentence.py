@@ -67,16 +67,16 @@ def _is_busy(reason: str | None, words: str | None) -> bool:
     return reason == "audio_device" and "busy" in (words or "").lower()
 
 
-def remedy(reason: str | None, words: str | None = None, player: str | None = None) -> str:
-    """Return what to do about a goal that ended for this reason; `player`: what has played it, if that is known."""
+def remedy(reason: str | None, words: str | None = None, player: object = None, device: object = None) -> str:
+    """Return what to do about a goal that ended for this reason; `player`, `device`: what has played it, if known."""
     if _is_busy(reason, words):
         return _BUSY
     if reason == "audio_device" and words and ("denied" in words.lower() or "not permitted" in words.lower()):
         return "sudo usermod -aG audio USER for the user who serves, log in again, and start the server again"
     if reason == "engine_failed" and words and "libespeak-ng" in words:
         return INSTALL_LIBRARY
-    if reason in _OF_PLAYER and player and is_custom(player):
-        command = player.replace("{rate}", "22050").replace("{device}", "default")
+    if reason in _OF_PLAYER and isinstance(player, str) and is_custom(player):
+        command = player.replace("{rate}", "22050").replace("{device}", str(device or "default"))
         return f"try the player by hand, with a second of silence: head -c 44100 /dev/zero | {command}"
     return REMEDIES.get(reason or "", _AGAIN)
 
@@ -90,12 +90,13 @@ def judge(
     behind: str | None = None,
     hangs: bool = False,
     speaking: bool = False,
+    device: object = None,
 ) -> Finding:
     """Judge the sentence; `silent`: whether it made no sound; `server`: whether a server has played it.
 
     `suspended`: sinks that took no data when it had ended; `behind`: what is to be done about player and device;
     `hangs`: whether the sound server does, for which engines wait at their start; `speaking`: whether a server spoke
-    with the same device meanwhile.
+    with the same device meanwhile; `device`: the one that was named for the player.
     """
     how = "through the server" if server else "by an engine of this command's own"
     if played.state is State.SUCCEEDED:
@@ -112,7 +113,7 @@ def judge(
     if played.reason == "audio_stalled" and suspended:
         words = f"{words}; suspended: {', '.join(suspended)}"
         return failed(SENTENCE, f"{label}: {words}", f"pactl suspend-sink {suspended[0]} 0")
-    step = remedy(played.reason, words, played.player)
+    step = remedy(played.reason, words, played.player, device)
     # Player and device have been looked at from nearer before, unless the player itself names the cause.
     causes = _OF_SOUND | _OF_START if hangs else _OF_SOUND
     if played.reason in causes and behind is not None and step != _BUSY:

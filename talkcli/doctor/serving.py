@@ -26,7 +26,7 @@ def gone(words: str) -> Finding:
 
 def judge(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
     """Judge a server by its own description and by the goals that ended last, oldest first."""
-    return [_itself(server), _settings(server), _failures(log, now, str(server.get("player") or ""))]
+    return [_itself(server), _settings(server), _failures(log, now, server)]
 
 
 def _itself(server: JsonObject) -> Finding:
@@ -65,7 +65,7 @@ def _settings(server: JsonObject) -> Finding:
     return done("settings", words)
 
 
-def _failures(log: Sequence[Goal], now: float, player: str) -> Finding:
+def _failures(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
     if not log:
         return done("failures", "none: this server has spoken nothing yet")
     aborted = [each for each in log if each.state is State.ABORTED]
@@ -80,7 +80,7 @@ def _failures(log: Sequence[Goal], now: float, player: str) -> Finding:
     after = [each for each in log[log.index(last) + 1 :] if each.state is State.SUCCEEDED]
     if after:
         return done("failures", f"{told}; {len(after)} succeeded since")
-    return warning("failures", told, remedy(last.reason, words, player))
+    return warning("failures", told, remedy(last.reason, words, server.get("player"), server.get("device")))
 
 
 def _when(at: float, now: float) -> str:

@@ -11,7 +11,7 @@ from talkcli.doctor.findings import Finding, done, failed, warning
 from talkcli.doctor.session import Session, seen_from
 from talkcli.values import frozen
 
-#: Players by name: what they need is known; of a command that is another program, only its user knows.
+#: Players that are programs known here, as `engine.players` has them; nothing of the engine is imported to judge.
 NAMED = frozenset({"aplay", "pacat", "pw-cat"})
 #: Players that need no device.
 SILENT = "null"
@@ -92,7 +92,7 @@ def is_silent(player: str | None) -> bool:
 
 
 def is_custom(player: str | None) -> bool:
-    """Tell whether a player is a command of the user's own, with a program that isn't known here."""
+    """Tell whether a player is a command of the user's own: what another program needs, only its user knows."""
     program = program_of(player) if player and not is_silent(player) else None
     return program is not None and program.rpartition("/")[2] not in NAMED
 

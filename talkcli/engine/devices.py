@@ -13,8 +13,10 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-#: Variables that name a sound server, or another configuration of ALSA's.
-_VARIABLES = ("PULSE_SERVER", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH")
+#: Variables that name a sound server, or another configuration than the usual one.
+_VARIABLES = ("PULSE_SERVER", "PULSE_CLIENTCONFIG", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH")
+#: Where a PulseAudio that serves all users listens.
+_SYSTEM_WIDE = "/run/pulse"
 
 
 def playing(nodes: str = "/dev/snd") -> list[str]:
@@ -26,7 +28,7 @@ def sound_servers(env: Mapping[str, str], *uids: int) -> list[str]:
     """Return the sockets of PulseAudio and PipeWire that are there: by an environment, of these users, of all."""
     own = [env.get("XDG_RUNTIME_DIR"), *(f"/run/user/{each}" for each in uids)]
     found = [f"{each}/{socket}" for each in own if each for socket in ("pulse/native", "pipewire-0")]
-    found += [f"{each}/native" for each in (env.get("PULSE_RUNTIME_PATH"), "/run/pulse") if each]
+    found += [f"{each}/native" for each in (env.get("PULSE_RUNTIME_PATH"), _SYSTEM_WIDE) if each]
     if env.get("PIPEWIRE_RUNTIME_DIR"):
         found.append(f"{env['PIPEWIRE_RUNTIME_DIR']}/pipewire-0")
     # Without a runtime directory PulseAudio makes one in /tmp, and a link to it.

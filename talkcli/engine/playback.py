@@ -41,6 +41,10 @@ DRAIN_WITHIN = 3.0
 #: silence. The pause at a sentence's end is longer than this, so that nothing audible can be missing.
 EARLY_END = 0.25
 
+#: Seconds for which a device that somebody else holds is tried again, and those between two tries: a sound of another
+#: program's, or `talk doctor --silent`, must not cost a sentence.
+BUSY_FOR, BUSY_PAUSE = 1.0, 0.05
+
 #: Seconds within which a player that was killed must be gone: it takes 1 ms, unless it hangs in a device's driver.
 GONE_WITHIN = 1.0
 
@@ -65,6 +69,8 @@ class Playback:
         self._sent = 0  # bytes that players have taken
         self._began = False  # whether any are known to be heard
         self._stopped = False
+        #: until when a device that is busy is tried again; 0 before it was found so
+        self._busy_until = 0.0
         #: since when the player has been given nothing but silence, because the sentence is held
         self._silent_at: float | None = None
 
@@ -162,9 +168,18 @@ class Playback:
         first = self._first_error or error
         self._first_error = first
         lost = feed is not None and (feed.sink.proven or error.reason == "audio_stalled")
-        if lost or not self._candidates:
+        if lost or not (self._candidates or self._is_busy(first)):
             raise error if lost else first
         self._leave()
+        if not self._candidates:
+            self._wait((), time.monotonic() + BUSY_PAUSE)
+
+    def _is_busy(self, error: AudioFailed) -> bool:
+        """Whether the device is held by somebody else, and not for long yet."""
+        if error.reason != "audio_device" or "busy" not in str(error).lower():
+            return False
+        self._busy_until = self._busy_until or time.monotonic() + BUSY_FOR
+        return time.monotonic() < self._busy_until
 
     def _leave(self) -> None:
         """End the player; the next one begins where `_begin` says."""

@@ -31,6 +31,7 @@ def put(path: Path, text: str = "") -> None:
 
 def nothing(tmp_path: Path, env: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> bool:
     monkeypatch.setattr(os, "getuid", lambda: 4_242_424)  # this machine's user may have a sound server
+    monkeypatch.setattr(devices, "_SYSTEM_WIDE", f"{tmp_path}/system")  # and this machine
     return devices.nothing_sounds(env, f"{tmp_path}/snd", f"{tmp_path}/etc")
 
 
@@ -69,7 +70,7 @@ def test_a_sound_server_that_settings_name_may_sound(
     assert not nothing(tmp_path, bare, monkeypatch)
 
 
-@pytest.mark.parametrize("name", ["PULSE_SERVER", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH"])
+@pytest.mark.parametrize("name", ["PULSE_SERVER", "PULSE_CLIENTCONFIG", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH"])
 def test_what_a_variable_names_may_sound(
     tmp_path: Path, bare: dict[str, str], monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:

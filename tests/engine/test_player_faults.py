@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine import protocol
+from talkcli.engine import playback, protocol
 from tests.engine.spawned import SOON, Spawned, children
 from tests.support.timing import assert_within, limits
 
@@ -107,6 +107,43 @@ sys.stderr.write("aplay: main:831: audio open error: No such file or directory\\
 sys.exit("ACCESS: RW_INTERLEAVED\\nBUFFER_SIZE: [1 2]")
 """
     assert _failure(player.command(code)) == ("audio_device", "aplay: audio open error: No such file or directory")
+
+
+#: Finds the device held by another, so many times.
+BUSY = """
+import os, sys
+with open("{tries}", "a") as tries:
+    tries.write(".")
+if os.path.getsize("{tries}") <= {times}:
+    sys.exit("aplay: main:831: audio open error: Device or resource busy")
+"""
+
+
+@pytest.mark.parametrize("times", [1, 4, 1000])
+def test_a_device_that_is_busy_is_tried_again_for_a_while(player: Player, times: int, tmp_path: Path) -> None:
+    command = player.command(BUSY.format(tries=tmp_path / "tries", times=times) + PLAYS.format(during="pass", after=""))
+    if times < 1000:
+        with Spawned(command) as engine:
+            engine.until(protocol.Ready)
+            ended = engine.spoken(TEXT)
+            assert ended.outcome == protocol.COMPLETED
+            assert player.heard.stat().st_size == round((ended.duration or 0) * 22050) * 2
+        return
+    with limits():
+        began = time.monotonic()
+        assert _failure(command) == ("audio_device", "aplay: audio open error: Device or resource busy")
+        assert time.monotonic() - began >= playback.BUSY_FOR
+        assert_within(time.monotonic() - began, playback.BUSY_FOR + 1, "the end of a goal whose device is held")
+
+
+def test_a_goal_whose_device_is_busy_is_stopped_at_once(player: Player, tmp_path: Path) -> None:
+    with Spawned(player.command(BUSY.format(tries=tmp_path / "tries", times=1000))) as engine:
+        engine.until(protocol.Ready)
+        engine.say(TEXT)
+        while not (tmp_path / "tries").exists():
+            time.sleep(0.005)  # what a player does is no event
+        engine.send(protocol.Stop("g1"))
+        assert engine.until(protocol.Ended) == protocol.Ended("g1", protocol.STOPPED)
 
 
 def test_exits_0_at_once(player: Player) -> None:

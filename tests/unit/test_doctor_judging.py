@@ -67,9 +67,9 @@ def test_a_player_of_one_s_own_is_cured_by_itself_unless_it_names_a_cause() -> N
 
     def cure(reason: str, words: str, player: str) -> str | None:
         played = Played(State.ABORTED, reason, words, player=player)
-        return sentence.judge(played, silent=False, server=True).next
+        return sentence.judge(played, silent=False, server=True, device="usb").next
 
-    by_hand = "try the player by hand, with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d default"
+    by_hand = "try the player by hand, with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d usb"
     assert cure("audio_stalled", "it took no sound for 5 s", "sox -r {rate} -d {device}") == by_hand
     assert cure("audio_stalled", "it took no sound for 5 s", "aplay -r {rate}") == sentence.REMEDIES["audio_stalled"]
     assert "another program" in str(cure("audio_device", "Device or resource busy", "sox"))
@@ -144,7 +144,7 @@ PATH = "/run/user/1000/talk/talk.sock"
         (Places((Place("/x", ABSENT),), "TALK_SOCKET", elsewhere=PATH), "/x", f"a server is on {PATH}"),
         (Places((Place(PATH, places.MUTE),), None, None, "it does not answer"), "it does not answer", "restart"),
         (Places((Place(PATH, places.MUTE),), None, None, "busy", "busy"), "busy", "--max-clients"),
-        (Places((Place(PATH, places.STOPPED, 0, 7),), None, None, "it does not answer"), "stopped; it", "kill -CONT 7"),
+        (Places((Place(PATH, places.STOPPED, 0, 7),), None, None, "it does not answer"), "is stopped", "kill -CONT 7"),
         (Places((Place(PATH, ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
     ],
 )

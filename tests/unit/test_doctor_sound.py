@@ -64,12 +64,6 @@ def test_a_player_without_sound_is_not_heard(player: str) -> None:
     assert sound.judge_setting("aplay", "the server's") == []
 
 
-def test_players_that_are_known_by_name_are_those_that_there_are() -> None:
-    assert players.PACKAGES.keys() == sound.NAMED
-    assert all(map(sound.is_custom, ("sleep 100", "/opt/bin/play -x", "false")))
-    assert not any(map(sound.is_custom, ("/usr/bin/aplay -q", "pacat", "null", "file:a.wav", "'", "", None)))
-
-
 def test_a_device_is_looked_for_among_those_that_the_player_lists() -> None:
     assert judged("device", devices=replace(DEVICES, wanted="default")).state == DONE
     assert judged("device", devices=replace(DEVICES, wanted="plughw:1,0")).state == DONE
@@ -155,3 +149,9 @@ def test_what_is_muted_is_not_heard() -> None:
     assert level.judge((replace(wire, percent=0),), default=True)[0].state == FAILED
     assert level.judge((alsa,), default=True)[0].state == DONE
     assert level.judge((), default=True) == []
+
+
+def test_a_player_is_a_user_s_own_where_its_program_is_another() -> None:
+    assert players.PACKAGES.keys() == sound.NAMED
+    assert all(map(sound.is_custom, ("sleep 100", "/opt/bin/play -x", "false")))
+    assert not any(map(sound.is_custom, ("/usr/bin/aplay -q", "pacat", "null", "file:a.wav", "'", "", None)))
