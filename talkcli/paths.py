@@ -37,9 +37,13 @@ def client_sockets(named: str | None) -> list[str]:
 
 def found_at(path: str, error: OSError) -> str:
     """Return what is at a place where a connection failed: a constant of `unreachable`, else the system's words."""
-    if os.path.isdir(path):
+    try:
+        mode = os.stat(path).st_mode
+    except OSError:  # `error` tells why; or it was removed just now
+        mode = stat.S_IFSOCK
+    if stat.S_ISDIR(mode):
         return DIRECTORY
-    if os.path.exists(path) and not stat.S_ISSOCK(os.stat(path).st_mode):
+    if not stat.S_ISSOCK(mode):
         return FILE
     if error.errno in {errno.ENOENT, errno.ENOTDIR}:
         return ABSENT

@@ -1,4 +1,4 @@
-"""What the system lets this process have of memory, processes and threads, in words, for errors that come of that."""
+"""What the system lets this process have of memory and threads, in words, for errors that come of that."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import resource
 _LIMITS = (
     (resource.RLIMIT_DATA, "bytes of memory", "ulimit -d, LimitDATA="),
     (resource.RLIMIT_AS, "bytes of address space", "ulimit -v, LimitAS="),
-    (getattr(resource, "RLIMIT_NPROC", None), "processes and threads of its user", "ulimit -u, LimitNPROC="),
 )
 
 
 def limits() -> str:
     """Return the first limit that this process runs under, or where else to look: the end of a sentence."""
     for number, what, where in _LIMITS:
-        allowed = resource.RLIM_INFINITY if number is None else resource.getrlimit(number)[0]
+        allowed = resource.getrlimit(number)[0]
         if allowed != resource.RLIM_INFINITY:
             return f"it is limited to {allowed:,} {what} ({where})"
-    return "see 'free', and MemoryMax= and TasksMax= of its unit"
+    return "see 'free', 'ulimit -u', and MemoryMax= and TasksMax= of its unit"

@@ -239,8 +239,8 @@ class Scheduler:
 
     def deadline(self) -> float | None:
         """Return the monotonic time at which `tick` has something to do."""
-        silence, expiry = self._silence_deadline(), self._pending.next_expiry()
-        return silence if expiry is None else expiry if silence is None else min(silence, expiry)
+        due = (self._silence_deadline(), self._pending.next_expiry(), self._unbegun_deadline())
+        return min((each for each in due if each is not None), default=None)
 
     def tick(self, now: Now) -> list[Effect]:
         """Do what is due: recall goals whose time is over; abort one that was stopped and isn't silent in time."""
@@ -250,6 +250,9 @@ class Scheduler:
             record = self.active
             words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
             effects = [GiveUp(record), *self._end(record, State.ABORTED, "not_silent", words, record.by, now)]
+        deadline = self._unbegun_deadline()
+        if self.active is not None and deadline is not None and now.monotonic >= deadline:
+            effects += self._stop(self.active, "expired", None, now)
         return effects + self._expire(now)
 
     # -- inside
@@ -316,6 +319,13 @@ class Scheduler:
         if self.active is None or self.active.stop_since is None:
             return None
         return self.active.stop_since + SILENCE_LIMIT
+
+    def _unbegun_deadline(self) -> float | None:
+        """Return when the active goal expires: one whose engine was lost before it was heard may have to begin anew."""
+        goal = self.active
+        if goal is None or self.has_engine or goal.state is not State.ACTIVE or goal.spoken_end:
+            return None
+        return goal.expires_at
 
     def _start_next(self, now: Now) -> list[Effect]:
         if self.active or self.paused or not self.has_engine:

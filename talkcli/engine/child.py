@@ -74,11 +74,10 @@ class Child:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
             if pid:
                 self._status = os.waitstatus_to_exitcode(status)
-        if self._status is not None and self._leash is not None and is_held(self._leash):
-            kill_holders(self._leash)
-            if is_held(self._leash):
-                return None
-        return self._status
+        if self._status is None or self._leash is None:
+            return self._status
+        # One that can't be killed, another user's, would keep it for ever; the server sees that it is there.
+        return None if kill_holders(self._leash) and is_held(self._leash) else self._status
 
     def kill(self) -> None:
         """Kill it and what it has started."""

@@ -27,13 +27,19 @@ def is_held(pipe: int, seconds: float = 0.0) -> bool:
     return not poll.poll(seconds * 1000)
 
 
-def kill_holders(pipe: int) -> None:
-    """Kill the processes that hold a pipe, but this one, where they don't let go of it in a moment."""
+def kill_holders(pipe: int) -> bool:
+    """Kill the processes that hold a pipe, but this one, where they don't let go of it in a moment.
+
+    Return whether any of them was killed: others can't be, or can't be found.
+    """
+    killed = False
     if not is_held(pipe, _MOMENT):
-        return
+        return killed
     for pid in _holders(f"pipe:[{os.fstat(pipe).st_ino}]"):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.kill(pid, signal.SIGKILL)
+            killed = True
+    return killed
 
 
 def _holders(link: str) -> Iterator[int]:

@@ -24,7 +24,7 @@ class Restarts:
     def __init__(self, now: float) -> None:
         #: when the next process may be started
         self.due_at = 0.0
-        #: why no process will get ready, where that is known: no goal waits for one then
+        #: why the last start failed, where that is known to stay: no goal waits for another one then
         self.error: str | None = None
         self._failures = 0
         #: since when there has been no ready process
@@ -49,8 +49,8 @@ class Restarts:
         `lasting`: the cause in words, where it is known to stay.
         """
         self._wait_longer(now)
-        self.error = lasting or self.error
-        return self.error is None and began >= self._missing_since + PATIENCE
+        self.error = lasting
+        return lasting is None and began >= self._missing_since + PATIENCE
 
     def _wait_longer(self, now: float) -> None:
         self.due_at = now + BACK_OFF[min(self._failures, len(BACK_OFF) - 1)]

@@ -102,7 +102,7 @@ class EngineProcess:
                 return False  # closed
             try:
                 return self.socket.send(line) == len(line)
-            except (BlockingIOError, BrokenPipeError, ConnectionResetError):
+            except OSError:  # gone, full, or the system has no memory for it: it has no whole line of it
                 return False
 
     def receive(self) -> Iterator[protocol.Event | None]:

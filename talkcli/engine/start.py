@@ -64,7 +64,7 @@ def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait, hol
     from talkcli.engine.espeak import DRIVER
 
     name = DRIVER if own else driver or pyttsx3.engine.default_engine_by_sys_platform()
-    engine = _init(pyttsx3, name)
+    engine = _init(pyttsx3, name, named=driver is not None)
     settings = Settings(engine, name, own)
     _start_loop(engine, name)
     try:
@@ -93,14 +93,15 @@ def _register_own(outlet: Outlet, wait: Wait, hold: Hold) -> str:
     return library.version
 
 
-def _init(pyttsx3: Any, name: str) -> Any:
+def _init(pyttsx3: Any, name: str, *, named: bool) -> Any:
+    """Return the engine of a driver; `named`: whether an option has named it."""
     try:
         return pyttsx3.init(name)
     except ModuleNotFoundError as error:
         if error.name == f"pyttsx3.drivers.{name}":
             words = f'unknown driver "{name}": there are {", ".join(_driver_names(pyttsx3))}'
-            raise CannotStart(words, usage=True) from error
-        raise CannotStart(f'the driver "{name}" cannot be loaded: {error}', usage=True) from error
+            raise CannotStart(words, usage=named) from error
+        raise CannotStart(f'the driver "{name}" cannot be loaded: {error}', usage=named) from error
     except Exception as error:
         words = f'the driver "{name}" cannot be started: {type(error).__name__}: {error}'
         raise CannotStart(words, lasting=False) from error

@@ -137,6 +137,7 @@ class EngineThread:
         elif goal and goal.pause_at is not None and now >= goal.pause_at + PAUSE_LIMIT:
             self._lose_process(f"the engine did not confirm a pause within {PAUSE_LIMIT:g} s", "engine_hung")
         for process in self._dying.overdue(now):
+            process.kill()  # what could not be found before, for want of a descriptor, may be found now
             if self._goal and self._goal.verdict_on is process:
                 words = f"the player could not be ended within {SILENCE_LIMIT:g} s"
                 self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "not_silent", words))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import resources
 from talkcli.engine import protocol
+from talkcli.engine.limits import START_LIMIT
 from talkcli.engine.thread import EngineThread
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
 from talkcli.messages import Sender
@@ -93,8 +94,10 @@ class _Server:
             acceptor.open(self._listener.socket)
             upkeep.begin()
             if settings.voice or settings.driver:
-                await service.engine_known.wait()  # who asked for what can't be had is told so, and nothing else
-            if not service.fatal:
+                # Who asked for what can't be had is told so, and nothing else.
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(service.engine_known.wait(), START_LIMIT)
+            if not service.closing:
                 supervisor.ready()
                 log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:

@@ -77,14 +77,15 @@ class Service:
         self.voices: tuple[protocol.Voice, ...] | None = None
         #: how the engine is, in a few words
         self.engine_words = "starting"
-        #: set once the first engine process is ready, or has failed
+        #: set once an engine process is ready, or it is known that none will be; and at the server's end
         self.engine_known = asyncio.Event()
         self.began = self._now()
         self._loop = asyncio.get_running_loop()
         self.audience = Audience(self._loop)
         self.later = Later(self._loop, self.audience, self.scheduler.has_room, self.failed)
         self._answers = Answers(self)
-        self._closing = False
+        #: whether it was told to end, and takes no goal any more
+        self.closing = False
         self._timer: asyncio.TimerHandle | None = None
         #: when the goals that were handed to the engine began, until their end is told: one, or for a moment two
         self._started: dict[str, float] = {}
@@ -192,7 +193,7 @@ class Service:
         self._set_timer()
         self.later.look()
         self.changed()
-        if self._closing and self.scheduler.active is None:
+        if self.closing and self.scheduler.active is None:
             self.finished.set()
 
     def _carry_out(self, effect: Effect) -> None:
@@ -280,6 +281,7 @@ class Service:
 
     def _died(self, died: EngineDied) -> None:
         self.scheduler.engine_lost()
+        self._set_timer()
         self._engine_fails(died.words)
 
     def _missing(self, missing: EngineMissing) -> None:
@@ -295,18 +297,18 @@ class Service:
     def _start_failed(self, failed: protocol.StartFailed) -> None:
         if failed.usage and self.ready is None:
             self.fatal = UsageError(failed.message)
-            self.engine_known.set()
             self.shut_down()
             return
         self._engine_fails(failed.message)
-        if failed.lasting:  # none will come: goals need not wait to be told
+        if failed.lasting:
+            self.engine_known.set()
+            # None will come: goals need not wait to be told.
             self.apply(self.scheduler.engine_ready(self.now()))
 
     def _engine_fails(self, words: str) -> None:
         if words != self.engine_words:
             log.line(log.shown(words))
         self.engine_words = words
-        self.engine_known.set()
         self.later.voices_known()
         self.changed()
 
@@ -354,7 +356,8 @@ class Service:
 
     def shut_down(self) -> None:
         """End every goal; `finished` is set once it is silent."""
-        self._closing = True
+        self.closing = True
+        self.engine_known.set()
         self.apply(self.scheduler.shutdown(self._now()))
         self.later.voices_known()
 

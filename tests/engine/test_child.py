@@ -123,8 +123,10 @@ def test_it_is_killed_with_all_that_it_has_started() -> None:
 #: Starts what it is told to, in a session of its own, and lives no longer itself.
 _LEAVES = """
 import os, sys, time
-os.write(2, b"%d" % os.getpid())
+ready, begun = os.pipe()
 if os.fork():
+    os.close(begun)
+    os.read(ready, 1)
     os._exit(0)
 os.setsid()
 {then}
@@ -138,7 +140,7 @@ def _leaving(then: str, *inherited: int) -> Child:
 
 def test_what_left_its_session_is_killed_too_before_it_counts_as_ended() -> None:
     reading, writing = os.pipe()
-    child = _leaving("", writing)
+    child = _leaving("os.write(begun, b'.')", writing)
     os.close(writing)
     assert _status(child) == 0
     os.set_blocking(reading, False)

@@ -44,15 +44,15 @@ def test_a_process_that_dies_as_soon_as_it_is_ready_is_waited_for_longer_and_lon
         assert restarts.due_at == 100.0 + wait
 
 
-def test_what_is_known_to_stay_is_an_error_until_a_process_is_ready() -> None:
+def test_what_is_known_to_stay_is_an_error_until_the_next_start_says_otherwise() -> None:
     restarts = Restarts(100.0)
     assert not restarts.failed(100.0, 100.0, LACKING)
     assert restarts.error == LACKING
-    assert not restarts.failed(100.0 + 2 * PATIENCE, 100.0 + 2 * PATIENCE, None), (
-        "nothing waits: nothing is to be ended"
-    )
-    assert restarts.error == LACKING
     restarts.ready()
+    assert restarts.error is None
+    restarts.died(200.0, age=SHORT_LIFE * 2, had_goal=False)
+    restarts.failed(200.0, 200.0, LACKING)
+    assert restarts.failed(200.0 + PATIENCE, 200.0 + PATIENCE, None), "goals wait again, and not for ever"
     assert restarts.error is None
 
 

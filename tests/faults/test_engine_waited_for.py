@@ -14,6 +14,7 @@ import pytest
 from tests.conformance.hearing import LONG, begin, engine_process, send
 from tests.faults.broken import python_path, write
 from tests.support import census
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -40,6 +41,11 @@ def too_few_descriptors(talk: Talk) -> Iterator[None]:
     resource.prlimit(talk.pid, resource.RLIMIT_NOFILE, (TOO_FEW, allowed[1]))
     yield
     resource.prlimit(talk.pid, resource.RLIMIT_NOFILE, allowed)
+
+
+def _scripted_engine(talk: Talk) -> int:
+    (engine,) = census.descendants(talk.pid)
+    return engine
 
 
 def _ends(talk: Talk, goals: list[str]) -> list[tuple[str, str | None]]:
@@ -78,7 +84,7 @@ def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted
     first = begin(talk, "never-ends", number=1)
     goals = [send(talk, "length=0.01") for _ in range(WAITING)]
     talk.script_start("hang")  # so that each start can be met in its middle
-    (engine,) = census.descendants(talk.pid)
+    engine = _scripted_engine(talk)
     for _ in range(3):
         os.kill(engine, signal.SIGKILL)
         known = engine
@@ -94,7 +100,7 @@ def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted
 def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     assert talk.run("voices").code == 0
-    for _ in range(10):
+    for _ in range(5):
         os.kill(engine_process(talk), signal.SIGKILL)
         goal = send(talk, "yes", rate=450)
         assert _ends(talk, [goal]) == [("SUCCEEDED", None)], talk.goal(goal)
@@ -108,16 +114,48 @@ def test_an_engine_that_does_not_come_for_long_costs_a_goal_each_time_it_is_trie
     assert talk.run("voices").code == 0
     talk.script_start("crash")
     began = time.monotonic()
-    (engine,) = census.descendants(talk.pid)
-    os.kill(engine, signal.SIGKILL)
+    os.kill(_scripted_engine(talk), signal.SIGKILL)
     goals = [send(talk, "length=0.5") for _ in range(4)]
-    assert _ends(talk, goals[:2]) == [("ABORTED", "engine_failed")] * 2
-    assert time.monotonic() - began >= 0.4, "it is waited for first"
+    talk.watcher.wait_for_terminal(goals[1])
+    waited = time.monotonic() - began
+    talk.script_start("")
+    assert waited >= 0.4, "it is waited for first"
+    ends = _ends(talk, goals)
+    assert (ends[:2], ends[-1]) == ([("ABORTED", "engine_failed")] * 2, ("SUCCEEDED", None))
     times = [talk.goal(each)["ended_at"] for each in goals[:2]]
     assert times[1] - times[0] >= 0.09, "one goal for one start"
     assert "the engine crashed: it was killed by SIGSEGV" in talk.goal(goals[0])["message"]
+
+
+def test_a_cause_that_stays_and_then_another_that_may_pass_leave_no_goal_waiting(
+    make_talk: MakeTalk, tmp_path: Path
+) -> None:
+    """As where pyttsx3 is missing, and then half installed."""
+    write(tmp_path / "sitecustomize.py", HASTY.format(patience=0.3))
+    talk = make_talk(scripted=True, env=python_path(tmp_path))
+    talk.script_start("fail")
+    os.kill(_scripted_engine(talk), signal.SIGKILL)
+    with talk.connect() as wire:
+        _await_engine(wire, "scripted start failure")
+        wire.request("say", text="length=0", wait=True)
+        assert wire.receive_event("result")["goal"]["reason"] == "engine_failed"
+        talk.script_start("crash")
+        _await_engine(wire, "the engine crashed: it was killed by SIGSEGV")
+        goal = wire.request("say", text="length=0", wait=True)["goal"]["id"]
+        ended = wire.receive_event("result")["goal"]
+        assert (ended["id"], ended["state"], ended["reason"]) == (goal, "ABORTED", "engine_failed")
     talk.script_start("")
-    assert _ends(talk, goals)[-1] == ("SUCCEEDED", None)
+
+
+def test_a_goal_that_an_engine_was_given_in_its_death_has_its_time(make_talk: MakeTalk) -> None:
+    """The next one may begin with it, but no later than it says."""
+    talk = make_talk("--player", "null")
+    assert talk.run("voices").code == 0
+    with talk.connect() as wire, too_few_descriptors(talk):
+        os.kill(engine_process(talk), signal.SIGKILL)
+        goal = wire.request("say", text="too late", ttl=0.3)["goal"]["id"]
+        assert talk.watcher.wait_for_terminal(goal) in {"RECALLED", "PREEMPTED"}
+        assert wire.request("status", id=goal)["goal"]["reason"] == "expired"
 
 
 @pytest.mark.parametrize("option", [("--driver", "parrot"), ("--driver", "nsss"), ("--voice", "parrot")], ids=" ".join)
@@ -132,3 +170,12 @@ def test_a_driver_or_a_voice_that_there_is_not_ends_the_server_before_it_is_read
     assert words.startswith("talk: "), words
     assert f'"{option[1]}"' in words or f"'{option[1]}'" in words, words
     assert not os.path.exists(place)
+
+
+def test_a_server_that_awaits_its_engine_ends_when_it_is_told_to(make_talk: MakeTalk) -> None:
+    talk = make_talk("--voice", "en", scripted=True, env={"SCRIPTED_START": "hang"})
+    with limits():
+        began = time.monotonic()
+        talk.stop()
+        assert_within(time.monotonic() - began, 1, "the end of a server whose engine hangs in its start")
+    assert "ready on" not in talk.log

@@ -218,7 +218,8 @@ class SideBySide:
                 self.finished[goal.id] = goal
 
     def compare_deadline(self) -> None:
-        over = [each.accepted_at + each.ttl for each in self.model.queue if each.ttl is not None]
+        mortal = self.model.queue + self.model.unbegun()
+        over = [each.accepted_at + each.ttl for each in mortal if each.ttl is not None]
         stopped = [each.stopped_at for each in self.model.voice if each.stopped_at is not None]
         deadline = self.real.deadline()
         if deadline is None:

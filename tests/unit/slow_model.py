@@ -278,12 +278,21 @@ class SlowModel:
     # Time
 
     def tick(self) -> None:
-        self.recall_what_is_too_late()
         for goal in list(self.voice):
             if goal.stopped_at is not None and self.monotonic - goal.stopped_at >= SILENCE:
                 self.end(goal, "ABORTED", "not_silent", goal.by)
                 self.orders.append(("give up", goal.id))
                 self.speak_next()
+        for goal in self.unbegun():
+            if self.monotonic - goal.accepted_at >= (goal.ttl or 0):
+                self.stop(goal, "expired", None)
+        self.recall_what_is_too_late()
+
+    def unbegun(self) -> list[SlowGoal]:
+        """Return the goal that has a time to live and lost its engine before any of it was heard: it may begin anew."""
+        return [
+            each for each in self.voice if each.ttl and not self.engine and each.state == "ACTIVE" and not each.spoken
+        ]
 
     def recall_what_is_too_late(self) -> None:
         for goal in self.queue:

@@ -152,6 +152,22 @@ def test_without_an_engine_goals_wait_and_their_time_runs() -> None:
     assert long.state is State.ACTIVE
 
 
+def test_a_goal_that_lost_its_engine_before_it_was_heard_has_its_time() -> None:
+    robot = Robot()
+    goal, heard = robot.asks(Say("door open", ttl=1.0)), robot.asks(Say("battery low", ttl=9.0))
+    robot.waits(2)
+    assert goal.state is State.ACTIVE, "it has begun"
+    robot.scheduler.engine_lost()
+    robot.waits(0)
+    assert (goal.state.name, goal.reason) == ("PREEMPTING", "expired")
+    robot.tells("stopped", goal.id)
+    robot.see(robot.scheduler.engine_ready(robot.now))
+    robot.tells("heard", heard.id)
+    robot.scheduler.engine_lost()
+    robot.waits(20)
+    assert heard.state is State.ACTIVE, "what was heard in part is not begun anew"
+
+
 def test_a_goal_that_is_spoken_may_end_after_its_engine_was_lost_and_the_next_waits() -> None:
     robot = Robot()
     goal, following = robot.says(), robot.says()
