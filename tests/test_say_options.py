@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -239,6 +240,11 @@ def test_output_writes_a_file_without_a_server(tmp_path: Path) -> None:
     told = json.loads(alone("--json", "say", "-o", str(file), "battery low").out)
     assert told["output"] == str(file)
     assert told["text"] == "battery low"
+    for closed in (">&-", "1</dev/null"):
+        with short_directory() as home:
+            script = f'"$@" --json say -o {shlex.quote(str(file))} one {closed}'
+            done = run(["bash", "-c", script, "bash", *TALK], environment(home, TALK_SOCKET=f"{home}/s"))
+            assert (done.code, done.err) == (0, "")
     assert told["seconds"] == pytest.approx(seconds, abs=0.05)
 
 

@@ -70,7 +70,7 @@ ALL_EXIT_CODES: dict[int | str, str] = {
     11: "the socket is served already, or its directory is not safe",
     12: "lost: it was sent, then the server went away; it may still be spoken",
     124: "timed out",
-    "128+n": "ended by signal n; 141: the reader of standard output went away",
+    "128+n": "ended by signal n; 141: standard output is closed, or its reader went away",
 }
 
 

@@ -105,6 +105,7 @@ def _command(
     given = plain.given
     if plain.command == "say":
         from talkcli.admission import bad_option
+        from talkcli.cli.interrupts import give_up_unread
         from talkcli.cli.saying import GOAL_OPTIONS, say
         from talkcli.requests import Say
 
@@ -114,6 +115,7 @@ def _command(
 
             return commands.run(arguments, Common())  # which knows how to say it
         end = None if given["timeout"] is None else began + given["timeout"]
+        give_up_unread()
         return say(options, " ".join(given["text"]), given, end, opened, held)
     if plain.command == "wait":
         from talkcli.cli.waiting import wait

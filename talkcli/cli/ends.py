@@ -6,7 +6,16 @@ import os
 import sys
 
 from talkcli import __version__
-from talkcli.cli.show import OUTPUT_FULL, give_up_output, note, output_failed, show_error
+from talkcli.cli.show import (
+    give_up_output,
+    has_failed,
+    never_readable,
+    no_room,
+    note,
+    output_failed,
+    reader_is_gone,
+    show_error,
+)
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, TalkError
 from talkcli.values import TYPE_CHECKING
 
@@ -31,21 +40,21 @@ def ended(command: Callable[[], object], options: Common) -> int:
         return error.exit_code
     except KeyboardInterrupt:
         return EXIT_SIGINT
-    except (OutputClosed, BrokenPipeError):
-        give_up_output()
-        return EXIT_SIGPIPE
     except MemoryError:
         note(_without_memory())
         return EXIT_ERROR
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in OUTPUT_FULL:
+        if isinstance(error, OutputClosed) or reader_is_gone(error) or never_readable(error):
+            give_up_output()
+            return EXIT_SIGPIPE
+        if no_room(error):
             output_failed(error)
             return EXIT_ERROR
         if os.environ.get("TALK_DEBUG"):
             raise
         note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
         return EXIT_ERROR
-    return code if isinstance(code, int) else 0
+    return (code if isinstance(code, int) else 0) or (EXIT_ERROR if has_failed() else 0)
 
 
 def _without_memory() -> str:

@@ -11,7 +11,7 @@ import select
 import signal
 import sys
 
-from talkcli.cli.show import give_up_output
+from talkcli.cli.show import OUTPUT, give_up_output
 from talkcli.errors import EXIT_SIGNAL, EXIT_SIGPIPE, EXIT_TIMEOUT
 from talkcli.values import TYPE_CHECKING
 
@@ -22,10 +22,6 @@ if TYPE_CHECKING:
 _CAUGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: Three years: what the system's timer is sure to take.
 _LONGEST = 1e8
-
-
-#: Standard output's descriptor.
-_OUTPUT = 1
 
 
 def give_up_unread() -> None:
@@ -40,15 +36,21 @@ def has_reader() -> bool:
     return sys.stdout is not None and not _condition() & (select.POLLERR | select.POLLHUP)
 
 
+def watched_output() -> dict[int, int]:
+    """Return what to wait for, as `dial.ready` takes it, so that a reader of standard output that goes away ends it."""
+    return {} if _condition() & select.POLLNVAL else {OUTPUT: 0}  # that would end it at once
+
+
 def _condition() -> int:
     """Return what poll says of standard output, unasked; 0 for nothing, as it always does of a file."""
     poll = select.poll()
-    poll.register(_OUTPUT, 0)
+    poll.register(OUTPUT, 0)
     return next((found for _, found in poll.poll(0)), 0)
 
 
 class Interrupts:
-    """Catches SIGINT, SIGTERM and SIGHUP: `number` is the signal then. A second one ends the process at once.
+    """Catches SIGINT, SIGTERM and SIGHUP: `number` is the signal then. A second one ends the process at once, but for
+    SIGHUP: of a terminal that is closed the shell tells its commands, and then the system.
 
     `descriptor` becomes readable. `watched` has all that there is to wait for, as `dial.ready` takes it; it may change.
     """
@@ -99,17 +101,16 @@ class Interrupts:
 
     def watch_output(self) -> None:
         """Have a reader of standard output that goes away from now on end the waiting, too."""
-        if not _condition() & select.POLLNVAL:  # which would end it at once
-            self.watched[_OUTPUT] = 0
+        self.watched.update(watched_output())
 
     def look(self) -> None:
         """Find out whether it was the reader of standard output that has ended the waiting."""
-        self.gone = self.gone or (_OUTPUT in self.watched and not has_reader())
+        self.gone = self.gone or (OUTPUT in self.watched and not has_reader())
 
     def clear(self) -> None:
-        """Have nothing end the waiting that has; there is no other signal, a second one ends the process."""
+        """Have nothing end the waiting that has; no other signal will."""
         self.look()
-        self.watched.pop(_OUTPUT, None)
+        self.watched.pop(OUTPUT, None)
         os.set_blocking(self.descriptor, False)
         try:
             os.read(self.descriptor, 16)
@@ -125,6 +126,8 @@ class Interrupts:
 
     def _caught(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         if self.number is not None:
+            if number == signal.SIGHUP:
+                return
             os._exit(EXIT_SIGNAL + number)
         self.number = number
         self.wake()

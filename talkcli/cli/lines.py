@@ -12,16 +12,17 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from talkcli import output
-from talkcli.cli.interrupts import Interrupts, give_up_unread
+from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import (
     SILENCE,
     SPEECH_IS_PAUSED,
     exit_code,
-    reader_is_gone,
+    regardless,
     report,
+    show_if_possible,
     until_ended,
 )
-from talkcli.cli.show import give_up_output, note, show, show_error, show_json
+from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.stdin import LineReader
 from talkcli.cli.utf8 import readable
 from talkcli.dial import ANSWER_LIMIT, Interrupted
@@ -52,7 +53,6 @@ def say_lines(
         from talkcli.cli.feedback import feedback as feedback_for
 
         shown = feedback_for(options)
-    give_up_unread()
     with Interrupts(timeout) as interrupts:
         if wait:
             interrupts.watch_output()
@@ -65,7 +65,7 @@ def say_lines(
             return interrupts.exit_code
         finally:
             if shown:
-                shown.close()
+                regardless(shown.close)
 
 
 class _Lines:
@@ -159,7 +159,7 @@ class _Lines:
     def _print(self, put: Callable[[], None]) -> None:
         """Show something; where its reader is gone, who waits ends as by a signal, and who doesn't goes on without."""
         try:
-            put()
+            show_if_possible(put)
         except OSError as error:
             if not reader_is_gone(error):
                 raise
@@ -203,9 +203,9 @@ class _Lines:
         recalled = [each for each in ended if each.state is State.RECALLED]
         for goal in ended:
             if self._shown:
-                self._show(goal)
+                regardless(self._show, goal)
             elif self._options.json or goal.state is not State.RECALLED:
-                report(goal, self._options)
+                regardless(report, goal, self._options)
         if recalled and not (self._shown or self._options.json or self._options.quiet):
             note(f"{len(recalled)} that waited: recalled")
 

@@ -1,22 +1,37 @@
-"""What `say` and `wait` have in common: waiting for a goal, telling how it ended, giving one up that is one's own."""
+"""What `say` and `wait` have in common: waiting for a goal, telling how it ended, giving one up that is one's own.
+
+None of this depends on whether standard output can be written.
+"""
 
 from __future__ import annotations
 
-import errno
 import time
 
-from talkcli.cli.show import give_up_output, note, show_json
+from talkcli.cli.show import (
+    give_up_output,
+    never_readable,
+    no_room,
+    note,
+    output_failed,
+    reader_is_gone,
+    show_json,
+)
 from talkcli.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.states import EXIT_CODES, State
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any, TypeVar
+
     from talkcli.cli.feedback import Feedback
     from talkcli.cli.interrupts import Interrupts
     from talkcli.cli.show import Common
     from talkcli.client import GoalHandle
     from talkcli.messages import Goal
+
+    _T = TypeVar("_T")
 
 #: Seconds for which a goal that was given up is awaited to be silent.
 SILENCE = 1.0
@@ -29,9 +44,31 @@ def rest(end: float | None) -> float | None:
     return None if end is None else max(0.0, end - time.monotonic())
 
 
-def reader_is_gone(error: OSError) -> bool:
-    """Whether that is why something couldn't be shown: a pipe that nobody reads, a terminal that is gone."""
-    return error.errno in (errno.EPIPE, errno.EIO)
+def show_if_possible(put: Callable[..., None], *what: object) -> None:
+    """Show something, with a function for that; where there is no room for it, all goes on without.
+
+    A reader that is gone is raised: see `reader_is_gone`.
+    """
+    try:
+        put(*what)
+    except OSError as error:
+        if never_readable(error):
+            give_up_output()
+        elif no_room(error):
+            output_failed(error)
+        else:
+            raise
+
+
+def regardless(act: Callable[..., _T], *given: Any) -> _T:
+    """Do this; where the reader of standard output is gone, again, and then nothing is shown."""
+    try:
+        return act(*given)
+    except OSError as error:
+        if not reader_is_gone(error):
+            raise
+        give_up_output()
+        return act(*given)
 
 
 def until_ended(goal: GoalHandle, timeout: float | None, shown: Feedback | None) -> None:
@@ -40,24 +77,26 @@ def until_ended(goal: GoalHandle, timeout: float | None, shown: Feedback | None)
         goal.wait(timeout)
         return
     for event in goal.events(timeout):
-        shown.show(goal.goal, event)
+        show_if_possible(shown.show, goal.goal, event)
 
 
-def give_up(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> None:
-    """Cancel a goal, and wait a moment for its silence."""
+def give_up(goal: GoalHandle, interrupts: Interrupts, options: Common, shown: Feedback | None) -> int:
+    """Cancel a goal, wait a moment for its silence, tell how it ended, and return the exit code for that.
+
+    Ctrl-C may have ended the reader, too, and a terminal is gone soon after SIGHUP.
+    """
     interrupts.clear()
-    tell = shown.aside if shown else note
+    unknown = ""
     try:
         goal.request_cancel()
-        try:
-            until_ended(goal, SILENCE, shown)
-        except BrokenPipeError:  # Ctrl-C has ended the reader, too
-            give_up_output()
-            until_ended(goal, SILENCE, shown)
+        regardless(until_ended, goal, SILENCE, shown)
     except TimeoutError:
-        tell(f"{goal.id}: cancelled, but the server did not confirm within {SILENCE:g} s that it is silent")
+        unknown = f"the server did not confirm within {SILENCE:g} s that it is silent"
     except (Interrupted, ServerUnavailable) as error:
-        tell(f"{goal.id}: cancelled, but it is not known whether it is silent: {error or 'interrupted'}")
+        unknown = f"it is not known whether it is silent: {error or 'interrupted'}"
+    if unknown:
+        regardless(shown.aside if shown else note, f"{goal.id}: cancelled, but {unknown}")
+    return regardless(report, goal.goal, options, shown)
 
 
 def report(goal: Goal, options: Common, shown: Feedback | None = None) -> int:
@@ -66,7 +105,7 @@ def report(goal: Goal, options: Common, shown: Feedback | None = None) -> int:
     `shown`: what has shown it already on standard output.
     """
     if options.json and shown is None:
-        show_json(goal.to_json())
+        show_if_possible(show_json, goal.to_json())
     if goal.state is not State.SUCCEEDED and goal.state.terminal and not options.quiet:
         from talkcli import output
 

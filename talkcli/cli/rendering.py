@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from talkcli.cli.interrupts import Interrupts
+from talkcli.cli.outcome import regardless, show_if_possible
 from talkcli.cli.show import note, show_json
 from talkcli.cli.utf8 import readable
 from talkcli.dial import Interrupted
@@ -59,5 +60,6 @@ def render_to(path: str, text: str, chosen: JsonObject, timeout: float | None, o
             note(str(error))
             return EXIT_TIMEOUT
     if options.json:
-        show_json({"output": path, "seconds": seconds, "text": text, **chosen})
+        done = {"output": path, "seconds": seconds, "text": text, **chosen}
+        regardless(show_if_possible, show_json, done)  # the file is there
     return EXIT_OK

@@ -15,9 +15,12 @@ from click.core import ParameterSource
 from talkcli.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
 from talkcli.cli import complete
 from talkcli.cli.common import common, common_options, filled, number, seconds, talk_command, timeout_option
+from talkcli.cli.interrupts import give_up_unread, watched_output
 from talkcli.cli.outcome import rest
 from talkcli.cli.saying import GOAL_OPTIONS, refuse, say
 from talkcli.cli.usage import ASKING, Command, Number, WholeNumber, told
+from talkcli.dial import Interrupted
+from talkcli.errors import EXIT_SIGPIPE
 from talkcli.requests import Say
 
 #: Options that mean something to a server alone.
@@ -63,7 +66,7 @@ class _SayCommand(Command):
         7: "preempted: stopped while it was spoken",
         12: "lost: it was sent, then the server went away; it may still be spoken",
         124: "timed out, and cancelled",
-        "128+n": "ended by signal n, and cancelled; 141: whoever read its output went away",
+        "128+n": "ended by signal n, and cancelled; 141: whoever read its output went away while it waited",
     },
 )
 @click.argument("text", nargs=-1, metavar="TEXT...")
@@ -157,6 +160,8 @@ def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> i
     fault = bad_option(Say("", **goal_options))
     if fault is not None:
         raise click.UsageError(fault, context)
+    if given["output"] is None:
+        give_up_unread()
     if given["lines"]:
         from talkcli.cli.lines import say_lines
 
@@ -166,9 +171,12 @@ def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> i
         from talkcli.cli.stdin import InputTooLong, read_text
 
         try:
-            sentence = read_text(end, whole=given["output"] is not None)
+            watched = watched_output() if given["wait"] else {}
+            sentence = read_text(end, watched, whole=given["output"] is not None)
         except InputTooLong as error:
             return refuse(f"Talk rejected: {error}", error.code, options, feedback=given["feedback"])
+        except Interrupted:  # nothing was sent
+            return EXIT_SIGPIPE
     if given["output"] is not None:
         from talkcli.cli.rendering import render_to, settings
 

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import time
 
-from talkcli.cli.interrupts import Interrupts, give_up_unread
+from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import (
     SPEECH_IS_PAUSED,
-    exit_code,
     give_up,
-    reader_is_gone,
+    regardless,
     report,
     rest,
+    show_if_possible,
     until_ended,
 )
-from talkcli.cli.show import OUTPUT_FULL, give_up_output, note, output_failed, show, show_error, show_json
+from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.dial import ANSWER_LIMIT, Interrupted
-from talkcli.errors import EXIT_ERROR, EXIT_OK, EXIT_TIMEOUT, Lost
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost
 from talkcli.states import State
 from talkcli.values import TYPE_CHECKING
 
@@ -55,7 +55,6 @@ def say(
         text, unreadable = readable(text)
         if unreadable and not options.quiet:
             note(unreadable)
-    give_up_unread()
     with Interrupts(held=held) as interrupts:
         if given["wait"]:
             interrupts.watch_output()
@@ -74,7 +73,7 @@ def say(
                 )
                 shown = _feedback(options) if given["feedback"] else None
                 if not given["wait"] or goal.state is State.REJECTED:
-                    return _tell(goal, options, shown)
+                    return regardless(_tell, goal, options, shown)
                 return _wait(goal, interrupts, end, options, shown)
         except Interrupted:
             interrupts.look()
@@ -94,8 +93,8 @@ def refuse(message: str, reason: str, options: Common, *, feedback: bool) -> int
     goal = Goal("", State.REJECTED, reason=reason, message=message)
     shown = _feedback(options) if feedback else None
     if shown and options.json:
-        shown.show(goal, Result(goal))
-    return report(goal, options, shown)
+        regardless(show_if_possible, shown.show, goal, Result(goal))
+    return regardless(report, goal, options, shown)
 
 
 def _feedback(options: Common) -> Feedback:
@@ -105,17 +104,7 @@ def _feedback(options: Common) -> Feedback:
 
 
 def _tell(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
-    """Tell of a goal that is not waited for: its id, or how it ended, if it has. What can't be shown is not."""
-    try:
-        return _shown(goal, options, shown)
-    except OSError as error:
-        if not reader_is_gone(error):
-            raise
-        give_up_output()
-        return exit_code(goal.goal) if goal.state.terminal else EXIT_OK
-
-
-def _shown(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
+    """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
     if goal.state is State.REJECTED:
         if shown and options.json:
             until_ended(goal, None, shown)
@@ -127,7 +116,7 @@ def _shown(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
     if goal.state.terminal:
         return report(goal.goal, options)
     if options.json:
-        show_json(goal.goal.to_json())
+        show_if_possible(show_json, goal.goal.to_json())
     return EXIT_OK
 
 
@@ -136,7 +125,7 @@ def _introduce(goal: GoalHandle, options: Common, shown: Feedback | None) -> Non
     if options.quiet:
         return
     if not options.json and shown is None:
-        show(goal.id)
+        show_if_possible(show, goal.id)
     if goal.speech_paused and not goal.state.terminal:
         note(SPEECH_IS_PAUSED)
 
@@ -146,7 +135,10 @@ def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: 
     `say` had sent it before, with the same id.
     """
     try:
-        failed = _follow(goal, end, options, shown)
+        _introduce(goal, options, shown)
+        if shown:
+            shown.begin([goal.goal])
+        until_ended(goal, rest(end), shown)
     except (Interrupted, OSError) as error:
         if isinstance(error, OSError) and not isinstance(error, TimeoutError):
             if not reader_is_gone(error):
@@ -158,31 +150,14 @@ def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: 
             give_up_output()
         if goal.attached:
             return _leave(goal, interrupts, shown)
-        give_up(goal, interrupts, shown)
-        code = report(goal.goal, options, shown)
+        code = give_up(goal, interrupts, options, shown)
         if not timed_out:
             return interrupts.exit_code
         return code if goal.state is State.SUCCEEDED else EXIT_TIMEOUT
     finally:
         if shown:
-            shown.close()
-    return report(goal.goal, options, shown) or failed
-
-
-def _follow(goal: GoalHandle, end: float | None, options: Common, shown: Feedback | None) -> int:
-    """Show a goal until it has ended; EXIT_ERROR where there was no room for that: it is waited for all the same."""
-    try:
-        _introduce(goal, options, shown)
-        if shown:
-            shown.begin([goal.goal])
-        until_ended(goal, rest(end), shown)
-    except OSError as error:
-        if error.errno not in OUTPUT_FULL or reader_is_gone(error):
-            raise
-        output_failed(error)
-        until_ended(goal, rest(end), None)
-        return EXIT_ERROR
-    return EXIT_OK
+            regardless(shown.close)
+    return report(goal.goal, options, shown)
 
 
 def _leave(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> int:

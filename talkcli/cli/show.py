@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 import sys
 
 from talkcli.values import TYPE_CHECKING
@@ -16,8 +17,12 @@ if TYPE_CHECKING:
     from talkcli.errors import TalkError
     from talkcli.messages import JsonObject
 
-#: What writing says where there is no room, or the terminal is gone.
-OUTPUT_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+#: Standard output's descriptor.
+OUTPUT = 1
+#: What writing says where there is no room, or the disk is broken.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+#: Whether there was no room for what was to be shown.
+_failed = False
 #: Columns of a terminal that doesn't say how many it has.
 _USUAL_WIDTH = 80
 #: Columns into which what is said always goes; a terminal that says it has fewer is not believed.
@@ -45,19 +50,49 @@ class Common:
 
 def give_up_output() -> None:
     """Write nothing more to standard output, which takes nothing; not even at the interpreter's end."""
-    _discard(1)
+    _discard(OUTPUT)
     if sys.stdout is None:
-        sys.stdout = open(1, "w", closefd=False, encoding="utf-8")  # noqa: SIM115 - it is open as long as the process
+        sys.stdout = open(OUTPUT, "w", closefd=False, encoding="utf-8")  # noqa: SIM115 - open as long as the process
 
 
 def _discard(descriptor: int) -> None:
-    os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, descriptor)
+    os.close(nowhere)
 
 
-def output_failed(error: OSError) -> None:
-    """Tell why standard output can't be written, and write nothing more to it."""
+def reader_is_gone(error: Exception) -> bool:
+    """Whether this error is from a standard output that nobody reads any more: a pipe, a terminal that is gone."""
+    if isinstance(error, OSError) and error.errno == errno.EIO:  # which a broken disk gives, too
+        return stat.S_ISCHR(os.fstat(OUTPUT).st_mode)
+    return isinstance(error, BrokenPipeError)
+
+
+def never_readable(error: Exception) -> bool:
+    """Whether this error is from a standard output that is open for reading alone."""
+    if not isinstance(error, OSError) or error.errno != errno.EBADF:
+        return False
+    import fcntl
+
+    return fcntl.fcntl(OUTPUT, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
+
+
+def no_room(error: Exception) -> bool:
+    """Whether this error is from a standard output that takes no more, though there may be somebody to read it."""
+    return isinstance(error, OSError) and error.errno in _FULL and not reader_is_gone(error)
+
+
+def output_failed(error: Exception) -> None:
+    """Tell why standard output can't be written, and write nothing more to it. See `has_failed`."""
+    global _failed  # noqa: PLW0603 - as standard output is the process's
+    _failed = True
     give_up_output()
-    note(f"standard output can't be written: {error.strerror}")
+    note(f"standard output can't be written: {error.strerror if isinstance(error, OSError) else error}")
+
+
+def has_failed() -> bool:
+    """Whether there was no room for what was to be shown: a command that went on without ends as one that failed."""
+    return _failed
 
 
 def show(line: str) -> None:
@@ -97,12 +132,11 @@ def note(words: str) -> None:
         lines = f"talk: {words}"
         if len(lines) > _NARROWEST and sys.stderr.isatty():
             lines = _folded(lines)
+        # Whoever read it may have gone, and have taken standard output along: what is to be done is done all the same.
         try:
             sys.stderr.write(f"{lines}\n")
             sys.stderr.flush()
-        except (
-            OSError
-        ):  # whoever read it has gone, and may have taken standard output along: what is to be done is done
+        except OSError:
             _discard(2)
 
 

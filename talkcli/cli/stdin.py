@@ -48,14 +48,15 @@ class Line:
     size: int
 
 
-def read_text(end: float | None, *, whole: bool = False) -> str:
+def read_text(end: float | None, interrupt: Mapping[int, int], *, whole: bool = False) -> str:
     """Return standard input as one text; InputTooLong for more than the longest one, which is not read to its end.
 
-    `end`: the monotonic time by which it must have been read, else InputLate; `whole`: read all of it, for no goal.
+    `end`: the monotonic time by which it must have been read, else InputLate; `interrupt`: what ends the reading with
+    Interrupted, as in `dial.ready`; `whole`: read all of it, for no goal.
     """
     data = bytearray()
     while whole or len(data) <= _MOST:
-        if not ready({0: select.POLLIN}, None if end is None else max(0.0, end - time.monotonic())):
+        if not ready({0: select.POLLIN}, None if end is None else max(0.0, end - time.monotonic()), interrupt):
             raise InputLate("standard input has not ended within the time: nothing was sent")
         more = _read(_CHUNK if whole else _MOST + 1 - len(data))
         if more == b"":

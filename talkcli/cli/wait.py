@@ -27,7 +27,7 @@ from talkcli.cli.waiting import wait
         8: "unknown goal",
         12: "lost: the server went away",
         124: "timed out; the goals go on",
-        "128+n": "ended by signal n, 141: whoever read its output went away; the goals go on",
+        "128+n": "ended by signal n, 141: whoever read its output went away meanwhile; the goals go on",
     },
 )
 @click.argument("ids", nargs=-1, metavar="[ID]...", shell_complete=complete.goal_ids)

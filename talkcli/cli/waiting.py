@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from talkcli.cli.interrupts import Interrupts, give_up_unread
-from talkcli.cli.outcome import report, rest
+from talkcli.cli.outcome import regardless, report, rest, show_if_possible
 from talkcli.cli.show import note
 from talkcli.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
@@ -28,7 +28,7 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None, *, feedba
         try:
             with options.connect(interrupt=interrupts.watched, patience=patience) as client:
                 goals = client.follow(ids or None, feedback=feedback)
-                shown = _show(goals, end, options) if feedback else None
+                shown = _show(goals, end, interrupts, options) if feedback else None
                 return _wait(goals, end, options, shown, named=bool(ids))
         except Interrupted:
             interrupts.look()
@@ -38,7 +38,7 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None, *, feedba
             return EXIT_TIMEOUT
 
 
-def _show(goals: list[GoalHandle], end: float | None, options: Common) -> Feedback:
+def _show(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, options: Common) -> Feedback:
     """Show what happens to the goals until all have ended."""
     from talkcli.cli.feedback import feedback
     from talkcli.following import merged
@@ -47,9 +47,12 @@ def _show(goals: list[GoalHandle], end: float | None, options: Common) -> Feedba
     try:
         shown.begin([each.goal for each in goals])
         for goal, event in merged(goals, rest(end)):
-            shown.show(goal.goal, event)
+            show_if_possible(shown.show, goal.goal, event)
+    except Interrupted:
+        interrupts.look()  # while standard output is what it was
+        raise
     finally:
-        shown.close()
+        regardless(shown.close)
     return shown
 
 
