@@ -82,7 +82,9 @@ class Client:
         from talkcli import paths
 
         self._followed = Followed()
-        name = name or os.environ.get("TALK_NAME") or None
+        # Bytes in a variable that are no UTF-8 keep nobody from cancelling.
+        called = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
+        name = name or called or None
         if name and len(name) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
         if isinstance(interrupt, int):

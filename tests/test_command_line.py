@@ -191,6 +191,26 @@ def test_variables_that_are_empty_count_as_not_set(scripted: Talk, local: dict[s
             assert client.server_pid == scripted.pid
 
 
+def test_a_name_that_is_no_utf8_speaks_nothing_but_cancels(scripted: Talk, local: dict[str, str]) -> None:
+    env = {**local, "TALK_NAME": "n\udcff"}
+    said = run([*TALK, "say", "x"], env)
+    assert (said.code, said.out) == (2, "")
+    assert said.err.startswith("talk: TALK_NAME in the environment: the byte 0xff in it is not UTF-8\n")
+    goal = scripted.run("say", "never-ends").id
+    assert run([*TALK, "cancel"], env).code == 0
+    assert scripted.goal(goal)["by"]["client"]["name"] == "n\ufffd"
+
+
+def test_arguments_are_utf8_where_the_locale_is_ascii(scripted: Talk) -> None:
+    env = {**scripted.env, "LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "TALK_NAME": "é"}
+    words = ["say", "-w", "--key", "日", "--", "length=0 a\udcff b é"]
+    done = run([*TALK, *words], env)
+    assert (done.code, done.err) == (0, "talk: line 1, column 11: the byte 0xff is not UTF-8, and is not spoken\n")
+    goal = scripted.goal(done.out.strip())
+    assert (goal["text"], goal["key"], goal["client"]["name"]) == ("length=0 a\ufffd b é", "日", "é")
+    assert run([*TALK, "cancel"], env).code == 0
+
+
 def test_standard_output_that_is_closed_is_141(scripted: Talk) -> None:
     for words in (["status"], ["--json", "status"], ["--help"]):
         reader, writer = os.pipe()

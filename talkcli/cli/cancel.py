@@ -6,7 +6,7 @@ import click
 
 from talkcli.cli import complete
 from talkcli.cli.asking import cancel
-from talkcli.cli.common import common, common_options, filled, talk_command
+from talkcli.cli.common import common, common_options, talk_command, word
 from talkcli.cli.usage import ASKING
 
 
@@ -29,14 +29,14 @@ from talkcli.cli.usage import ASKING
 @click.option(
     "--before",
     metavar="ID",
-    callback=filled,
+    callback=word,
     shell_complete=complete.goal_ids,
     help="This goal, and all that were accepted before it.",
 )
 @click.option(
     "--key",
     metavar="KEY",
-    callback=filled,
+    callback=word,
     shell_complete=complete.unfinished_keys,
     help="The goals with this key, spoken or waiting.",
 )

@@ -6,10 +6,12 @@ import math
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from talkcli.cli import complete
 from talkcli.cli.show import Common
 from talkcli.cli.usage import Command, Number
+from talkcli.cli.utf8 import decoded, unreadable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,7 +19,6 @@ if TYPE_CHECKING:
     from talkcli.cli.usage import Codes
 
 _F = TypeVar("_F", bound="Callable[..., Any]")
-_T = TypeVar("_T")
 
 
 def talk_command(
@@ -33,8 +34,8 @@ def common(context: click.Context) -> Common:
 
 
 def _store(context: click.Context, parameter: click.Parameter, value: object) -> None:
-    if parameter.name == "socket":
-        filled(context, parameter, value)
+    if value == "":
+        raise _wrong(_EMPTY, context, parameter)
     if value:
         setattr(common(context), parameter.name or "", value)
 
@@ -86,11 +87,28 @@ def seconds(context: click.Context, parameter: click.Parameter, value: float | N
     return number(context, parameter, value)
 
 
-def filled(context: click.Context, parameter: click.Parameter, value: _T) -> _T:
-    """Refuse an empty word: it comes from a variable that isn't set, and selects nothing."""
-    if value == "":
-        raise click.BadParameter("empty; is the variable set that it comes from?", context, parameter)
+#: What is said of an empty word: it comes from a variable that isn't set, and selects nothing.
+_EMPTY = "empty; is the variable set that it comes from?"
+
+
+def word(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+    """Refuse an empty word, and bytes that are no UTF-8: others would be shown what they can't read."""
+    if value is None:
+        return None
+    value = decoded(value)
+    if not value:
+        raise _wrong(_EMPTY, context, parameter)
+    byte = unreadable(value)
+    if byte is not None:
+        raise _wrong(f"the byte 0x{byte:02x} in it is not UTF-8", context, parameter)
     return value
+
+
+def _wrong(words: str, context: click.Context, parameter: click.Parameter) -> click.BadParameter:
+    """Return the error that names where the value came from: the option, or a variable instead of it."""
+    source = context.get_parameter_source(parameter.name or "")
+    named = f"{parameter.envvar} in the environment" if source is ParameterSource.ENVIRONMENT else parameter.opts[-1]
+    return click.BadParameter(words, context, parameter, named)
 
 
 def timeout_option(words: str) -> Callable[[_F], _F]:

@@ -71,7 +71,7 @@ def _option(options: dict[str, Any], word: str, rest: Iterator[str]) -> tuple[st
 def _value(kind: str, limits: list[float | None], text: str) -> Any:
     """Return the value of an option, None where it isn't plain."""
     if kind == "text":
-        return text if text and text[:1] != "-" else None
+        return text if text and text[:1] != "-" and text.isprintable() else None  # else it may be no UTF-8
     whole, point, part = text.partition(".")
     digits = whole.removeprefix("-") if kind == "int" else whole
     for each in (digits, part) if point else (digits,):
@@ -92,6 +92,8 @@ def _complete(
     for name, variable in table["environment"].items():
         if name not in given and environment.get(variable):
             given[name] = environment[variable]
+            if not given[name].isprintable():
+                return None
     given = {**table["defaults"], **given}
     argument, count = table["argument"] or (None, 0)
     if len(words) > count >= 0:

@@ -14,7 +14,7 @@ from click.core import ParameterSource
 
 from talkcli.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
 from talkcli.cli import complete
-from talkcli.cli.common import common, common_options, filled, number, seconds, talk_command, timeout_option
+from talkcli.cli.common import common, common_options, number, seconds, talk_command, timeout_option, word
 from talkcli.cli.interrupts import give_up_unread, watched_output
 from talkcli.cli.outcome import rest
 from talkcli.cli.saying import GOAL_OPTIONS, refuse, say
@@ -97,7 +97,7 @@ class _SayCommand(Command):
 @click.option(
     "--key",
     metavar="KEY",
-    callback=filled,
+    callback=word,
     shell_complete=complete.keys,
     help=f"A label of up to {MAX_KEY} characters; replaces what waits under the same one.",
 )
@@ -108,12 +108,12 @@ class _SayCommand(Command):
     metavar="SEC",
     help="Don't say the same again within SEC seconds; the same is its key, or else its text.",
 )
-@click.option("--id", metavar="ID", callback=filled, help="An id of your own: sent twice, it is spoken once.")
+@click.option("--id", metavar="ID", callback=word, help="An id of your own: sent twice, it is spoken once.")
 @click.option(
     "--as",
     "name",
     metavar="NAME",
-    callback=filled,
+    callback=word,
     envvar="TALK_NAME",
     show_envvar=True,
     help="What the sender calls itself.",
@@ -129,7 +129,7 @@ class _SayCommand(Command):
 @click.option(
     "--voice",
     metavar="VOICE",
-    callback=filled,
+    callback=word,
     shell_complete=complete.voices,
     help="Voice by id, name or language: see 'talk voices'.  [env var, with -o: TALK_VOICE]",
 )

@@ -10,7 +10,7 @@ import click
 from click.core import ParameterSource
 
 from talkcli.cli import complete, units
-from talkcli.cli.common import common, common_options, filled, number, seconds, talk_command
+from talkcli.cli.common import common, common_options, number, seconds, talk_command, word
 from talkcli.cli.show import note, show
 from talkcli.cli.usage import Number, WholeNumber
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE, Settings
@@ -76,7 +76,7 @@ def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int
     metavar="VOICE",
     envvar="TALK_VOICE",
     show_envvar=True,
-    callback=filled,
+    callback=word,
     shell_complete=complete.voices,
     help="Voice by id, name or language: see 'talk voices'.",
 )

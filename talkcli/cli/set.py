@@ -9,7 +9,7 @@ import click
 from talkcli.admission import PITCHES, RATES, VOLUMES
 from talkcli.cli import complete
 from talkcli.cli.asking import change
-from talkcli.cli.common import common, common_options, filled, number, seconds, talk_command
+from talkcli.cli.common import common, common_options, number, seconds, talk_command, word
 from talkcli.cli.usage import ASKING, Number, WholeNumber
 
 
@@ -31,7 +31,7 @@ from talkcli.cli.usage import ASKING, Number, WholeNumber
 @click.option(
     "--voice",
     metavar="VOICE",
-    callback=filled,
+    callback=word,
     shell_complete=complete.voices,
     help="Voice by id, name or language: see 'talk voices'; 'default' is the engine's own.",
 )

@@ -1,4 +1,4 @@
-"""Bytes that are no UTF-8 in what is to be spoken: each becomes U+FFFD, and words say where the first one is. Pure."""
+"""Bytes that are no UTF-8, in what is to be spoken and in other words that were typed. Pure."""
 
 from __future__ import annotations
 
@@ -8,11 +8,22 @@ _UNREADABLE = "\ufffd"
 _FIRST, _LAST = "\udc80", "\udcff"
 
 
+def decoded(text: str) -> str:
+    """Return a text that came as bytes, read as UTF-8 even where the locale made Python take arguments for ASCII."""
+    return text.encode(errors="surrogateescape").decode(errors="surrogateescape")
+
+
+def unreadable(text: str) -> int | None:
+    """Return the first byte of such a text that is no UTF-8, if there is one."""
+    return next((ord(each) - 0xDC00 for each in text if _FIRST <= each <= _LAST), None)
+
+
 def readable(text: str, line: int = 1) -> tuple[str, str | None]:
-    """Return a text without bytes that are no UTF-8, of the same length, and what is said of them, if there are any.
+    """Return a text with U+FFFD for each byte that is no UTF-8, and what is said of them, if there are any.
 
     `line`: the number of its first line.
     """
+    text = decoded(text)
     found = [place for place, each in enumerate(text) if _FIRST <= each <= _LAST]
     if not found:
         return text, None
