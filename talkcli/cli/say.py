@@ -106,7 +106,7 @@ class _SayCommand(Command):
     type=Number(0),
     callback=seconds,
     metavar="SEC",
-    help="Don't say the same again within SEC seconds; the same is its key, or else its text.",
+    help="Don't say the same again within SEC seconds; what is the same, --key says, or else the text.",
 )
 @click.option("--id", metavar="ID", callback=word, help="An id of your own: sent twice, it is spoken once.")
 @click.option(

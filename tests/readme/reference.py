@@ -45,9 +45,9 @@ def _table(parameters: list[click.Parameter], context: click.Context) -> str:
 
 
 def _words(text: str) -> str:
-    """Return help as it stands in a table: names of options and variables as code, no link made of brackets."""
+    """Return help as it stands in a table: what is typed, and names of variables, as code; no link made of brackets."""
     text = re.sub(r"(?<![\w`'-])(--[a-z][a-z-]*)", r"`\1`", _cell(text))
-    text = re.sub(r"'(talk [^']*|aplay [^']*|pactl [^']*|pw-cli [^']*)'", r"`\1`", text)
+    text = re.sub(r"'(-|default|talk [^']*|aplay [^']*|pactl [^']*|pw-cli [^']*)'", r"`\1`", text)
     text = re.sub(r"\b(TALK_[A-Z]+)\b", r"`\1`", text)
     return re.sub(r"\s+", " ", text).replace("<", "&lt;").replace("*", "\\*")
 
