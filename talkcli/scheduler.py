@@ -87,10 +87,10 @@ class Scheduler:
         """Return the goals with this key that have not ended."""
         return [each for each in (self.active, self._pending.with_key(key)) if each and each.key == key is not None]
 
-    def lacks_room(self, say: Say, now: Now) -> bool:
-        """Whether this goal would be REJECTED for no other reason than that the queue is full."""
+    def lacks_room(self, say: Say, now: Now, fault: tuple[str, str] | None = None) -> bool:
+        """Whether this goal would be REJECTED only because the queue is full; `fault` as in `submit`."""
         early = self._early.find(say.id, now.monotonic)
-        return not (early or self.has_room(say)) and self._refuse(say, None, None) is None
+        return not (early or self.has_room(say)) and self._refuse(say, fault, None) is None
 
     def has_room(self, say: Say) -> bool:
         """Whether a goal that lacked nothing but room need wait no longer."""

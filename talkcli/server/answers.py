@@ -106,7 +106,8 @@ class Answers:
         later, sender = self._service.later, connection.sender
         now = self._service.now()
         later.look_now()
-        if not (request.patient and self._scheduler.lacks_room(request, now)):
+        fault = self._service.voice_fault(request.voice)
+        if not (request.patient and self._scheduler.lacks_room(request, now, fault)):
             self._submit(connection, seq, request, sender)
         elif later.is_full(connection):
             self._submit(connection, seq, request, sender, TOO_MANY)

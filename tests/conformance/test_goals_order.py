@@ -151,6 +151,7 @@ def test_a_patient_goal_that_is_refused_for_another_reason_does_not_wait(make_ta
     queue(talk, 0)
     assert_rejected(submit(talk, "", patient=True), "invalid_text")
     assert_rejected(submit(talk, "length=0", patient=True, volume=2), "bad_option")
+    assert_rejected(submit(talk, "length=0", patient=True, voice="nobody's"), "unknown_voice")
     assert talk.request("cancel")["count"] == 2
 
 

@@ -52,8 +52,8 @@ class Robot:
     def says(self, text: str = "door open", *, preempt: bool | None = None, priority: int = 0) -> Record:
         return self.asks(Say(text, preempt=preempt, priority=priority))
 
-    def lacks_room(self, say: Say) -> bool:
-        return self.scheduler.lacks_room(say, self.now)
+    def lacks_room(self, say: Say, fault: tuple[str, str] | None = None) -> bool:
+        return self.scheduler.lacks_room(say, self.now, fault)
 
     def cancels(self, *ids: str, current: bool = False, before: str | None = None, key: str | None = None) -> Cancelled:
         done = self.scheduler.cancel(Cancel(ids or None, current, before, key), DOOR, self.now)

@@ -50,8 +50,8 @@ class SideBySide:
         first = self.model.first_of(wish)
         refusals = self.model.refusals(wish, fault)
         before = list(self.real.pending()), self.real.unfinished()
-        could_wait = self.real.lacks_room(say, self.now)
         outside = ("unknown_voice", "no such voice") if fault == "unknown_voice" else None
+        could_wait = self.real.lacks_room(say, self.now, outside)
         done = self.real.submit(say, sender, self.now, outside)
         if done.attached:
             assert not could_wait

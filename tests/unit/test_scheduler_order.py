@@ -214,6 +214,7 @@ def test_a_goal_that_could_wait_for_room_is_known() -> None:
         assert not robot.lacks_room(fits)
     for would_not_help in (Say(""), Say("x", rate=1), Say("y", id="mine"), Say("z", id="mine")):
         assert not robot.lacks_room(would_not_help)
+    assert not robot.lacks_room(Say("x"), ("unknown_voice", "no such voice"))
     robot.cancels("early")
     assert not robot.lacks_room(Say("x", id="early")), "it is RECALLED at once"
     robot.cancels(waiting.id)
