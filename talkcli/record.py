@@ -154,5 +154,5 @@ class Record:
             queued_at=self.queued_at,
             started_at=started_at,
             ended_at=None if accepted else self.ended_at,
-            duration=self.duration,
+            duration=None if accepted else self.duration,
         )

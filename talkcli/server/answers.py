@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from talkcli import __version__, wire
@@ -156,11 +157,23 @@ class Answers:
         for record in records:
             if not record.state.terminal:
                 self._service.audience.await_result(record.id, connection, feedback=request.feedback)
-        goals = [record.snapshot().to_json() for record in records]
-        # Of those that have ended, whose results are told here and not by the audience, there may be a thousand.
-        ended = [goal for record, goal in zip(records, goals, strict=True) if record.state.terminal]
-        results: Iterator[JsonObject] = ({"event": "result", "goal": each} for each in ended)
-        connection.stream((wire.item(seq, goal=each) for each in goals), wire.ok(seq, count=len(goals)), results)
+        # As they are now: what becomes of them meanwhile is told by the events that come after the list. Of a thousand
+        # that have ended, each is looked at when its turn comes to be sent.
+        active = self._scheduler.active
+        spoken = active.snapshot() if active else None
+        states = [record.state for record in records]
+
+        def goals() -> Iterator[JsonObject]:
+            for record, state in zip(records, states, strict=True):
+                goal = spoken if spoken and record is active else record.snapshot(state)
+                yield wire.item(seq, goal=goal.to_json())
+
+        def results() -> Iterator[JsonObject]:
+            for record, state in zip(records, states, strict=True):
+                if state.terminal:  # the audience tells the others'
+                    yield {"event": "result", "goal": record.snapshot().to_json()}
+
+        connection.stream(goals(), wire.ok(seq, count=len(records)), results())
 
     def _cancel(self, connection: Connection, seq: int | None, request: Cancel) -> None:
         recalled = self._service.later.cancel(request, By(client=connection.sender))
@@ -296,11 +309,11 @@ class Answers:
         ended = list(done.recalled)
         if done.stopping and done.stopping.state is not State.SUCCEEDED:
             ended.append(done.stopping)
-        items = [wire.item(seq, canceled=each.snapshot().to_json()) for each in ended]
-        items += [wire.item(seq, ended=each.snapshot().to_json()) for each in done.ended]
+        canceled = (wire.item(seq, canceled=each.snapshot().to_json()) for each in ended)
+        before = (wire.item(seq, ended=each.snapshot().to_json()) for each in done.ended)
         if done.unknown:
             words = ", ".join(repr(each) for each in done.unknown)
             reply = wire.failure(seq, UnknownGoal.code, f"no goal {words} is known: see `talk status`")
         else:
             reply = wire.ok(seq, count=len(ended))
-        connection.stream(items, reply)
+        connection.stream(chain(canceled, before), reply)

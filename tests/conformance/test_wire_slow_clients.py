@@ -42,6 +42,10 @@ ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)
 HELLO = b'{"request": "hello"}\n'
 
 
+def line(**fields: object) -> bytes:
+    return json.dumps(fields).encode() + b"\n"
+
+
 @contextlib.contextmanager
 def others_served(talk: Talk, speak: str | None = None) -> Iterator[list[float]]:
     """Ask for the status all the time, on a connection of its own, and say something at the end; gives the times."""
@@ -182,6 +186,29 @@ def test_what_waits_for_all_clients_together_has_a_limit(scripted: Talk) -> None
     assert grown < 128, f"{grown:.0f} MiB"
     assert 20 < clients < 100, "those for which there is room stay, and no more"
     assert_told_in_order(scripted)  # to who reads
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the memory of a process is not told here")
+@pytest.mark.parametrize("asked", ["wait", "cancel"])
+def test_lists_that_nobody_reads_take_no_more_memory_than_what_may_wait_of_them(
+    make_talk: MakeTalk, asked: str
+) -> None:
+    count, clients = 1_000, 40
+    talk = make_talk("--max-queue", str(count), scripted=True)
+    with talk.connect() as wire, contextlib.ExitStack() as stack:
+        wire.send_raw(line(request="pause") + line(request="say", text="length=0") * count)
+        assert wire.request("cancel")["count"] == count
+        ids = [each["canceled"]["id"] for each in wire.items if "canceled" in each]
+        before = peak_memory(talk.pid)
+        raws = [stack.enter_context(Raw(talk.socket)) for _ in range(clients)]
+        for each in raws:
+            each.send(line(request=asked, ids=ids))
+        for each in raws:
+            each.socket.recv(4_096, socket.MSG_WAITALL)  # its list has begun
+        assert wire.request("status")["ok"]
+        grown = (peak_memory(talk.pid) - before) / 1024
+    # A quarter of a megabyte waits for each, half a megabyte at most while that is sent.
+    assert grown < clients * 0.6, f"{grown:.0f} MiB"
 
 
 def test_slow_clients_are_closed_by_limits_of_a_tenth(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
