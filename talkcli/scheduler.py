@@ -23,7 +23,7 @@ from talkcli.selection import making_way, select
 from talkcli.states import IllegalTransition, State
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
     from talkcli.effects import Effect, Now
     from talkcli.messages import Sender
@@ -95,7 +95,7 @@ class Scheduler:
     def has_room(self, say: Say) -> bool:
         """Whether a goal that lacked nothing but room need wait no longer."""
         attaches = say.id is not None and self.find(say.id) is not None
-        return self._closing or attaches or self._way(say) is not None
+        return attaches or self._way(say) is not None
 
     def unfinished(self) -> list[Record]:
         """Return the active goal and the pending ones."""
@@ -135,11 +135,16 @@ class Scheduler:
         effects += self._make_way(record, way or [], now)
         return Submitted(record, effects + self._start_next(now))
 
-    def cancel(self, selection: Cancel, sender: Sender | None, now: Now) -> Cancelled:
-        """End what is selected: pending goals at once, the active one as soon as the engine is silent."""
+    def cancel(
+        self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
+    ) -> Cancelled:
+        """End what is selected: pending goals at once, the active one as soon as the engine is silent.
+
+        `waiting`: ids that it selects of goals that have not been submitted yet.
+        """
         done = Cancelled()
         by = By(client=sender)
-        chosen = select(selection, self, done)
+        chosen = select(selection, self, done, waiting)
         for goal_id in filter(is_clients_id, done.unknown):
             self._early.note(goal_id, by, now.monotonic)
         for record in chosen:

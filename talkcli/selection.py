@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from talkcli.effects import Cancelled
     from talkcli.pending import Pending
@@ -17,25 +17,28 @@ if TYPE_CHECKING:
     from talkcli.scheduler import Scheduler
 
 
-def select(selection: Cancel, goals: Scheduler, done: Cancelled) -> list[Record]:
-    """Return the selected goals that have not ended; note in `done` what else was named."""
+def select(selection: Cancel, goals: Scheduler, done: Cancelled, waiting: Collection[str | None] = ()) -> list[Record]:
+    """Return the selected goals that have not ended; note in `done` what else was named.
+
+    `waiting`: ids of the selected ones that are not accepted yet: they are known, and come after all that are.
+    """
     if selection.everything:
         chosen = goals.unfinished()
     else:
-        chosen = [*_named(selection, goals, done), *goals.with_key(selection.key)]
+        chosen = [*_named(selection, goals, done, waiting), *goals.with_key(selection.key)]
         if selection.current and goals.active:
             chosen.append(goals.active)
         if selection.before is not None:
-            chosen += _accepted_until(selection.before, goals, done)
+            chosen += _accepted_until(selection.before, goals, done, waiting)
     once = {each.number: each for each in chosen}.values()
     # The active one last: another must not start, even for the length of this step, and be stopped again.
     return sorted(once, key=lambda each: (each is goals.active, each.number))
 
 
 def select_waiting(selection: Cancel, waiting: Sequence[Say]) -> list[int]:
-    """Return which of the goals that wait for room are selected: their places in the order in which they came.
+    """Return which of the goals that are not accepted yet are selected: their places in the order in which they came.
 
-    None of them is accepted yet: `before` selects them only where it names one of them, by its sender's id.
+    `before` selects them only where it names one of them, by its sender's id.
     """
     ids = set(selection.ids or ())
     last = max((place for place, say in enumerate(waiting) if say.id == selection.before), default=-1)
@@ -70,19 +73,22 @@ def _outdone(say: Say, pending: Pending, *, preempts: bool) -> list[tuple[Record
     return [(replaced, "replaced"), *preempted] if replaced else preempted
 
 
-def _named(selection: Cancel, goals: Scheduler, done: Cancelled) -> Iterator[Record]:
+def _named(selection: Cancel, goals: Scheduler, done: Cancelled, waiting: Collection[str | None]) -> Iterator[Record]:
     for goal_id in dict.fromkeys(selection.ids or ()):
         record = goals.find(goal_id)
         if record is None:
-            done.unknown.append(goal_id)
+            if goal_id not in waiting:
+                done.unknown.append(goal_id)
         elif record.state.terminal:
             done.ended.append(record)
         else:
             yield record
 
 
-def _accepted_until(goal_id: str, goals: Scheduler, done: Cancelled) -> list[Record]:
+def _accepted_until(goal_id: str, goals: Scheduler, done: Cancelled, waiting: Collection[str | None]) -> list[Record]:
     last = goals.find(goal_id)
+    if last is None and goal_id in waiting:
+        return goals.unfinished()
     if last is None:
         done.unknown.append(goal_id)
         return []

@@ -13,7 +13,6 @@ from talkcli.errors import UnknownGoal
 from talkcli.messages import By
 from talkcli.requests import Cancel, Log, Pause, Request, Resume, Say, Set, Status, Voices, Wait, Watch
 from talkcli.server import log
-from talkcli.server.later import MAX_WAITING
 from talkcli.server.pauses import Pauses
 from talkcli.states import State
 from talkcli.values import replace
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
 
 #: Ended goals that `status` lists.
 RECENT = 10
-#: Why a goal is REJECTED of whose client as many requests wait as may: reason and words.
-TOO_MANY = "queue_full", f"{MAX_WAITING:,} requests of this connection are waiting already"
 
 
 class Answers:
@@ -58,16 +55,17 @@ class Answers:
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
         """Carry out a request, and answer it now or later."""
         later = self._service.later
-        if isinstance(request, Cancel) or (isinstance(request, Pause) and later.holds(connection)):
-            later.voices_known()  # silence waits for nothing; what was asked for before it comes before it
+        if isinstance(request, Cancel | Pause):
+            later.hurry(connection)  # silence waits for nothing; what was asked for before it comes before it
         elif later.holds(connection) or self._awaits_voices(request):
-            if not later.is_full(connection):
-                later.until_voices(connection, lambda: self._carry_out(connection, seq, request))
+            fault = later.too_many(connection, request)
+            if fault is None:
+                later.until_voices(connection, request, lambda by: self._go(connection, seq, request, by))
                 return
             if isinstance(request, Say):
-                self._submit(connection, seq, request, connection.sender, TOO_MANY)
+                self._submit(connection, seq, request, connection.sender, fault)
                 return
-            later.voices_known()
+            later.hurry(connection)
         self._carry_out(connection, seq, request)
 
     def left(self, connection: Connection) -> None:
@@ -86,6 +84,13 @@ class Answers:
         self.pauses.ended(record)
 
     # -- one method a request
+
+    def _go(self, connection: Connection, seq: int | None, request: Request, by: By | None) -> Submitted | None:
+        """Carry out a request that has waited for the voices; with `by`, it is a goal that was cancelled meanwhile."""
+        if by and isinstance(request, Say):
+            return self._submit(connection, seq, request, connection.sender, canceled=by)
+        self._carry_out(connection, seq, request)
+        return None
 
     def _carry_out(self, connection: Connection, seq: int | None, request: Request) -> None:
         try:
@@ -108,16 +113,14 @@ class Answers:
         now = self._service.now()
         later.look_now()
         fault = self._service.voice_fault(request.voice)
-        if not (request.patient and self._scheduler.lacks_room(request, now, fault)):
-            self._submit(connection, seq, request, sender)
-        elif later.is_full(connection):
-            self._submit(connection, seq, request, sender, TOO_MANY)
-        else:
-            later.until_room(
-                connection,
-                request,
-                lambda canceled: self._submit(connection, seq, request, sender, canceled=canceled),
-            )
+        if request.patient and self._scheduler.lacks_room(request, now, fault):
+            fault = later.too_many(connection, request)
+            if fault is None:
+                later.until_room(
+                    connection, request, lambda by: self._submit(connection, seq, request, sender, canceled=by)
+                )
+                return
+        self._submit(connection, seq, request, sender, fault)
 
     def _submit(
         self,
@@ -176,16 +179,23 @@ class Answers:
         connection.stream(goals(), wire.ok(seq, count=len(records)), results())
 
     def _cancel(self, connection: Connection, seq: int | None, request: Cancel) -> None:
-        recalled = self._service.later.cancel(request, By(client=connection.sender))
-        done = self._scheduler.cancel(request, connection.sender, self._service.now())
-        done.ended = [each for each in done.ended if each not in recalled]
-        done.recalled += recalled
+        later, now = self._service.later, self._service.now()
+        waiting = later.choose(request, By(client=connection.sender))
+        ids = {each.request.id for each in waiting if isinstance(each.request, Say)}
+        # The engine is told before thousands of clients may be.
+        done = self._scheduler.cancel(request, connection.sender, now, ids)
         self._service.apply(done.effects)
-        if done.stopping is None or done.stopping.state.terminal:
-            self._report_cancel(connection, seq, done)
-        else:
-            connection.owed += 1
-            self._cancels.append((connection, seq, done))
+        connection.owed += 1
+
+        def answer() -> None:
+            done.recalled += [each.ended for each in waiting if each.ended]
+            if done.stopping is None or done.stopping.state.terminal:
+                self._report_cancel(connection, seq, done)
+                connection.settle()
+            else:
+                self._cancels.append((connection, seq, done))
+
+        later.end(answer)
 
     def _status(self, connection: Connection, seq: int | None, request: Status) -> None:
         if request.id is None:
@@ -224,6 +234,7 @@ class Answers:
         changed = {name: getattr(request, name) for name in request.fields if getattr(request, name) is not None}
         scheduler.preempt = changed.get("preempt", scheduler.preempt)
         scheduler.ttl = changed.get("ttl", scheduler.ttl)
+        service.later.look()  # what preempts may have room
         service.settings = replace(service.settings, **changed)
         if changed:
             values = ", ".join(f"{name} {value}" for name, value in changed.items())

@@ -20,6 +20,7 @@ from talkcli.engine.reports import EngineDied, EngineMissing, EngineSaid, Report
 from talkcli.engine.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.messages import Sender
+from talkcli.requests import Cancel
 from talkcli.scheduler import Scheduler
 from talkcli.server import log
 from talkcli.server.answers import Answers
@@ -28,6 +29,7 @@ from talkcli.server.clock import LOOK_EVERY, elapsed
 from talkcli.server.later import Later
 from talkcli.server.mailbox import Mailbox
 from talkcli.server.stream import Streams
+from talkcli.states import State
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -82,7 +84,8 @@ class Service:
         self.began = self._now()
         self._loop = asyncio.get_running_loop()
         self.audience = Audience(self._loop)
-        self.later = Later(self._loop, self.audience, self.scheduler.has_room, self.failed)
+        self.streams = Streams(self._loop)
+        self.later = Later(self._loop, self.streams, self.audience, self.scheduler.has_room, self.failed)
         self._answers = Answers(self)
         #: whether it was told to end, and takes no goal any more
         self.closing = False
@@ -102,7 +105,6 @@ class Service:
             EngineMissing: self._missing,
             ThreadDied: self._thread_died,
         }
-        self.streams = Streams(self._loop)
         #: whether the engine was told that a goal waits behind the one it has in hand
         self._followed = False
 
@@ -191,10 +193,8 @@ class Service:
                 self.failed(type(effect).__name__, error)
         self._tell_followed()
         self._set_timer()
-        self.later.look()
         self.changed()
-        if self.closing and self.scheduler.active is None:
-            self.finished.set()
+        self._look_finished()
 
     def _carry_out(self, effect: Effect) -> None:
         if isinstance(effect, Changed):
@@ -213,6 +213,8 @@ class Service:
     def _changed(self, change: Changed) -> None:
         record = change.record
         self.audience.changed(record, change.state, time.time())
+        if change.state is not State.REJECTED:
+            self.later.look()
         if change.state.terminal:
             began = self._started.pop(record.id, None)
             log.ended(record, None if began is None else time.monotonic() - began)
@@ -358,8 +360,14 @@ class Service:
         """End every goal; `finished` is set once it is silent."""
         self.closing = True
         self.engine_known.set()
+        self.later.choose(Cancel(), None)
         self.apply(self.scheduler.shutdown(self._now()))
         self.later.voices_known()
+        self.later.end(self._look_finished)
+
+    def _look_finished(self) -> None:
+        if self.closing and self.scheduler.active is None and not self.later.ends_goals:
+            self.finished.set()
 
 
 def _is_told(effect: Effect) -> bool:

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -15,9 +16,13 @@ from tests.conformance.witness import states
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
+    import pathlib
+
     from tests.conftest import MakeTalk
     from tests.support.connection import Message, Wire
     from tests.support.processes import Talk
+
+ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 
 def begin(talk: Talk, text: str = "never-ends words=1", **fields: object) -> str:
@@ -203,6 +208,79 @@ def test_a_thousand_goals_of_one_connection_wait_for_room_and_no_more(make_talk:
     assert ends == [f"length=0 line {number}" for number in replies]
     assert len(spoken(talk)) == 1
     assert_told_in_order(talk)
+    told = [each["state"] for each in talk.watcher.events() if each["event"] == "state"]
+    # What is being spoken is stopped before a thousand are told that they never will be.
+    assert told.index("PREEMPTING") < told.index("PENDING", 3)
+
+
+def test_all_hear_of_a_cancel_that_ends_more_than_may_wait_for_them(make_talk: MakeTalk) -> None:
+    count = 800
+    talk = make_talk("--max-queue", "1", scripted=True)
+    begin(talk)
+    queue(talk, 0)
+    text = "length=0 " + "w" * 9_900  # 20 kB are told of each, four times what may wait in all
+    with contextlib.ExitStack() as stack:
+        sender, one, other = (stack.enter_context(talk.connect()) for _ in range(3))
+        for number in range(count):
+            sender.send({"request": "say", "text": text, "id": f"goal/{number}", "patient": True, "wait": True})
+        assert sender.request("hello")["ok"]
+        with ThreadPoolExecutor() as pool:
+            results = pool.submit(lambda: [sender.receive_event("result")["goal"] for _ in range(count)])
+            replies = [
+                pool.submit(one.request, "cancel", timeout=10),
+                pool.submit(other.request, "cancel", timeout=10, ids=[f"goal/{count - 1}"]),
+            ]
+            ends = [(each["id"], each["state"]) for each in results.result()]
+            assert all(each.result()["ok"] for each in replies), "one that is being ended is known"
+    assert ends == [(f"goal/{number}", "RECALLED") for number in range(count)]
+    talk.watcher.wait_for(f"goal/{count - 1}", "RECALLED")
+    assert_told_in_order(talk)
+
+
+def test_all_hear_of_the_server_s_end_where_it_is_more_than_may_wait_for_them(make_talk: MakeTalk) -> None:
+    count = 150
+    talk = make_talk("--max-queue", "1", scripted=True)
+    begin(talk)
+    queue(talk, 0)
+    with talk.connect() as wire, ThreadPoolExecutor() as pool:
+        for _ in range(count):
+            waits(wire, "🤖" * 9_900)
+        reasons = pool.submit(lambda: [wire.receive_event("result")["goal"]["reason"] for _ in range(count)])
+        talk.stop()
+        assert reasons.result() == ["shutdown"] * count
+
+
+#: Serves with the scripted engine, and logs how often it looks which goals have room.
+COUNTING = """
+import sys
+sys.path.insert(0, {root!r})
+from talkcli.server import later, log
+from tests.support import scripted_serve
+let_go = later.Later._let_go
+def counted(self):
+    log.line("looks for room")
+    let_go(self)
+later.Later._let_go = counted
+scripted_serve.main()
+"""
+
+
+def test_room_is_looked_for_only_when_the_queue_has_changed(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
+    program = tmp_path / "serve.py"
+    program.write_text(COUNTING.format(root=ROOT))
+    talk = make_talk("--max-queue", "1", program=str(program))
+    begin(talk)
+    queue(talk, 0)
+    with talk.connect() as wire:
+        waits(wire, "patient")
+        before = talk.log.count("looks for room")
+        for _ in range(20):
+            assert_rejected(submit(talk, "length=0"), "queue_full")
+        assert talk.log.count("looks for room") == before
+        submit(talk, "length=0", priority=1)
+        assert talk.request("hello")["ok"]
+        assert talk.log.count("looks for room") > before
+        assert talk.request("cancel")["ok"]
 
 
 # -- a cancel ends what waits for room, too

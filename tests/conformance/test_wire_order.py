@@ -176,6 +176,36 @@ def test_requests_that_wait_for_the_voices_keep_their_order(make_talk: MakeTalk,
     assert spoken == ([*expected, "last"] if behind == "nothing" else expected[: len(spoken)])
 
 
+def test_a_cancel_or_a_pause_does_not_hurry_what_others_wait_for(make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True, env={"SCRIPTED_START": "slow=0.5"})
+    with talk.connect() as asking, talk.connect() as canceling, talk.connect() as pausing:
+        requests: list[dict[str, Any]] = [
+            {"request": "voices"},
+            {"request": "set", "voice": "nonsense"},
+            {"request": "say", "text": "length=0 one", "voice": "default", "id": "one"},
+            {"request": "say", "text": "length=0 two", "voice": "nonsense", "id": "two", "wait": True},
+            {"request": "say", "text": "length=0 three", "voice": "nonsense"},
+        ]
+        asking.send_raw(b"".join(line(seq=seq, **each) for seq, each in enumerate(requests, 5_000)))
+        assert canceling.request("cancel", key="nobody")["count"] == 0
+        assert canceling.request("cancel", ids=["two"])["count"] == 1
+        assert asking.receive_event("result")["goal"]["state"] == "RECALLED"
+        pausing.send({"request": "set", "voice": "default"})
+        assert pausing.request("pause")["ok"]
+        assert pausing.request("resume")["ok"]
+        assert asking.request("hello")["ok"]
+        replies: dict[int, Any] = {}
+        while 5_004 not in replies:
+            message = asking.items.pop(0) if asking.items else asking.receive()
+            if "ok" in message:
+                replies[message["seq"]] = message
+    assert replies[5_000]["count"] > 0
+    assert replies[5_001]["error"]["code"] == "unknown_voice"
+    assert replies[5_002]["goal"]["state"] == "PENDING"
+    assert replies[5_004]["goal"]["reason"] == "unknown_voice"
+    assert talk.watcher.wait_for_terminal("one") == "SUCCEEDED"
+
+
 def test_past_a_thousand_requests_that_wait_for_the_voices_goals_are_rejected(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "5000", scripted=True, env={"SCRIPTED_START": "slow=2"})
     with talk.connect() as wire:

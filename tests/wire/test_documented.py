@@ -18,7 +18,7 @@ from talkcli.messages import Goal
 from talkcli.requests import KINDS, MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
 from talkcli.server import connection, stream
 from talkcli.server.answers import RECENT
-from talkcli.server.later import MAX_WAITING
+from talkcli.server.later import ALL_WAITING, EACH, MAX_WAITING
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
 from talkcli.states import State
 from tests.wire.readme import ROOT, examples, first_column, section, tables, words
@@ -181,7 +181,10 @@ def test_limits_are_those_of_the_code() -> None:
     assert f"past {stream.ALL_OUTPUT // 2**20} MiB for all" in limits["clients that don't read"]
     assert limits["clients"].startswith(f"{MAX_CLIENTS} ")
     assert limits["queue"].startswith(f"{MAX_QUEUE} ")
-    assert limits["requests that wait"].startswith(f"{MAX_WAITING:,} ")
+    assert limits["requests that wait"].startswith(
+        f"{MAX_WAITING:,} of one connection, and {ALL_WAITING >> 20} MiB for all"
+    )
+    assert f"and {EACH >> 10} KiB)" in limits["requests that wait"]
 
 
 def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
