@@ -1,0 +1,280 @@
+"""Writes down the surface of `talk`: help, errors, exit codes, the library, what the wire says to each request.
+
+    python -m tests.golden.surface          writes tests/golden/*.txt anew; `git diff` shows what has changed
+
+Each file is one kind of promise, and each line of it can be read. What differs from run to run stands as its type.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import talkcli
+from talkcli import errors
+from talkcli.cli.commands import COMMANDS
+from tests.conformance.bareserve import TALK, environment, run
+from tests.support.processes import Talk
+from tests.support.surroundings import short_directory
+from tests.wire.test_recorded import VARIES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+HERE = Path(__file__).parent
+
+#: Command lines that are wrong, or find no server. Each is shown with its exit code and what it says.
+ERRORS = (
+    "nonsense",
+    "sey hello",
+    "--sockt /x status",
+    "--socket '' status",
+    "status --json --json extra words",
+    "say",
+    "say ''",
+    "say '  '",
+    "say hello",
+    "say --wait hello",
+    "say --prempt hello",
+    "say -t 5 hello",
+    "say -wt 0 hello",
+    "say -wt never hello",
+    "say --preempt --queue --flush hello",
+    "say --queue --flush hello",
+    "say --priority high hello",
+    "say --priority 1000001 hello",
+    "say --ttl -1 hello",
+    "say --ttl nan hello",
+    "say --key '' hello",
+    "say --throttle -1 hello",
+    "say --id '' hello",
+    "say --id 4k7f-12 hello",
+    "say --id 12 hello",
+    "say --id 'a b' hello",
+    "say --as '' hello",
+    "say --rate 79 hello",
+    "say --rate 451 hello",
+    "say --rate 99.5 hello",
+    "say --volume 1.1 hello",
+    "say --volume loud hello",
+    "say --pitch 101 hello",
+    "say --voice '' hello",
+    "say -o",
+    "say -o '' hello",
+    "say -o /nowhere/x.wav hello",
+    "say -o x.wav --key k hello",
+    "say --lines hello",
+    "say -- ''",
+    "wait --timeout -1",
+    "wait -t 0.1",
+    "wait ''",
+    "cancel",
+    "cancel ''",
+    "cancel --before ''",
+    "cancel --key ''",
+    "status",
+    "status a b",
+    "status ''",
+    "--json status",
+    "watch",
+    "watch now",
+    "log",
+    "log -n 0",
+    "log -n 1201",
+    "set",
+    "set --rate 5",
+    "set --ttl -1",
+    "set --preempt --no-preempt --rate x",
+    "pause",
+    "resume",
+    "voices",
+    "voices --language ''",
+    "serve --rate 5",
+    "serve --volume 2",
+    "serve --pitch -1",
+    "serve --max-queue 0",
+    "serve --max-text 10001",
+    "serve --max-clients 0",
+    "serve --lead-in 5001",
+    "serve --socket-mode 0888",
+    "serve --socket-mode 0066",
+    "serve --player null --device x",
+    "serve --player file:",
+    "serve --player null --driver parrot",
+    "serve --print-unit nonsense",
+    "serve now",
+    "completion",
+    "completion tcsh",
+    "doctor now",
+)
+
+#: A conversation with a server that has the scripted engine: each request that there is, and some that there is not.
+REQUESTS: tuple[dict[str, Any], ...] = (
+    {"request": "hello", "name": "golden"},
+    {"seq": 1, "request": "voices"},
+    {"seq": 2, "request": "status"},
+    {"seq": 3, "request": "set"},
+    {"seq": 4, "request": "set", "rate": 150, "volume": 0.5, "voice": "en", "pitch": 60, "preempt": True, "ttl": 9},
+    {"seq": 5, "request": "set", "rate": 1},
+    {"seq": 6, "request": "watch"},
+    {"seq": 7, "request": "pause"},
+    {"seq": 8, "request": "say", "text": "one length=0", "wait": True, "feedback": True, "id": "a/1", "preempt": False},
+    {
+        "seq": 9,
+        "request": "say",
+        "text": "two",
+        "key": "k",
+        "priority": 3,
+        "ttl": 60,
+        "rate": 90,
+        "volume": 1,
+        "pitch": 1,
+        "data": {"a": 1},
+    },
+    {"seq": 10, "request": "say", "text": "three", "key": "k", "priority": 3, "preempt": False, "voice": "en"},
+    {"seq": 11, "request": "say", "text": "four", "throttle": 5, "flush": True, "preempt": False},
+    {"seq": 12, "request": "say", "text": "five", "format": "ssml"},
+    {"seq": 13, "request": "say", "text": ""},
+    {"seq": 14, "request": "say", "text": "six", "voice": "parrot"},
+    {"seq": 15, "request": "say", "text": "one length=0 more", "id": "a/1"},
+    {"seq": 16, "request": "say", "text": "seven", "id": "4k7f-3"},
+    {"seq": 17, "request": "say", "text": "eight", "rate": 200.5},
+    {"seq": 18, "request": "say", "text": "nine", "louder": True},
+    {"seq": 19, "request": "say"},
+    {"seq": 20, "request": "shout"},
+    {"seq": 21},
+    {"seq": "22", "request": "status"},
+    {"seq": 23, "request": "status", "id": "a/1"},
+    {"seq": 24, "request": "status", "id": "nobody"},
+    {"seq": 25, "request": "wait", "ids": ["nobody"]},
+    {"seq": 26, "request": "cancel", "ids": ["nobody", "later.1"], "before": "nowhere"},
+    {"seq": 27, "request": "cancel", "key": "k"},
+    {"seq": 28, "request": "cancel", "current": True},
+    {"seq": 29, "request": "say", "text": "ten", "id": "later.1"},
+    {"seq": 30, "request": "resume"},
+    {"seq": 31, "request": "wait"},
+    {"seq": 32, "request": "wait", "ids": ["a/1"], "feedback": True},
+    {"seq": 33, "request": "log", "count": 3},
+    {"seq": 34, "request": "log", "count": 0},
+    {"seq": 35, "request": "cancel"},
+)
+
+
+def surface() -> dict[str, str]:
+    """Return every file of the surface: its name, without ending, and what it has."""
+    found = {f"help-{name or 'talk'}": text for name, text in _helps()}
+    return {**found, "errors": _errors(), "library": _library(), "wire": _wire()}
+
+
+def write() -> None:
+    """Write the files anew; one that is of no use any more goes."""
+    for each in HERE.glob("*.txt"):
+        each.unlink()
+    for name, text in surface().items():
+        (HERE / f"{name}.txt").write_text(text, encoding="utf-8")
+
+
+def _alone(home: str, words: list[str]) -> tuple[int, str, str]:
+    """Run `talk` where there is no server and no sound; return its exit code and what it wrote, without the place."""
+    done = run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", COLUMNS="80", PULSE_SERVER="unix:/nowhere"))
+    return done.code, done.out.replace(home, "HOME"), done.err.replace(home, "HOME")
+
+
+def _helps() -> Iterator[tuple[str, str]]:
+    with short_directory() as home:
+        for name in ("", *COMMANDS):
+            code, out, err = _alone(home, [*([name] if name else []), "--help"])
+            assert (code, err) == (0, ""), name
+            yield name, out
+
+
+def _errors() -> str:
+    told = []
+    with short_directory() as home:
+        for line in ERRORS:
+            code, out, err = _alone(home, shlex.split(line))
+            told.append(f"$ talk {line}\n{_indented(out)}{_indented(err, '! ')}= {code}\n")
+    return "\n".join(told)
+
+
+def _indented(text: str, mark: str = "  ") -> str:
+    return "".join(f"{mark}{each}\n" for each in text.splitlines())
+
+
+def _library() -> str:
+    """Return what `from talkcli import …` gives: each name, its signature, what is public in it; and the errors."""
+    lines = [f"__all__ = {talkcli.__all__}"]
+    for name in talkcli.__all__:
+        found = getattr(talkcli, name)
+        if isinstance(found, type):
+            lines += ["", f"class {name}", *_members(found)]
+    lines += ["", "errors"]
+    for each in vars(errors).values():
+        if isinstance(each, type) and issubclass(each, errors.TalkError):
+            (base, *_) = each.__bases__
+            lines.append(f"    {each.__name__}({base.__name__}): code {each.code}, exit {each.exit_code}")
+    return "\n".join(lines) + "\n"
+
+
+def _members(found: type) -> Iterator[str]:
+    if hasattr(found, "__members__"):
+        yield from (f"    {each.name} = {each.value}" for each in found)  # type: ignore[attr-defined]
+        return
+    if "__init__" in vars(found) and not vars(found).get("__annotations__"):
+        yield f"    def __init__{_signature(found.__init__)}"  # type: ignore[misc]
+    yield from (f"    {name}: {kind}" for name, kind in inspect.get_annotations(found).items())
+    for name, member in sorted(vars(found).items()):
+        if name.startswith("_"):
+            continue
+        if isinstance(member, property):
+            yield f"    {name}: {inspect.signature(member.fget).return_annotation}"  # type: ignore[arg-type]
+        elif callable(member):
+            yield f"    def {name}{_signature(member)}"
+
+
+def _signature(found: Any) -> str:
+    return str(inspect.signature(found))
+
+
+def _wire() -> str:
+    """Return what a server with the scripted engine says to each of the requests, in its order."""
+    talk = Talk(scripted=True)
+    try:
+        with talk.connect() as wire:
+            boot = str(wire.greeting["boot"])
+            lines = [f"< {_told(wire.greeting)}"]
+            for request in REQUESTS:
+                wire.send(request)
+                lines.append(f"> {json.dumps(request)}")
+                # The one goal that is left is spoken then, to its result.
+                awaited = {"ok", "result"} if request.get("request") == "resume" else {"ok"}
+                while awaited:
+                    message = wire.receive()
+                    lines.append(f"< {_told(message)}")
+                    awaited -= {"ok"} & message.keys() | {str(message.get("event"))}
+        talk.stop()
+    finally:
+        talk.close()
+    return "\n".join(lines).replace(f"{boot}-", "BOOT-") + "\n"
+
+
+def _told(message: Mapping[str, Any]) -> str:
+    return json.dumps(_steady(message))
+
+
+def _steady(value: Any, name: str = "") -> Any:
+    """Return a message with the type in the place of what differs from run to run; messages for people stay."""
+    if isinstance(value, dict):
+        return {key: _steady(each, key) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_steady(each) for each in value]
+    if name in VARIES - {"message", "clients"} or name == "boot":
+        return "null" if value is None else type(value).__name__
+    return value
+
+
+if __name__ == "__main__":
+    write()
