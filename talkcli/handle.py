@@ -18,12 +18,25 @@ from talkcli.states import State
 from talkcli.values import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
+    from typing import Protocol
     from weakref import WeakSet
 
-    from talkcli.client import Client
+    from talkcli.connection import Connection
     from talkcli.events import Event
     from talkcli.messages import Goal, JsonObject
+    from talkcli.replies import Canceled
+
+    class Client(Protocol):
+        """What a handle needs of the client that made it."""
+
+        _connection: Connection
+
+        def cancel(self, ids: Iterable[str] | None = None) -> Canceled: ...
+
+        def goal(self, goal_id: str) -> Goal: ...
+
+        def _follow_late(self, handle: GoalHandle, *, feedback: bool) -> None: ...
 
 
 class GoalHandle:

@@ -18,8 +18,8 @@ from talkcli.values import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from talkcli.client import ServerStatus
     from talkcli.messages import Goal, JsonObject
+    from talkcli.replies import ServerStatus
 
 #: Characters of a text that a list shows.
 MAX_TEXT = 200

@@ -9,15 +9,26 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
+    from typing import Protocol
 
     from talkcli.effects import Cancelled
     from talkcli.pending import Pending
     from talkcli.record import Record
     from talkcli.requests import Cancel, Say
-    from talkcli.scheduler import Scheduler
+
+    class Goals(Protocol):
+        """What there is to select from: the scheduler's goals."""
+
+        active: Record | None
+
+        def find(self, goal_id: str) -> Record | None: ...
+
+        def unfinished(self) -> list[Record]: ...
+
+        def with_key(self, key: str | None) -> list[Record]: ...
 
 
-def select(selection: Cancel, goals: Scheduler, done: Cancelled, waiting: Collection[str | None] = ()) -> list[Record]:
+def select(selection: Cancel, goals: Goals, done: Cancelled, waiting: Collection[str | None] = ()) -> list[Record]:
     """Return the selected goals that have not ended; note in `done` what else was named.
 
     `waiting`: ids of the selected ones that are not accepted yet: they are known, and come after all that are.
@@ -73,7 +84,7 @@ def _outdone(say: Say, pending: Pending, *, preempts: bool) -> list[tuple[Record
     return [(replaced, "replaced"), *preempted] if replaced else preempted
 
 
-def _named(selection: Cancel, goals: Scheduler, done: Cancelled, waiting: Collection[str | None]) -> Iterator[Record]:
+def _named(selection: Cancel, goals: Goals, done: Cancelled, waiting: Collection[str | None]) -> Iterator[Record]:
     for goal_id in dict.fromkeys(selection.ids or ()):
         record = goals.find(goal_id)
         if record is None:
@@ -85,7 +96,7 @@ def _named(selection: Cancel, goals: Scheduler, done: Cancelled, waiting: Collec
             yield record
 
 
-def _accepted_until(goal_id: str, goals: Scheduler, done: Cancelled, waiting: Collection[str | None]) -> list[Record]:
+def _accepted_until(goal_id: str, goals: Goals, done: Cancelled, waiting: Collection[str | None]) -> list[Record]:
     last = goals.find(goal_id)
     if last is None and goal_id in waiting:
         return goals.unfinished()

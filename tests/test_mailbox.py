@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from talkcli.engine import protocol
 from talkcli.messages import Sender
 from talkcli.requests import Say
+from talkcli.server.answers import Answers
 from talkcli.server.mailbox import AT_ONCE, Mailbox
 from talkcli.server.service import Service
 from talkcli.server.settings import Settings
@@ -89,6 +90,7 @@ def test_the_engine_gets_to_work_before_clients_are_told() -> None:
     async def play() -> None:
         written: list[str] = []
         served = Service("4k7f", Settings(), "unused", 0o600)
+        served.requests = Answers(served)
         served.engine = _Written(written)  # type: ignore[assignment]
         served.scheduler.engine_ready(served.now())
 

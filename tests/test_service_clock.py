@@ -14,6 +14,7 @@ import pytest
 from talkcli.messages import Sender
 from talkcli.requests import Say
 from talkcli.server import clock, service
+from talkcli.server.answers import Answers
 from talkcli.server.service import Service
 from talkcli.server.settings import Settings
 from talkcli.states import State
@@ -45,6 +46,7 @@ class _Clock:
 
 async def _queued_behind_another(ttl: float) -> Service:
     served = Service("4k7f", Settings(ttl=ttl), "unused", 0o600)
+    served.requests = Answers(served)
     served.engine = _BusyEngine()  # type: ignore[assignment]
     served.scheduler.engine_ready(served.now())
     for text in ("a long sentence", "the door is open"):

@@ -38,7 +38,7 @@ class Answers:
         self._scheduler = service.scheduler
         #: cancels that are answered when the goal they stopped is silent
         self._cancels: list[tuple[Connection, int | None, Cancelled]] = []
-        self.pauses = Pauses(service)
+        self._pauses = Pauses(service)
         self._by_kind: dict[type[Request], Callable[..., None]] = {
             Say: self._say,
             Wait: self._wait,
@@ -48,8 +48,8 @@ class Answers:
             Watch: self._watch,
             Log: self._log,
             Set: self._set,
-            Pause: self.pauses.pause,
-            Resume: self.pauses.resume,
+            Pause: self._pauses.pause,
+            Resume: self._pauses.resume,
         }
 
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
@@ -68,10 +68,14 @@ class Answers:
             later.hurry(connection)
         self._carry_out(connection, seq, request)
 
+    def silent(self, goal_id: str, pause: int) -> None:
+        """Answer those who wait for the active goal to be silent in this pause of it."""
+        self._pauses.silent(goal_id, pause)
+
     def left(self, connection: Connection) -> None:
         """Owe a connection that is gone nothing more."""
         self._cancels = [each for each in self._cancels if each[0] is not connection]
-        self.pauses.left(connection)
+        self._pauses.left(connection)
 
     def ended(self, record: Record) -> None:
         """Answer those who wait for this goal to be silent."""
@@ -81,7 +85,7 @@ class Answers:
         for connection, seq, done in due:
             self._report_cancel(connection, seq, done)
             connection.settle()
-        self.pauses.ended(record)
+        self._pauses.ended(record)
 
     # -- one method a request
 

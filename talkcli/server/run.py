@@ -20,6 +20,7 @@ from talkcli.messages import Sender
 from talkcli.requests import Say
 from talkcli.server import log
 from talkcli.server.accept import Acceptor, make_room
+from talkcli.server.answers import Answers
 from talkcli.server.connection import Connection
 from talkcli.server.listener import InheritedListener, Listener, listen
 from talkcli.server.notify import Supervisor
@@ -74,6 +75,7 @@ class _Server:
         settings = self._settings
         make_room(settings.max_clients + DOOR)
         service = self._service = Service(_boot(), settings, self._listener.path, self._listener.mode)
+        service.requests = Answers(service)
         supervisor = self._supervisor = Supervisor(loop, os.environ, service.words)
         service.changed = supervisor.changed
         acceptor = self._acceptor = Acceptor(loop, lambda each: Connection(service, loop, each).begin(), service.failed)

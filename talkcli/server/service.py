@@ -10,7 +10,7 @@ import asyncio
 import os
 import time
 import traceback
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from talkcli import __version__, peers, wire
 from talkcli.admission import DEFAULT_VOICE
@@ -23,7 +23,6 @@ from talkcli.messages import Sender
 from talkcli.requests import Cancel
 from talkcli.scheduler import Scheduler
 from talkcli.server import log
-from talkcli.server.answers import Answers
 from talkcli.server.audience import Audience
 from talkcli.server.clock import LOOK_EVERY, elapsed
 from talkcli.server.later import Later
@@ -47,6 +46,22 @@ if TYPE_CHECKING:
 DOOR = 16
 
 
+class Requests(Protocol):
+    """Who carries out the requests of a service's clients, and owes them answers."""
+
+    def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
+        """Carry out a request."""
+
+    def silent(self, goal_id: str, pause: int) -> None:
+        """Take note that the active goal is silent in this pause of it."""
+
+    def ended(self, record: Record) -> None:
+        """Take note that a goal has ended."""
+
+    def left(self, connection: Connection) -> None:
+        """Owe a connection that is gone nothing more."""
+
+
 class Service:
     """One server's state, for as long as it runs. It is the handler of its connections."""
 
@@ -57,6 +72,8 @@ class Service:
         #: whether the socket's mode lets others in than its owner
         self._open_to_others = bool(mode & 0o066)
         self.engine: EngineThread
+        #: who carries out the clients' requests; set, as the engine is, before the first client is there
+        self.requests: Requests
         #: called, in the loop's thread, when `words` may have changed
         self.changed: Callable[[], None] = lambda: None
         self.scheduler = Scheduler(
@@ -86,7 +103,6 @@ class Service:
         self.audience = Audience(self._loop)
         self.streams = Streams(self._loop)
         self.later = Later(self._loop, self.streams, self.audience, self.scheduler.has_room, self.failed)
-        self._answers = Answers(self)
         #: whether it was told to end, and takes no goal any more
         self.closing = False
         self._timer: asyncio.TimerHandle | None = None
@@ -98,7 +114,7 @@ class Service:
             protocol.StartFailed: self._start_failed,
             protocol.Voices: self._voices_known,
             protocol.Word: self._word,
-            protocol.Paused: lambda paused: self._answers.pauses.silent(paused.id, paused.number),
+            protocol.Paused: lambda paused: self.requests.silent(paused.id, paused.number),
             protocol.Ended: self._ended,
             EngineSaid: lambda said: log.line(f"engine: {log.shown(said.words)}"),
             EngineDied: self._died,
@@ -141,11 +157,11 @@ class Service:
                 waiting[0].admit()
         self.audience.left(connection)
         self.later.left(connection)
-        self._answers.left(connection)
+        self.requests.left(connection)
 
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
         """Carry out a request."""
-        self._answers.handle(connection, seq, request)
+        self.requests.handle(connection, seq, request)
 
     def failed(self, what: str, error: Exception) -> None:
         """Log a bug, with the place where it is, on one line."""
@@ -218,7 +234,7 @@ class Service:
         if change.state.terminal:
             began = self._started.pop(record.id, None)
             log.ended(record, None if began is None else time.monotonic() - began)
-            self._answers.ended(record)
+            self.requests.ended(record)
 
     def _start(self, record: Record) -> None:
         self._started[record.id] = time.monotonic()
