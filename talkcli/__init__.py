@@ -8,17 +8,17 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # `typing` takes as long to import as a server to answer
 if TYPE_CHECKING:
-    from talkcli.client import Client as Client
-    from talkcli.events import PausedChanged as PausedChanged
-    from talkcli.events import Result as Result
-    from talkcli.events import Snapshot as Snapshot
-    from talkcli.events import StateChanged as StateChanged
-    from talkcli.events import WordHeard as WordHeard
-    from talkcli.handle import GoalHandle as GoalHandle
-    from talkcli.messages import Goal as Goal
-    from talkcli.replies import Canceled as Canceled
-    from talkcli.replies import ServerStatus as ServerStatus
-    from talkcli.states import State as State
+    from talkcli.client.client import Client as Client
+    from talkcli.client.handle import GoalHandle as GoalHandle
+    from talkcli.goals.messages import Goal as Goal
+    from talkcli.goals.states import State as State
+    from talkcli.protocol.events import PausedChanged as PausedChanged
+    from talkcli.protocol.events import Result as Result
+    from talkcli.protocol.events import Snapshot as Snapshot
+    from talkcli.protocol.events import StateChanged as StateChanged
+    from talkcli.protocol.events import WordHeard as WordHeard
+    from talkcli.protocol.replies import Canceled as Canceled
+    from talkcli.protocol.replies import ServerStatus as ServerStatus
 
 __version__ = "0.1.0"
 __all__ = [
@@ -39,19 +39,19 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     if name in {"Canceled", "Client", "GoalHandle", "ServerStatus"}:
-        from talkcli import client
+        from talkcli.client import client
 
         return getattr(client, name)
     if name in {"PausedChanged", "Result", "Snapshot", "StateChanged", "WordHeard"}:
-        from talkcli import events
+        from talkcli.protocol import events
 
         return getattr(events, name)
     if name == "Goal":
-        from talkcli.messages import Goal
+        from talkcli.goals.messages import Goal
 
         return Goal
     if name == "State":
-        from talkcli.states import State
+        from talkcli.goals.states import State
 
         return State
     raise AttributeError(f"module 'talkcli' has no attribute {name!r}")

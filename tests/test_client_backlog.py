@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from talkcli import Client
-from talkcli.backlog import MAX_FEEDBACK, MAX_STATES
+from talkcli.client.backlog import MAX_FEEDBACK, MAX_STATES
 from talkcli.errors import Lost, UnknownGoal
-from talkcli.events import Event, Result, Snapshot, StateChanged, WordHeard
-from talkcli.states import State
-from talkcli.wire import MAX_LINE
+from talkcli.goals.states import State
+from talkcli.protocol.events import Event, Result, Snapshot, StateChanged, WordHeard
+from talkcli.protocol.wire import MAX_LINE
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import OVERVIEW, Peer, goal, result, serving
 

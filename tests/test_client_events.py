@@ -10,19 +10,20 @@ from typing import TYPE_CHECKING
 import pytest
 
 import talkcli
-from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard, events
-from talkcli.backlog import MAX_FEEDBACK, MAX_STATES, Backlog
+from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard
+from talkcli.client.backlog import MAX_FEEDBACK, MAX_STATES, Backlog
 from talkcli.errors import Lost, UnknownGoal, UsageError
-from talkcli.messages import By, Goal, Sender
-from talkcli.replies import ServerStatus
+from talkcli.goals.messages import By, Goal, Sender
+from talkcli.protocol import events
+from talkcli.protocol.replies import ServerStatus
 from tests.support.connection import PATIENCE
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from talkcli.events import Event
-    from talkcli.messages import JsonObject
+    from talkcli.goals.messages import JsonObject
+    from talkcli.protocol.events import Event
     from tests.support.processes import Talk
 
 GOAL = Goal("4k7f-7", State.ACTIVE, "moving back", client=Sender(7, 0, "talk", "sh", "patrol"), queued_at=1.5)
@@ -317,7 +318,7 @@ def test_poll_tells_that_the_goal_is_lost_where_the_server_says_nothing_any_more
     client: Client, scripted: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     handle = client.say("never-ends words=1")
-    monkeypatch.setattr("talkcli.handle.SILENCE_LIMIT", 0.3)
+    monkeypatch.setattr("talkcli.client.handle.SILENCE_LIMIT", 0.3)
     scripted.freeze()
     began = time.monotonic()
     assert told(polled(handle))[-1] is Result

@@ -13,7 +13,7 @@ import pytest
 
 from talkcli import Client
 from talkcli.errors import AccessDenied, Busy, Lost, ServerUnavailable, UnknownGoal, UsageError
-from talkcli.states import State
+from talkcli.goals.states import State
 from tests.conformance.rawsocket import GREETING, FakeServer
 from tests.support.surroundings import short_directory
 

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import Client, PausedChanged, State, StateChanged
+from talkcli.client.outgoing import batches
 from talkcli.errors import BadOption, RequestRefused, UnknownGoal, UsageError
-from talkcli.outgoing import batches
+from talkcli.protocol.wire import MAX_LINE, encode
 from talkcli.server import audience
-from talkcli.wire import MAX_LINE, encode
 from tests.support.processes import Talk
 
 if TYPE_CHECKING:

@@ -11,13 +11,13 @@ import pytest
 
 from talkcli import Client, Result, Snapshot, State, StateChanged, WordHeard
 from talkcli.errors import Lost
-from talkcli.states import TRANSITIONS
+from talkcli.goals.states import TRANSITIONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from talkcli import GoalHandle
-    from talkcli.events import Event
+    from talkcli.protocol.events import Event
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 

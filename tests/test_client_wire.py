@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import Client
-from talkcli.dial import Interrupted
+from talkcli.client.dial import Interrupted
 from talkcli.errors import Lost, ServerUnavailable
-from talkcli.events import Event, PausedChanged, Result, Snapshot, StateChanged, WordHeard
-from talkcli.states import State
+from talkcli.goals.states import State
+from talkcli.protocol.events import Event, PausedChanged, Result, Snapshot, StateChanged, WordHeard
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import OVERVIEW, Peer, goal, result, serving
 
@@ -70,7 +70,7 @@ def test_answer_to_any_other_say_must_come_in_time() -> None:
 
 
 def test_server_that_says_nothing_at_all_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("talkcli.connection.SILENCE_LIMIT", 0.3)
+    monkeypatch.setattr("talkcli.client.connection.SILENCE_LIMIT", 0.3)
     with serving(unanswered) as path, Client(path, patience=5) as client:
         began = time.monotonic()
         with pytest.raises(Lost, match=r"nothing for 0\.3 s"):
@@ -81,7 +81,7 @@ def test_server_that_says_nothing_at_all_is_given_up(monkeypatch: pytest.MonkeyP
 
 
 def test_watch_goes_on_as_long_as_the_server_is_alive(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("talkcli.client.SILENCE_LIMIT", 0.4)
+    monkeypatch.setattr("talkcli.client.client.SILENCE_LIMIT", 0.4)
 
     def play(peer: Peer) -> None:
         peer.reply("watch", **OVERVIEW)

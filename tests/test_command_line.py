@@ -326,7 +326,7 @@ def test_the_installed_script_is_this_one_and_imports_nothing_itself() -> None:
 
 
 def test_client_imports_nothing_heavy(scripted: Talk) -> None:
-    heavy = ["asyncio", "pyttsx3", "platformdirs", "talkcli.server", "talkcli.scheduler", "talkcli.engine", "ssl"]
+    heavy = ["asyncio", "pyttsx3", "platformdirs", "talkcli.server", "talkcli.goals.scheduler", "talkcli.engine", "ssl"]
     code = "import sys; from talkcli.cli import run; assert run({}) == 0; print([m for m in {} if m in sys.modules])"
     for words in (["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"]):
         done = run([sys.executable, "-c", code.format(words, heavy)], scripted.env)

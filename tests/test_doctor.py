@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli import Client, dial
+from talkcli import Client
+from talkcli.client import dial
 from talkcli.doctor import look, reach, sentence
-from talkcli.states import State
+from talkcli.goals.states import State
 from tests.faults.broken import write
 from tests.support.compare import assert_silent, extent
 from tests.support.processes import run_talk

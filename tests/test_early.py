@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.opening import Opened, open_early, stand_back
+from talkcli.client.opening import Opened, open_early, stand_back
 from talkcli.paths import client_sockets
 from tests.conformance.bareserve import TALK, run
 from tests.support.connection import PATIENCE
@@ -87,12 +87,12 @@ def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
     """What it costs whoever waits for the first word: none of what follows is there when the request is out."""
     code = (
         "import sys\n"
-        "from talkcli import opening\n"
+        "from talkcli.client import opening\n"
         "opened = opening.open_early\n"
         "def spy(*arguments):\n"
         "    found = opened(*arguments)\n"
         "    assert found and found.sent\n"
-        "    heavy = {{'click', 'json', 're', 'enum', 'socket', 'typing', 'talkcli.client'}}\n"
+        "    heavy = {{'click', 'json', 're', 'enum', 'socket', 'typing', 'talkcli.client.client'}}\n"
         "    print(sorted(heavy & {{*sys.modules}}))\n"
         "    return found\n"
         "opening.open_early = spy\n"
@@ -109,11 +109,11 @@ def test_who_waits_for_a_goal_imports_nothing_until_the_server_has_had_its_time(
     """They would run beside the engine and the player until the first sound."""
     code = (
         "import sys\n"
-        "from talkcli import opening\n"
+        "from talkcli.client import opening\n"
         "stand_back = opening.stand_back\n"
         "def spy(*opened):\n"
         "    found = stand_back(*opened)\n"
-        "    print('stood back', {{'json', 'talkcli.client'}} & {{*sys.modules}})\n"
+        "    print('stood back', {{'json', 'talkcli.client.client'}} & {{*sys.modules}})\n"
         "    return found\n"
         "opening.stand_back = spy\n"
         "from talkcli.cli import run\n"
@@ -134,13 +134,13 @@ def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(mon
     begun = Opened(ours.detach(), "s", b"greeting\n", b"request\n")
     with theirs:
         theirs.sendall(b"reply\n")
-        monkeypatch.setattr("talkcli.opening.time.process_time", lambda: 0.1)
+        monkeypatch.setattr("talkcli.client.opening.time.process_time", lambda: 0.1)
         began = time.monotonic()
         found = stand_back(begun, None)
         assert time.monotonic() - began >= 0.1
         assert found == Opened(begun.descriptor, "s", b"greeting\nreply\n", b"request\n")
-        monkeypatch.setattr("talkcli.opening.time.process_time", lambda: PATIENCE)
-        monkeypatch.setattr("talkcli.opening._BACK", PATIENCE)
+        monkeypatch.setattr("talkcli.client.opening.time.process_time", lambda: PATIENCE)
+        monkeypatch.setattr("talkcli.client.opening._BACK", PATIENCE)
         began = time.monotonic()
         assert stand_back(found, 0.05) == found  # its own limit comes first
         for refused in (b'{"seq": 1, "ok": false}\n', b'{"goal": {"state": "REJECTED"}}\n'):

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import click
 import pytest
 
-from talkcli import admission, errors, states
+from talkcli import errors
 from talkcli.cli import commands, serve, show
 from talkcli.cli.usage import Command
 from talkcli.engine import devices
+from talkcli.goals import admission, states
 from tests.conformance.bareserve import TALK, environment, run
 from tests.support.surroundings import short_directory
 from tests.support.terminal import Terminal

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from talkcli.requests import Cancel, Say, Wait
+from talkcli.goals.requests import Cancel, Say, Wait
 from talkcli.server import later
 from talkcli.server.later import ALL_WAITING, EACH, Later
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from talkcli.messages import By
+    from talkcli.goals.messages import By
 
 
 class Client:

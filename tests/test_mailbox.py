@@ -7,16 +7,16 @@ import threading
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
-from talkcli.messages import Sender
-from talkcli.requests import Say
+from talkcli.goals.messages import Sender
+from talkcli.goals.requests import Say
 from talkcli.server.answers import Answers
 from talkcli.server.mailbox import AT_ONCE, Mailbox
 from talkcli.server.service import Service
 from talkcli.server.settings import Settings
 
 if TYPE_CHECKING:
-    from talkcli.record import Record
-    from talkcli.states import State
+    from talkcli.goals.record import Record
+    from talkcli.goals.states import State
 
 COUNT = 5 * AT_ONCE + 1
 

@@ -10,19 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from talkcli import wire
 from talkcli.cli import early, plain, tabulate
 from talkcli.cli.commands import talk
 from talkcli.cli.plain_table import COMMANDS, COMMON
 from talkcli.cli.saying import GOAL_OPTIONS
 from talkcli.cli.show import Common
-from talkcli.opening import GREETING
-from talkcli.requests import Cancel, Hello, Pause, Resume, Say, Status, write_request
+from talkcli.client.opening import GREETING
+from talkcli.goals.requests import Cancel, Hello, Pause, Resume, Say, Status, write_request
+from talkcli.protocol import wire
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from talkcli.requests import Request
+    from talkcli.goals.requests import Request
 
 TABLES = [COMMON, *(each["options"] for each in COMMANDS.values())]
 OPTIONS = sorted({name for each in TABLES for name in each})

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.lighting import MORE, Sentence, View, width
-from talkcli.printable import printable
+from talkcli.terminal.lighting import MORE, Sentence, View, width
+from talkcli.terminal.printable import printable
 
 LONG = "the quick brown fox jumps over the lazy dog"
 #: Plain, wide, combining, joined, escaped: what widths go wrong with.

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.messages import Sender
-from talkcli.requests import Say
+from talkcli.goals.messages import Sender
+from talkcli.goals.requests import Say
+from talkcli.goals.states import State
 from talkcli.server import clock, service
 from talkcli.server.answers import Answers
 from talkcli.server.service import Service
 from talkcli.server.settings import Settings
-from talkcli.states import State
 
 if TYPE_CHECKING:
     from talkcli.engine import protocol

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.cli.show import Common
-    from talkcli.client import Client
-    from talkcli.messages import Goal, JsonObject
-    from talkcli.opening import Opened
-    from talkcli.replies import Canceled
+    from talkcli.client.client import Client
+    from talkcli.client.opening import Opened
+    from talkcli.goals.messages import Goal, JsonObject
+    from talkcli.protocol.replies import Canceled
 
 #: Characters of what was heard last that are shown of a goal that is held.
 _MAX_SPOKEN = 40
@@ -41,7 +41,7 @@ def cancel(
             if key and not done.canceled and not options.quiet and sys.stderr and sys.stderr.isatty():
                 _suggest_key(key, client)
         except UnknownGoal as error:
-            from talkcli.replies import Canceled
+            from talkcli.protocol.replies import Canceled
 
             _show_canceled(Canceled.from_items(error.items), options)
             raise
@@ -50,8 +50,8 @@ def cancel(
 
 def status(options: Common, goal_id: str | None, opened: Opened | None = None) -> int:
     """Show how the server stands, or one goal, and return the exit code."""
-    from talkcli import output
-    from talkcli.messages import Goal
+    from talkcli.goals.messages import Goal
+    from talkcli.terminal import output
 
     with options.connect(urgent=True, opened=opened) as client:
         found = client.status() if goal_id is None else client.goal(goal_id)
@@ -66,7 +66,7 @@ def status(options: Common, goal_id: str | None, opened: Opened | None = None) -
 
 def log(options: Common, count: int, opened: Opened | None = None) -> int:
     """Show the goals that ended last, and return the exit code."""
-    from talkcli.transcript import log_lines
+    from talkcli.terminal.transcript import log_lines
 
     with options.connect(opened=opened) as client:
         goals = client.log(count)
@@ -80,7 +80,7 @@ def log(options: Common, count: int, opened: Opened | None = None) -> int:
 
 def voices(options: Common, language: str | None, opened: Opened | None = None) -> int:
     """Show the engine's voices, or those of a language with its variants, and return the exit code."""
-    from talkcli import output
+    from talkcli.terminal import output
 
     with options.connect(opened=opened) as client:
         found = every = client.voices()
@@ -99,7 +99,7 @@ def voices(options: Common, language: str | None, opened: Opened | None = None) 
 
 def change(options: Common, opened: Opened | None = None, **settings: Any) -> int:
     """Change those settings of the server that aren't None, or show them all, and return the exit code."""
-    from talkcli import output
+    from talkcli.terminal import output
 
     asked = {name: value for name, value in settings.items() if value is not None}
     with options.connect(opened=opened) as client:
@@ -115,7 +115,7 @@ def pause(options: Common, opened: Opened | None = None) -> int:
     """Hold speech, and return the exit code."""
     with options.connect(opened=opened) as client:
         held = client.pause()
-    from talkcli.printable import printable
+    from talkcli.terminal.printable import printable
 
     heard = held.spoken[-_MAX_SPOKEN:] if held and held.spoken else ""
     where = f', after "{printable(heard)}"' if heard else ""
@@ -128,7 +128,7 @@ def resume(options: Common, opened: Opened | None = None) -> int:
     """Go on where speech is held, and return the exit code."""
     with options.connect(opened=opened) as client:
         goal = client.resume()
-    from talkcli.printable import printable
+    from talkcli.terminal.printable import printable
 
     words = f"speech goes on with {printable(goal.id)}" if goal else "speech goes on"
     _tell(options, goal, paused=False, words=words)
@@ -161,7 +161,7 @@ def _show_canceled(done: Canceled, options: Common) -> None:
 def _suggest_key(key: str, client: Client) -> None:
     """Where nothing has this key, but something a similar one, tell whoever typed it."""
     from talkcli.cli.nearest import nearest
-    from talkcli.printable import printable
+    from talkcli.terminal.printable import printable
 
     try:
         status = client.status()
@@ -176,7 +176,7 @@ def _suggest_key(key: str, client: Client) -> None:
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     """Return what is said where no voice speaks a language, which may have been given by its name."""
     from talkcli.cli.nearest import nearest
-    from talkcli.printable import printable
+    from talkcli.terminal.printable import printable
 
     codes = {_language(each): _language(each) for each in voices}
     # "German", "English_(America)": all that speak it are listed by the first part of its code

@@ -25,7 +25,7 @@ from talkcli.cli.usage import (
     write_options,
 )
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, UsageError
-from talkcli.printable import printable
+from talkcli.terminal.printable import printable
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     import click
     from click.shell_completion import CompletionItem
 
-    from talkcli.client import Client, ServerStatus
-    from talkcli.messages import Goal, JsonObject
+    from talkcli.client.client import Client, ServerStatus
+    from talkcli.goals.messages import Goal, JsonObject
 
     Items = list[CompletionItem[str]]
 
@@ -94,7 +94,7 @@ def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
 
 def _ask(context: click.Context, question: Callable[[Client], _Answer]) -> _Answer | None:
     """Return the server's answer, or None if there is none for whatever reason."""
-    from talkcli.client import Client
+    from talkcli.client.client import Client
 
     socket = getattr(context.find_root().obj, "socket", None)  # --socket, where it stood before
     try:
@@ -141,14 +141,14 @@ def _fits(value: str, incomplete: str) -> bool:
 
 
 def _goal_help(goal: Goal) -> str:
-    from talkcli.printable import printable
+    from talkcli.terminal.printable import printable
 
     text = "" if goal.text is None else printable(goal.text, _MAX_TEXT)
     return f"{goal.state.name} {text}"
 
 
 def _voice_help(voice: JsonObject, field: str) -> str:
-    from talkcli.printable import printable
+    from talkcli.terminal.printable import printable
 
     parts = [printable(str(voice.get(each) or ""), _MAX_TEXT) for each in ("name", "language") if each != field]
     return ", ".join(filter(None, parts)) or "voice"

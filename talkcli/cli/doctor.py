@@ -7,8 +7,8 @@ import click
 from talkcli.cli.common import common, common_options, talk_command
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, screen, show, show_json
-from talkcli.dial import Interrupted
-from talkcli.states import EXIT_CODES, State
+from talkcli.client.dial import Interrupted
+from talkcli.goals.states import EXIT_CODES, State
 
 #: What nobody would hear ends as a goal that nobody hears.
 _NOT_HEARD = EXIT_CODES[State.ABORTED]

@@ -11,7 +11,7 @@ import _signal
 import os
 import time
 
-from talkcli.opening import open_early, stand_back
+from talkcli.client.opening import open_early, stand_back
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from talkcli.cli.plain import Plain
     from talkcli.cli.show import Common
-    from talkcli.opening import Opened
+    from talkcli.client.opening import Opened
 
 #: Fields of the requests that are sent early, in their order, as `requests` has them.
 _FIELDS = {
@@ -104,10 +104,10 @@ def _command(
 ) -> int:
     given = plain.given
     if plain.command == "say":
-        from talkcli.admission import bad_option
         from talkcli.cli.interrupts import give_up_unread
         from talkcli.cli.saying import GOAL_OPTIONS, say
-        from talkcli.requests import Say
+        from talkcli.goals.admission import bad_option
+        from talkcli.goals.requests import Say
 
         if bad_option(Say("", **{name: given[name] for name in GOAL_OPTIONS})):
             from talkcli.cli import commands

@@ -14,12 +14,12 @@ import threading
 from typing import Protocol
 
 from talkcli.cli.show import colourful, note, show, show_json
-from talkcli.columns import Screen
-from talkcli.dial import ready
-from talkcli.events import PausedChanged, Result, StateChanged, WordHeard
-from talkcli.lighting import Sentence
-from talkcli.printable import printable
-from talkcli.states import State
+from talkcli.client.dial import ready
+from talkcli.goals.states import State
+from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
+from talkcli.terminal.columns import Screen
+from talkcli.terminal.lighting import Sentence
+from talkcli.terminal.printable import printable
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from talkcli.cli.show import Common
-    from talkcli.events import Event
-    from talkcli.messages import Goal
+    from talkcli.goals.messages import Goal
+    from talkcli.protocol.events import Event
 
 #: Columns of a terminal that doesn't say how many it has.
 _USUAL_WIDTH = 80

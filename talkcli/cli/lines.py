@@ -11,7 +11,6 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from talkcli import output
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import (
     SILENCE,
@@ -25,12 +24,13 @@ from talkcli.cli.outcome import (
 from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.stdin import LineReader
 from talkcli.cli.utf8 import readable
-from talkcli.dial import ANSWER_LIMIT, Interrupted
+from talkcli.client.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
-from talkcli.messages import Goal
-from talkcli.replies import Canceled
-from talkcli.states import State
-from talkcli.text import MAX_BYTES
+from talkcli.goals.messages import Goal
+from talkcli.goals.states import State
+from talkcli.goals.text import MAX_BYTES
+from talkcli.protocol.replies import Canceled
+from talkcli.terminal import output
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from talkcli.cli.feedback import Feedback
     from talkcli.cli.show import Common
     from talkcli.cli.stdin import Line
-    from talkcli.client import Client, GoalHandle
+    from talkcli.client.client import Client, GoalHandle
 
 
 def say_lines(
@@ -227,7 +227,7 @@ class _Lines:
             self._tell(f"line {self._sending.number} may not have been accepted; what follows it was not sent")
 
     def _show(self, goal: Goal) -> None:
-        from talkcli.events import Result
+        from talkcli.protocol.events import Result
 
         if self._shown:
             self._shown.show(goal, Result(goal))

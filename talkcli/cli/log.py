@@ -7,7 +7,7 @@ import click
 from talkcli.cli.asking import log
 from talkcli.cli.common import common, common_options, talk_command
 from talkcli.cli.usage import ASKING, WholeNumber
-from talkcli.requests import MAX_LOG
+from talkcli.goals.requests import MAX_LOG
 
 
 @talk_command(

@@ -16,9 +16,9 @@ from talkcli.cli.show import (
     reader_is_gone,
     show_json,
 )
-from talkcli.dial import Interrupted
+from talkcli.client.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
-from talkcli.states import EXIT_CODES, State
+from talkcli.goals.states import EXIT_CODES, State
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from talkcli.cli.feedback import Feedback
     from talkcli.cli.interrupts import Interrupts
     from talkcli.cli.show import Common
-    from talkcli.client import GoalHandle
-    from talkcli.messages import Goal
+    from talkcli.client.client import GoalHandle
+    from talkcli.goals.messages import Goal
 
     _T = TypeVar("_T")
 
@@ -107,7 +107,7 @@ def report(goal: Goal, options: Common, shown: Feedback | None = None) -> int:
     if options.json and shown is None:
         show_if_possible(show_json, goal.to_json())
     if goal.state is not State.SUCCEEDED and goal.state.terminal and not options.quiet:
-        from talkcli import output
+        from talkcli.terminal import output
 
         tell = shown.aside if shown else note
         words = output.ending(goal)

@@ -12,12 +12,12 @@ from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import regardless, show_if_possible
 from talkcli.cli.show import note, show_json
 from talkcli.cli.utf8 import readable
-from talkcli.dial import Interrupted
+from talkcli.client.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, UsageError
 
 if TYPE_CHECKING:
     from talkcli.cli.show import Common
-    from talkcli.messages import JsonObject
+    from talkcli.goals.messages import JsonObject
 
 #: Settings, and the variables that hold for them where nothing is spoken: a server has its own.
 _VARIABLES = {"rate": "TALK_RATE", "volume": "TALK_VOLUME", "voice": "TALK_VOICE", "pitch": None}

@@ -12,16 +12,16 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from talkcli.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
 from talkcli.cli import complete
 from talkcli.cli.common import common, common_options, number, seconds, talk_command, timeout_option, word
 from talkcli.cli.interrupts import give_up_unread, watched_output
 from talkcli.cli.outcome import rest
 from talkcli.cli.saying import GOAL_OPTIONS, refuse, say
 from talkcli.cli.usage import ASKING, Command, Number, WholeNumber, told
-from talkcli.dial import Interrupted
+from talkcli.client.dial import Interrupted
 from talkcli.errors import EXIT_SIGPIPE
-from talkcli.requests import Say
+from talkcli.goals.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
+from talkcli.goals.requests import Say
 
 #: Options that mean something to a server alone.
 _SERVER_ONLY = ("wait", "feedback", "lines", "preempt", "flush", "priority", "ttl", "key", "throttle", "id", "name")

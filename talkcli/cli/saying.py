@@ -18,9 +18,9 @@ from talkcli.cli.outcome import (
     until_ended,
 )
 from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
-from talkcli.dial import ANSWER_LIMIT, Interrupted
+from talkcli.client.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost
-from talkcli.states import State
+from talkcli.goals.states import State
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from talkcli.cli.feedback import Feedback
     from talkcli.cli.show import Common
-    from talkcli.client import GoalHandle
-    from talkcli.opening import Opened
+    from talkcli.client.client import GoalHandle
+    from talkcli.client.opening import Opened
 
 #: Options of a goal, by the names that `Client.say` has for them.
 GOAL_OPTIONS = ("preempt", "flush", "priority", "ttl", "key", "throttle", "id", "rate", "volume", "voice", "pitch")
@@ -87,8 +87,8 @@ def say(
 
 def refuse(message: str, reason: str, options: Common, *, feedback: bool) -> int:
     """Tell of a goal that is REJECTED before it is sent, as if a server had done so, and return the exit code."""
-    from talkcli.events import Result
-    from talkcli.messages import Goal
+    from talkcli.goals.messages import Goal
+    from talkcli.protocol.events import Result
 
     goal = Goal("", State.REJECTED, reason=reason, message=message)
     shown = _feedback(options) if feedback else None

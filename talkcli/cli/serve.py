@@ -13,8 +13,8 @@ from talkcli.cli import complete, units
 from talkcli.cli.common import common, common_options, number, seconds, talk_command, word
 from talkcli.cli.show import note, show
 from talkcli.cli.usage import Number, WholeNumber
+from talkcli.goals.text import MAX_CHARACTERS
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE, Settings
-from talkcli.text import MAX_CHARACTERS
 
 #: As `admission` has them, which imports what printing a unit doesn't need; a test compares the two.
 RATES, VOLUMES, PITCHES = (80, 450), (0.0, 1.0), (0, 100)
@@ -203,9 +203,9 @@ def _warn_of_sound(player: str, driver: object) -> None:
 def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
     from talkcli.cli.nearest import nearest
-    from talkcli.engine.players import commands, on_path
-    from talkcli.engine.sink import AudioFailed
-    from talkcli.printable import printable
+    from talkcli.engine.players.programs import commands, on_path
+    from talkcli.engine.players.sink import AudioFailed
+    from talkcli.terminal.printable import printable
 
     try:
         commands(player, None, 0, on_path, None)
@@ -216,7 +216,7 @@ def _warn_of_player(player: str) -> None:
 
 
 def _print_unit(context: click.Context, name: str) -> None:
-    from talkcli.printable import printable
+    from talkcli.terminal.printable import printable
 
     given = {each.name: each for each in context.command.params if _is_given(context, each)}
     mode = context.params["socket_mode"] if "socket_mode" in given else None

@@ -6,11 +6,11 @@ from typing import Any
 
 import click
 
-from talkcli.admission import PITCHES, RATES, VOLUMES
 from talkcli.cli import complete
 from talkcli.cli.asking import change
 from talkcli.cli.common import common, common_options, number, seconds, talk_command, word
 from talkcli.cli.usage import ASKING, Number, WholeNumber
+from talkcli.goals.admission import PITCHES, RATES, VOLUMES
 
 
 @talk_command(

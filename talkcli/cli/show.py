@@ -12,10 +12,10 @@ from talkcli.values import TYPE_CHECKING
 if TYPE_CHECKING:
     from typing import Any, TextIO
 
-    from talkcli.client import Client
-    from talkcli.columns import Screen
+    from talkcli.client.client import Client
     from talkcli.errors import TalkError
-    from talkcli.messages import JsonObject
+    from talkcli.goals.messages import JsonObject
+    from talkcli.terminal.columns import Screen
 
 #: Standard output's descriptor.
 OUTPUT = 1
@@ -43,7 +43,7 @@ class Common:
 
     def connect(self, **options: Any) -> Client:
         """Return a client connected to the server; see `Client` for the options."""
-        from talkcli.client import Client
+        from talkcli.client.client import Client
 
         return Client(self.socket, **options)
 
@@ -114,11 +114,11 @@ def show_json(message: JsonObject) -> None:
 
 
 def _write_json(stream: TextIO, message: JsonObject) -> None:
-    from talkcli import wire  # help and completion have nothing to do with JSON
+    from talkcli.protocol import wire  # help and completion have nothing to do with JSON
 
     line = wire.encode(message)
     if stream.isatty():
-        from talkcli.printable import printable_json
+        from talkcli.terminal.printable import printable_json
 
         line = printable_json(line.decode()[:-1]).encode() + b"\n"
     stream.flush()
@@ -178,7 +178,7 @@ def colourful() -> bool:
 
 def screen() -> Screen:
     """Return what standard output is at this moment: how wide, if it is a terminal, and whether it takes colour."""
-    from talkcli.columns import Screen
+    from talkcli.terminal.columns import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():
         return Screen()

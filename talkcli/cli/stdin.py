@@ -7,10 +7,10 @@ import select
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.dial import ready
+from talkcli.client.dial import ready
 from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
-from talkcli.states import EXIT_CODES, State
-from talkcli.text import MAX_BYTES, MAX_CHARACTERS
+from talkcli.goals.states import EXIT_CODES, State
+from talkcli.goals.text import MAX_BYTES, MAX_CHARACTERS
 from talkcli.values import frozen
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import paths
 from talkcli.errors import UsageError
-from talkcli.printable import printable
+from talkcli.terminal.printable import printable
 from talkcli.values import frozen, replace
 
 if TYPE_CHECKING:

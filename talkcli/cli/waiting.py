@@ -7,15 +7,15 @@ import time
 from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.outcome import regardless, report, rest, show_if_possible
 from talkcli.cli.show import note
-from talkcli.dial import ANSWER_LIMIT, Interrupted
+from talkcli.client.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
-from talkcli.states import State
+from talkcli.goals.states import State
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.cli.feedback import Feedback
     from talkcli.cli.show import Common
-    from talkcli.client import GoalHandle
+    from talkcli.client.client import GoalHandle
 
 
 def wait(options: Common, ids: tuple[str, ...], timeout: float | None, *, feedback: bool) -> int:
@@ -41,7 +41,7 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None, *, feedba
 def _show(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, options: Common) -> Feedback:
     """Show what happens to the goals until all have ended."""
     from talkcli.cli.feedback import feedback
-    from talkcli.following import merged
+    from talkcli.client.following import merged
 
     shown = feedback(options)
     try:

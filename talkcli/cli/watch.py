@@ -13,9 +13,9 @@ from talkcli.cli.common import common, common_options, talk_command
 from talkcli.cli.interrupts import Interrupts, has_reader
 from talkcli.cli.show import Common, screen, show, show_json
 from talkcli.cli.usage import ASKING
-from talkcli.dial import Interrupted
+from talkcli.client.dial import Interrupted
 from talkcli.errors import EXIT_SIGPIPE
-from talkcli.transcript import Transcript
+from talkcli.terminal.transcript import Transcript
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -26,7 +26,7 @@ _NO_DEVICES = frozenset(
 
 def players(env: Mapping[str, str], wanted: str | None, by: str | None) -> Players:
     """Return which players there are; `wanted`: the setting, `by` whom it is."""
-    from talkcli.engine.players import PACKAGES
+    from talkcli.engine.players.programs import PACKAGES
 
     found = tuple(each for each in PACKAGES if programs.path_of(each, env))
     runs = True

@@ -15,16 +15,16 @@ from talkcli.doctor import ask, findings, level, look, places, probe, reach, sen
 from talkcli.doctor.probe import Setting
 from talkcli.doctor.sentence import Played
 from talkcli.errors import TalkError
-from talkcli.states import State
+from talkcli.goals.states import State
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from talkcli.client import Client
+    from talkcli.client.client import Client
     from talkcli.doctor.findings import Finding
     from talkcli.doctor.places import Places
     from talkcli.doctor.voice import Engine
-    from talkcli.messages import Goal, JsonObject
+    from talkcli.goals.messages import Goal, JsonObject
 
 #: Seconds that the sentence may take, its time in the queue included: long enough for one that is being spoken.
 LIMIT = 20.0

@@ -10,7 +10,7 @@ import select
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.dial import Interrupted, ready
+from talkcli.client.dial import Interrupted, ready
 from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Engine
 from talkcli.values import frozen
@@ -70,7 +70,7 @@ def look(setting: Setting) -> Engine:
 def speak(text: str, setting: Setting, volume: float, limit: float) -> Played:
     """Play a sentence by an engine process, in at most `limit` seconds, and return how that went."""
     from talkcli.engine import protocol
-    from talkcli.states import State
+    from talkcli.goals.states import State
 
     try:
         with _Talked(setting, limit) as talked:

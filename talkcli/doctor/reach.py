@@ -11,19 +11,19 @@ import socket
 from typing import TYPE_CHECKING
 
 from talkcli import paths, peers
-from talkcli.client import Client
-from talkcli.dial import Interrupted
+from talkcli.client.client import Client
+from talkcli.client.dial import Interrupted
 from talkcli.doctor.places import FOREIGN, MUTE, SERVER, STOPPED, Place, Places
 from talkcli.doctor.sentence import Played
 from talkcli.errors import TalkError
-from talkcli.states import State
+from talkcli.goals.states import State
 from talkcli.values import replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.handle import GoalHandle
-    from talkcli.messages import Goal
+    from talkcli.client.handle import GoalHandle
+    from talkcli.goals.messages import Goal
 
 #: What this client calls itself.
 _NAME = "talk doctor"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import textwrap
 
-from talkcli.columns import GAP, Screen, pad
 from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding, heard, next_step
-from talkcli.states import State
+from talkcli.goals.states import State
+from talkcli.terminal.columns import GAP, Screen, pad
 from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:

@@ -1,4 +1,6 @@
 """The engine: one thread in the server that owns one engine process, and what runs inside that process.
 
-Only this package names pyttsx3, and only in the process: `thread` and `protocol` are the server's side of it.
+It may import what is below the server: the client's way to wait, protocol, goals, the ground. It knows no queue and no
+client. What plays goes to `players`, what speaks to `synthesizers`, what watches over the process to `thread` and the
+modules beside it; only here pyttsx3 is named.
 """

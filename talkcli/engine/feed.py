@@ -9,11 +9,11 @@ from __future__ import annotations
 import select
 import time
 
-from talkcli.engine.sink import PIECE, SAMPLE
+from talkcli.engine.players.sink import PIECE, SAMPLE
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from talkcli.engine.sink import Interest, Sink
+    from talkcli.engine.players.sink import Interest, Sink
     from talkcli.engine.wordclock import WordClock
 
 #: Seconds of sound that a player holds at least between taking and playing it: of the 60 ms it is asked for, aplay was

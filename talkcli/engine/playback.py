@@ -10,8 +10,8 @@ import time
 
 from talkcli.engine.feed import Feed
 from talkcli.engine.hold import CLOCK_AHEAD, RELEASE_AFTER, SAID_AGAIN, SILENT_WITHIN
+from talkcli.engine.players.sink import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
 from talkcli.engine.samples import Samples
-from talkcli.engine.sink import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
 from talkcli.engine.wordclock import WordClock
 
 TYPE_CHECKING = False
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from talkcli.engine.hold import Hold
-    from talkcli.engine.outlet import Outlet
-    from talkcli.engine.sink import Sink, Wait
+    from talkcli.engine.players.outlet import Outlet
+    from talkcli.engine.players.sink import Sink, Wait
     from talkcli.engine.wordclock import TimedWord
 
 #: Seconds within which a player must take the first sound: a Bluetooth or USB device that sleeps needs one or two, a

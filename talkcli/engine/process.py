@@ -55,9 +55,9 @@ def _configuration(channel: Channel) -> protocol.Configure | None:
 
 
 def _serve(channel: Channel, configure: protocol.Configure) -> None:
-    from talkcli.engine.outlet import Outlet
+    from talkcli.engine.players.outlet import Outlet
+    from talkcli.engine.players.sink import CannotEnd
     from talkcli.engine.session import Session
-    from talkcli.engine.sink import CannotEnd
     from talkcli.engine.start import CannotStart, start
 
     outlet = Outlet(configure.player, configure.device, _inherited(), configure.lead_in / 1000, configure.output)

@@ -16,13 +16,13 @@ import stat
 import time
 from typing import TYPE_CHECKING
 
-from talkcli import text as texts
-from talkcli.dial import ready
+from talkcli.client.dial import ready
 from talkcli.engine import protocol, spawn
 from talkcli.engine.limits import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
 from talkcli.engine.pieces import pieces
-from talkcli.engine.wavestream import WavStream
+from talkcli.engine.players.wavestream import WavStream
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
+from talkcli.goals import text as texts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

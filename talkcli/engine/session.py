@@ -16,10 +16,10 @@ from collections import deque
 
 from talkcli.engine import protocol
 from talkcli.engine.hold import Hold
+from talkcli.engine.players.sink import AudioFailed
 from talkcli.engine.settings import SettingFailed
-from talkcli.engine.sink import AudioFailed
-from talkcli.engine.voices import list_voices
-from talkcli.engine.words import Words
+from talkcli.engine.synthesizers.voices import list_voices
+from talkcli.engine.synthesizers.words import Words
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
     from talkcli.engine.changeover import Changeover
     from talkcli.engine.channel import Channel
+    from talkcli.engine.players.sink import Interest
     from talkcli.engine.protocol import Command
     from talkcli.engine.settings import Settings
-    from talkcli.engine.sink import Interest
 
 #: Seconds between two steps of a driver that is not ours while it has a goal in hand: it has no way to wake us.
 STEP = 0.05

@@ -7,8 +7,8 @@ by an id that the driver itself lists.
 
 from __future__ import annotations
 
-from talkcli.engine.espeak import UnknownVoice
-from talkcli.engine.voices import find_voice, list_voices, unknown_voice
+from talkcli.engine.synthesizers.espeak import UnknownVoice
+from talkcli.engine.synthesizers.voices import find_voice, list_voices, unknown_voice
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

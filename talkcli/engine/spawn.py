@@ -17,8 +17,8 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
-from talkcli.engine.holders import kill_holders
-from talkcli.wire import LineSplitter
+from talkcli.engine.players.holders import kill_holders
+from talkcli.protocol.wire import LineSplitter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.hold import Hold
-    from talkcli.engine.outlet import Outlet
-    from talkcli.engine.sink import Wait
+    from talkcli.engine.players.outlet import Outlet
+    from talkcli.engine.players.sink import Wait
 
 #: The drivers of macOS that speak in Apple's run loop, which somebody has to run.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
@@ -61,7 +61,7 @@ def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait, hol
         raise CannotStart(f"pyttsx3 is missing: pip install pyttsx3 ({error})") from error
     own = is_own(driver)
     version = _register_own(outlet, wait, hold) if own else None
-    from talkcli.engine.espeak import DRIVER
+    from talkcli.engine.synthesizers.espeak import DRIVER
 
     name = DRIVER if own else driver or pyttsx3.engine.default_engine_by_sys_platform()
     engine = _init(pyttsx3, name, named=driver is not None)
@@ -82,8 +82,8 @@ def is_own(driver: str | None) -> bool:
 
 
 def _register_own(outlet: Outlet, wait: Wait, hold: Hold) -> str:
-    from talkcli.engine.espeak import register
-    from talkcli.engine.library import LibraryMissing, load
+    from talkcli.engine.synthesizers.espeak import register
+    from talkcli.engine.synthesizers.library import LibraryMissing, load
 
     try:
         library = load()

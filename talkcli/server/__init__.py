@@ -1,5 +1,5 @@
 """The server: asyncio around the scheduler, and the engine thread beside it.
 
-Only this package names asyncio, and only the command `serve` imports it. It does I/O: what is spoken when is decided by
-the scheduler, how it is spoken by the engine.
+It does I/O only: what happens is decided by `goals`. It may import all but doctor and cli, and only `cli.serve` imports
+it. What a request is answered goes to `answers`, who hears of what to `audience`, what a client may do to `connection`.
 """

@@ -10,7 +10,7 @@ import errno
 import resource
 from typing import TYPE_CHECKING
 
-from talkcli import wire
+from talkcli.protocol import wire
 from talkcli.server import log
 
 if TYPE_CHECKING:

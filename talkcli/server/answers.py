@@ -7,22 +7,23 @@ import time
 from itertools import chain
 from typing import TYPE_CHECKING
 
-from talkcli import __version__, wire
-from talkcli.admission import DEFAULT_VOICE, bad_setting
+from talkcli import __version__
 from talkcli.errors import UnknownGoal
-from talkcli.messages import By
-from talkcli.requests import Cancel, Log, Pause, Request, Resume, Say, Set, Status, Voices, Wait, Watch
+from talkcli.goals.admission import DEFAULT_VOICE, bad_setting
+from talkcli.goals.messages import By
+from talkcli.goals.requests import Cancel, Log, Pause, Request, Resume, Say, Set, Status, Voices, Wait, Watch
+from talkcli.goals.states import State
+from talkcli.protocol import wire
 from talkcli.server import log
 from talkcli.server.pauses import Pauses
-from talkcli.states import State
 from talkcli.values import replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from talkcli.effects import Cancelled, Submitted
-    from talkcli.messages import JsonObject, Sender
-    from talkcli.record import Record
+    from talkcli.goals.effects import Cancelled, Submitted
+    from talkcli.goals.messages import JsonObject, Sender
+    from talkcli.goals.record import Record
     from talkcli.server.connection import Connection
     from talkcli.server.service import Service
 

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from talkcli import wire
-from talkcli.states import State
+from talkcli.goals.states import State
+from talkcli.protocol import wire
 
 if TYPE_CHECKING:
     import asyncio
     from collections.abc import Iterable
 
-    from talkcli.messages import By, JsonObject
-    from talkcli.record import Record
+    from talkcli.goals.messages import By, JsonObject
+    from talkcli.goals.record import Record
     from talkcli.server.connection import Connection
 
 #: Seconds between signs of life to those who wait; a client gives a server up after three of them.

@@ -11,9 +11,9 @@ from collections import deque
 from itertools import chain
 from typing import TYPE_CHECKING, Protocol
 
-from talkcli import wire
 from talkcli.errors import BadRequest, LineTooLong
-from talkcli.requests import Cancel, Hello, Request, Status, read_request
+from talkcli.goals.requests import Cancel, Hello, Request, Status, read_request
+from talkcli.protocol import wire
 from talkcli.server.stream import Stream
 from talkcli.values import replace
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Iterable, Iterator
 
-    from talkcli.messages import JsonObject, Sender
+    from talkcli.goals.messages import JsonObject, Sender
     from talkcli.server.stream import Streams
 
 #: Bytes that may wait for a client before feedback for it is dropped, and before its requests are left unread.

@@ -10,17 +10,17 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from talkcli.requests import Say
-from talkcli.selection import select_waiting
+from talkcli.goals.requests import Say
+from talkcli.goals.selection import select_waiting
 
 if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
-    from talkcli.effects import Submitted
-    from talkcli.messages import By
-    from talkcli.record import Record
-    from talkcli.requests import Cancel, Request
+    from talkcli.goals.effects import Submitted
+    from talkcli.goals.messages import By
+    from talkcli.goals.record import Record
+    from talkcli.goals.requests import Cancel, Request
     from talkcli.server.audience import Audience
     from talkcli.server.connection import Connection
     from talkcli.server.stream import Streams

@@ -11,16 +11,16 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.engine.players import NO_PLAYER
-from talkcli.printable import printable
-from talkcli.states import State
+from talkcli.engine.players.programs import NO_PLAYER
+from talkcli.goals.states import State
+from talkcli.terminal.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from talkcli.engine.protocol import Ready
-    from talkcli.messages import By, Sender
-    from talkcli.record import Record
+    from talkcli.goals.messages import By, Sender
+    from talkcli.goals.record import Record
 
 #: Bytes of one line at most: a pipe that poll calls writable takes as many without blocking (PIPE_BUF on Linux).
 _MAX_LINE = 4096

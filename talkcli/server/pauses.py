@@ -6,14 +6,14 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from talkcli import wire
-from talkcli.messages import By
+from talkcli.goals.messages import By
+from talkcli.goals.states import State
+from talkcli.protocol import wire
 from talkcli.server import log
-from talkcli.states import State
 
 if TYPE_CHECKING:
-    from talkcli.record import Record
-    from talkcli.requests import Pause, Resume
+    from talkcli.goals.record import Record
+    from talkcli.goals.requests import Pause, Resume
     from talkcli.server.connection import Connection
     from talkcli.server.service import Service
 

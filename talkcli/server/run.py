@@ -16,8 +16,8 @@ from talkcli.engine import protocol
 from talkcli.engine.limits import START_LIMIT
 from talkcli.engine.thread import EngineThread
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
-from talkcli.messages import Sender
-from talkcli.requests import Say
+from talkcli.goals.messages import Sender
+from talkcli.goals.requests import Say
 from talkcli.server import log
 from talkcli.server.accept import Acceptor, make_room
 from talkcli.server.answers import Answers

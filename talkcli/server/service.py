@@ -12,32 +12,33 @@ import time
 import traceback
 from typing import TYPE_CHECKING, Protocol
 
-from talkcli import __version__, peers, wire
-from talkcli.admission import DEFAULT_VOICE
-from talkcli.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
+from talkcli import __version__, peers
 from talkcli.engine import protocol
 from talkcli.engine.reports import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
-from talkcli.engine.voices import find_voice, unknown_voice
+from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
-from talkcli.messages import Sender
-from talkcli.requests import Cancel
-from talkcli.scheduler import Scheduler
+from talkcli.goals.admission import DEFAULT_VOICE
+from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
+from talkcli.goals.messages import Sender
+from talkcli.goals.requests import Cancel
+from talkcli.goals.scheduler import Scheduler
+from talkcli.goals.states import State
+from talkcli.protocol import wire
 from talkcli.server import log
 from talkcli.server.audience import Audience
 from talkcli.server.clock import LOOK_EVERY, elapsed
 from talkcli.server.later import Later
 from talkcli.server.mailbox import Mailbox
 from talkcli.server.stream import Streams
-from talkcli.states import State
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
     from talkcli.engine.thread import EngineThread
-    from talkcli.messages import JsonObject
-    from talkcli.record import Record
-    from talkcli.requests import Request
+    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.record import Record
+    from talkcli.goals.requests import Request
     from talkcli.server.connection import Connection
     from talkcli.server.settings import Settings
     from talkcli.server.stream import Stream

@@ -19,9 +19,9 @@ import sys
 import threading
 from collections import deque
 
-from talkcli import wire
-from talkcli.messages import Goal, Sender
-from talkcli.states import State
+from talkcli.goals.messages import Goal, Sender
+from talkcli.goals.states import State
+from talkcli.protocol import wire
 
 #: An engine process that ends each sentence at once.
 _ENGINE = "import os\nwhile data := os.read(0, 65536):\n    os.write(0, data)"

@@ -10,11 +10,11 @@ import time
 from itertools import count, islice
 from typing import TYPE_CHECKING
 
-from talkcli import wire
-from talkcli.effects import Now
-from talkcli.messages import Sender
-from talkcli.requests import Cancel, Say
-from talkcli.scheduler import Scheduler
+from talkcli.goals.effects import Now
+from talkcli.goals.messages import Sender
+from talkcli.goals.requests import Cancel, Say
+from talkcli.goals.scheduler import Scheduler
+from talkcli.protocol import wire
 from tests.bench.installed import serve
 from tests.bench.table import Limit, Row
 from tests.bench.wires import Wires

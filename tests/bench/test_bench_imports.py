@@ -18,10 +18,16 @@ if TYPE_CHECKING:
 HEAVY = [
     *("asyncio", "concurrent", "multiprocessing", "subprocess", "ssl", "tempfile", "logging", "dataclasses", "pathlib"),
     *("pyttsx3", "espeakng_loader", "platformdirs"),
-    *("talkcli.scheduler", "talkcli.history", "talkcli.engine", "talkcli.server.run", "talkcli.server.service"),
+    *(
+        "talkcli.goals.scheduler",
+        "talkcli.goals.history",
+        "talkcli.engine",
+        "talkcli.server.run",
+        "talkcli.server.service",
+    ),
 ]
 #: What only a command that talks to a server needs.
-CLIENT = ["socket", "select", "talkcli.client", "talkcli.connection"]
+CLIENT = ["socket", "select", "talkcli.client.client", "talkcli.client.connection"]
 ALONE = {"serve --print-unit user", "--version", "--help"}
 
 

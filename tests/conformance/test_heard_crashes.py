@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.guard import guarded
+from talkcli.engine.synthesizers.guard import guarded
 from tests.conformance import stopped
 from tests.conformance.hearing import (
     HOME,

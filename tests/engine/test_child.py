@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.child import Child
-from talkcli.engine.pipe import PlayerPipe
-from talkcli.engine.players import Command
+from talkcli.engine.players.child import Child
+from talkcli.engine.players.pipe import PlayerPipe
+from talkcli.engine.players.programs import Command
 from tests.engine.spawned import FAST, Spawned, children
 from tests.engine.test_player_faults import Player
 from tests.support.reference import render
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: What happens when: a line for each player that is started, each text that is looked at, each fork.
 _WATCHED = """
-from talkcli.engine import guard
+from talkcli.engine.synthesizers import guard
 tell = lambda what: sys.stderr.write(what + "\\n")
 sys.addaudithook(lambda name, _: name in ("os.posix_spawn", "os.fork", "subprocess.Popen") and tell(name))
 guarded = guard.guarded
@@ -188,7 +188,7 @@ def test_a_text_without_a_sound_is_no_fault_of_the_player(tmp_path: Path) -> Non
 
 def test_a_player_for_another_rate_is_replaced_before_the_first_sample(player: Player) -> None:
     before = """
-from talkcli.engine import library
+from talkcli.engine.synthesizers import library
 from talkcli.values import replace
 load = library.load
 library.load = lambda: replace(load(), rate=16_000)

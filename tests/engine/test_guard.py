@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.engine import guard
+from talkcli.engine.synthesizers import guard
 
 #: What the rules are about, and what comes near it: initials, stops, apostrophes, scripts of every kind, long words.
 _PIECES = (

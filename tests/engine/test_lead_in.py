@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine import outlet, protocol
+from talkcli.engine import protocol
+from talkcli.engine.players import outlet
 from tests.engine.spawned import FAST, SOON, Spawned, children
 from tests.engine.test_player_faults import Player, player
 from tests.support import compare
@@ -73,7 +74,7 @@ def test_a_player_gets_it_once_and_it_does_not_count(player: Player) -> None:
 
 def test_a_device_that_was_idle_gets_it_again(player: Player) -> None:
     sentences = _bytes()
-    before = "from talkcli.engine import outlet\noutlet.IDLE_AFTER = 0.0"
+    before = "from talkcli.engine.players import outlet\noutlet.IDLE_AFTER = 0.0"
     with Spawned(player.plays(), lead_in=LEAD_IN, before=before) as engine:
         engine.until(protocol.Voices)
         for number, text in enumerate(TEXTS):
@@ -82,7 +83,7 @@ def test_a_device_that_was_idle_gets_it_again(player: Player) -> None:
 
 
 def test_a_player_after_a_long_pause_gets_it_again(player: Player) -> None:
-    before = "from talkcli.engine import outlet\noutlet.IDLE_AFTER = 0.2"
+    before = "from talkcli.engine.players import outlet\noutlet.IDLE_AFTER = 0.2"
     constants = {"RELEASE_AFTER": 0.1}
     with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=0.3) as engine:
         engine.until(protocol.Voices)
@@ -102,7 +103,7 @@ def test_a_player_after_a_long_pause_gets_it_again(player: Player) -> None:
 
 
 def test_a_sentence_that_goes_on_as_soon_as_the_device_was_let_go_of_gets_it_again(player: Player) -> None:
-    before, constants = "from talkcli.engine import outlet\noutlet.IDLE_AFTER = 0.3", {"RELEASE_AFTER": 0.3}
+    before, constants = "from talkcli.engine.players import outlet\noutlet.IDLE_AFTER = 0.3", {"RELEASE_AFTER": 0.3}
     with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=SOON) as engine:
         engine.until(protocol.Voices)
         engine.say(TEXTS[0])

@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.dial import Interrupted
+from talkcli.client.dial import Interrupted
 from talkcli.engine import render as rendering
 from talkcli.engine import spawn
 from talkcli.engine.pieces import pieces

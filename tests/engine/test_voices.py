@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine import protocol, voices
+from talkcli.engine import protocol
 from talkcli.engine.protocol import Voice
-from talkcli.engine.voices import find_voice, unknown_voice
+from talkcli.engine.synthesizers import voices
+from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from tests.engine.spawned import USUAL, Spawned
 from tests.support.reference import Sentence, render
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 SET_ALL = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
-from talkcli.engine.library import load
+from talkcli.engine.synthesizers.library import load
 espeak = load().espeak
 current = []
 for each in json.load(sys.stdin):

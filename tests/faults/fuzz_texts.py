@@ -32,7 +32,7 @@ _START, _LONGEST = 20.0, 60.0
 #: What a process says last that wrote past the end of a buffer, which is what the guard knows.
 OVERFLOW = "SIGABRT"
 #: Puts the texts before the library as they are.
-_UNGUARDED = "from talkcli.engine import guard; guard.guarded = lambda text, voice: text; "
+_UNGUARDED = "from talkcli.engine.synthesizers import guard; guard.guarded = lambda text, voice: text; "
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
 
-from talkcli.text import fault
+from talkcli.goals.text import fault
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.render import render
-from talkcli.text import fault
+from talkcli.goals.text import fault
 from tests.conformance.hearing import LOW, assert_same, send
 from tests.faults.fuzz_texts import speak_all
 from tests.faults.fuzz_texts_generator import SENTENCES, Case

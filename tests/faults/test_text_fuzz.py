@@ -11,7 +11,7 @@ import random
 
 import pytest
 
-from talkcli.engine.guard import guarded
+from talkcli.engine.synthesizers.guard import guarded
 from tests.faults.fuzz_texts import fuzz, list_voices, speak_all
 from tests.faults.fuzz_texts_generator import Case, cases, crashers, dated
 

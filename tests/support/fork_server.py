@@ -31,9 +31,18 @@ _LEFT_OUT = {
     f"talkcli.{each}" for each in ("__main__", "cli.tabulate", "engine.espeak", "engine.library", "engine.process")
 }
 
+_PACKAGES = ("cli", "client", "doctor", "engine", "engine.players", "goals", "protocol", "server", "terminal")
+
 
 def _import_talk() -> None:
-    for package in ("talkcli", "talkcli.cli", "talkcli.client", "talkcli.doctor", "talkcli.engine", "talkcli.server"):
+    for package in (
+        "talkcli",
+        "talkcli.cli",
+        "talkcli.client.client",
+        "talkcli.doctor",
+        "talkcli.engine",
+        "talkcli.server",
+    ):
         for each in pkgutil.iter_modules(getattr(importlib.import_module(package), "__path__", ())):
             name = f"{package}.{each.name}"
             if name not in _LEFT_OUT:

@@ -12,8 +12,8 @@ import socket
 import threading
 from typing import TYPE_CHECKING, Any
 
-from talkcli.messages import Goal
-from talkcli.states import State
+from talkcli.goals.messages import Goal
+from talkcli.goals.states import State
 from tests.support.connection import PATIENCE
 from tests.support.surroundings import short_directory
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from talkcli.effects import Cancelled, Changed, Effect, Now, Submitted
-from talkcli.messages import By, Sender
-from talkcli.requests import Cancel, Say
-from talkcli.scheduler import Scheduler
+from talkcli.goals.effects import Cancelled, Changed, Effect, Now, Submitted
+from talkcli.goals.messages import By, Sender
+from talkcli.goals.requests import Cancel, Say
+from talkcli.goals.scheduler import Scheduler
 
 if TYPE_CHECKING:
-    from talkcli.record import Record
-    from talkcli.states import State
+    from talkcli.goals.record import Record
+    from talkcli.goals.states import State
 
 ARM = Sender(pid=7, uid=1000, command="talk", name="arm")
 DOOR = Sender(pid=8, uid=1000, command="talk", name="door")

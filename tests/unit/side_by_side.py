@@ -12,19 +12,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start, Stop
-from talkcli.requests import Cancel, Say
-from talkcli.scheduler import Scheduler
-from talkcli.states import IllegalTransition, State
+from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start, Stop
+from talkcli.goals.requests import Cancel, Say
+from talkcli.goals.scheduler import Scheduler
+from talkcli.goals.states import IllegalTransition, State
 from tests.unit.random_goals import BOOT, MAX_TEXT
 from tests.unit.slow_goal import ENDS, Selection, Wish
 from tests.unit.slow_model import Refused, SlowModel
 from tests.unit.witness import Witness
 
 if TYPE_CHECKING:
-    from talkcli.effects import Submitted
-    from talkcli.messages import By, Goal, Sender
-    from talkcli.record import Record
+    from talkcli.goals.effects import Submitted
+    from talkcli.goals.messages import By, Goal, Sender
+    from talkcli.goals.record import Record
 
 ORDERS: dict[type[Effect], str] = {Start: "start", Stop: "stop", GiveUp: "give up", Hold: "hold", Resume: "resume"}
 

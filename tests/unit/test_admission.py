@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.admission import MAX_KEY, MAX_PRIORITY, bad_option, bad_setting, is_clients_id
-from talkcli.requests import Say, Set
+from talkcli.goals.admission import MAX_KEY, MAX_PRIORITY, bad_option, bad_setting, is_clients_id
+from talkcli.goals.requests import Say, Set
 from talkcli.server import run
 
 NO_SECONDS: list[object] = [-1, -0.001, math.nan, math.inf, -math.inf, 10**400, -(10**400)]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 from talkcli import __version__
-from talkcli.columns import Screen, width
 from talkcli.doctor import places, report, sentence, serving, voice
 from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding, behind, done, failed, heard, next_step, warning
 from talkcli.doctor.places import Place, Places
 from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Engine, Python
-from talkcli.messages import Goal
-from talkcli.states import State
+from talkcli.goals.messages import Goal
+from talkcli.goals.states import State
+from talkcli.terminal.columns import Screen, width
 from talkcli.unreachable import ABSENT, FORBIDDEN, STALE
 
 PYTHON = Python("3.11.2", "/usr/bin/python3", "2.99")

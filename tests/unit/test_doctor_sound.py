@@ -8,7 +8,7 @@ from talkcli.doctor import level, session, sound
 from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding
 from talkcli.doctor.session import Session
 from talkcli.doctor.sound import Cards, Devices, Players, SoundServer
-from talkcli.engine import players
+from talkcli.engine.players import programs as players
 from talkcli.values import replace
 
 PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)

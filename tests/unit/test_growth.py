@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli import wire
-from talkcli.pending import Pending
-from talkcli.record import Record
-from talkcli.requests import Say
+from talkcli.goals.pending import Pending
+from talkcli.goals.record import Record
+from talkcli.goals.requests import Say
+from talkcli.protocol import wire
 from tests.unit.robot import ARM, Robot
 
 if TYPE_CHECKING:

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli import history as module
-from talkcli.history import History
-from talkcli.messages import Sender
-from talkcli.record import Record
-from talkcli.states import State
+from talkcli.goals import history as module
+from talkcli.goals.history import History
+from talkcli.goals.messages import Sender
+from talkcli.goals.record import Record
+from talkcli.goals.states import State
 
 
 def ended(number: int, state: State = State.SUCCEEDED, text: str = "door open") -> Record:

@@ -22,42 +22,27 @@ from tests.support.surroundings import needs
 
 PACKAGE = Path(talkcli.__file__).parent
 
-#: Each of these may import those after it, never one before it.
-CHAIN = ["cli", "client", "wire", "requests", "messages", "states", "errors"]
+#: Each layer may import those before it, and itself; nothing imports one behind it.
+LAYERS = ["ground", "goals", "protocol", "terminal", "client", "engine", "server", "doctor", "cli"]
+#: The files of the ground, which lie flat and import nothing of the others but each other.
+GROUND = {"errors", "paths", "peers", "resources", "unreachable", "values"}
+#: What lies flat besides: the package's face and its command, which hand on what others have.
+FACE = {"", "__main__"}
+#: What is pure besides all of `goals` and `protocol`.
 PURE = [
-    "states",
-    "scheduler",
-    "admission",
-    "effects",
-    "pending",
-    "recent",
-    "selection",
-    "record",
-    "history",
-    "text",
-    "messages",
-    "events",
-    "replies",
-    "backlog",
-    "outgoing",
-    "requests",
-    "wire",
     "errors",
     "unreachable",
     "values",
+    "client.backlog",
+    "client.outgoing",
     "engine.changeover",
-    "engine.guard",
     "engine.murmur",
     "engine.restarts",
+    "engine.synthesizers.guard",
 ]
 IMPURE = {
     *("asyncio", "threading", "_thread", "socket", "_socket", "select", "selectors", "signal", "time", "datetime"),
     *("random", "secrets", "click", "pyttsx3", "platformdirs", "os", "io", "pathlib", "subprocess", "multiprocessing"),
-}
-#: What the package is made of, at its top: each a module, or a folder of them.
-PARTS = {
-    *("engine", "engine.thread", "engine.process", "engine.espeak", "engine.players", "scheduler"),
-    *("server", "paths", "client", "output", "cli"),
 }
 #: What stands at the top of the project; beside it only files and folders whose names begin with a dot.
 TOP = {"pyproject.toml", "talkcli", "tests", "completions", "README.md", "LICENSE"}
@@ -95,11 +80,19 @@ def sources() -> dict[str, ast.Module]:
 
 
 def part(module: str) -> str:
-    """Return which part of the package a module is of; `python -m talkcli` is the cli's, `server_x` the server's."""
+    """Return the layer of a module, or a file of the ground by its own name; `python -m talkcli` is the cli's."""
     first = module.partition(".")[0]
-    if first.startswith("server"):
-        return "server"
     return "cli" if first == "__main__" else first
+
+
+def layer(module: str) -> int:
+    """Return the place of a module's layer among the `LAYERS`."""
+    return LAYERS.index("ground" if module in GROUND else part(module))
+
+
+def pure() -> list[str]:
+    """Return the modules that have no I/O, no clock and no thread."""
+    return PURE + [each for each in sources() if part(each) in {"goals", "protocol"}]
 
 
 def absolute(module: str, node: ast.ImportFrom) -> str:
@@ -156,9 +149,16 @@ def inside(module: str) -> list[tuple[str, Import]]:
     ]
 
 
-def test_the_modules_that_these_rules_are_about_are_there() -> None:
-    assert set(PURE) | set(CHAIN) | PARTS <= sources().keys()
+def test_every_module_is_of_a_layer() -> None:
+    assert {part(each) for each in sources()} - {*FACE, "cli"} == GROUND | set(LAYERS) - {"ground", "cli"}
+    assert set(PURE) <= sources().keys()
     assert {"asyncio", "json"} & set().union(*map(outside, sources()))
+
+
+def test_nothing_imports_a_layer_above_it_not_even_for_its_types() -> None:
+    for module in sources().keys() - FACE:
+        above = {name for name, _ in inside(module) if name not in FACE and layer(name) > layer(module)}
+        assert not above, f"talkcli.{module} is of a layer below {above}"
 
 
 def test_the_top_of_the_project_holds_what_it_should() -> None:
@@ -191,17 +191,6 @@ def test_every_module_is_used() -> None:
     assert sources().keys() - used <= parents
 
 
-@pytest.mark.parametrize("name", CHAIN)
-def test_imports_point_one_way(name: str) -> None:
-    before = set(CHAIN[: CHAIN.index(name)]) | {"server", "engine"}
-    if name == "cli":
-        before = set()
-    for module in sources():
-        if part(module) == name:
-            wrong = {each for each, _ in inside(module) if part(each) in before}
-            assert not wrong, f"talkcli.{module} imports {wrong}"
-
-
 def test_no_module_imports_itself_by_a_detour_not_even_for_its_types() -> None:
     graph = {module: {name for name, _ in inside(module)} - {"", module} for module in sources() if module}
     try:
@@ -210,10 +199,10 @@ def test_no_module_imports_itself_by_a_detour_not_even_for_its_types() -> None:
         pytest.fail(f"imports go round: {error.args[1]}")
 
 
-@pytest.mark.parametrize("module", PURE)
+@pytest.mark.parametrize("module", pure())
 def test_what_decides_is_pure(module: str) -> None:
     assert not outside(module) & IMPURE
-    assert not {each for each, _ in inside(module) if part(each) not in PURE}
+    assert not {each for each, _ in inside(module) if each not in pure()}
 
 
 @pytest.mark.parametrize("library", ONLY)
@@ -256,7 +245,7 @@ def test_only_the_cli_prints_and_exits() -> None:
         assert "sys.stderr" not in words or module in COMPLAINING, f"talkcli.{module} writes to standard error"
 
 
-HEAVY = ["asyncio", "pyttsx3", "click", "platformdirs", "espeakng_loader", "talkcli.server", "talkcli.scheduler"]
+HEAVY = ["asyncio", "pyttsx3", "click", "platformdirs", "espeakng_loader", "talkcli.server", "talkcli.goals.scheduler"]
 #: What every start of a client would pay for: each takes as long to import as a server takes to answer, or longer.
 COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", "logging", "subprocess", "tempfile"]
 
@@ -264,12 +253,12 @@ COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", 
 @pytest.mark.parametrize(
     ("statement", "without"),
     [
-        ("import talkcli", [*HEAVY, *COSTLY, "talkcli.client"]),
-        ("import talkcli.client", [*HEAVY, *COSTLY]),
+        ("import talkcli", [*HEAVY, *COSTLY, "talkcli.client.client"]),
+        ("import talkcli.client.client", [*HEAVY, *COSTLY]),
         ("from talkcli import Client", [*HEAVY, *COSTLY]),
         ("import talkcli.cli, talkcli.cli.early", [*HEAVY, *COSTLY, "json", "re", "enum", "signal"]),
         ("import talkcli.cli.asking, talkcli.cli.saying, talkcli.cli.waiting", [*HEAVY, *COSTLY]),
-        ("import talkcli.output, talkcli.transcript, talkcli.cli.show, talkcli.cli.nearest", HEAVY),
+        ("import talkcli.terminal.output, talkcli.terminal.transcript, talkcli.cli.show, talkcli.cli.nearest", HEAVY),
     ],
 )
 def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> None:
@@ -283,7 +272,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 #: The doctor's modules that judge facts; they read a clock's format at most, and gather nothing.
 JUDGING = ["findings", "session", "voice", "sound", "level", "places", "sentence", "serving", "report"]
 #: What those may import of the package besides each other.
-FOR_JUDGING = {"", "columns", "messages", "printable", "states", "unreachable", "values"}
+FOR_JUDGING = {"", "goals.messages", "goals.states", "terminal.columns", "terminal.printable", "unreachable", "values"}
 
 
 def test_the_doctor_judges_without_looking() -> None:
@@ -298,7 +287,7 @@ def test_the_doctor_is_imported_by_its_command_alone_and_the_engine_where_it_nee
     for module in sources():
         for name, each in inside(module):
             if part(module) == "doctor" and not each.typing:
-                assert part(name) not in {"cli", "server", "output"}, f"talkcli.{module} imports {name}"
+                assert part(name) not in {"cli", "server"}, f"talkcli.{module} imports {name}"
                 assert part(name) != "engine" or each.function, f"talkcli.{module}:{each.line}"
             if part(name) == "doctor" and part(module) != "doctor":
                 assert module == "cli.doctor", f"talkcli.{module} imports {name}"

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.messages import By, Goal, Sender
-from talkcli.states import State
+from talkcli.goals.messages import By, Goal, Sender
+from talkcli.goals.states import State
 
 #: A goal always has all of these, null where unknown.
 KEYS = [

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.messages import Sender
-from talkcli.pending import Pending
-from talkcli.record import Record
+from talkcli.goals.messages import Sender
+from talkcli.goals.pending import Pending
+from talkcli.goals.record import Record
 
 steps = st.lists(
     st.tuples(

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest
-from talkcli.requests import (
+from talkcli.goals.requests import (
     KINDS,
     MAX_DATA,
     MAX_ID,
@@ -31,10 +31,10 @@ from talkcli.requests import (
     read_request,
     write_request,
 )
-from talkcli.wire import decode, encode, failure
+from talkcli.protocol.wire import decode, encode, failure
 
 if TYPE_CHECKING:
-    from talkcli.messages import JsonObject
+    from talkcli.goals.messages import JsonObject
 
 values = st.recursive(
     st.none()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.effects import Cancelled, Changed, Now
-from talkcli.messages import By
-from talkcli.requests import Say
-from talkcli.states import State
+from talkcli.goals.effects import Cancelled, Changed, Now
+from talkcli.goals.messages import By
+from talkcli.goals.requests import Say
+from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending, numbers
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.effects import GiveUp, Now, Start, Stop
-from talkcli.messages import By
-from talkcli.requests import Say
-from talkcli.scheduler import SILENCE_LIMIT
-from talkcli.states import IllegalTransition, State
+from talkcli.goals.effects import GiveUp, Now, Start, Stop
+from talkcli.goals.messages import By
+from talkcli.goals.requests import Say
+from talkcli.goals.scheduler import SILENCE_LIMIT
+from talkcli.goals.states import IllegalTransition, State
 from tests.unit.robot import DOOR, Robot, ending
 
 # What an engine may not say

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.messages import By
-from talkcli.recent import EARLY_CANCEL, MAX_EARLY_CANCELS
-from talkcli.requests import Say
-from talkcli.states import State
+from talkcli.goals.messages import By
+from talkcli.goals.recent import EARLY_CANCEL, MAX_EARLY_CANCELS
+from talkcli.goals.requests import Say
+from talkcli.goals.states import State
 from tests.unit.robot import DOOR, Robot, ending, numbers
 
 

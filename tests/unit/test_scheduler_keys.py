@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.messages import By
-from talkcli.recent import MAX_SAID
-from talkcli.requests import Say
-from talkcli.states import State
+from talkcli.goals.messages import By
+from talkcli.goals.recent import MAX_SAID
+from talkcli.goals.requests import Say
+from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending, numbers
 
 # Key

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.effects import Changed
-from talkcli.messages import By
-from talkcli.requests import Cancel, Say
-from talkcli.selection import select_waiting
-from talkcli.states import State
+from talkcli.goals.effects import Changed
+from talkcli.goals.messages import By
+from talkcli.goals.requests import Cancel, Say
+from talkcli.goals.selection import select_waiting
+from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending
 
 # Priority

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.effects import Hold, Now, Resume
-from talkcli.messages import By
-from talkcli.requests import Say
-from talkcli.scheduler import SILENCE_LIMIT
-from talkcli.states import State
+from talkcli.goals.effects import Hold, Now, Resume
+from talkcli.goals.messages import By
+from talkcli.goals.requests import Say
+from talkcli.goals.scheduler import SILENCE_LIMIT
+from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending
 
 # Time to live

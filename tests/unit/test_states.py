@@ -6,9 +6,9 @@ import itertools
 
 import pytest
 
-from talkcli.messages import Sender
-from talkcli.record import Record
-from talkcli.states import EXIT_CODES, TRANSITIONS, IllegalTransition, State, follow
+from talkcli.goals.messages import Sender
+from talkcli.goals.record import Record
+from talkcli.goals.states import EXIT_CODES, TRANSITIONS, IllegalTransition, State, follow
 
 #: actionlib's names and numbers.
 NUMBERS = {

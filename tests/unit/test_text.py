@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.text import fault
+from talkcli.goals.text import fault
 
 INVALID = {
     "empty": "",

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli import columns, output
-from talkcli.columns import Screen, width
-from talkcli.events import Event, PausedChanged, Snapshot, StateChanged, WordHeard
-from talkcli.messages import By, Goal, Sender
-from talkcli.replies import ServerStatus
-from talkcli.senders import who_forms, why_forms
-from talkcli.states import State
-from talkcli.transcript import Transcript, log_lines
+from talkcli.goals.messages import By, Goal, Sender
+from talkcli.goals.states import State
+from talkcli.protocol.events import Event, PausedChanged, Snapshot, StateChanged, WordHeard
+from talkcli.protocol.replies import ServerStatus
+from talkcli.terminal import columns, output
+from talkcli.terminal.columns import Screen, width
+from talkcli.terminal.senders import who_forms, why_forms
+from talkcli.terminal.transcript import Transcript, log_lines
 from talkcli.values import replace
 
 PATROL = Sender(812, 1000, "talk", "/bin/bash /home/robot/bin/patrol.sh --fast", "night watch")

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest, Busy, LineTooLong, ProtocolMismatch
-from talkcli.wire import (
+from talkcli.protocol.wire import (
     MAX_LINE,
     PROTOCOL,
     LineSplitter,
@@ -28,7 +28,7 @@ from talkcli.wire import (
 )
 
 if TYPE_CHECKING:
-    from talkcli.messages import JsonObject
+    from talkcli.goals.messages import JsonObject
 
 KIB = 1024
 

@@ -11,16 +11,18 @@ from typing import TYPE_CHECKING
 import click
 import pytest
 
-from talkcli import admission, errors, paths, states, text, wire
+from talkcli import errors, paths
 from talkcli.cli import commands
-from talkcli.history import MAX_ENDED, MAX_REJECTED
-from talkcli.messages import Goal
-from talkcli.requests import KINDS, MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
+from talkcli.goals import admission, states, text
+from talkcli.goals.history import MAX_ENDED, MAX_REJECTED
+from talkcli.goals.messages import Goal
+from talkcli.goals.requests import KINDS, MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
+from talkcli.goals.states import State
+from talkcli.protocol import wire
 from talkcli.server import connection, stream
 from talkcli.server.answers import RECENT
 from talkcli.server.later import ALL_WAITING, EACH, MAX_WAITING
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
-from talkcli.states import State
 from tests.wire.readme import ROOT, examples, first_column, section, tables, words
 
 if TYPE_CHECKING:

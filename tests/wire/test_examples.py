@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.states import EXIT_CODES
+from talkcli.goals.states import EXIT_CODES
 from tests.support.surroundings import needs
 from tests.wire.readme import examples, section
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli import events, wire
 from talkcli.errors import RequestRefused, refusal
-from talkcli.messages import Goal
-from talkcli.replies import ServerStatus
-from talkcli.requests import KINDS
+from talkcli.goals.messages import Goal
+from talkcli.goals.requests import KINDS
+from talkcli.protocol import events, wire
+from talkcli.protocol.replies import ServerStatus
 from tests.conformance.rawsocket import Raw
 
 if TYPE_CHECKING:

@@ -1,0 +1,270 @@
+"""A goal that was sent, or is followed: its state, its events as they come, its end.
+
+It reads nothing by itself: whoever waits on the client's connection reads for all, and `Followed` hands on what is for
+which handle. Whatever changes a handle does so under the connection's lock, and never after the goal has ended.
+"""
+
+from __future__ import annotations
+
+import time
+
+from talkcli.client.backlog import Backlog
+from talkcli.client.connection import SILENCE_LIMIT
+from talkcli.errors import UsageError
+from talkcli.goals.requests import Cancel
+from talkcli.goals.states import State
+from talkcli.protocol import events
+from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
+from talkcli.values import TYPE_CHECKING, replace
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from typing import Protocol
+    from weakref import WeakSet
+
+    from talkcli.client.connection import Connection
+    from talkcli.goals.messages import Goal, JsonObject
+    from talkcli.protocol.events import Event
+    from talkcli.protocol.replies import Canceled
+
+    class Client(Protocol):
+        """What a handle needs of the client that made it."""
+
+        _connection: Connection
+
+        def cancel(self, ids: Iterable[str] | None = None) -> Canceled: ...
+
+        def goal(self, goal_id: str) -> Goal: ...
+
+        def _follow_late(self, handle: GoalHandle, *, feedback: bool) -> None: ...
+
+
+class GoalHandle:
+    """A goal that was sent, or is followed. Any number of threads may use it.
+
+    Its events are kept until somebody takes them, the last 5,000 words of them: `events`, `feedback` and `poll` take
+    from the same store, each event is handed out once, and who breaks off and calls again goes on where it was. An
+    iterator is for one thread; another calls for its own.
+    """
+
+    def __init__(self, client: Client, goal: Goal) -> None:
+        self._client = client
+        #: the goal as it was last heard of
+        self.goal = goal
+        #: whether another `say` had sent this goal before, with the same id: this one only watches
+        self.attached = False
+        #: whether the server holds all speech, as far as it was heard of: nothing is spoken until somebody resumes
+        self.speech_paused = False
+        #: whether the server tells this connection how it ends
+        self._followed = False
+        #: … and each word
+        self._fed = False
+        #: since when the server has said that it is alive, by the monotonic clock
+        self._followed_at = 0.0
+        self._backlog = Backlog()
+        #: whether its Result has been handed out
+        self._told = False
+
+    @property
+    def id(self) -> str:
+        """The goal's id; empty where the goal was REJECTED before it was sent."""
+        return self.goal.id
+
+    @property
+    def state(self) -> State:
+        """The goal's state as far as it was read: `wait`, or any other call of the client, reads on."""
+        return self.goal.state
+
+    def wait(self, timeout: float | None = None) -> Goal:
+        """Wait until the goal has ended, and return it; TimeoutError after `timeout` seconds.
+
+        Where the server goes away first, the goal's state is LOST: it may have been spoken or not.
+        """
+        end = _end(timeout)
+        self._follow(feedback=False)
+        if not self._client._connection.wait_until(lambda: self.state.terminal, lambda: end, SILENCE_LIMIT):
+            self._give_up(timeout)
+        return self.goal
+
+    def events(self, timeout: float | None = None) -> Iterator[Event]:
+        """Iterate over what happens to the goal, as it happens; the last item is its Result.
+
+        StateChanged for each state; and if it was sent or followed with `feedback`, WordHeard for each word as it is
+        heard, and PausedChanged where speech is held or goes on.
+
+        TimeoutError where the goal has not ended `timeout` seconds after this call. Where the server goes away first,
+        the Result is a goal that is LOST, as with `wait`.
+        """
+        end = _end(timeout)
+        self._follow(feedback=False)
+        return self._events(end, timeout)
+
+    def feedback(self, timeout: float | None = None) -> Iterator[WordHeard]:
+        """Iterate over the goal's words as they are heard, until it has ended; TimeoutError as with `events`.
+
+        A goal that was sent without `feedback` gives those heard from this call on.
+        """
+        end = _end(timeout)
+        self._follow(feedback=True)
+        return (each for each in self._events(end, timeout) if isinstance(each, WordHeard))
+
+    def poll(self) -> Event | None:
+        """Return the next event that has come, as `events` has them, else None; the last is the Result. Never waits.
+
+        For a loop that must not: it reads what the server has said meanwhile, so it has to be called again and again.
+        UsageError for a goal that was sent with `follow=False`, of which nothing comes until `wait` or `events` asks.
+        """
+        event: Event | None = None
+
+        def arrived() -> bool:
+            nonlocal event
+            event = self._backlog.take()
+            return event is not None or self.state.terminal
+
+        if not (self._followed or self.state.terminal):
+            raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
+        connection, now = self._client._connection, time.monotonic()
+        if not connection.wait_until(arrived, lambda: now, SILENCE_LIMIT, since=self._followed_at, interruptible=False):
+            self._lose()
+        if event is None and self.state.terminal and not self._told:
+            event = self._result()
+        return event
+
+    def request_cancel(self) -> None:
+        """Ask for the goal to be cancelled, without waiting for it: `wait` tells how it ended."""
+        if self.id:
+            self._client._connection.post(Cancel((self.id,)))
+
+    def cancel(self) -> Goal:
+        """Cancel the goal, and return it once it has ended: silent, if it was being spoken."""
+        if not self.state.terminal:
+            found = self._client.cancel([self.id])
+            goal = next((each for each in (*found.canceled, *found.ended) if each.id == self.id), None)
+            self._settle(goal or self._client.goal(self.id))
+        return self.goal
+
+    # -- inside
+
+    def _hear(self, event: Event) -> None:
+        """Take up an event of this goal, or of all speech."""
+        if self.state.terminal:
+            return
+        if isinstance(event, Result):
+            self.goal = event.goal
+        elif isinstance(event, StateChanged):
+            # Its end comes with the result, which says how and why.
+            if not event.state.terminal:
+                self.goal = replace(self.goal, state=event.state)
+            self._backlog.add(event)
+        else:
+            if isinstance(event, PausedChanged):
+                self.speech_paused = event.paused
+                held = event.paused and event.id == self.id and self.state is State.ACTIVE
+                self.goal = replace(self.goal, paused=held)
+            if self._fed:
+                self._backlog.add(event)
+
+    def _settle(self, goal: Goal) -> None:
+        """Take up what the server says of the goal now, unless it is known to have ended."""
+        with self._client._connection.changed:
+            if not self.state.terminal:
+                self.goal = goal
+
+    def _events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
+        event: Event | None = None
+
+        def arrived() -> bool:
+            nonlocal event
+            event = self._backlog.take()
+            return event is not None or self.state.terminal
+
+        late = False
+        while True:
+            if late:  # what had arrived by the deadline counts, nothing after it: the goal may go on for ever
+                with self._client._connection.changed:
+                    found = arrived()
+            else:
+                found = self._client._connection.wait_until(arrived, lambda: end, SILENCE_LIMIT)
+                late = end is not None and time.monotonic() >= end
+            if not found:
+                self._give_up(timeout)
+            if event is None:
+                yield self._result()
+                return
+            yield event
+
+    def _result(self) -> Result:
+        self._told = True
+        return Result(self.goal)
+
+    def _follow(self, *, feedback: bool) -> None:
+        """Have this connection told of the goal, if it isn't yet."""
+        if not (self.state.terminal or (self._followed and (self._fed or not feedback))):
+            self._client._follow_late(self, feedback=feedback)
+
+    def _give_up(self, timeout: float | None) -> None:
+        """Conclude that the goal is lost, where nothing more can be heard of it; else raise TimeoutError."""
+        if not self._lose():
+            raise TimeoutError(f"{self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
+
+    def _lose(self) -> bool:
+        """Conclude that the goal is lost, and return True, where nothing more can be heard of it."""
+        ended = self._client._connection.ended
+        if ended is not None:
+            words = f"Talk lost: {ended}; it may still be spoken"
+            self._settle(replace(self.goal, state=State.LOST, reason="lost", message=words))
+        return ended is not None
+
+
+class Followed:
+    """Who is told what: handles of the goals that are followed, and those who watch all. Used under one lock."""
+
+    def __init__(self) -> None:
+        self._handles: dict[str, list[GoalHandle]] = {}
+        self._watches: WeakSet[Backlog] | None = None
+
+    def add(self, handle: GoalHandle, *, feedback: bool) -> None:
+        """Tell a handle of its goal from now on."""
+        handle._fed = handle._fed or feedback
+        if not (handle._followed or handle.state.terminal):
+            self._handles.setdefault(handle.id, []).append(handle)
+            handle._followed_at = time.monotonic()
+        handle._followed = True
+
+    def watch(self, backlog: Backlog) -> None:
+        """Put everything that happens into this backlog, as long as somebody holds it."""
+        from weakref import WeakSet  # few watch, and all would wait for the import
+
+        # A watch ends when nobody holds its iterator any more.
+        self._watches = WeakSet() if self._watches is None else self._watches
+        self._watches.add(backlog)
+
+    def hear(self, message: JsonObject) -> None:
+        """Hand on an event; ValueError where it is none."""
+        event = events.from_json(message)
+        if isinstance(event, Result):
+            for handle in self._handles.pop(event.goal.id, ()):
+                handle._hear(event)
+        elif isinstance(event, StateChanged | WordHeard | PausedChanged):
+            self._tell_handles(event)
+            # Of the goals that are waited for the states come twice: with the whole goal to those who watch.
+            if not isinstance(event, StateChanged) or event.goal or not _tells_all(event.state):
+                for backlog in self._watches or ():
+                    backlog.add(event)
+
+    def _tell_handles(self, event: StateChanged | WordHeard | PausedChanged) -> None:
+        if isinstance(event, PausedChanged):
+            handles = [handle for each in self._handles.values() for handle in each]
+        else:
+            handles = self._handles.get(event.id, [])
+        for handle in handles:
+            handle._hear(event)
+
+
+def _tells_all(state: State) -> bool:
+    """Whether those who watch are told the whole goal with this state."""
+    return state is State.PENDING or state.terminal
+
+
+def _end(timeout: float | None) -> float | None:
+    return None if timeout is None else time.monotonic() + timeout

@@ -1,0 +1,102 @@
+"""Where the sound goes: opens a sink for each sentence, as `--player` and `--device` say.
+
+It remembers which player worked and when the device was last in use: none is open between two sentences.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+
+from talkcli.engine.changeover import Changeover
+from talkcli.engine.players.nullsink import NullSink
+from talkcli.engine.players.pipe import PlayerPipe
+from talkcli.engine.players.programs import commands, on_path
+from talkcli.engine.players.sink import AudioFailed
+from talkcli.engine.players.wavefile import WavFile
+from talkcli.engine.players.wavestream import WavStream
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from talkcli.engine.players.sink import Sink
+
+_NULL = "null"
+_FILE = "file:"
+
+#: Seconds after which a device that was let go of counts as idle, and gets the lead-in again: the power saving of sound
+#: cards (snd_hda_intel) begins after 1 s where it is on, sound servers suspend a device after 5 s. Silence counts as
+#: idle: loudspeakers that switch themselves off do so by what they hear.
+IDLE_AFTER = 1.0
+
+
+class Outlet:
+    """The player setting of one engine process."""
+
+    def __init__(
+        self,
+        player: str | None,
+        device: str | None,
+        inherited: Sequence[int] = (),
+        lead_in: float = 0.0,
+        output: int | None = None,
+    ) -> None:
+        """`inherited` are descriptors that every player program gets, `lead_in` seconds for a device that slept.
+
+        `output`: a descriptor that gets a WAV file of all sentences, instead of any player.
+        """
+        self._player = player
+        self._device = device
+        self._inherited = inherited
+        self._lead_in = lead_in
+        self._output = output
+        self._streaming = False
+        #: what lies between two sentences
+        self.changeover = Changeover()
+        self._worked: str | None = None
+        self._used_at: float | None = None
+
+    @property
+    def is_program(self) -> bool:
+        """Whether what plays is a program, which takes a while to start."""
+        return self._output is None and self._player != _NULL and not (self._player or "").startswith(_FILE)
+
+    def candidates(self, rate: int) -> list[Callable[[], Sink]]:
+        """Return what opens the sinks to try for a sentence, best first; AudioFailed if there is none."""
+        if self._output is not None:
+            return [partial(self._stream, self._output, rate)]
+        if self._player == _NULL:
+            return [partial(NullSink, rate)]
+        if self._player is not None and self._player.startswith(_FILE):
+            return [partial(WavFile, self._player[len(_FILE) :], rate)]
+        found = commands(self._player, self._device, rate, on_path, self._worked)
+        return [partial(PlayerPipe, command, self._inherited) for command in found]
+
+    def worked(self, name: str) -> None:
+        """Take note that a sentence was played whole by the player of this name."""
+        self._worked = name
+
+    def let_go(self, silent_at: float | None = None) -> None:
+        """Take note that a device was closed; `silent_at`: since when it had played nothing but silence."""
+        self._used_at = time.monotonic() if silent_at is None else silent_at
+
+    def lead_in(self) -> float:
+        """Return the seconds of silence that a player which is started now begins with."""
+        idle = self._used_at is None or time.monotonic() - self._used_at >= IDLE_AFTER
+        return self._lead_in if idle else 0.0
+
+    def first(self) -> str | None:
+        """Return the name of what is tried first, for people; None if nothing is found."""
+        if self._output is not None:
+            return WavStream.name
+        if self._player is not None:
+            return self._player
+        try:
+            return commands(None, None, 1, on_path, self._worked)[0].name
+        except AudioFailed:
+            return None
+
+    def _stream(self, output: int, rate: int) -> WavStream:
+        first, self._streaming = not self._streaming, True
+        return WavStream(output, rate, first=first)

@@ -1,0 +1,194 @@
+"""A player program at the end of a pipe: the sink that is heard.
+
+It is started for one sentence and is gone after it. Nothing in here blocks, except that a killed player is given a
+moment to be reaped.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import struct
+import time
+
+from talkcli.engine.players.child import Child
+from talkcli.engine.players.complaint import Complaint
+from talkcli.engine.players.sink import AudioFailed
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from talkcli.engine.players.programs import Command
+    from talkcli.engine.players.sink import Interest
+
+#: Seconds that a player which closed its input is given to end and to say why, before it is killed.
+LAST_WORDS = 0.5
+
+#: Seconds to wait on the spot for a killed player; it takes 1 ms. One that hangs in the kernel is left to `gone`.
+REAP_WITHIN = 0.02
+
+#: Seconds between two looks at the player where the system has no descriptor for its end (macOS, Linux before 5.3).
+LOOK_EVERY = 0.01
+
+#: Bytes of standard error that are read in one go; a player that floods it must not keep us from the sound.
+STDERR_AT_ONCE = 65536
+
+
+class PlayerPipe:
+    """The running player of one sentence."""
+
+    real_time = True
+
+    def __init__(self, command: Command, inherited: Sequence[int] = ()) -> None:
+        """Start the player; AudioFailed (no_player) if that is impossible. It inherits the descriptors given."""
+        self.name = command.name
+        self.proven = False
+        self._read_ahead = command.read_ahead
+        self._at_start = command.at_start
+        self._complaint = Complaint()
+        self._child = _start(command, inherited)
+        self._overhead = len(command.preamble)
+        self._written = 0
+        self._consumed = 0
+        self._broken_at: float | None = None
+        self._closed = False
+        self._write(memoryview(command.preamble))
+
+    def offer(self, data: memoryview) -> int:
+        """Write what fits into the pipe."""
+        self.ended()  # raises if the player is gone
+        # One piece at a time: what waits in the pipe would be heard late by whoever pauses.
+        waiting = 0 if self._child.stdin is None else _unread(self._child.stdin)
+        if waiting == 0:
+            return self._write(data)
+        # But a player that has taken nothing yet is to find what it needs to begin.
+        room = self._at_start - waiting if waiting == self._written else 0
+        return self._write(data[:room]) if room > 0 else 0
+
+    def consumed(self) -> int:
+        """Return how many bytes of sound the player has taken out of the pipe."""
+        if self._child.stdin is not None and self._broken_at is None:
+            self._consumed = max(self._consumed, self._written - _unread(self._child.stdin) - self._overhead)
+        elif self._closed:
+            self._consumed = self._written - self._overhead
+        if self._consumed > self._read_ahead:
+            self.proven = True
+        return self._consumed
+
+    def close(self) -> None:
+        """Close the player's input: it drains and ends."""
+        self.consumed()
+        self._closed = True
+        self._child.close_stdin()
+
+    def ended(self) -> bool:
+        """Return True when the player ended well after `close`; AudioFailed if it ended in any other way."""
+        self._read_stderr()
+        status = self._child.status()
+        if status is None:
+            self._check_broken()
+            return False
+        self._read_stderr()
+        if status == 0 and self._closed:
+            return True
+        raise self._verdict(status)
+
+    def interests(self) -> list[Interest]:
+        """Return the pipe, where there is something to write, the player's standard error, and its end."""
+        child, wanted = self._child, []
+        if child.stdin is not None and self._broken_at is None:
+            wanted.append((child.stdin, select.POLLOUT))
+        if child.stderr is not None:
+            wanted.append((child.stderr, select.POLLIN))
+        if child.exit is not None:
+            wanted.append((child.exit, select.POLLIN))
+        return wanted
+
+    def wake_at(self) -> float | None:
+        """Return when to look at the player again."""
+        if self._child.exit is None:
+            return time.monotonic() + LOOK_EVERY
+        return None if self._broken_at is None else self._broken_at + LAST_WORDS
+
+    def kill(self) -> None:
+        """Kill the player and what it has started, and reap it if that takes no time."""
+        self._child.kill()
+        self._child.close_stdin()
+        self._child.await_end(REAP_WITHIN)
+        self.gone()
+
+    def gone(self) -> bool:
+        """Return True once the player is reaped."""
+        if self._child.status() is None:
+            return False
+        self._child.release()
+        return True
+
+    def _write(self, data: memoryview) -> int:
+        if self._child.stdin is None or self._broken_at is not None:
+            return 0
+        try:
+            written = os.write(self._child.stdin, data)
+        except BlockingIOError:
+            return 0
+        except BrokenPipeError:
+            self._broken_at = time.monotonic()
+            return 0
+        self._written += written
+        return written
+
+    def _check_broken(self) -> None:
+        """Give up on a player that closed its input but does not end."""
+        if self._broken_at is not None and time.monotonic() - self._broken_at >= LAST_WORDS:
+            line = self._complaint.line()
+            raise AudioFailed("audio_lost", line or f"{self.name} closed its input before the sound was over")
+
+    def _verdict(self, status: int) -> AudioFailed:
+        self.consumed()
+        line = self._complaint.line()
+        if status < 0:
+            return AudioFailed("audio_lost", f"{self.name} was killed by {_signal_name(-status)}")
+        if status == 0:
+            return AudioFailed("audio_lost", line or f"{self.name} ended before the sound did")
+        reason = "audio_lost" if self.proven else "audio_device"
+        return AudioFailed(reason, line or f"{self.name} exited with status {status}")
+
+    def _read_stderr(self) -> None:
+        if self._child.stderr is None:
+            return
+        try:
+            data = os.read(self._child.stderr, STDERR_AT_ONCE)
+        except BlockingIOError:
+            return
+        if data:
+            self._complaint.feed(data)
+        else:
+            self._child.close_stderr()
+
+
+def _start(command: Command, inherited: Sequence[int]) -> Child:
+    try:
+        return Child(command.argv, inherited)
+    except OSError as error:
+        text = error.strerror or str(error)
+        raise AudioFailed("no_player", f"{command.name} cannot be started: {text}") from error
+
+
+def _unread(pipe: int) -> int:
+    """Return how many bytes wait in the pipe; 0 where the system does not tell."""
+    import fcntl
+    import termios
+
+    try:
+        return int(struct.unpack("i", fcntl.ioctl(pipe, termios.FIONREAD, b"\0\0\0\0"))[0])
+    except OSError:
+        return 0
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

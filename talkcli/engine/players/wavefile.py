@@ -1,0 +1,162 @@
+"""The player "file:PATH": a WAV file to which every sentence is appended.
+
+It is a valid WAV file after every sentence and after a stop. It never writes to a file that it might not have
+written: only the plain 44-byte header that it writes itself is accepted. What a crash left behind the length in that
+header is cut off.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import struct
+
+from talkcli.engine.players.sink import SAMPLE, AudioFailed
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from talkcli.engine.players.sink import Interest
+
+_HEADER = struct.Struct("<4sI4s4sIHHIIHH4sI")
+#: The header's two lengths are 32 bits wide.
+_UNKNOWN = 0xFFFFFFFF
+_LONGEST = _UNKNOWN - _HEADER.size
+
+
+class WavFile:
+    """The WAV file, open for one sentence."""
+
+    real_time = False
+    proven = True
+
+    def __init__(self, path: str, rate: int) -> None:
+        """Open or create the file; AudioFailed (audio_device) if it cannot take this sentence."""
+        self.name = f"file:{path}"
+        self._path = path
+        self._rate = rate
+        self._start = 0
+        self._taken = 0
+        self._file: int | None = _open(path)
+        try:
+            self._start = _data_length(self._file, path, rate)
+            os.ftruncate(self._file, _HEADER.size + self._start)
+            self._write_header()
+        except (OSError, AudioFailed) as error:
+            os.close(self._file)
+            self._file = None
+            raise _refused(path, error) from error
+
+    def offer(self, data: memoryview) -> int:
+        """Append the samples."""
+        if self._file is None:
+            return 0
+        if self._start + self._taken + len(data) > _LONGEST:
+            raise AudioFailed("audio_lost", f"{self._path} is full: a WAV file holds 4 GiB")
+        try:
+            taken = os.pwrite(self._file, data, _HEADER.size + self._start + self._taken)
+        except OSError as error:
+            raise AudioFailed("audio_lost", f"{self._path}: {error.strerror}") from error
+        self._taken += taken
+        return taken
+
+    def consumed(self) -> int:
+        """Return what was appended."""
+        return self._taken
+
+    def close(self) -> None:
+        """Write the new length into the header."""
+        if self._file is None:
+            return
+        file, self._file = self._file, None
+        try:
+            self._write_header(file)
+        except OSError as error:
+            raise AudioFailed("audio_lost", f"{self._path}: {error.strerror}") from error
+        finally:
+            os.close(file)
+
+    def ended(self) -> bool:
+        """Return True once it is closed."""
+        return self._file is None
+
+    def interests(self) -> list[Interest]:
+        """Return nothing: a file takes everything at once."""
+        return []
+
+    def wake_at(self) -> float | None:
+        """Return "at once"."""
+        return 0.0
+
+    def kill(self) -> None:
+        """Keep what was written so far as a valid file."""
+        # The sentence has ended by a stop or by an error of its own, which is the one to report.
+        with contextlib.suppress(AudioFailed):
+            self.close()
+
+    def gone(self) -> bool:
+        """Return True once it is closed."""
+        return self._file is None
+
+    def _write_header(self, file: int | None = None) -> None:
+        target = self._file if file is None else file
+        assert target is not None
+        os.pwrite(target, _header(self._rate, self._start + self._taken), 0)
+
+
+def _open(path: str) -> int:
+    try:
+        if not path:
+            raise AudioFailed("audio_device", "the player file: needs a path, as in file:speech.wav")
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o666)
+    except OSError as error:
+        raise _refused(path, error) from error
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
+        raise AudioFailed("audio_device", f"{path} is no regular file")
+    return file
+
+
+def _refused(path: str, error: OSError | AudioFailed) -> AudioFailed:
+    if isinstance(error, AudioFailed):
+        return error
+    return AudioFailed("audio_device", f"{path} cannot be written: {error.strerror}")
+
+
+def _header(rate: int, length: int) -> bytes:
+    size = _HEADER.size - 8 + length
+    return _HEADER.pack(
+        b"RIFF", size, b"WAVE", b"fmt ", 16, 1, 1, rate, rate * SAMPLE, SAMPLE, 8 * SAMPLE, b"data", length
+    )
+
+
+def endless_header(rate: int) -> bytes:
+    """Return the header of a file whose length nobody knows yet: both of its lengths are the greatest there are."""
+    return _HEADER.pack(
+        b"RIFF", _UNKNOWN, b"WAVE", b"fmt ", 16, 1, 1, rate, rate * SAMPLE, SAMPLE, 8 * SAMPLE, b"data", _UNKNOWN
+    )
+
+
+def _data_length(file: int, path: str, rate: int) -> int:
+    """Return the length of the samples in the file, 0 for an empty one; AudioFailed if the file is not ours."""
+    size = os.fstat(file).st_size
+    if size == 0:
+        return 0
+    header = os.pread(file, _HEADER.size, 0)
+    if len(header) < _HEADER.size:
+        raise _foreign(path)
+    fields = _HEADER.unpack(header)
+    found_rate, length = fields[7], fields[12]
+    if header != _header(found_rate, length):
+        raise _foreign(path)
+    if found_rate != rate:
+        raise AudioFailed(
+            "audio_device", f"{path} has {found_rate} samples a second, this voice {rate}: use another file"
+        )
+    if size < _HEADER.size + length:
+        raise AudioFailed("audio_device", f"{path} is shorter than its header says: use another file")
+    return int(length)
+
+
+def _foreign(path: str) -> AudioFailed:
+    return AudioFailed("audio_device", f"{path} is no WAV file of talk's (16 bit, one channel): use another file")

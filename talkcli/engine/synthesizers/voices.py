@@ -1,0 +1,190 @@
+"""Voices as pyttsx3's drivers list them, in the protocol's form, and how a user's word is matched with them.
+
+libespeak-ng itself takes a name, an id or its last part, but no language ("en-gb" is unknown to it); it drops a variant
+that it doesn't know without a word, and copies any into 40 bytes. So what it is given is always an id and a variant of
+its own lists, found here. This module asks the driver and sets nothing.
+"""
+
+from __future__ import annotations
+
+import os
+
+from talkcli.engine.protocol import Voice
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from typing import Any
+
+#: A variant changes how any of espeak's voices sounds. It is listed by what is written behind the voice's name, and
+#: alone it goes with the driver's default, which is English.
+VARIANT = "+"
+_DEFAULT = "en"
+#: Two of the lists that libespeak-ng gives only when asked by these names, in the place of a language.
+_VARIANTS, _MBROLA = b"variant", b"mbrola"
+#: Where it looks for the sounds of a voice of MBROLA's, which it can speak only if these and the program are there.
+_MBROLA_PLACES = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
+
+#: Words that are proposed in the place of an unknown one, and how near they must be to it.
+_NEAR, _CUTOFF = 3, 0.5
+#: How near a word must be to the English name of a language to be a slip of the finger: "englsh" is, "welsh" is not.
+_SAME_NAME = 0.85
+#: Characters of an unknown word that are repeated in the message.
+_SHOWN = 60
+
+
+def list_voices(engine: Any) -> tuple[Voice, ...]:
+    """Return all voices of the engine's driver; of `talk`'s own, after them, the variants as "+f3"."""
+    from talkcli.engine.synthesizers.espeak import DRIVER
+
+    found = [_voice(each) for each in engine.getProperty("voices") or ()]
+    if engine.driver_name == DRIVER:
+        found += [*_mbrola_voices(), *_variants()]
+    return tuple(found)
+
+
+def find_voice(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
+    """Return the voice with this id, last part of an id, name or language, in this order; case does not count.
+
+    Each may have a variant of espeak's behind it, "en-us+f3"; the id of what is returned has it, too.
+    """
+    plain, variants = _parted(voices)
+    found = _named(wanted, plain)
+    if found is not None or not variants:
+        return found
+    name, plus, suffix = wanted.partition(VARIANT)
+    variant = _variant(suffix, variants) if plus else _named(wanted, variants)
+    base = _named(name if plus and name else _DEFAULT, plain)
+    if variant is None or base is None:
+        return None
+    return Voice(base.id + variant.id, base.language, base.name + variant.id)
+
+
+def unknown_voice(wanted: str, voices: tuple[Voice, ...]) -> str:
+    """Return the message for a voice that is not there: what comes near, and the next step."""
+    plain, variants = _parted(voices)
+    name, plus, suffix = wanted.partition(VARIANT)
+    shown = wanted if len(wanted) <= _SHOWN else f"{wanted[:_SHOWN]}…"
+    if plus and variants and (not name or _named(name, plain)):
+        words = {each.id.removeprefix(VARIANT): each for each in variants}
+        near = [f"{name}{VARIANT}{each}" for each in _near(suffix, words)]
+    else:
+        words = {}
+        for place in reversed(range(4)):  # as `talk voices` writes them: the language's "en-us" before the id's "en-US"
+            for each in plain:
+                words.setdefault(_words(each)[place] or each.id, each)
+        # The names of another driver's voices may be anything: macOS has persons'.
+        near = (_in_english(name, plain) if variants else []) or _near(name, words)
+    hint = f"did you mean {' or '.join(repr(word) for word in near)}? " if near else ""
+    return f'unknown voice "{shown}": {hint}"talk voices" lists them'
+
+
+def _parted(voices: Iterable[Voice]) -> tuple[list[Voice], list[Voice]]:
+    """Return the voices that speak by themselves, and the variants."""
+    plain: list[Voice] = []
+    variants: list[Voice] = []
+    for voice in voices:
+        (variants if voice.id.startswith(VARIANT) else plain).append(voice)
+    return plain, variants
+
+
+def _named(wanted: str, voices: list[Voice]) -> Voice | None:
+    word = wanted.casefold()
+    if not word:
+        return None
+    named = [[each.casefold() for each in _words(voice)] for voice in voices]
+    for place in range(4):
+        for voice, words in zip(voices, named, strict=True):
+            if words[place] == word:
+                return voice
+    return None
+
+
+def _words(voice: Voice) -> tuple[str, str, str, str]:
+    """Return what a voice can be called, in the order in which it counts."""
+    return voice.id, voice.id.rpartition("/")[2], voice.name, voice.language or ""
+
+
+def _variant(suffix: str, variants: list[Voice]) -> Voice | None:
+    """Return the variant behind a plus; a number is a male one, from 11 on a female one, as libespeak-ng has it."""
+    word = suffix.casefold()
+    if word.isdecimal() and word.isascii() and len(word) < 3:
+        number = int(word)
+        word = f"m{number}" if number < 10 else f"f{number - 10}"
+    return next((each for each in variants if each.id.casefold() == VARIANT + word), None)
+
+
+def _near(wanted: str, words: dict[str, Voice]) -> list[str]:
+    """Return the words that come near, each of another voice."""
+    import difflib
+
+    folded: dict[str, str] = {}
+    for each in words:
+        folded.setdefault(each.casefold(), each)
+    word = wanted.casefold()
+    near = difflib.get_close_matches(word, folded, n=4 * _NEAR, cutoff=_CUTOFF)
+    if len(word) > 2:
+        near.sort(key=lambda each: word not in each)
+        near += [each for each in folded if word in each]
+    result: dict[str, str] = {}
+    for each in near:
+        result.setdefault(words[folded[each]].id, folded[each])
+    return list(result.values())[:_NEAR]
+
+
+def _in_english(wanted: str, voices: list[Voice]) -> list[str]:
+    """Return the languages whose English name was mistyped: libespeak-ng's are "English (Great Britain)" and the like.
+
+    The three shortest. None for a name without a slip, or a voice's whole name: these come near by themselves.
+    """
+    import difflib
+
+    called: dict[str, list[str]] = {}
+    for each in voices:
+        if each.language:
+            called.setdefault(each.name.partition(" ")[0].casefold(), []).append(each.language)
+    word = wanted.casefold()
+    found = difflib.get_close_matches(word, called, n=1, cutoff=_SAME_NAME)
+    if not found or found[0] in {word, *(each.name.casefold() for each in voices)}:
+        return []
+    return sorted(called[found[0]], key=len)[:_NEAR]
+
+
+def _voice(found: Any) -> Voice:
+    languages = found.languages or []
+    language = languages[0] if languages else None
+    if isinstance(language, bytes):  # older drivers: a priority byte, then the language
+        language = language[1:].decode("utf-8", "replace")
+    return Voice(id=str(found.id), language=language or None, name=str(found.name or found.id))
+
+
+def _variants() -> list[Voice]:
+    """Return the variants, whose ids are files: "!v/f3"."""
+    found = [(identifier.rpartition("/")[2], name) for identifier, _, name in _listed(_VARIANTS)]
+    return [Voice(VARIANT + file, None, f"variant {name}") for file, name in found]
+
+
+def _mbrola_voices() -> list[Voice]:
+    """Return those of MBROLA's voices that are installed; libespeak-ng lists all that it knows of."""
+    if not any(os.access(os.path.join(each, "mbrola"), os.X_OK) for each in os.get_exec_path()):
+        return []
+    return [Voice(*each) for each in _listed(_MBROLA) if _has_sounds(each[0])]
+
+
+def _has_sounds(identifier: str) -> bool:
+    """Tell whether the sounds of "mb/mb-de4-en", which are called "de4", are there."""
+    sounds = identifier.rpartition("/")[2].split("-")[1]
+    return any(os.path.isfile(place.format(sounds)) for place in _MBROLA_PLACES)
+
+
+def _listed(kind: bytes) -> list[tuple[str, str, str]]:
+    """Return id, language and name of what libespeak-ng lists under a name; `talk`'s own driver has loaded it."""
+    from pyttsx3.drivers import _espeak
+
+    found = []
+    for each in _espeak.ListVoices(_espeak.VOICE(languages=kind)):
+        # The first byte of the languages is a priority.
+        fields = (each.identifier, (each.languages or b"")[1:], each.name)
+        identifier, language, name = ((field or b"").decode("utf-8", "replace") for field in fields)
+        found.append((identifier, language, name))
+    return found

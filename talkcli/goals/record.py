@@ -1,0 +1,158 @@
+"""The scheduler's own record of a goal. Outside the scheduler it is read, never written.
+
+Slots and no dictionary: a queue of a hundred thousand goals has to stay small.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from talkcli.goals.messages import By, Goal
+from talkcli.goals.states import State, follow
+
+if TYPE_CHECKING:
+    from talkcli.goals.messages import JsonObject, Sender
+    from talkcli.goals.requests import Say
+
+
+class Record:
+    """One goal, from its acceptance to its end."""
+
+    __slots__ = (
+        "ahead",
+        "began",
+        "behind",
+        "by",
+        "data",
+        "duration",
+        "ended_at",
+        "expires_at",
+        "format",
+        "holds",
+        "id",
+        "key",
+        "message",
+        "newer",
+        "number",
+        "older",
+        "paused",
+        "pitch",
+        "preempt",
+        "priority",
+        "queued_at",
+        "rate",
+        "reason",
+        "sender",
+        "spoken_end",
+        "started_at",
+        "state",
+        "stop_since",
+        "text",
+        "text_bytes",
+        "text_hash",
+        "ttl",
+        "voice",
+        "volume",
+        "waits",
+    )
+
+    def __init__(self, goal_id: str, number: int, text: str, sender: Sender, queued_at: float) -> None:
+        self.id = goal_id
+        #: order of acceptance
+        self.number = number
+        self.text: str | None = text
+        #: stands for the text once that is dropped
+        self.text_hash = 0
+        #: what the text takes in the history
+        self.text_bytes = len(text.encode(errors="surrogatepass"))
+        self.sender = sender
+        self.queued_at = queued_at
+        self.state = State.PENDING
+        self.preempt = False
+        self.priority = 0
+        self.key: str | None = None
+        #: seconds from acceptance in which it must begin, and the monotonic time at which they are over
+        self.ttl: float | None = None
+        self.expires_at: float | None = None
+        #: its own settings, None where it has the server's
+        self.rate: int | None = None
+        self.volume: float | None = None
+        self.voice: str | None = None
+        self.pitch: int | None = None
+        #: whether it is in the queue, and its neighbours there, by turn and by acceptance; the queue's business alone
+        self.waits = False
+        self.ahead: Record | None = None
+        self.behind: Record | None = None
+        self.older: Record | None = None
+        self.newer: Record | None = None
+        self.format = "text"
+        self.data: JsonObject | None = None
+        self.reason: str | None = None
+        self.by: By | None = None
+        self.message: str | None = None
+        #: offset after the last word that was heard
+        self.spoken_end = 0
+        #: held in the middle of being spoken
+        self.paused = False
+        #: how often that was asked for
+        self.holds = 0
+        #: monotonic time at which it was handed to the engine
+        self.began = 0.0
+        self.started_at: float | None = None
+        self.ended_at: float | None = None
+        self.duration: float | None = None
+        #: monotonic time of the first stop
+        self.stop_since: float | None = None
+
+    def become(self, state: State) -> None:
+        """Change the state as the table allows, or raise IllegalTransition and change nothing."""
+        self.state = follow(self.state, state)
+
+    def hold(self) -> None:
+        """Be held, once more."""
+        self.paused = True
+        self.holds += 1
+
+    def take_options(self, say: Say) -> None:
+        """Take over what the goal's sender asked for, but for what the server decides: preempt and ttl."""
+        self.priority, self.key = say.priority, say.key
+        self.rate, self.volume, self.voice, self.pitch = say.rate, say.volume, say.voice, say.pitch
+        self.format, self.data = say.format, say.data
+
+    def drop_text(self) -> None:
+        """Forget the text, to make room; the result stays."""
+        self.text_hash = hash(self.text)
+        self.text = None
+
+    def has_text(self, text: str) -> bool:
+        """Whether this was the goal's text, also where it is not kept any more."""
+        return hash(text) == self.text_hash if self.text is None else text == self.text
+
+    def snapshot(self, state: State | None = None) -> Goal:
+        """Return the goal as it is now; with PENDING, as it was when it was accepted."""
+        state = self.state if state is None else state
+        accepted = state is State.PENDING
+        started_at = None if accepted else self.started_at
+        spoken = None
+        if started_at is not None and self.text is not None:
+            spoken = self.text[: self.spoken_end]
+        return Goal(
+            id=self.id,
+            state=state,
+            text=self.text,
+            reason=None if accepted else self.reason,
+            by=None if accepted else self.by,
+            message=None if accepted else self.message,
+            format=self.format,
+            spoken=spoken,
+            priority=self.priority,
+            key=self.key,
+            ttl=self.ttl,
+            data=self.data,
+            client=self.sender,
+            paused=self.paused and state is self.state,
+            queued_at=self.queued_at,
+            started_at=started_at,
+            ended_at=None if accepted else self.ended_at,
+            duration=None if accepted else self.duration,
+        )

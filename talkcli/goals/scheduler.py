@@ -1,0 +1,390 @@
+"""The scheduler: which goal is spoken, which waits, and how each ends.
+
+Pure: a request, an engine event or the time goes in, effects come out; no thread, socket or clock inside. A method
+either does all of its step or raises and has changed nothing. Effects are to be carried out in their order.
+
+What holds after every step: at most one goal is ACTIVE or PREEMPTING, and none starts before that one has ended, while
+speech is paused, or while there is no engine; a goal ends once; the order in which goals wait is `pending`'s.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from talkcli.goals import text as texts
+from talkcli.goals.admission import bad_option, is_clients_id
+from talkcli.goals.effects import Cancelled, Changed, GiveUp, Hold, Resume, Start, Stop, Submitted
+from talkcli.goals.history import History
+from talkcli.goals.messages import By
+from talkcli.goals.pending import Pending
+from talkcli.goals.recent import EarlyCancels, Said, throttling
+from talkcli.goals.record import Record
+from talkcli.goals.selection import making_way, select
+from talkcli.goals.states import IllegalTransition, State
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+
+    from talkcli.goals.effects import Effect, Now
+    from talkcli.goals.messages import Sender
+    from talkcli.goals.requests import Cancel, Say
+
+#: Seconds after a stop in which silence must be confirmed: `cancel` is answered within 2 s whatever happens.
+SILENCE_LIMIT = 1.9
+
+SUCCEEDED_MESSAGE = "Talk completed successfully"
+PREEMPTED_MESSAGE = "Talk preempted"
+
+
+class Scheduler:
+    """Goals of one server. `boot` makes their ids: four characters a server start."""
+
+    def __init__(
+        self,
+        boot: str,
+        *,
+        preempt: bool,
+        max_queue: int,
+        max_text: int = texts.MAX_CHARACTERS,
+        ttl: float = 0.0,
+    ) -> None:
+        self.boot = boot
+        #: whether goals that don't say preempt
+        self.preempt = preempt
+        #: time to live of goals that don't say, in seconds; 0 for no limit
+        self.ttl = ttl
+        self.max_queue = max_queue
+        self.max_text = max_text
+        self.history = History()
+        #: the goal that is ACTIVE or PREEMPTING
+        self.active: Record | None = None
+        #: whether nothing is to be spoken until `resume`
+        self.paused = False
+        #: whether there is an engine to start the next goal; without one they wait
+        self.has_engine = True
+        self._pending = Pending()
+        self._by_id: dict[str, Record] = {}
+        self._said = Said()
+        self._early = EarlyCancels()
+        self._count = 0
+        self._closing = False
+
+    # -- what there is
+
+    @property
+    def pending_count(self) -> int:
+        return len(self._pending)
+
+    def pending(self) -> Iterator[Record]:
+        """Return the pending goals in the order in which they will be spoken."""
+        return iter(self._pending)
+
+    def find(self, goal_id: str) -> Record | None:
+        """Return a goal that is active, pending, or still remembered."""
+        return self._by_id.get(goal_id) or self.history.find(goal_id)
+
+    def with_key(self, key: str | None) -> list[Record]:
+        """Return the goals with this key that have not ended."""
+        return [each for each in (self.active, self._pending.with_key(key)) if each and each.key == key is not None]
+
+    def lacks_room(self, say: Say, now: Now, fault: tuple[str, str] | None = None) -> bool:
+        """Whether this goal would be REJECTED only because the queue is full; `fault` as in `submit`."""
+        early = self._early.find(say.id, now.monotonic)
+        return not (early or self.has_room(say)) and self._refuse(say, fault, None) is None
+
+    def has_room(self, say: Say) -> bool:
+        """Whether a goal that lacked nothing but room need wait no longer."""
+        attaches = say.id is not None and self.find(say.id) is not None
+        return attaches or self._way(say) is not None
+
+    def unfinished(self) -> list[Record]:
+        """Return the active goal and the pending ones."""
+        return ([self.active] if self.active else []) + list(self._pending)
+
+    # -- what clients ask for
+
+    def submit(
+        self, say: Say, sender: Sender, now: Now, fault: tuple[str, str] | None = None, canceled: By | None = None
+    ) -> Submitted:
+        """Accept or reject a goal. Admission is one step: a goal that is REJECTED has done nothing to the others.
+
+        `fault`: reason and words, where something was found wrong with it that can't be known here; `canceled`: who
+        cancelled it while it waited for room, so that it is RECALLED at once.
+        """
+        first = self.find(say.id) if say.id is not None and is_clients_id(say.id) else None
+        if first is not None and first.has_text(say.text):
+            return Submitted(first, [], attached=True)
+        self._count += 1
+        record = self._record(say, sender, now)
+        by = canceled or self._early.find(say.id, now.monotonic)
+        refused = self._refuse(say, fault, first) or (None if canceled else self._throttle(say, record, now))
+        way = self._way(say)
+        if way is None and not (by or refused):
+            refused = "queue_full", f"{len(self._pending)} goals are waiting already (`talk serve --max-queue`)"
+        if refused:
+            record.reason, words = refused
+            record.state, record.message, record.ended_at = State.REJECTED, f"Talk rejected: {words}", now.wall
+            self.history.add(record)
+            return Submitted(record, [Changed(record, State.REJECTED)])
+        record.id = say.id or record.id
+        self._by_id[record.id] = record
+        effects: list[Effect] = [Changed(record, State.PENDING)]
+        if by:
+            words = "canceled before it was spoken" if canceled else "canceled before it arrived"
+            return Submitted(record, effects + self._recalled(record, "canceled", words, by, now))
+        effects += self._make_way(record, way or [], now)
+        return Submitted(record, effects + self._start_next(now))
+
+    def cancel(
+        self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
+    ) -> Cancelled:
+        """End what is selected: pending goals at once, the active one as soon as the engine is silent.
+
+        `waiting`: ids that it selects of goals that have not been submitted yet.
+        """
+        done = Cancelled()
+        by = By(client=sender)
+        chosen = select(selection, self, done, waiting)
+        for goal_id in filter(is_clients_id, done.unknown):
+            self._early.note(goal_id, by, now.monotonic)
+        for record in chosen:
+            if record.state is State.PENDING:
+                done.effects += self._recall(record, "canceled", "canceled before it was spoken", by, now)
+                done.recalled.append(record)
+            else:
+                done.effects += self._stop(record, "canceled", by, now)
+                done.stopping = record
+        return done
+
+    def shutdown(self, now: Now) -> list[Effect]:
+        """End everything, and take no goal any more."""
+        self._closing = True
+        effects: list[Effect] = []
+        for record in list(self._pending):
+            effects += self._recall(record, "shutdown", "the server was stopped", None, now)
+        if self.active:
+            effects += self._stop(self.active, "shutdown", None, now)
+        return effects
+
+    def pause(self) -> list[Effect]:
+        """Hold the goal being spoken, and start none."""
+        if self.paused:
+            return []
+        self.paused = True
+        if self.active is None or self.active.state is not State.ACTIVE:
+            return []
+        self.active.hold()
+        return [Hold(self.active)]
+
+    def resume(self, now: Now) -> list[Effect]:
+        """Go on with the goal that is held, or else with the next."""
+        if not self.paused:
+            return []
+        self.paused = False
+        if self.active is None:
+            return self._start_next(now)
+        if not self.active.paused:
+            return []  # it is being stopped
+        self.active.paused = False
+        return [Resume(self.active)]
+
+    # -- what the engine says
+
+    def engine_lost(self) -> None:
+        """Start no goal until there is an engine again."""
+        self.has_engine = False
+
+    def engine_ready(self, now: Now) -> list[Effect]:
+        """Go on: there is an engine that takes the next goal."""
+        self.has_engine = True
+        return self._start_next(now)
+
+    def engine_missing(self, words: str, now: Now) -> list[Effect]:
+        """End the goal whose turn it is: an engine was waited for long enough, and once more none came."""
+        if self.active or self.paused or self.has_engine:
+            return []
+        effects = self._expire(now)
+        record = self._pending.first()
+        if record is None:
+            return effects
+        effects.append(self._activate(record, now))
+        return effects + self.failed(record.id, "engine_failed", words, None, now)
+
+    def heard(self, goal_id: str, end: int) -> Record:
+        """Note that the word that ends at this offset of the text is being heard."""
+        record = self._spoken(goal_id)
+        record.spoken_end = max(record.spoken_end, end)
+        return record
+
+    def completed(self, goal_id: str, duration: float | None, now: Now) -> list[Effect]:
+        """End the active goal: all of it was played."""
+        record = self._spoken(goal_id)
+        record.duration = duration
+        record.spoken_end = len(record.text or "")
+        # A stop that came too late ended nothing: its reason goes.
+        return self._end(record, State.SUCCEEDED, None, SUCCEEDED_MESSAGE, None, now)
+
+    def failed(self, goal_id: str, reason: str, words: str, duration: float | None, now: Now) -> list[Effect]:
+        """End the active goal: engine or audio failed.
+
+        One that was being stopped is silent now, so it is PREEMPTED, unless the silence is what failed (not_silent).
+        """
+        record = self._spoken(goal_id)
+        record.duration = duration
+        if record.state is State.PREEMPTING and reason != "not_silent":
+            return self.stopped(goal_id, now)
+        return self._end(record, State.ABORTED, reason, f"Talk aborted: {words}", record.by, now)
+
+    def stopped(self, goal_id: str, now: Now) -> list[Effect]:
+        """End the active goal, which was told to stop: it is silent."""
+        record = self._spoken(goal_id)
+        return self._end(record, State.PREEMPTED, record.reason, PREEMPTED_MESSAGE, record.by, now)
+
+    # -- time
+
+    def deadline(self) -> float | None:
+        """Return the monotonic time at which `tick` has something to do."""
+        due = (self._silence_deadline(), self._pending.next_expiry(), self._unbegun_deadline())
+        return min((each for each in due if each is not None), default=None)
+
+    def tick(self, now: Now) -> list[Effect]:
+        """Do what is due: recall goals whose time is over; abort one that was stopped and isn't silent in time."""
+        effects: list[Effect] = []
+        deadline = self._silence_deadline()
+        if self.active is not None and deadline is not None and now.monotonic >= deadline:
+            record = self.active
+            words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
+            effects = [GiveUp(record), *self._end(record, State.ABORTED, "not_silent", words, record.by, now)]
+        deadline = self._unbegun_deadline()
+        if self.active is not None and deadline is not None and now.monotonic >= deadline:
+            effects += self._stop(self.active, "expired", None, now)
+        return effects + self._expire(now)
+
+    # -- inside
+
+    def _record(self, say: Say, sender: Sender, now: Now) -> Record:
+        record = Record(f"{self.boot}-{self._count}", self._count, say.text, sender, now.wall)
+        record.preempt = self._preempts(say)
+        record.ttl = (self.ttl if say.ttl is None else say.ttl) or None
+        record.expires_at = None if record.ttl is None else now.monotonic + record.ttl
+        record.take_options(say)
+        return record
+
+    def _refuse(self, say: Say, fault: tuple[str, str] | None, first: Record | None) -> tuple[str, str] | None:
+        """Return reason and words why a goal can't be had, whatever else is being said."""
+        if self._closing:
+            return "shutdown", "the server is being stopped"
+        words = bad_option(say)
+        if words:
+            return "bad_option", words
+        if first is not None:
+            return "id_conflict", f"the id {say.id} is that of another text already"
+        return texts.fault(say.text, self.max_text) or fault
+
+    def _throttle(self, say: Say, record: Record, now: Now) -> tuple[str, str] | None:
+        found = throttling(say, self.active, self._pending, self._said, now.monotonic)
+        if found is None:
+            return None
+        record.by = By(goal=found[0])
+        return "throttled", f"the same {found[1]}"
+
+    def _way(self, say: Say) -> list[tuple[Record, str]] | None:
+        # There never are more goals in the queue than may be: one that will be recalled makes room enough.
+        return making_way(say, self._pending, self.max_queue, preempts=self._preempts(say))
+
+    def _preempts(self, say: Say) -> bool:
+        return say.flush or (self.preempt if say.preempt is None else say.preempt)
+
+    def _make_way(self, record: Record, ended: list[tuple[Record, str]], now: Now) -> list[Effect]:
+        """Queue a goal that was accepted, and end what it replaces, preempts or displaces."""
+        by = By(goal=record.id)
+        effects: list[Effect] = []
+        queued = False
+        for each, reason in ended:
+            if reason == "replaced" and each.priority == record.priority and not record.preempt:
+                self._pending.replace(each, record)
+                queued = True
+            else:
+                self._pending.remove(each)
+            effects += self._recalled(each, reason, f"{reason} by {record.id}", by, now)
+        if record.preempt and self.active and self.active.priority <= record.priority:
+            effects += self._stop(self.active, "preempted", by, now)
+        if not queued:
+            self._pending.add(record)
+        return effects
+
+    def _expire(self, now: Now) -> list[Effect]:
+        effects: list[Effect] = []
+        for record in self._pending.expired(now.monotonic):
+            words = f"its time to live of {record.ttl:g} s was over before it was spoken"
+            effects += self._recall(record, "expired", words, None, now)
+        return effects
+
+    def _silence_deadline(self) -> float | None:
+        if self.active is None or self.active.stop_since is None:
+            return None
+        return self.active.stop_since + SILENCE_LIMIT
+
+    def _unbegun_deadline(self) -> float | None:
+        """Return when the active goal expires: one whose engine was lost before it was heard may have to begin anew."""
+        goal = self.active
+        if goal is None or self.has_engine or goal.state is not State.ACTIVE or goal.spoken_end:
+            return None
+        return goal.expires_at
+
+    def _start_next(self, now: Now) -> list[Effect]:
+        if self.active or self.paused or not self.has_engine:
+            return []
+        effects = self._expire(now)
+        record = self._pending.first()
+        if record is None:
+            return effects
+        return [*effects, self._activate(record, now), Start(record)]
+
+    def _activate(self, record: Record, now: Now) -> Changed:
+        record.become(State.ACTIVE)
+        self._pending.remove(record)
+        record.started_at, record.began = now.wall, now.monotonic
+        self.active = record
+        return Changed(record, State.ACTIVE)
+
+    def _recall(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
+        self._pending.remove(record)
+        return self._recalled(record, reason, words, by, now)
+
+    def _recalled(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
+        record.become(State.RECALLING)
+        return self._close(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
+
+    def _stop(self, record: Record, reason: str, by: By | None, now: Now) -> list[Effect]:
+        if record.state is State.PREEMPTING:
+            return []  # the first stop gives the reason, later ones join it
+        record.become(State.PREEMPTING)
+        record.reason, record.by, record.stop_since = reason, by, now.monotonic
+        record.paused = False
+        return [Changed(record, State.PREEMPTING), Stop(record)]
+
+    def _spoken(self, goal_id: str) -> Record:
+        if self.active is None or self.active.id != goal_id:
+            raise IllegalTransition(f"{goal_id} is not being spoken")
+        return self.active
+
+    def _end(
+        self, record: Record, state: State, reason: str | None, message: str, by: By | None, now: Now
+    ) -> list[Effect]:
+        effects = self._close(record, state, reason, message, by, now)
+        self.active = None
+        return effects + self._start_next(now)
+
+    def _close(
+        self, record: Record, state: State, reason: str | None, message: str, by: By | None, now: Now
+    ) -> list[Effect]:
+        record.become(state)
+        record.reason, record.message, record.by = reason, message, by
+        record.ended_at = now.wall
+        record.paused = False
+        if record.spoken_end and state is not State.ABORTED:
+            self._said.note(record)
+        self._by_id.pop(record.id)
+        self.history.add(record)
+        return [Changed(record, state)]

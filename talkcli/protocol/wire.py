@@ -1,0 +1,171 @@
+"""The wire: one JSON object a line, UTF-8, and the greeting. No I/O: bytes go in, objects come out, and back.
+
+Rules for this file: it knows lines and their limits, never what a request means. Anything that comes from outside ends
+as an object or as a BadRequest, whatever bytes they were. A change that an older peer could not read needs another
+PROTOCOL number; `{"request": "cancel"}` and `{"request": "status"}` stay the same in all of them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+
+from talkcli.errors import BadRequest, Busy, LineTooLong, ProtocolMismatch
+from talkcli.values import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from talkcli.goals.messages import JsonObject
+
+PROTOCOL = 1
+
+#: Bytes of one request line, its newline included: the longest text (40,000 bytes of UTF-8) fits with room for quotes,
+#: and so do 10,000 characters that are all escaped as \uXXXX.
+MAX_LINE = 64 * 1024
+
+#: A JSON integer of more digits is no count or time of ours, and converting thousands of digits takes quadratic time.
+MAX_DIGITS = 20
+
+
+def encode(message: JsonObject) -> bytes:
+    """Return the object as a line. Text goes as UTF-8; only what UTF-8 cannot hold (a lone surrogate) is escaped."""
+    try:
+        return _ENCODER.encode(message).encode() + b"\n"
+    except UnicodeEncodeError:
+        return _ASCII_ENCODER.encode(message).encode() + b"\n"
+
+
+def decode(line: bytes) -> JsonObject:
+    """Return the object in a line; BadRequest, whose code says why, where there is none."""
+    try:
+        value = _DECODER.decode(line.decode())
+    except UnicodeDecodeError as error:
+        raise BadRequest(f"a line is UTF-8, but byte {error.start} of this one is not", "bad_encoding") from None
+    except RecursionError:
+        raise BadRequest("this JSON is nested too deep", "bad_json") from None
+    except ValueError as error:
+        raise BadRequest(f"a line is one JSON object: {error}", "bad_json") from None
+    if not isinstance(value, dict):
+        raise BadRequest(f"a line is one JSON object, not {type(value).__name__}", "bad_json")
+    return value
+
+
+def _no_duplicates(pairs: list[tuple[str, object]]) -> JsonObject:
+    fields = dict(pairs)
+    if len(fields) != len(pairs):
+        raise ValueError("the same key twice")
+    return fields
+
+
+def _no_constant(name: str) -> object:
+    raise ValueError(f"{name} is no JSON")
+
+
+def _short_integer(digits: str) -> int:
+    if len(digits) > MAX_DIGITS:
+        raise ValueError(f"an integer of {len(digits)} digits")
+    return int(digits)
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise ValueError("a number past every float")
+    return number
+
+
+# Made once: `json.dumps` and `json.loads` make a new one for each line that isn't written or read in their own way,
+# which takes half as long as an event's line itself.
+_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
+_ASCII_ENCODER = json.JSONEncoder(allow_nan=False)
+_DECODER = json.JSONDecoder(
+    object_pairs_hook=_no_duplicates, parse_constant=_no_constant, parse_int=_short_integer, parse_float=_finite
+)
+
+
+class LineSplitter:
+    """Cuts a stream of bytes into lines; holds no more than one line of `limit` bytes that is not finished."""
+
+    __slots__ = ("_limit", "_rest")
+
+    def __init__(self, limit: int | None = MAX_LINE) -> None:
+        """`limit` is for what comes from a client; None, for what comes from a server that is trusted."""
+        self._limit = limit
+        self._rest = bytearray()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Return the lines that are complete now, without their newlines; LineTooLong, with those before it, past the
+        limit.
+
+        After that error the stream cannot be followed any further: the connection has to be closed.
+        """
+        self._rest += data
+        lines: list[bytes] = []
+        if b"\n" in data:
+            *complete, rest = self._rest.split(b"\n")
+            for line in complete:
+                self._check(line, lines)
+                lines.append(bytes(line))
+            self._rest = rest
+        self._check(self._rest, lines)
+        return lines
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether a line has begun and not ended."""
+        return bool(self._rest)
+
+    def _check(self, line: bytearray, before: list[bytes]) -> None:
+        if self._limit is not None and len(line) + 1 > self._limit:
+            raise LineTooLong(self._limit, before)
+
+
+def greeting(version: str, pid: int, boot: str) -> JsonObject:
+    """Return what a server says first."""
+    return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": []}
+
+
+def busy_greeting() -> JsonObject:
+    """Return what a server says first, and last, that takes no more clients."""
+    return {"talk": PROTOCOL, "error": "busy"}
+
+
+def check_greeting(message: JsonObject, version: str) -> None:
+    """Raise ProtocolMismatch or Busy where a client of `version` can't go on after this greeting."""
+    theirs = message.get("talk")
+    if theirs != PROTOCOL or isinstance(theirs, bool):
+        server = ascii(message.get("version", "unknown"))
+        older = isinstance(theirs, int) and theirs < PROTOCOL
+        side = "restart the server with the newer version" if older else "upgrade this command"
+        raise ProtocolMismatch(
+            f"this command (version {version}) speaks protocol {PROTOCOL}, the server (version {server}) speaks "
+            f"{theirs!a}: {side}"
+        )
+    if message.get("error") == "busy":
+        raise Busy("the server has as many clients as it takes (`talk serve --max-clients`)", "busy")
+
+
+def ok(seq: int | None, **fields: object) -> JsonObject:
+    """Return the reply that closes a request that was carried out."""
+    return {**_numbered(seq), "ok": True, **fields}
+
+
+def item(seq: int | None, **fields: object) -> JsonObject:
+    """Return one line of a list; the list's reply follows."""
+    return {**_numbered(seq), **fields}
+
+
+def failure(seq: int | None, code: str, message: str) -> JsonObject:
+    """Return the reply to a request that was not carried out."""
+    return {**_numbered(seq), "ok": False, "error": {"code": code, "message": message}}
+
+
+def take_seq(message: JsonObject) -> int | None:
+    """Take the number of a request out of it; BadRequest where it is no number."""
+    seq = message.pop("seq", None)
+    if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
+        raise BadRequest('"seq" must be an integer', "bad_field")
+    return seq
+
+
+def _numbered(seq: int | None) -> JsonObject:
+    return {} if seq is None else {"seq": seq}

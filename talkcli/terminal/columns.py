@@ -1,0 +1,161 @@
+"""Text in the columns of a terminal: how wide it is, cut to fit, padded, coloured, shared out.
+
+Pure: the terminal's width and whether it takes colour come from the caller. What is given is fit to be shown already;
+see `printable`.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+from talkcli.goals.states import State
+from talkcli.values import TYPE_CHECKING, frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+#: Between two columns.
+GAP = "  "
+#: An id of a client's own may have 64 characters; a column for all of them would leave nothing for the text.
+LONGEST_ID = 20
+#: A terminal that says it is narrower is not believed: a line of less would show nothing.
+NARROWEST = 40
+
+_COLOURING = re.compile("\x1b\\[[0-9;]*m")
+_COLOURS = {
+    State.PENDING: "36",
+    State.ACTIVE: "1;32",
+    State.PREEMPTING: "33",
+    State.PREEMPTED: "33",
+    State.RECALLED: "33",
+    State.SUCCEEDED: "32",
+    State.ABORTED: "31",
+    State.REJECTED: "31",
+    State.LOST: "31",
+}
+
+
+@frozen
+class Screen:
+    """Where lines will be shown."""
+
+    #: columns; None where it is no terminal, and nothing has to fit
+    width: int | None = None
+    colour: bool = False
+
+    def room(self, taken: int) -> int | None:
+        """Return the columns that are left beside those taken; None for any number."""
+        return None if self.width is None else max(self.width, NARROWEST) - taken
+
+    def painted(self, text: str, state: State | None) -> str:
+        """Return the text in the colour of a state."""
+        code = _COLOURS.get(state) if state is not None else "1"
+        return f"\x1b[{code}m{text}\x1b[0m" if self.colour and code else text
+
+
+def width(text: str) -> int:
+    """Return how many columns the text takes; colours take none."""
+    if "\x1b" in text:
+        text = _COLOURING.sub("", text)
+    return len(text) if text.isascii() else sum(map(_columns, text))
+
+
+def cut(text: str, columns: int | None) -> str:
+    """Return the text, ended with an … where it is wider than so many columns; it must not be coloured."""
+    if columns is None or width(text) <= columns:
+        return text
+    taken = 0
+    for place, character in enumerate(text):
+        taken += _columns(character)
+        if taken > columns - 1:
+            return f"{text[:place]}…" if columns > 0 else ""
+    return text
+
+
+def shortened(text: str, columns: int | None) -> str:
+    """Return the text, cut to so many columns; one in quotes keeps the closing one."""
+    if columns is None or not (len(text) > 1 and text[0] == text[-1] == '"'):
+        return cut(text, columns)
+    return f'"{cut(text[1:-1], columns - 2)}"'
+
+
+def id_room(screen: Screen) -> int | None:
+    """Return how many columns an id may take: on a terminal, a quarter of the line."""
+    room = screen.room(0)
+    return None if room is None else max(LONGEST_ID, room // 4)
+
+
+def pad(text: str, columns: int) -> str:
+    """Return the text with blanks after it, so that it takes at least so many columns."""
+    return text + " " * (columns - width(text))
+
+
+def longest_that_fits(forms: Sequence[str], columns: int | None) -> str:
+    """Return the first of the forms, longest first, that fits; the last one cut if none does."""
+    for form in forms:
+        if columns is None or width(form) <= columns:
+            return form
+    return cut(forms[-1], columns)
+
+
+def share(wanted: Sequence[int], weights: Sequence[int], room: int) -> list[int]:
+    """Return how many columns each gets: what it wants, or its share by weight of what the others leave."""
+    given = [0] * len(wanted)
+    left, weight_left = room, sum(weights)
+    for each in sorted(range(len(wanted)), key=lambda each: wanted[each] / weights[each]):
+        given[each] = max(0, min(wanted[each], left * weights[each] // weight_left))
+        left -= given[each]
+        weight_left -= weights[each]
+    return given
+
+
+def fitted(texts: Sequence[str], *others: Sequence[Sequence[str]], weights: Sequence[int], room: int) -> list[str]:
+    """Return a line for each text, in columns that take no more than `room` together.
+
+    `others`: what stands beside the texts, column by column: for each text its forms, the longest first. What they
+    leave of their share (by `weights`, the texts' first) is the texts'.
+    """
+    room -= len(GAP) * len(others)
+    longest = [max(map(width, texts)), *(max(width(forms[0]) for forms in column) for column in others)]
+    shares = share(longest, weights, room)[1:]
+    chosen = [
+        [longest_that_fits(forms, columns) for forms in column] for column, columns in zip(others, shares, strict=True)
+    ]
+    widths = [max(map(width, column)) for column in chosen]
+    left = min(longest[0], room - sum(widths))
+    return [
+        GAP.join(map(pad, (shortened(text, left), *beside), (left, *widths))).rstrip()
+        for text, *beside in zip(texts, *chosen, strict=True)
+    ]
+
+
+def wrapped(parts: Sequence[str], first: str, screen: Screen) -> list[str]:
+    """Return the parts, joined by commas, as lines that begin under the end of `first` and break between two parts."""
+    return _lines([*(f"{each}," for each in parts[:-1]), parts[-1]], first, screen)
+
+
+def folded(text: str, first: str, screen: Screen) -> list[str]:
+    """Return a text as lines that begin under the end of `first` and break between two words."""
+    return _lines(text.split(" "), first, screen)
+
+
+def _lines(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
+    """Return the pieces, joined by blanks; one that is wider than a line is left to the terminal to break."""
+    room = screen.room(width(first))
+    lines = []
+    line = pieces[0]
+    for piece in pieces[1:]:
+        if room is not None and width(line) + 1 + width(piece) > room:
+            lines.append(line)
+            line = piece
+        else:
+            line += f" {piece}"
+    lines.append(line)
+    return [f"{' ' * width(first) if number else first}{each}" for number, each in enumerate(lines)]
+
+
+def _columns(character: str) -> int:
+    if unicodedata.combining(character):
+        return 0
+    return 2 if unicodedata.east_asian_width(character) in "WF" else 1

@@ -1,0 +1,231 @@
+"""What the commands print, as text: goals, status, voices, settings. It prints nothing itself and knows neither click
+nor the terminal, so that any client can use it; how wide it is and whether there is colour is said by its caller.
+
+Text from others always goes through `printable`. What happens as it happens is in `transcript`.
+"""
+
+from __future__ import annotations
+
+import time
+
+from talkcli.goals.states import State
+from talkcli.terminal import columns
+from talkcli.terminal.columns import GAP, Screen
+from talkcli.terminal.printable import printable
+from talkcli.terminal.senders import by_whom, who, who_forms, why_forms
+from talkcli.values import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from talkcli.goals.messages import Goal, JsonObject
+    from talkcli.protocol.replies import ServerStatus
+
+#: Characters of a text that a list shows.
+MAX_TEXT = 200
+#: Columns of what stands before each line of `status`.
+_LABEL = 9
+
+
+def ending(goal: Goal) -> str:
+    """Return how a goal ended, in one line for people."""
+    words = printable(goal.message or goal.state.name)
+    if goal.by:
+        words += f" ({by_whom(goal.by)})"
+    return f"{printable(goal.id)}: {words}" if goal.id else words
+
+
+def goal_lines(goal: Goal, screen: Screen, now: float | None = None) -> list[str]:
+    """Return all that is known of one goal, a line each; on a terminal what is longer goes on under its beginning."""
+    now = time.time() if now is None else now
+    state = screen.painted(goal.state.name, goal.state)
+    rows = [
+        ("id", printable(goal.id)),
+        ("state", f"{state}, paused" if goal.paused and not goal.state.terminal else state),
+        ("reason", goal.reason and printable(goal.reason)),
+        ("message", goal.message and printable(goal.message)),
+        ("ended", by_whom(goal.by) if goal.by else None),
+        ("text", None if goal.text is None else f'"{printable(goal.text)}"'),
+        ("spoken", None if goal.spoken is None else f'"{printable(goal.spoken)}"'),
+        ("from", who(goal.client)),
+        ("priority", str(goal.priority)),
+        ("key", goal.key and f'"{printable(goal.key)}"'),
+        ("ttl", _ttl(goal, now)),
+        ("data", None if goal.data is None else printable(_json(goal.data))),
+        ("queued", _moment(goal.queued_at)),
+        ("started", _moment(goal.started_at)),
+        ("ended at", _moment(goal.ended_at)),
+        ("duration", None if goal.duration is None else f"{goal.duration:.2f} s of audio"),
+    ]
+    # What is JSON is left to the terminal to break: copied from there it is the same still.
+    return [
+        line
+        for name, value in rows
+        if value
+        for line in columns.folded(value, f"{name:<{_LABEL}}", Screen() if name == "data" else screen)
+    ]
+
+
+def status_lines(status: ServerStatus, screen: Screen, now: float | None = None) -> list[str]:
+    """Return what a server says, will say and said; `now`: seconds since 1970, for how long something takes."""
+    now = time.time() if now is None else now
+    server = status.server
+    uptime = server.get("uptime")
+    about = [
+        f"pid {_field(server, 'pid')} on {_field(server, 'socket')}",
+        f"up {span(float(uptime) if isinstance(uptime, int | float) else 0.0)}",
+        f"{_field(server, 'clients')} of {_field(server, 'max_clients')} clients",
+    ]
+    lines = columns.wrapped(about, f"{'server':<{_LABEL}}", screen)
+    lines += columns.wrapped(_engine(server), f"{'engine':<{_LABEL}}", screen)
+    lines += columns.wrapped(_settings(server), f"{'settings':<{_LABEL}}", screen)
+    if server.get("paused"):
+        lines.append(f"{'paused':<{_LABEL}}{screen.painted('speech is held', State.PREEMPTING)}: talk resume")
+    goals = [*([status.active] if status.active else []), *status.pending, *status.recent]
+    widest = max((columns.width(printable(goal.id)) for goal in goals), default=0)
+    table = _Table(screen, now, min(widest, columns.id_room(screen) or columns.LONGEST_ID))
+    lines += table.rows("now", [status.active] if status.active else [], "silent")
+    lines += table.rows("queue", status.pending, "nothing")
+    lines += table.rows("said", status.recent, "nothing")
+    return lines
+
+
+def setting_lines(settings: Mapping[str, object]) -> list[str]:
+    """Return a server's settings, a line each: the name of its option, and a value that this option takes."""
+    shown = {"voice": "default", "ttl": 0}
+    rows = [(name, shown.get(name, "-") if value is None else value) for name, value in settings.items()]
+    longest = max((len(name) for name, _ in rows), default=0)
+    return [f"{printable(name):<{longest}}{GAP}{_value(value)}" for name, value in rows]
+
+
+def voice_lines(voices: list[JsonObject]) -> list[str]:
+    """Return the voices in columns: id, language, name."""
+    rows = [[printable(str(each.get(name) or "-")) for name in ("id", "language", "name")] for each in voices]
+    widths = [max((columns.width(row[place]) for row in rows), default=0) for place in (0, 1)]
+    return [GAP.join((columns.pad(row[0], widths[0]), columns.pad(row[1], widths[1]), row[2])) for row in rows]
+
+
+def span(seconds: float) -> str:
+    """Return a length of time in its two largest units."""
+    whole = int(seconds)
+    for size, name, smaller, small_name in ((86400, "d", 3600, "h"), (3600, "h", 60, "min"), (60, "min", 1, "s")):
+        if whole >= size:
+            return f"{whole // size} {name} {whole % size // smaller} {small_name}"
+    return f"{whole} s"
+
+
+class _Table:
+    """The goals in a status: each on a line, that fits the terminal."""
+
+    def __init__(self, screen: Screen, now: float, id_columns: int) -> None:
+        self._screen = screen
+        self._now = now
+        self._id_columns = id_columns
+
+    def rows(self, label: str, goals: Sequence[Goal], without: str) -> list[str]:
+        """Return a line for each goal, or the one word where there is none."""
+        if not goals:
+            return [f"{label:<{_LABEL}}{without}"]
+        heads = [f"{'' if number else label:<{_LABEL}}{self._head(goal)}" for number, goal in enumerate(goals)]
+        tails = [self._tails(goal) for goal in goals]
+        texts = [_text(goal) for goal in goals]
+        room = self._screen.room(max(map(columns.width, heads)))
+        if room is None:
+            return [GAP.join([head + text, *tail[:1]]) for head, text, tail in zip(heads, texts, tails, strict=True)]
+        said = columns.fitted(texts, [tail or [""] for tail in tails], weights=(1, 1), room=room)
+        return [head + words for head, words in zip(heads, said, strict=True)]
+
+    def _head(self, goal: Goal) -> str:
+        """Return what stands before a goal's text."""
+        goal_id = columns.pad(columns.cut(printable(goal.id), columns.id_room(self._screen)), self._id_columns)
+        state = self._screen.painted(columns.pad(goal.state.name, 9), goal.state)
+        head = f"{goal_id}{GAP}{state}{GAP}"
+        return f"{_clock(goal.ended_at)}{GAP}{head}" if goal.state.terminal else head
+
+    def _tails(self, goal: Goal) -> list[str]:
+        """Return what stands after a goal's text, the longest form first."""
+        if goal.state.terminal:
+            return [] if goal.state is State.SUCCEEDED else why_forms(goal)
+        # The sender first: what does not fit is cut at its end.
+        notes = _notes(goal, self._now)
+        return [", ".join([f"from {each}", *notes]) for each in who_forms(goal.client)]
+
+
+def _text(goal: Goal) -> str:
+    return "(text no longer kept)" if goal.text is None else f'"{printable(goal.text, MAX_TEXT)}"'
+
+
+def _notes(goal: Goal, now: float) -> list[str]:
+    """Return what is worth knowing of a goal that has not ended, beside its text and its sender."""
+    notes = []
+    if goal.started_at is not None:
+        held = "held, " if goal.paused else ""
+        notes.append(f"{held}for {max(0.0, now - goal.started_at):.1f} s")
+    if goal.priority:
+        notes.append(f"priority {goal.priority}")
+    if goal.key is not None:
+        notes.append(f'key "{printable(goal.key)}"')
+    left = _left(goal, now)
+    return notes if left is None else [*notes, left]
+
+
+def _ttl(goal: Goal, now: float) -> str | None:
+    if not goal.ttl:
+        return None
+    left = _left(goal, now)
+    return f"{goal.ttl:g} s" if left is None else f"{goal.ttl:g} s, {left}"
+
+
+def _left(goal: Goal, now: float) -> str | None:
+    """Return how long a goal may still wait for its turn."""
+    if goal.state is not State.PENDING or not goal.ttl or goal.queued_at is None:
+        return None
+    left = max(0.0, goal.queued_at + goal.ttl - now)
+    return f"{left:.1f} s left" if left < 60 else f"{span(left)} left"
+
+
+def _engine(server: JsonObject) -> list[str]:
+    parts = [_field(server, "engine"), f"driver {_field(server, 'driver')}"]
+    if server.get("synthesizer"):
+        parts.append(_field(server, "synthesizer"))
+    parts.append(f"player {_field(server, 'player')}")
+    if server.get("device"):
+        parts.append(f"device {_field(server, 'device')}")
+    if server.get("lead_in"):
+        parts.append(f"lead-in {_field(server, 'lead_in')} ms")
+    return parts
+
+
+def _settings(server: JsonObject) -> list[str]:
+    parts = [f"{_field(server, 'rate')} words a minute", f"volume {_value(server.get('volume'))}"]
+    parts += [f"pitch {_field(server, 'pitch')}", f"voice {_field(server, 'voice')}"]
+    if server.get("ttl"):
+        parts.append(f"ttl {_value(server['ttl'])} s")
+    if server.get("preempt"):
+        parts.append("preempts")
+    return parts
+
+
+def _value(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else printable(str(value))
+
+
+def _json(data: JsonObject) -> str:
+    from talkcli.protocol import wire
+
+    return wire.encode(data).decode().rstrip("\n")
+
+
+def _clock(seconds: float | None) -> str:
+    return "--:--:--" if seconds is None else time.strftime("%H:%M:%S", time.localtime(seconds))
+
+
+def _moment(seconds: float | None) -> str | None:
+    return None if seconds is None else time.strftime("%Y-%m-%d %H:%M:%S %z", time.localtime(seconds))
+
+
+def _field(server: JsonObject, name: str) -> str:
+    value = server.get(name)
+    return "default" if value is None else printable(str(value), MAX_TEXT)

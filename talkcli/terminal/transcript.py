@@ -1,0 +1,197 @@
+"""What happens to goals and what happened to them, in lines for people: `talk watch` and `talk log`.
+
+Pure: events and goals go in, lines come out; times are shown in the local time zone. Every line has its columns in the
+same order: time, state, id, text, who sent it, why it ended.
+"""
+
+from __future__ import annotations
+
+import time
+
+from talkcli.goals.states import State
+from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
+from talkcli.terminal import columns
+from talkcli.terminal.columns import GAP, Screen, pad
+from talkcli.terminal.printable import printable
+from talkcli.terminal.senders import who_forms, why_forms
+from talkcli.values import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from talkcli.goals.messages import Goal
+    from talkcli.protocol.events import Event
+
+#: Columns of the text where nothing has to fit: most sentences of a robot are shorter, so that what follows lines up.
+_TEXT_COLUMNS = 40
+#: A text of at least so much is shown beside why a goal ended; a longer why has a line of its own.
+_LEAST_TEXT = 16
+#: Columns of a server's ids, until it has given more than 999.
+_USUAL_ID = 8
+#: Where a line begins that goes on from the one before it: under the state.
+_INDENT = 10
+_CLOCK = "%H:%M:%S"
+_DATE = "%b %d %H:%M:%S"
+
+
+class Transcript:
+    """Turns a server's events into lines, one after the other. It knows what it has been told, and no more.
+
+    `full`: a line for each event; else what is over at once is left out: that a goal waits where nothing is before it,
+    and that one is being stopped. `words`: a line for each word that is heard, too.
+    """
+
+    def __init__(self, *, full: bool, words: bool) -> None:
+        self._full = full
+        self._with_words = words
+        self._goals: dict[str, Goal] = {}
+        self._active: set[str] = set()
+        self._paused = False
+        self._id_columns = _USUAL_ID
+
+    def lines(self, event: Event, screen: Screen, now: float | None = None) -> list[str]:
+        """Return what is to be shown of an event; `now`: when it happened, where the event doesn't tell."""
+        now = time.time() if now is None else now
+        if isinstance(event, Snapshot):
+            return self._begin(event, screen, now)
+        if isinstance(event, StateChanged):
+            return self._changed(event, screen, now)
+        if isinstance(event, PausedChanged):
+            return self._held(event, screen, now)
+        if isinstance(event, WordHeard) and self._with_words:
+            word = f"{printable(event.word)}{GAP}{event.time:.2f} s"
+            return [self._head(event.at or now, "word", None, event.id, screen) + word]
+        assert not isinstance(event, Result), "a watcher waits for no goal"
+        return []
+
+    def _begin(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
+        status = event.status
+        known = ([status.active] if status.active else []) + list(status.pending)
+        for goal in known:
+            self._goals[goal.id] = goal
+            self._make_room(goal.id, screen)
+        self._active = {goal.id for goal in known if goal.state is not State.PENDING}
+        self._paused = status.server.get("paused") is True
+        place = f"server {printable(str(status.server.get('pid')))} on {printable(str(status.server.get('socket')))}"
+        waiting = f", {len(status.pending)} waiting" if status.pending else ""
+        at_work = "paused" if self._paused else "speaking" if status.active else "silent"
+        lines = [_fitted(f"{_clock(now)}{GAP}{pad('watching', 10)}{GAP}{at_work}{waiting}; {place}", screen)]
+        return lines + [line for goal in known for line in self._goal(goal, goal.state, _since(goal, now), screen)]
+
+    def _changed(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
+        if event.goal is not None:
+            self._goals[event.id] = event.goal
+        before = bool(self._active or self._paused or len(self._goals) > 1)
+        goal = self._goals.get(event.id)
+        if event.state.terminal:
+            self._goals.pop(event.id, None)
+            self._active.discard(event.id)
+        elif event.state is not State.PENDING:
+            self._active.add(event.id)
+        brief = event.state is State.PREEMPTING or (event.state is State.PENDING and not before)
+        if brief and not self._full:
+            return []
+        at = event.at or now
+        if goal is None:
+            return [self._head(at, event.state.name, event.state, event.id, screen).rstrip()]
+        return self._goal(goal, event.state, at, screen)
+
+    def _held(self, event: PausedChanged, screen: Screen, now: float) -> list[str]:
+        self._paused = event.paused
+        name = "paused" if event.paused else "resumed"
+        head = self._head(event.at or now, name, State.PREEMPTING, event.id or "", screen)
+        by = event.by.client if event.by else None
+        who = [f"by {each}" for each in who_forms(by)] if by else [""]
+        room = screen.room(columns.width(head))
+        return [(head + columns.longest_that_fits(who, room)).rstrip()]
+
+    def _goal(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
+        head = self._head(at, state.name, state, goal.id, screen)
+        ended = state.terminal
+        forms = why_forms(goal) if ended else who_forms(goal.client)
+        if state is State.REJECTED:  # it had no line before that told who sent it
+            forms = [f"{forms[0]}, from {each}" for each in who_forms(goal.client)] + forms
+        room = screen.room(columns.width(head))
+        if room is None:
+            return [(head + pad(_text(goal), _TEXT_COLUMNS) + GAP + forms[0]).rstrip()]
+        tail_room = room // 3
+        # Who ended it must not give way to its column; who sent it was told when it began.
+        whole = forms[:-1] if ended and goal.by is not None and len(forms) > 1 else forms
+        tail = next((each for each in whole if columns.width(each) <= tail_room), None)
+        if tail is None and ended:
+            return self._ending(head, goal, whole, screen)
+        tail = columns.cut(forms[-1], tail_room) if tail is None else tail
+        text_room = room - tail_room - len(GAP)
+        return [(head + pad(columns.shortened(_text(goal), text_room), text_room) + GAP + tail).rstrip()]
+
+    def _ending(self, head: str, goal: Goal, forms: list[str], screen: Screen) -> list[str]:
+        """Return the end of a goal whose reason is too long for its column: beside the text, or else under it."""
+        text = _text(goal)
+        room = screen.room(columns.width(head)) or 0
+        beside = room - len(GAP) - min(columns.width(text), _LEAST_TEXT)
+        tail = next((each for each in forms if columns.width(each) <= beside), None)
+        if tail is not None:
+            return [head + columns.shortened(text, room - len(GAP) - columns.width(tail)) + GAP + tail]
+        tail = columns.longest_that_fits(forms, screen.room(_INDENT))
+        return [head + columns.shortened(text, room), " " * _INDENT + tail]
+
+    def _head(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
+        shown = self._make_room(goal_id, screen)
+        return GAP.join((_clock(at), screen.painted(pad(word, 10), state), pad(shown, self._id_columns), ""))
+
+    def _make_room(self, goal_id: str, screen: Screen) -> str:
+        """Widen the column of the ids for this one, and return it as it is shown."""
+        shown = columns.cut(printable(goal_id), columns.id_room(screen))
+        self._id_columns = max(self._id_columns, min(columns.width(shown), columns.LONGEST_ID))
+        return shown
+
+
+def log_lines(goals: Sequence[Goal], screen: Screen, now: float | None = None) -> list[str]:
+    """Return goals that have ended, a line each: when, how, who said what, and why it ended."""
+    today = time.localtime(time.time() if now is None else now)[:3]
+    heads = [
+        (_when(goal.ended_at, today), goal.state.name, columns.cut(printable(goal.id), columns.id_room(screen)))
+        for goal in goals
+    ]
+    widths = [max((columns.width(head[place]) for head in heads), default=0) for place in range(3)]
+    texts = [_text(goal) for goal in goals]
+    who = [who_forms(goal.client) for goal in goals]
+    why = [why_forms(goal) for goal in goals]
+    room = screen.room(sum(widths) + 3 * len(GAP))
+    if room is None:
+        # Most lines line up; one that is longer is whole, and pushes what follows.
+        said = [
+            GAP.join((pad(text, _TEXT_COLUMNS), pad(sender[0], _TEXT_COLUMNS), reason[0])).rstrip()
+            for text, sender, reason in zip(texts, who, why, strict=True)
+        ]
+    else:
+        said = columns.fitted(texts, who, why, weights=(4, 2, 3), room=room) if goals else []
+    return [
+        GAP.join(
+            (f"{when:>{widths[0]}}", screen.painted(pad(state, widths[1]), goal.state), pad(goal_id, widths[2]), words)
+        )
+        for goal, (when, state, goal_id), words in zip(goals, heads, said, strict=True)
+    ]
+
+
+def _text(goal: Goal) -> str:
+    return "(text no longer kept)" if goal.text is None else f'"{printable(goal.text)}"'
+
+
+def _fitted(line: str, screen: Screen) -> str:
+    return columns.cut(line, screen.room(0))
+
+
+def _since(goal: Goal, now: float) -> float:
+    return (goal.queued_at if goal.started_at is None else goal.started_at) or now
+
+
+def _clock(seconds: float) -> str:
+    return time.strftime(_CLOCK, time.localtime(seconds))
+
+
+def _when(seconds: float | None, today: tuple[int, ...]) -> str:
+    if seconds is None:
+        return "--:--:--"
+    local = time.localtime(seconds)
+    return time.strftime(_CLOCK if local[:3] == today else _DATE, local)
