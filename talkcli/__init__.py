@@ -9,8 +9,8 @@ from __future__ import annotations
 TYPE_CHECKING = False  # `typing` takes as long to import as a server to answer
 if TYPE_CHECKING:
     from talkcli.client.client import Client as Client
-    from talkcli.client.handle import GoalHandle as GoalHandle
-    from talkcli.goals.messages import Goal as Goal
+    from talkcli.client.goal import GoalHandle as GoalHandle
+    from talkcli.goals.goal import Goal as Goal
     from talkcli.goals.states import State as State
     from talkcli.protocol.events import PausedChanged as PausedChanged
     from talkcli.protocol.events import Result as Result
@@ -47,7 +47,7 @@ def __getattr__(name: str) -> object:
 
         return getattr(events, name)
     if name == "Goal":
-        from talkcli.goals.messages import Goal
+        from talkcli.goals.goal import Goal
 
         return Goal
     if name == "State":

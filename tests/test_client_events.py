@@ -13,7 +13,7 @@ import talkcli
 from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard
 from talkcli.client.backlog import MAX_FEEDBACK, MAX_STATES, Backlog
 from talkcli.errors import Lost, UnknownGoal, UsageError
-from talkcli.goals.messages import By, Goal, Sender
+from talkcli.goals.goal import By, Goal, Sender
 from talkcli.protocol import events
 from talkcli.protocol.replies import ServerStatus
 from tests.support.connection import PATIENCE
@@ -22,7 +22,7 @@ from tests.support.timing import assert_within, limits
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
     from tests.support.processes import Talk
 
@@ -318,7 +318,7 @@ def test_poll_tells_that_the_goal_is_lost_where_the_server_says_nothing_any_more
     client: Client, scripted: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     handle = client.say("never-ends words=1")
-    monkeypatch.setattr("talkcli.client.handle.SILENCE_LIMIT", 0.3)
+    monkeypatch.setattr("talkcli.client.goal.SILENCE_LIMIT", 0.3)
     scripted.freeze()
     began = time.monotonic()
     assert told(polled(handle))[-1] is Result

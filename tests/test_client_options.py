@@ -15,7 +15,7 @@ from talkcli import Client, PausedChanged, State, StateChanged
 from talkcli.client.outgoing import batches
 from talkcli.errors import BadOption, RequestRefused, UnknownGoal, UsageError
 from talkcli.protocol.wire import MAX_LINE, encode
-from talkcli.server import audience
+from talkcli.server import subscribers
 from tests.support.processes import Talk
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 ALIVE = """
 import sys
 sys.path.insert(0, {root!r})
-from talkcli.server import audience
+from talkcli.server import subscribers
 from tests.support import scripted_serve
-audience.ALIVE_EVERY = {every}
+subscribers.ALIVE_EVERY = {every}
 scripted_serve.main()
 """
 SETTINGS = {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
@@ -183,7 +183,7 @@ def test_patient_goal_waits_for_room(make_talk: MakeTalk) -> None:
         assert states == [State.SUCCEEDED]
 
 
-@pytest.mark.parametrize("every", [0.5, pytest.param(audience.ALIVE_EVERY, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [0.5, pytest.param(subscribers.ALIVE_EVERY, marks=pytest.mark.slow)])
 def test_patient_goal_whose_sender_hangs_up_is_not_spoken(make_talk: MakeTalk, tmp_path: Path, every: float) -> None:
     """The server sees that somebody who waits has hung up when it says that it is alive."""
     program = tmp_path / "serve.py"

@@ -17,7 +17,7 @@ from talkcli.server.later import ALL_WAITING, EACH, Later
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from talkcli.goals.messages import By
+    from talkcli.goals.goal import By
 
 
 class Client:

@@ -7,7 +7,7 @@ import threading
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
-from talkcli.goals.messages import Sender
+from talkcli.goals.goal import Sender
 from talkcli.goals.requests import Say
 from talkcli.server.answers import Answers
 from talkcli.server.mailbox import AT_ONCE, Mailbox
@@ -97,7 +97,7 @@ def test_the_engine_gets_to_work_before_clients_are_told() -> None:
         def changed(record: Record, state: State, _: float) -> None:
             written.append(f"{state.name} {record.text}")
 
-        served.audience.changed = changed  # type: ignore[assignment, method-assign]
+        served.subscribers.changed = changed  # type: ignore[assignment, method-assign]
         for text, preempt in (("first", False), ("second", True)):
             served.apply(served.scheduler.submit(Say(text, preempt=preempt), Sender(), served.now()).effects)
         served.report(protocol.Ended("4k7f-1", protocol.STOPPED))

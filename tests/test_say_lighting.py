@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.terminal.lighting import MORE, Sentence, View, width
+from talkcli.terminal.highlight import MORE, Sentence, View, width
 from talkcli.terminal.printable import printable
 
 LONG = "the quick brown fox jumps over the lazy dog"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.goals.messages import Sender
+from talkcli.goals.goal import Sender
 from talkcli.goals.requests import Say
 from talkcli.goals.states import State
 from talkcli.server import clock, service

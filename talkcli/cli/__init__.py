@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 
-from talkcli.values import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from typing import NoReturn

@@ -9,7 +9,7 @@ import sys
 
 from talkcli.cli.show import note, screen, show, show_json
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
-from talkcli.values import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from talkcli.cli.show import Common
     from talkcli.client.client import Client
     from talkcli.client.opening import Opened
-    from talkcli.goals.messages import Goal, JsonObject
+    from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.replies import Canceled
 
 #: Characters of what was heard last that are shown of a goal that is held.
@@ -50,7 +50,7 @@ def cancel(
 
 def status(options: Common, goal_id: str | None, opened: Opened | None = None) -> int:
     """Show how the server stands, or one goal, and return the exit code."""
-    from talkcli.goals.messages import Goal
+    from talkcli.goals.goal import Goal
     from talkcli.terminal import output
 
     with options.connect(urgent=True, opened=opened) as client:

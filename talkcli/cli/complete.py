@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from talkcli.client.client import Client, ServerStatus
-    from talkcli.goals.messages import Goal, JsonObject
+    from talkcli.goals.goal import Goal, JsonObject
 
     Items = list[CompletionItem[str]]
 

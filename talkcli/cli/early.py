@@ -12,7 +12,7 @@ import os
 import time
 
 from talkcli.client.opening import open_early, stand_back
-from talkcli.values import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from typing import Any

@@ -17,7 +17,7 @@ from talkcli.cli.show import (
     show_error,
 )
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, TalkError
-from talkcli.values import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable

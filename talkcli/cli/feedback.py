@@ -15,19 +15,19 @@ from typing import Protocol
 
 from talkcli.cli.show import colourful, note, show, show_json
 from talkcli.client.dial import ready
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.terminal.columns import Screen
-from talkcli.terminal.lighting import Sentence
+from talkcli.terminal.highlight import Sentence
 from talkcli.terminal.printable import printable
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from types import FrameType
 
     from talkcli.cli.show import Common
-    from talkcli.goals.messages import Goal
+    from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Event
 
 #: Columns of a terminal that doesn't say how many it has.

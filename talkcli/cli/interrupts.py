@@ -13,7 +13,7 @@ import sys
 
 from talkcli.cli.show import OUTPUT, give_up_output
 from talkcli.errors import EXIT_SIGNAL, EXIT_SIGPIPE, EXIT_TIMEOUT
-from talkcli.values import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

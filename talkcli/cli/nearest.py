@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from talkcli.values import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

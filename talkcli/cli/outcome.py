@@ -18,8 +18,8 @@ from talkcli.cli.show import (
 )
 from talkcli.client.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import EXIT_CODES, State
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from talkcli.cli.interrupts import Interrupts
     from talkcli.cli.show import Common
     from talkcli.client.client import GoalHandle
-    from talkcli.goals.messages import Goal
+    from talkcli.goals.goal import Goal
 
     _T = TypeVar("_T")
 

@@ -8,7 +8,7 @@ that contradict each other. A test shows that both read any command line alike.
 from __future__ import annotations
 
 from talkcli.cli.plain_table import COMMANDS, COMMON
-from talkcli.values import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

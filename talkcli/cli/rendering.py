@@ -17,7 +17,7 @@ from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, UsageError
 
 if TYPE_CHECKING:
     from talkcli.cli.show import Common
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
 
 #: Settings, and the variables that hold for them where nothing is spoken: a server has its own.
 _VARIABLES = {"rate": "TALK_RATE", "volume": "TALK_VOLUME", "voice": "TALK_VOICE", "pitch": None}

@@ -20,8 +20,8 @@ from talkcli.cli.outcome import (
 from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.client.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, Lost
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -87,7 +87,7 @@ def say(
 
 def refuse(message: str, reason: str, options: Common, *, feedback: bool) -> int:
     """Tell of a goal that is REJECTED before it is sent, as if a server had done so, and return the exit code."""
-    from talkcli.goals.messages import Goal
+    from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Result
 
     goal = Goal("", State.REJECTED, reason=reason, message=message)

@@ -203,8 +203,8 @@ def _warn_of_sound(player: str, driver: object) -> None:
 def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
     from talkcli.cli.nearest import nearest
+    from talkcli.engine.players.base import AudioFailed
     from talkcli.engine.players.programs import commands, on_path
-    from talkcli.engine.players.sink import AudioFailed
     from talkcli.terminal.printable import printable
 
     try:

@@ -7,14 +7,14 @@ import os
 import stat
 import sys
 
-from talkcli.values import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from typing import Any, TextIO
 
     from talkcli.client.client import Client
     from talkcli.errors import TalkError
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
     from talkcli.terminal.columns import Screen
 
 #: Standard output's descriptor.

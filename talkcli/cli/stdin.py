@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from talkcli.client.dial import ready
 from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
+from talkcli.frozen import frozen
 from talkcli.goals.states import EXIT_CODES, State
 from talkcli.goals.text import MAX_BYTES, MAX_CHARACTERS
-from talkcli.values import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -30,7 +30,7 @@ An option: its name for click, and True or False, the value of a flag; or "text"
 
 from __future__ import annotations
 
-from talkcli.values import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from typing import Any

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 from talkcli import paths
 from talkcli.errors import UsageError
+from talkcli.frozen import frozen, replace
 from talkcli.terminal.printable import printable
-from talkcli.values import frozen, replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

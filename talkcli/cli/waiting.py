@@ -9,8 +9,8 @@ from talkcli.cli.outcome import regardless, report, rest, show_if_possible
 from talkcli.cli.show import note
 from talkcli.client.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.cli.feedback import Feedback

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.protocol.events import PausedChanged, StateChanged, WordHeard
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.protocol.events import Event

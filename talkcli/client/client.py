@@ -19,10 +19,11 @@ from talkcli import __version__
 from talkcli.client.backlog import MAX_STATES, Backlog
 from talkcli.client.connection import SILENCE_LIMIT, Connection
 from talkcli.client.dial import ANSWER_LIMIT
-from talkcli.client.handle import Followed, GoalHandle
+from talkcli.client.goal import Followed, GoalHandle
 from talkcli.client.outgoing import batches, check, check_key, full_id, too_long
 from talkcli.errors import Lost, UnknownGoal, UsageError
-from talkcli.goals.messages import Goal
+from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.goal import Goal
 from talkcli.goals.requests import (
     MAX_LOG,
     MAX_NAME,
@@ -41,14 +42,13 @@ from talkcli.goals.requests import (
 from talkcli.goals.states import State
 from talkcli.protocol.events import Snapshot
 from talkcli.protocol.replies import Canceled, ServerStatus, goal_in, goals
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from types import TracebackType
 
     from talkcli.client.opening import Opened
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
 
 __all__ = ["Canceled", "Client", "GoalHandle", "ServerStatus"]

@@ -18,16 +18,16 @@ from collections.abc import Callable
 
 from talkcli.client.dial import ANSWER_LIMIT, dial, ready
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.requests import Say, write_request
 from talkcli.protocol import wire
 from talkcli.terminal.printable import printable
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from talkcli.client.opening import Opened
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
     from talkcli.goals.requests import Hello, Request
 
 #: Seconds of silence from a server that somebody waits for; it says that it is alive every 5.

@@ -8,13 +8,13 @@ from __future__ import annotations
 import time
 
 from talkcli.client.connection import SILENCE_LIMIT
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from talkcli.client.handle import GoalHandle
+    from talkcli.client.goal import GoalHandle
     from talkcli.protocol.events import Event
 
 

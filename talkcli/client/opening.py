@@ -13,7 +13,7 @@ import sys
 import time
 
 from talkcli import paths
-from talkcli.values import TYPE_CHECKING, frozen, replace
+from talkcli.frozen import TYPE_CHECKING, frozen, replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable

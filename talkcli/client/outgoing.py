@@ -6,12 +6,12 @@ Pure: it sends nothing. What it refuses was never sent.
 from __future__ import annotations
 
 from talkcli.errors import UnknownGoal, UsageError
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.admission import MAX_KEY, bad_option, bad_setting
-from talkcli.goals.messages import Goal
+from talkcli.goals.goal import Goal
 from talkcli.goals.requests import MAX_ID, MAX_IDS, Say, write_request
 from talkcli.goals.states import State
 from talkcli.protocol import wire
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from talkcli.doctor.findings import Finding
     from talkcli.doctor.places import Places
     from talkcli.doctor.voice import Engine
-    from talkcli.goals.messages import Goal, JsonObject
+    from talkcli.goals.goal import Goal, JsonObject
 
 #: Seconds that the sentence may take, its time in the queue included: long enough for one that is being spoken.
 LIMIT = 20.0

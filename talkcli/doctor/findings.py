@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.terminal.printable import printable
-from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
 
 #: The states of a finding. A warning may be why a sentence is not heard; with a failure it is certain.
 DONE, WARNING, FAILED = "done", "warning", "failed"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from talkcli.doctor.findings import Finding, done, failed, warning
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 #: The check's name.
 CHECK = "loudness"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from talkcli.doctor.findings import Finding, done, failed, warning
+from talkcli.frozen import frozen
 from talkcli.unreachable import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
-from talkcli.values import frozen
 
 #: What is found at a place, beside what `found_at` finds where nobody can be reached.
 FOREIGN = "another user's server"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from talkcli.client.dial import Interrupted, ready
 from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Engine
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

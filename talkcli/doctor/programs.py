@@ -10,7 +10,7 @@ import subprocess
 import tempfile
 from typing import TYPE_CHECKING
 
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

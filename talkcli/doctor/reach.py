@@ -16,14 +16,14 @@ from talkcli.client.dial import Interrupted
 from talkcli.doctor.places import FOREIGN, MUTE, SERVER, STOPPED, Place, Places
 from talkcli.doctor.sentence import Played
 from talkcli.errors import TalkError
+from talkcli.frozen import replace
 from talkcli.goals.states import State
-from talkcli.values import replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.client.handle import GoalHandle
-    from talkcli.goals.messages import Goal
+    from talkcli.client.goal import GoalHandle
+    from talkcli.goals.goal import Goal
 
 #: What this client calls itself.
 _NAME = "talk doctor"

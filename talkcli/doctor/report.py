@@ -5,9 +5,9 @@ from __future__ import annotations
 import textwrap
 
 from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding, heard, next_step
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.terminal.columns import GAP, Screen, pad
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -5,8 +5,8 @@ from __future__ import annotations
 from talkcli.doctor.findings import SENTENCE, Finding, done, failed
 from talkcli.doctor.sound import is_custom
 from talkcli.doctor.voice import INSTALL_LIBRARY
+from talkcli.frozen import frozen
 from talkcli.goals.states import State
-from talkcli.values import frozen
 
 #: What is said; short, and worth hearing.
 TEXT = "If you hear this, talk works."

@@ -7,13 +7,13 @@ import time
 from talkcli import __version__
 from talkcli.doctor.findings import Finding, done, failed, warning
 from talkcli.doctor.sentence import remedy
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from talkcli.goals.messages import Goal, JsonObject
+    from talkcli.goals.goal import Goal, JsonObject
 
 #: Volume below which a server's setting may be why nobody hears it.
 _FAINT = 0.2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from talkcli.doctor.findings import Finding, done, warning
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 
 @frozen

@@ -9,7 +9,7 @@ import shlex
 
 from talkcli.doctor.findings import Finding, done, failed, warning
 from talkcli.doctor.session import Session, seen_from
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 #: Players that are programs known here, as `engine.players` has them; nothing of the engine is imported to judge.
 NAMED = frozenset({"aplay", "pacat", "pw-cat"})

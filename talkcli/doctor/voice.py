@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from talkcli.doctor.findings import Finding, done, failed, warning
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 #: What to do where there is no library.
 INSTALL_LIBRARY = "sudo apt-get install -y libespeak-ng1, or: pip install espeakng-loader"

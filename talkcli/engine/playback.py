@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import time
 
-from talkcli.engine.feed import Feed
-from talkcli.engine.hold import CLOCK_AHEAD, RELEASE_AFTER, SAID_AGAIN, SILENT_WITHIN
-from talkcli.engine.players.sink import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
+from talkcli.engine.clock import WordClock
+from talkcli.engine.pause import CLOCK_AHEAD, RELEASE_AFTER, SAID_AGAIN, SILENT_WITHIN
+from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
 from talkcli.engine.samples import Samples
-from talkcli.engine.wordclock import WordClock
+from talkcli.engine.stream import Feed
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.engine.hold import Hold
+    from talkcli.engine.clock import TimedWord
+    from talkcli.engine.pause import Hold
+    from talkcli.engine.players.base import Sink, Wait
     from talkcli.engine.players.outlet import Outlet
-    from talkcli.engine.players.sink import Sink, Wait
-    from talkcli.engine.wordclock import TimedWord
 
 #: Seconds within which a player must take the first sound: a Bluetooth or USB device that sleeps needs one or two, a
 #: null sink that nobody records up to two.

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 
-from talkcli.values import fields, frozen
+from talkcli.frozen import fields, frozen
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

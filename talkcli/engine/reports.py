@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from talkcli.engine import protocol
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 
 @frozen

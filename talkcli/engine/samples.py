@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from array import array
 
-from talkcli.engine.players.sink import SAMPLE
+from talkcli.engine.players.base import SAMPLE
 
 #: A sample no louder than this, of 32,768, is silence: it is 66 dB below the loudest. libespeak-ng adds 235 to 275 ms
 #: of zeros behind a sentence; with a voice that has an echo ("f3") the last 100 ms or so are silence.

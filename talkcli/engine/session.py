@@ -15,8 +15,8 @@ import traceback
 from collections import deque
 
 from talkcli.engine import protocol
-from talkcli.engine.hold import Hold
-from talkcli.engine.players.sink import AudioFailed
+from talkcli.engine.pause import Hold
+from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.settings import SettingFailed
 from talkcli.engine.synthesizers.voices import list_voices
 from talkcli.engine.synthesizers.words import Words
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from typing import Any
 
-    from talkcli.engine.changeover import Changeover
     from talkcli.engine.channel import Channel
-    from talkcli.engine.players.sink import Interest
+    from talkcli.engine.gap import Changeover
+    from talkcli.engine.players.base import Interest
     from talkcli.engine.protocol import Command
     from talkcli.engine.settings import Settings
 

@@ -37,7 +37,7 @@ _LAST_BREATH = 0.2
 
 def engine_command() -> list[str]:
     """Return the command line of the engine process: this interpreter, with this process's own import path."""
-    code = f"import sys; sys.path[:] = {sys.path!r}; from talkcli.engine.process import main; main()"
+    code = f"import sys; sys.path[:] = {sys.path!r}; from talkcli.engine.main import main; main()"
     return [sys.executable, "-c", code]
 
 

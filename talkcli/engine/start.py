@@ -8,16 +8,16 @@ from __future__ import annotations
 import sys
 
 from talkcli.engine.settings import SettingFailed, Settings
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
-    from talkcli.engine.hold import Hold
+    from talkcli.engine.pause import Hold
+    from talkcli.engine.players.base import Wait
     from talkcli.engine.players.outlet import Outlet
-    from talkcli.engine.players.sink import Wait
 
 #: The drivers of macOS that speak in Apple's run loop, which somebody has to run.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")

@@ -8,8 +8,8 @@ from __future__ import annotations
 import re
 import sys
 
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.requests import MAX_ID
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.goals.requests import Say, Set

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
     from talkcli.goals.record import Record

@@ -10,8 +10,8 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from talkcli.goals.messages import By
-    from talkcli.goals.pending import Pending
+    from talkcli.goals.goal import By
+    from talkcli.goals.queue import Pending
     from talkcli.goals.record import Record
     from talkcli.goals.requests import Say
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from talkcli.goals.messages import By, Goal
+from talkcli.goals.goal import By, Goal
 from talkcli.goals.states import State, follow
 
 if TYPE_CHECKING:
-    from talkcli.goals.messages import JsonObject, Sender
+    from talkcli.goals.goal import JsonObject, Sender
     from talkcli.goals.requests import Say
 
 

@@ -11,12 +11,12 @@ import json
 from collections.abc import Callable, Mapping
 
 from talkcli.errors import BadRequest
-from talkcli.values import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from typing import ClassVar
 
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
 
 #: An id is at most this long; a longer one names no goal that could exist.
 MAX_ID = 64

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 from talkcli.goals import text as texts
 from talkcli.goals.admission import bad_option, is_clients_id
 from talkcli.goals.effects import Cancelled, Changed, GiveUp, Hold, Resume, Start, Stop, Submitted
+from talkcli.goals.goal import By
 from talkcli.goals.history import History
-from talkcli.goals.messages import By
-from talkcli.goals.pending import Pending
+from talkcli.goals.queue import Pending
 from talkcli.goals.recent import EarlyCancels, Said, throttling
 from talkcli.goals.record import Record
 from talkcli.goals.selection import making_way, select
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
     from talkcli.goals.effects import Effect, Now
-    from talkcli.goals.messages import Sender
+    from talkcli.goals.goal import Sender
     from talkcli.goals.requests import Cancel, Say
 
 #: Seconds after a stop in which silence must be confirmed: `cancel` is answered within 2 s whatever happens.

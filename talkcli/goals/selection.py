@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from typing import Protocol
 
     from talkcli.goals.effects import Cancelled
-    from talkcli.goals.pending import Pending
+    from talkcli.goals.queue import Pending
     from talkcli.goals.record import Record
     from talkcli.goals.requests import Cancel, Say
 

@@ -6,16 +6,16 @@ both alike. A field may be added, never renamed or given another meaning; a read
 
 from __future__ import annotations
 
-from talkcli.goals.messages import By, Goal
+from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.goals.goal import By, Goal
 from talkcli.goals.states import State
 from talkcli.protocol.replies import ServerStatus
-from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import TypeVar
 
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
 
     _T = TypeVar("_T")
 

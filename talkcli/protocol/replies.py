@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from talkcli.goals.messages import Goal
-from talkcli.values import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.goals.goal import Goal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
 
 
 @frozen

@@ -11,10 +11,10 @@ import json
 import math
 
 from talkcli.errors import BadRequest, Busy, LineTooLong, ProtocolMismatch
-from talkcli.values import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
 
 PROTOCOL = 1
 

@@ -1,5 +1,6 @@
 """The server: asyncio around the scheduler, and the engine thread beside it.
 
-It does I/O only: what happens is decided by `goals`. It may import all but doctor and cli, and only `cli.serve` imports
-it. What a request is answered goes to `answers`, who hears of what to `audience`, what a client may do to `connection`.
+It does I/O only: what happens is decided by `goals`. It may import all but doctor and cli, and only `cli.serve`
+imports it. What a request is answered goes to `answers`, who hears of what to `subscribers`, what one client may to
+`connection`.
 """

@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING
 
 from talkcli import __version__
 from talkcli.errors import UnknownGoal
+from talkcli.frozen import replace
 from talkcli.goals.admission import DEFAULT_VOICE, bad_setting
-from talkcli.goals.messages import By
+from talkcli.goals.goal import By
 from talkcli.goals.requests import Cancel, Log, Pause, Request, Resume, Say, Set, Status, Voices, Wait, Watch
 from talkcli.goals.states import State
 from talkcli.protocol import wire
 from talkcli.server import log
 from talkcli.server.pauses import Pauses
-from talkcli.values import replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from talkcli.goals.effects import Cancelled, Submitted
-    from talkcli.goals.messages import JsonObject, Sender
+    from talkcli.goals.goal import JsonObject, Sender
     from talkcli.goals.record import Record
     from talkcli.server.connection import Connection
     from talkcli.server.service import Service
@@ -150,7 +150,7 @@ class Answers:
         goal = record.snapshot(state).to_json()
         ended = submitted.attached and state.terminal
         if (request.wait or request.feedback) and not ended:
-            self._service.audience.await_result(record.id, connection, feedback=request.feedback)
+            self._service.subscribers.await_result(record.id, connection, feedback=request.feedback)
         connection.reply(wire.ok(seq, goal=goal, **extra))
         if ended and (request.wait or request.feedback):
             connection.publish(wire.encode({"event": "result", "goal": goal}))
@@ -164,7 +164,7 @@ class Answers:
             records = [self._find(each) for each in dict.fromkeys(request.ids)]
         for record in records:
             if not record.state.terminal:
-                self._service.audience.await_result(record.id, connection, feedback=request.feedback)
+                self._service.subscribers.await_result(record.id, connection, feedback=request.feedback)
         # As they are now: what becomes of them meanwhile is told by the events that come after the list. Of a thousand
         # that have ended, each is looked at when its turn comes to be sent.
         active = self._scheduler.active
@@ -178,7 +178,7 @@ class Answers:
 
         def results() -> Iterator[JsonObject]:
             for record, state in zip(records, states, strict=True):
-                if state.terminal:  # the audience tells the others'
+                if state.terminal:  # the subscribers are told of the others
                     yield {"event": "result", "goal": record.snapshot().to_json()}
 
         connection.stream(goals(), wire.ok(seq, count=len(records)), results())
@@ -210,7 +210,7 @@ class Answers:
 
     def _watch(self, connection: Connection, seq: int | None, _: Watch) -> None:
         self._send_overview(connection, seq)
-        self._service.audience.watch(connection)
+        self._service.subscribers.watch(connection)
 
     def _voices(self, connection: Connection, seq: int | None, _: Voices) -> None:
         self._send_voices(connection, seq)

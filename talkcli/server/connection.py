@@ -12,17 +12,17 @@ from itertools import chain
 from typing import TYPE_CHECKING, Protocol
 
 from talkcli.errors import BadRequest, LineTooLong
+from talkcli.frozen import replace
 from talkcli.goals.requests import Cancel, Hello, Request, Status, read_request
 from talkcli.protocol import wire
 from talkcli.server.stream import Stream
-from talkcli.values import replace
 
 if TYPE_CHECKING:
     import asyncio
     import socket
     from collections.abc import Iterable, Iterator
 
-    from talkcli.goals.messages import JsonObject, Sender
+    from talkcli.goals.goal import JsonObject, Sender
     from talkcli.server.stream import Streams
 
 #: Bytes that may wait for a client before feedback for it is dropped, and before its requests are left unread.

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from talkcli.goals.effects import Submitted
-    from talkcli.goals.messages import By
+    from talkcli.goals.goal import By
     from talkcli.goals.record import Record
     from talkcli.goals.requests import Cancel, Request
-    from talkcli.server.audience import Audience
     from talkcli.server.connection import Connection
     from talkcli.server.stream import Streams
+    from talkcli.server.subscribers import Subscribers
 
 #: Seconds for which the voices are awaited; a client gives up after five.
 VOICES_LIMIT = 4.0
@@ -68,7 +68,7 @@ class Later:
         self,
         loop: asyncio.AbstractEventLoop,
         streams: Streams,
-        audience: Audience,
+        subscribers: Subscribers,
         has_room: Callable[[Say], bool],
         failed: Callable[[str, Exception], None],
     ) -> None:
@@ -79,7 +79,7 @@ class Later:
         self._streams = streams
         self._failed = failed
         self._has_room = has_room
-        self._audience = audience
+        self._subscribers = subscribers
         self._for_voices: deque[Waiting] = deque()
         self._for_room: deque[Waiting] = deque()
         #: goals that don't wait any more and are to be told so, and whom to call when those before have been
@@ -125,7 +125,7 @@ class Later:
     def until_room(self, connection: Connection, say: Say, go: Callable[[By | None], Submitted | None]) -> None:
         """Submit a goal as soon as it has room; the client is told meanwhile that the server is alive."""
         self._for_room.append(self._owe(connection, say, go, None))
-        self._audience.keep_waiting(connection)
+        self._subscribers.keep_waiting(connection)
 
     def voices_known(self) -> None:
         """Carry out what waits for the voices, known or not."""
@@ -174,7 +174,7 @@ class Later:
                 if each.until is not None:  # what comes after it need not wait for the voices, too
                     each.until = None
                     self._await_voices[each.connection] -= 1
-                    self._audience.keep_waiting(each.connection)
+                    self._subscribers.keep_waiting(each.connection)
                 self._ending.append(each)
         return chosen
 
@@ -281,7 +281,7 @@ class Later:
         self._count[connection] -= 1
         self._size -= waiting.size
         if waiting.until is None:
-            self._audience.answered(connection)
+            self._subscribers.answered(connection)
         else:
             self._await_voices[connection] -= 1
         try:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from talkcli.engine.protocol import Ready
-    from talkcli.goals.messages import By, Sender
+    from talkcli.goals.goal import By, Sender
     from talkcli.goals.record import Record
 
 #: Bytes of one line at most: a pipe that poll calls writable takes as many without blocking (PIPE_BUF on Linux).

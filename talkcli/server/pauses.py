@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from talkcli.goals.messages import By
+from talkcli.goals.goal import By
 from talkcli.goals.states import State
 from talkcli.protocol import wire
 from talkcli.server import log
@@ -92,7 +92,7 @@ class Pauses:
     def _tell(self, connection: Connection, held: Record | None) -> None:
         """Publish and log that speech is paused, or not any more."""
         paused, by = self._scheduler.paused, By(client=connection.sender)
-        self._service.audience.paused(held.id if held else None, paused=paused, by=by, at=time.time())
+        self._service.subscribers.paused(held.id if held else None, paused=paused, by=by, at=time.time())
         log.line(f"{'paused' if paused else 'resumed'} by {log.who(connection.sender)}")
 
     def _answer(self, record: Record) -> None:

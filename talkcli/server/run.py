@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING
 from talkcli import resources
 from talkcli.engine import protocol
 from talkcli.engine.limits import START_LIMIT
-from talkcli.engine.thread import EngineThread
+from talkcli.engine.supervisor import Supervisor
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
-from talkcli.goals.messages import Sender
+from talkcli.goals.goal import Sender
 from talkcli.goals.requests import Say
 from talkcli.server import log
 from talkcli.server.accept import Acceptor, make_room
 from talkcli.server.answers import Answers
 from talkcli.server.connection import Connection
 from talkcli.server.listener import InheritedListener, Listener, listen
-from talkcli.server.notify import Supervisor
 from talkcli.server.service import DOOR, Service
+from talkcli.server.systemd import Systemd
 from talkcli.server.upkeep import Upkeep
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class _Server:
         self._settings = settings
         self._listener = listener
         self._service: Service
-        self._supervisor: Supervisor
+        self._systemd: Systemd
         self._acceptor: Acceptor
         self._ended_by = [signal.SIGTERM]
         # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
@@ -76,8 +76,8 @@ class _Server:
         make_room(settings.max_clients + DOOR)
         service = self._service = Service(_boot(), settings, self._listener.path, self._listener.mode)
         service.requests = Answers(service)
-        supervisor = self._supervisor = Supervisor(loop, os.environ, service.words)
-        service.changed = supervisor.changed
+        systemd = self._systemd = Systemd(loop, os.environ, service.words)
+        service.changed = systemd.changed
         acceptor = self._acceptor = Acceptor(loop, lambda each: Connection(service, loop, each).begin(), service.failed)
         upkeep = Upkeep(loop, self._listener, self._moved, self._lost)
         loop.set_exception_handler(self._on_bug)
@@ -85,7 +85,7 @@ class _Server:
             loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the voice along
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # whoever started this may have had some of them blocked
-        service.engine = EngineThread(
+        service.engine = Supervisor(
             protocol.Configure(
                 os.getpid(), settings.driver, settings.player, settings.device, settings.voice, settings.lead_in
             ),
@@ -100,24 +100,24 @@ class _Server:
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(service.engine_known.wait(), START_LIMIT)
             if not service.closing:
-                supervisor.ready()
+                systemd.ready()
                 log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
                 service.apply(service.scheduler.submit(Say(settings.greeting), _self(), service.now()).effects)
             await service.finished.wait()
-            supervisor.stopping()
+            systemd.stopping()
             upkeep.end()
             acceptor.close()
             await self._say_goodbye()
         finally:
             service.engine.close()
             service.engine.join(_ENGINE_GOODBYE)
-            supervisor.close()
+            systemd.close()
         if service.fatal:
             raise service.fatal
 
     @staticmethod
-    def _start(engine: EngineThread) -> None:
+    def _start(engine: Supervisor) -> None:
         try:
             engine.start()
         except RuntimeError as error:  # all that Python says of a thread that it can't have
@@ -134,7 +134,7 @@ class _Server:
         """End: clients find another server, or none; a supervisor that starts this one again will hear why."""
         log.line(log.shown(f"ending: {error}"))
         self._service.fatal = error
-        self._supervisor.stopping()
+        self._systemd.stopping()
         self._service.shut_down()
 
     async def _say_goodbye(self) -> None:
@@ -151,7 +151,7 @@ class _Server:
         for each in self._ended_by:
             # Not by the loop, which may have a long turn to finish: whoever asks twice wants no goodbye.
             signal.signal(each, self._on_second_signal)
-        self._supervisor.stopping()
+        self._systemd.stopping()
         self._service.shut_down()
 
     def _on_second_signal(self, number: int, _: object) -> None:

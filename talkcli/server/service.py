@@ -1,6 +1,6 @@
 """The service: carries out requests, the scheduler's effects and the engine's reports, all in the loop's thread.
 
-What happens is the scheduler's decision, how it is spoken the engine thread's, who hears of it the audience's. It
+What happens is the scheduler's decision, how it is spoken the engine thread's, who hears of it the subscribers'. It
 passes between them and never waits for any of them.
 """
 
@@ -19,24 +19,24 @@ from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.goals.admission import DEFAULT_VOICE
 from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
-from talkcli.goals.messages import Sender
+from talkcli.goals.goal import Sender
 from talkcli.goals.requests import Cancel
 from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.states import State
 from talkcli.protocol import wire
 from talkcli.server import log
-from talkcli.server.audience import Audience
 from talkcli.server.clock import LOOK_EVERY, elapsed
 from talkcli.server.later import Later
 from talkcli.server.mailbox import Mailbox
 from talkcli.server.stream import Streams
+from talkcli.server.subscribers import Subscribers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
-    from talkcli.engine.thread import EngineThread
-    from talkcli.goals.messages import JsonObject
+    from talkcli.engine.supervisor import Supervisor
+    from talkcli.goals.goal import JsonObject
     from talkcli.goals.record import Record
     from talkcli.goals.requests import Request
     from talkcli.server.connection import Connection
@@ -72,7 +72,7 @@ class Service:
         self.path = path
         #: whether the socket's mode lets others in than its owner
         self._open_to_others = bool(mode & 0o066)
-        self.engine: EngineThread
+        self.engine: Supervisor
         #: who carries out the clients' requests; set, as the engine is, before the first client is there
         self.requests: Requests
         #: called, in the loop's thread, when `words` may have changed
@@ -101,9 +101,9 @@ class Service:
         self.engine_known = asyncio.Event()
         self.began = self._now()
         self._loop = asyncio.get_running_loop()
-        self.audience = Audience(self._loop)
+        self.subscribers = Subscribers(self._loop)
         self.streams = Streams(self._loop)
-        self.later = Later(self._loop, self.streams, self.audience, self.scheduler.has_room, self.failed)
+        self.later = Later(self._loop, self.streams, self.subscribers, self.scheduler.has_room, self.failed)
         #: whether it was told to end, and takes no goal any more
         self.closing = False
         self._timer: asyncio.TimerHandle | None = None
@@ -156,7 +156,7 @@ class Service:
             waiting = [each for each in self.connections if not each.admitted]
             if waiting and len(self.connections) - len(waiting) < self.settings.max_clients:
                 waiting[0].admit()
-        self.audience.left(connection)
+        self.subscribers.left(connection)
         self.later.left(connection)
         self.requests.left(connection)
 
@@ -229,7 +229,7 @@ class Service:
 
     def _changed(self, change: Changed) -> None:
         record = change.record
-        self.audience.changed(record, change.state, time.time())
+        self.subscribers.changed(record, change.state, time.time())
         if change.state is not State.REJECTED:
             self.later.look()
         if change.state.terminal:
@@ -369,7 +369,7 @@ class Service:
             "number": word.number,
             "time": word.time,
         }
-        self.audience.heard(word.id, event, time.time())
+        self.subscribers.heard(word.id, event, time.time())
 
     # -- the end
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 #: Clients at once. Each takes a descriptor of the 1,024 that a process usually has.
 MAX_CLIENTS = 256

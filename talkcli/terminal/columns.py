@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 import unicodedata
 
+from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
-from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

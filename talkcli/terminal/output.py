@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import time
 
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.terminal import columns
 from talkcli.terminal.columns import GAP, Screen
 from talkcli.terminal.printable import printable
 from talkcli.terminal.senders import by_whom, who, who_forms, why_forms
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from talkcli.goals.messages import Goal, JsonObject
+    from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.replies import ServerStatus
 
 #: Characters of a text that a list shows.

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import re
 
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.terminal.printable import printable
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from talkcli.goals.messages import By, Goal, Sender
+    from talkcli.goals.goal import By, Goal, Sender
 
 #: Characters of a command line that are shown.
 MAX_COMMAND = 60

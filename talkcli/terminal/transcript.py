@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import time
 
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
 from talkcli.terminal import columns
 from talkcli.terminal.columns import GAP, Screen, pad
 from talkcli.terminal.printable import printable
 from talkcli.terminal.senders import who_forms, why_forms
-from talkcli.values import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from talkcli.goals.messages import Goal
+    from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Event
 
 #: Columns of the text where nothing has to fit: most sentences of a robot are shorter, so that what follows lines up.

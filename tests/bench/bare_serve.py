@@ -19,7 +19,7 @@ import sys
 import threading
 from collections import deque
 
-from talkcli.goals.messages import Goal, Sender
+from talkcli.goals.goal import Goal, Sender
 from talkcli.goals.states import State
 from talkcli.protocol import wire
 

@@ -11,7 +11,7 @@ from itertools import count, islice
 from typing import TYPE_CHECKING
 
 from talkcli.goals.effects import Now
-from talkcli.goals.messages import Sender
+from talkcli.goals.goal import Sender
 from talkcli.goals.requests import Cancel, Say
 from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol import wire

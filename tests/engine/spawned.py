@@ -63,7 +63,7 @@ class Spawned:
         code = f"{path}{before}\nfrom talkcli.engine import playback\n{settings}"
         with theirs:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", f"{code}from talkcli.engine.process import main\nmain()"],
+                [sys.executable, "-c", f"{code}from talkcli.engine.main import main\nmain()"],
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,

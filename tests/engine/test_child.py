@@ -14,7 +14,7 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.players.child import Child
-from talkcli.engine.players.pipe import PlayerPipe
+from talkcli.engine.players.program import PlayerPipe
 from talkcli.engine.players.programs import Command
 from tests.engine.spawned import FAST, Spawned, children
 from tests.engine.test_player_faults import Player
@@ -189,7 +189,7 @@ def test_a_text_without_a_sound_is_no_fault_of_the_player(tmp_path: Path) -> Non
 def test_a_player_for_another_rate_is_replaced_before_the_first_sample(player: Player) -> None:
     before = """
 from talkcli.engine.synthesizers import library
-from talkcli.values import replace
+from talkcli.frozen import replace
 load = library.load
 library.load = lambda: replace(load(), rate=16_000)
 """

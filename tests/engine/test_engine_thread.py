@@ -11,7 +11,7 @@ import pytest
 
 import talkcli
 from talkcli.engine import protocol, restarts, spawn
-from talkcli.engine import thread as engine_thread
+from talkcli.engine import supervisor as engine_thread
 from talkcli.engine.murmur import LINES
 from talkcli.engine.reports import EngineDied, EngineMissing, EngineSaid
 from tests.engine.threads import Thread, start

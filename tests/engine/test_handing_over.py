@@ -12,9 +12,9 @@ import pytest
 
 import talkcli
 from talkcli.engine import protocol, spawn
-from talkcli.engine import thread as engine_thread
+from talkcli.engine import supervisor as engine_thread
 from talkcli.engine.reports import EngineDied
-from talkcli.engine.thread import EngineThread
+from talkcli.engine.supervisor import Supervisor
 from tests.engine.threads import PATIENCE, Thread, start
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def test_the_answer_to_a_goal_is_understood_although_the_goal_has_not_been_noted
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posted: list[Report] = []
-    engine, process = EngineThread(protocol.Configure(os.getpid(), None, None, None, None), posted.append), Swift()
+    engine, process = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), posted.append), Swift()
     for name in ("_process", "_open"):
         monkeypatch.setattr(engine, name, process)
     engine.say(protocol.Say("g1", "yes", 200, 1.0, None, 50))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from talkcli.engine.clock import TimedWord, WordClock
+from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.players.complaint import LONGEST_LINE, Complaint
 from talkcli.engine.players.programs import commands
-from talkcli.engine.players.sink import AudioFailed
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.engine.synthesizers.words import Words
-from talkcli.engine.wordclock import TimedWord, WordClock
 
 
 def _complaint(text: str) -> str | None:

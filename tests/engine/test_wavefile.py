@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.players.sink import AudioFailed
-from talkcli.engine.players.wavefile import WavFile
+from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.wav import WavFile
 from tests.engine.spawned import Spawned
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import pytest
 
 from talkcli.engine import protocol, spawn
-from talkcli.engine.thread import EngineThread
+from talkcli.engine.supervisor import Supervisor
 from tests.support import scripted_engine
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class Thread:
     def __init__(self) -> None:
         self.seen: list[Report] = []
         self._posted: queue.Queue[Report] = queue.Queue()
-        self.engine = EngineThread(protocol.Configure(os.getpid(), None, None, None, None), self._posted.put)
+        self.engine = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), self._posted.put)
         self.engine.start()
 
     def say(self, text: str, goal: str = "g1") -> None:

@@ -41,7 +41,7 @@ GROWTH = 4096
 #: is the engine's. Its argument is the file.
 SLOW_START = """
 import os, sys, time
-while "talkcli.engine.process" in "".join(sys.orig_argv) and os.path.exists({flag!r}):
+while "talkcli.engine.main" in "".join(sys.orig_argv) and os.path.exists({flag!r}):
     time.sleep(0.001)
 """
 

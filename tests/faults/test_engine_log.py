@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 #: A library that complains of each text, with what would colour a terminal.
 COMPLAINS = """
 import sys
-if "talkcli.engine.process" in "".join(sys.orig_argv):
+if "talkcli.engine.main" in "".join(sys.orig_argv):
     from pyttsx3.drivers import _espeak
     speak = _espeak.Synth
     def complain(text, *rest, **options):

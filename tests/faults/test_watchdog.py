@@ -57,7 +57,7 @@ STUCK_SYNTHESIS = """
 from talkcli.engine import limits
 limits.HANG_AFTER = {limit}
 import sys, time
-if "talkcli.engine.process" in "".join(sys.orig_argv):
+if "talkcli.engine.main" in "".join(sys.orig_argv):
     from pyttsx3.drivers import _espeak
     speak = _espeak.Synth
     def wait(text, *rest, **options):

@@ -1,6 +1,6 @@
 """An engine process that does what the text of a goal tells it to: it fails, hangs, crashes, ignores stop, on request.
 
-It stands in for `talkcli.engine.process` where the real one can't be made to misbehave, and speaks the same protocol on
+It stands in for `talkcli.engine.main` where the real one can't be made to misbehave, and speaks the same protocol on
 file descriptor 0. What it can be told is in `script`. Of talk it knows `talkcli.engine.protocol` alone.
 
 One loop: it waits for a command or for the next thing that the goal in hand has planned, whichever comes first.

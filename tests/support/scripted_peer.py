@@ -12,7 +12,7 @@ import socket
 import threading
 from typing import TYPE_CHECKING, Any
 
-from talkcli.goals.messages import Goal
+from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
 from tests.support.connection import PATIENCE
 from tests.support.surroundings import short_directory

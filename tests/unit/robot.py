@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from talkcli.goals.effects import Cancelled, Changed, Effect, Now, Submitted
-from talkcli.goals.messages import By, Sender
+from talkcli.goals.goal import By, Sender
 from talkcli.goals.requests import Cancel, Say
 from talkcli.goals.scheduler import Scheduler
 

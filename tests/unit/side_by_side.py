@@ -23,7 +23,7 @@ from tests.unit.witness import Witness
 
 if TYPE_CHECKING:
     from talkcli.goals.effects import Submitted
-    from talkcli.goals.messages import By, Goal, Sender
+    from talkcli.goals.goal import By, Goal, Sender
     from talkcli.goals.record import Record
 
 ORDERS: dict[type[Effect], str] = {Start: "start", Stop: "stop", GiveUp: "give up", Hold: "hold", Resume: "resume"}

@@ -10,7 +10,7 @@ from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding, behind, done
 from talkcli.doctor.places import Place, Places
 from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Engine, Python
-from talkcli.goals.messages import Goal
+from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
 from talkcli.terminal.columns import Screen, width
 from talkcli.unreachable import ABSENT, FORBIDDEN, STALE

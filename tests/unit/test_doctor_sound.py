@@ -9,7 +9,7 @@ from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding
 from talkcli.doctor.session import Session
 from talkcli.doctor.sound import Cards, Devices, Players, SoundServer
 from talkcli.engine.players import programs as players
-from talkcli.values import replace
+from talkcli.frozen import replace
 
 PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)
 PACKAGES = {"aplay": "alsa-utils", "pacat": "pulseaudio-utils", "pw-cat": "pipewire-bin"}

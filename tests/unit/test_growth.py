@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.goals.pending import Pending
+from talkcli.goals.queue import Pending
 from talkcli.goals.record import Record
 from talkcli.goals.requests import Say
 from talkcli.protocol import wire

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.goals import history as module
+from talkcli.goals.goal import Sender
 from talkcli.goals.history import History
-from talkcli.goals.messages import Sender
 from talkcli.goals.record import Record
 from talkcli.goals.states import State
 

@@ -25,17 +25,17 @@ PACKAGE = Path(talkcli.__file__).parent
 #: Each layer may import those before it, and itself; nothing imports one behind it.
 LAYERS = ["ground", "goals", "protocol", "terminal", "client", "engine", "server", "doctor", "cli"]
 #: The files of the ground, which lie flat and import nothing of the others but each other.
-GROUND = {"errors", "paths", "peers", "resources", "unreachable", "values"}
+GROUND = {"errors", "frozen", "paths", "peers", "resources", "unreachable"}
 #: What lies flat besides: the package's face and its command, which hand on what others have.
 FACE = {"", "__main__"}
 #: What is pure besides all of `goals` and `protocol`.
 PURE = [
     "errors",
     "unreachable",
-    "values",
+    "frozen",
     "client.backlog",
     "client.outgoing",
-    "engine.changeover",
+    "engine.gap",
     "engine.murmur",
     "engine.restarts",
     "engine.synthesizers.guard",
@@ -69,7 +69,7 @@ class Import:
 
 
 def module_name(path: Path) -> str:
-    """Return a file's name within the package: `wire`, `engine.thread`, and "" for the package itself."""
+    """Return a file's name within the package: `wire`, `engine.supervisor`, and "" for the package itself."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -183,7 +183,7 @@ def test_every_module_says_what_it_is_and_is_no_longer_than_one_can_keep_in_mind
 def test_every_module_is_used() -> None:
     """By the command, by the engine process, or by a module that is itself run."""
     used: set[str] = set()
-    new = {"__main__", "engine.process", "cli.tabulate", *(f"cli.{each}" for each in COMMANDS)}
+    new = {"__main__", "engine.main", "cli.tabulate", *(f"cli.{each}" for each in COMMANDS)}
     while new:
         used |= new
         new = {name for module in new for name, _ in inside(module)} - used
@@ -232,7 +232,7 @@ def test_the_server_is_imported_by_the_serve_command_alone() -> None:
 #: Who else may end the process on the spot: the server, on its second signal, in the handler.
 ENDING = {"server.run": {"os._exit"}}
 #: Who else may write to standard error: the server's log, and the engine process, whose server reads it.
-COMPLAINING = {"server.log", "engine.process", "engine.session"}
+COMPLAINING = {"server.log", "engine.main", "engine.session"}
 
 
 def test_only_the_cli_prints_and_exits() -> None:
@@ -272,7 +272,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 #: The doctor's modules that judge facts; they read a clock's format at most, and gather nothing.
 JUDGING = ["findings", "session", "voice", "sound", "level", "places", "sentence", "serving", "report"]
 #: What those may import of the package besides each other.
-FOR_JUDGING = {"", "goals.messages", "goals.states", "terminal.columns", "terminal.printable", "unreachable", "values"}
+FOR_JUDGING = {"", "goals.goal", "goals.states", "terminal.columns", "terminal.printable", "unreachable", "frozen"}
 
 
 def test_the_doctor_judges_without_looking() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.goals.messages import By, Goal, Sender
+from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import State
 
 #: A goal always has all of these, null where unknown.

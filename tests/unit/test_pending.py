@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.goals.messages import Sender
-from talkcli.goals.pending import Pending
+from talkcli.goals.goal import Sender
+from talkcli.goals.queue import Pending
 from talkcli.goals.record import Record
 
 steps = st.lists(

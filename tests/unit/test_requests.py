@@ -34,7 +34,7 @@ from talkcli.goals.requests import (
 from talkcli.protocol.wire import decode, encode, failure
 
 if TYPE_CHECKING:
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
 
 values = st.recursive(
     st.none()

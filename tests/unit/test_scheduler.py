@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from talkcli.goals.effects import Cancelled, Changed, Now
-from talkcli.goals.messages import By
+from talkcli.goals.goal import By
 from talkcli.goals.requests import Say
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending, numbers

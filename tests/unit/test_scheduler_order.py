@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from talkcli.goals.effects import Changed
-from talkcli.goals.messages import By
+from talkcli.goals.goal import By
 from talkcli.goals.requests import Cancel, Say
 from talkcli.goals.selection import select_waiting
 from talkcli.goals.states import State

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from talkcli.goals.effects import Hold, Now, Resume
-from talkcli.goals.messages import By
+from talkcli.goals.goal import By
 from talkcli.goals.requests import Say
 from talkcli.goals.scheduler import SILENCE_LIMIT
 from talkcli.goals.states import State

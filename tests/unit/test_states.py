@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from talkcli.goals.messages import Sender
+from talkcli.goals.goal import Sender
 from talkcli.goals.record import Record
 from talkcli.goals.states import EXIT_CODES, TRANSITIONS, IllegalTransition, State, follow
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.goals.messages import By, Goal, Sender
+from talkcli.frozen import replace
+from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, PausedChanged, Snapshot, StateChanged, WordHeard
 from talkcli.protocol.replies import ServerStatus
@@ -17,7 +18,6 @@ from talkcli.terminal import columns, output
 from talkcli.terminal.columns import Screen, width
 from talkcli.terminal.senders import who_forms, why_forms
 from talkcli.terminal.transcript import Transcript, log_lines
-from talkcli.values import replace
 
 PATROL = Sender(812, 1000, "talk", "/bin/bash /home/robot/bin/patrol.sh --fast", "night watch")
 NOON = time.mktime((2024, 5, 17, 12, 0, 0, 0, 0, -1))

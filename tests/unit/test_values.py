@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import pytest
 
-from talkcli.values import fields, frozen, replace
+from talkcli.frozen import fields, frozen, replace
 
 
 @frozen
@@ -109,6 +109,6 @@ def test_a_copy_is_equal() -> None:
 
 
 def test_it_imports_nothing() -> None:
-    command = "import sys; before = set(sys.modules); import talkcli.values; print(sorted(set(sys.modules) - before))"
+    command = "import sys; before = set(sys.modules); import talkcli.frozen; print(sorted(set(sys.modules) - before))"
     done = subprocess.run([sys.executable, "-S", "-c", command], capture_output=True, text=True, check=True, cwd=".")
-    assert done.stdout.strip() == "['__future__', 'talkcli', 'talkcli.values']"
+    assert done.stdout.strip() == "['__future__', 'talkcli', 'talkcli.frozen']"

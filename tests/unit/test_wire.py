@@ -28,7 +28,7 @@ from talkcli.protocol.wire import (
 )
 
 if TYPE_CHECKING:
-    from talkcli.goals.messages import JsonObject
+    from talkcli.goals.goal import JsonObject
 
 KIB = 1024
 

@@ -14,8 +14,8 @@ import pytest
 from talkcli import errors, paths
 from talkcli.cli import commands
 from talkcli.goals import admission, states, text
+from talkcli.goals.goal import Goal
 from talkcli.goals.history import MAX_ENDED, MAX_REJECTED
-from talkcli.goals.messages import Goal
 from talkcli.goals.requests import KINDS, MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME, Cancel, Log, Say
 from talkcli.goals.states import State
 from talkcli.protocol import wire

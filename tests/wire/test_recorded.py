@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.errors import RequestRefused, refusal
-from talkcli.goals.messages import Goal
+from talkcli.goals.goal import Goal
 from talkcli.goals.requests import KINDS
 from talkcli.protocol import events, wire
 from talkcli.protocol.replies import ServerStatus

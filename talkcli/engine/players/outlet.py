@@ -8,19 +8,19 @@ from __future__ import annotations
 import time
 from functools import partial
 
-from talkcli.engine.changeover import Changeover
-from talkcli.engine.players.nullsink import NullSink
-from talkcli.engine.players.pipe import PlayerPipe
+from talkcli.engine.gap import Changeover
+from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.null import NullSink
+from talkcli.engine.players.program import PlayerPipe
 from talkcli.engine.players.programs import commands, on_path
-from talkcli.engine.players.sink import AudioFailed
-from talkcli.engine.players.wavefile import WavFile
+from talkcli.engine.players.wav import WavFile
 from talkcli.engine.players.wavestream import WavStream
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from talkcli.engine.players.sink import Sink
+    from talkcli.engine.players.base import Sink
 
 _NULL = "null"
 _FILE = "file:"

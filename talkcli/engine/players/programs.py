@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import struct
 
-from talkcli.engine.players.sink import PIECE, SAMPLE, AudioFailed
-from talkcli.values import frozen
+from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed
+from talkcli.frozen import frozen
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

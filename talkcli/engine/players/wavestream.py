@@ -9,12 +9,12 @@ from __future__ import annotations
 import os
 import select
 
-from talkcli.engine.players.sink import AudioFailed
-from talkcli.engine.players.wavefile import endless_header
+from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.wav import endless_header
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from talkcli.engine.players.sink import Interest
+    from talkcli.engine.players.base import Interest
 
 
 class WavStream:

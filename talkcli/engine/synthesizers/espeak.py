@@ -15,20 +15,20 @@ import sys
 import time
 import types
 
+from talkcli.engine.clock import TimedWord
 from talkcli.engine.playback import Playback
-from talkcli.engine.players.sink import SAMPLE, AudioFailed, Stopped
+from talkcli.engine.players.base import SAMPLE, AudioFailed, Stopped
 from talkcli.engine.synthesizers import guard
 from talkcli.engine.synthesizers.words import letters
-from talkcli.engine.wordclock import TimedWord
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import Any
 
-    from talkcli.engine.hold import Hold
+    from talkcli.engine.pause import Hold
+    from talkcli.engine.players.base import Wait
     from talkcli.engine.players.outlet import Outlet
-    from talkcli.engine.players.sink import Wait
     from talkcli.engine.synthesizers.library import Library
 
 #: Its name among pyttsx3's drivers.

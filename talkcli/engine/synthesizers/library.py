@@ -11,7 +11,7 @@ import ctypes
 import errno
 import os
 
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

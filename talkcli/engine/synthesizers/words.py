@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import unicodedata
 
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 #: What goes on behind a letter without a report of its own: "it's", "well-known", "U.S.A".
 _GOES_ON = re.compile(r"(?:['’-][^\W\d_]\w*|\.[^\W\d_](?!\w))+")

@@ -24,7 +24,7 @@ RETRY_AFTER = 0.5
 BEATS = 2.5
 
 
-class Supervisor:
+class Systemd:
     """The one that started this process, if it wants to be told. All calls are made in the event loop's thread."""
 
     def __init__(

@@ -9,8 +9,8 @@ from __future__ import annotations
 import unicodedata
 from bisect import bisect_right
 
+from talkcli.frozen import frozen
 from talkcli.terminal.printable import printable
-from talkcli.values import frozen
 
 #: Stands for what is left out at either end.
 MORE = "…"

@@ -9,12 +9,12 @@ from __future__ import annotations
 import select
 import time
 
-from talkcli.engine.players.sink import PIECE, SAMPLE
+from talkcli.engine.players.base import PIECE, SAMPLE
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from talkcli.engine.players.sink import Interest, Sink
-    from talkcli.engine.wordclock import WordClock
+    from talkcli.engine.clock import WordClock
+    from talkcli.engine.players.base import Interest, Sink
 
 #: Seconds of sound that a player holds at least between taking and playing it: of the 60 ms it is asked for, aplay was
 #: seen to hold 42 to 78, pacat 25 to 60.

@@ -12,16 +12,16 @@ import signal
 import struct
 import time
 
+from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.players.child import Child
 from talkcli.engine.players.complaint import Complaint
-from talkcli.engine.players.sink import AudioFailed
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from talkcli.engine.players.base import Interest
     from talkcli.engine.players.programs import Command
-    from talkcli.engine.players.sink import Interest
 
 #: Seconds that a player which closed its input is given to end and to say why, before it is killed.
 LAST_WORDS = 0.5

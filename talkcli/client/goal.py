@@ -11,11 +11,11 @@ import time
 from talkcli.client.backlog import Backlog
 from talkcli.client.connection import SILENCE_LIMIT
 from talkcli.errors import UsageError
+from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.requests import Cancel
 from talkcli.goals.states import State
 from talkcli.protocol import events
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
-from talkcli.values import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from weakref import WeakSet
 
     from talkcli.client.connection import Connection
-    from talkcli.goals.messages import Goal, JsonObject
+    from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.events import Event
     from talkcli.protocol.replies import Canceled
 

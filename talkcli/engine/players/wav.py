@@ -12,11 +12,11 @@ import os
 import stat
 import struct
 
-from talkcli.engine.players.sink import SAMPLE, AudioFailed
+from talkcli.engine.players.base import SAMPLE, AudioFailed
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from talkcli.engine.players.sink import Interest
+    from talkcli.engine.players.base import Interest
 
 _HEADER = struct.Struct("<4sI4s4sIHHIIHH4sI")
 #: The header's two lengths are 32 bits wide.

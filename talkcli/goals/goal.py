@@ -7,8 +7,8 @@ know; requests, where that would drop what somebody asked for, are in `requests`
 
 from __future__ import annotations
 
+from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
-from talkcli.values import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

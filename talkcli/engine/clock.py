@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from talkcli.values import frozen
+from talkcli.frozen import frozen
 
 
 @frozen

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import time
 
-from talkcli.engine.players.sink import SAMPLE
+from talkcli.engine.players.base import SAMPLE
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.engine.players.sink import Interest
+    from talkcli.engine.players.base import Interest
 
 #: Seconds of sound that it takes ahead of its clock, as much as a real player's buffer holds.
 AHEAD = 0.06

@@ -55,8 +55,8 @@ def _configuration(channel: Channel) -> protocol.Configure | None:
 
 
 def _serve(channel: Channel, configure: protocol.Configure) -> None:
+    from talkcli.engine.players.base import CannotEnd
     from talkcli.engine.players.outlet import Outlet
-    from talkcli.engine.players.sink import CannotEnd
     from talkcli.engine.session import Session
     from talkcli.engine.start import CannotStart, start
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Iterable
 
-    from talkcli.goals.messages import By, JsonObject
+    from talkcli.goals.goal import By, JsonObject
     from talkcli.goals.record import Record
     from talkcli.server.connection import Connection
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 ALIVE_EVERY = 5.0
 
 
-class Audience:
+class Subscribers:
     """The connections that have asked to be told."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:

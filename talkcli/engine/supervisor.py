@@ -19,7 +19,7 @@ from talkcli.engine.limits import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_
 from talkcli.engine.murmur import Murmur
 from talkcli.engine.reports import EngineDied, EngineMissing, EngineSaid, ThreadDied
 from talkcli.engine.restarts import Restarts
-from talkcli.values import replace
+from talkcli.frozen import replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from talkcli.engine.reports import Report
 
 
-class EngineThread:
+class Supervisor:
     """`post` is called in this thread, with what the engine process says and with an `Ended` for each goal."""
 
     def __init__(self, configure: protocol.Configure, post: Callable[[Report], None]) -> None:
