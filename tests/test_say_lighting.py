@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.terminal.highlight import MORE, Sentence, View, width
+from talkcli.terminal.columns import width
+from talkcli.terminal.highlight import MORE, Sentence, View
 from talkcli.terminal.printable import printable
 
 LONG = "the quick brown fox jumps over the lazy dog"

@@ -110,7 +110,7 @@ class _Talked:
         return self
 
     def __exit__(self, *_: object) -> None:
-        from talkcli.engine.limits import SILENCE_LIMIT
+        from talkcli.engine.protocol import SILENCE_LIMIT
 
         self.process.kill()
         if ready({self.process.liveness: select.POLLIN}, SILENCE_LIMIT):
@@ -120,7 +120,7 @@ class _Talked:
     def events(self) -> Iterator[protocol.Event]:
         """Give what the process says; _Broken where it fails, TimeoutError past the limit, Interrupted."""
         from talkcli.engine import protocol
-        from talkcli.engine.limits import HANG_AFTER, START_LIMIT
+        from talkcli.engine.protocol import HANG_AFTER, START_LIMIT
 
         process, heard = self.process, time.monotonic()
         up = False

@@ -19,9 +19,23 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any, ClassVar
 
-#: Seconds between two messages of an engine process that has a goal in hand. Far below `limits.HANG_AFTER`, so that one
+#: Seconds between two messages of an engine process that has a goal in hand. Far below `HANG_AFTER`, so that one
 #: late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
 ALIVE_EVERY = 0.5
+
+# How long an engine process may take for what it has to do, whoever watches it: server, `say -o`, `talk doctor`.
+
+#: Seconds until a process that was started must be ready: a cold start from an SD card takes two or three.
+START_LIMIT = 10.0
+#: Seconds without a sign of life from a process that has a goal in hand; it sends one each `protocol.ALIVE_EVERY`.
+HANG_AFTER = 3.0
+#: Seconds after which a stop that isn't confirmed becomes a kill.
+STOP_LIMIT = 0.15
+#: Seconds after a kill in which process and player must be gone.
+SILENCE_LIMIT = 2.0
+#: Seconds after which a pause that isn't confirmed becomes a kill, twice what a client waits for it: a driver that is
+#: not ours may finish its word first, or more.
+PAUSE_LIMIT = 4.0
 
 # How a `Say` ended.
 COMPLETED = "completed"  # every sample was played and the player ended well

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 from talkcli.client.dial import ready
 from talkcli.engine import protocol, spawn
-from talkcli.engine.limits import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
 from talkcli.engine.pieces import pieces
 from talkcli.engine.players.wavestream import WavStream
+from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
 

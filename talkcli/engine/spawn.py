@@ -2,6 +2,9 @@
 
 What makes "silent" provable is one pipe that nobody writes to: the engine process and its player inherit the writing
 end, so its reading end shows end of file exactly when both are gone, however they went.
+
+What the process writes to standard error comes out of here as whole lines, and no more of them than a log can take: a
+driver of somebody else's may write a line for each word, for months.
 """
 
 from __future__ import annotations
@@ -33,6 +36,10 @@ _SEND_BUFFER = 512 * 1024
 _STDERR_KEPT = 4096
 #: Seconds a process that closed its connection is given to end by itself, so that its own exit status is seen.
 _LAST_BREATH = 0.2
+#: Lines of standard error that are passed on in a while, and the seconds of that: a whole traceback, and no flood.
+LINES, WHILE = 20, 60.0
+#: Bytes of such a line that are kept, of one that never ends as well.
+LONGEST = 1000
 
 
 def engine_command() -> list[str]:
@@ -209,3 +216,32 @@ def _signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f"signal {number}"
+
+
+class Murmur:
+    """Lines from standard error, of one engine process after the other."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+        self._since = float("-inf")
+        self._passed = 0
+        self._left_out = 0
+
+    def take(self, data: bytes, now: float) -> list[str]:
+        """Take what was written, and return the lines to pass on; no data means that the process wrote its last."""
+        *lines, rest = (self._rest + (data or b"\n")).split(b"\n")
+        self._rest = rest[:LONGEST]
+        return [words for line in lines if line.strip() for words in self._admit(line, now)]
+
+    def _admit(self, line: bytes, now: float) -> list[str]:
+        admitted = []
+        if now >= self._since + WHILE:
+            if self._left_out:
+                admitted.append(f"({self._left_out} lines were left out)")
+            self._since, self._passed, self._left_out = now, 0, 0
+        if self._passed < LINES:
+            self._passed += 1
+            admitted.append(line[:LONGEST].decode(errors="replace").rstrip())
+        else:
+            self._left_out += 1
+        return admitted

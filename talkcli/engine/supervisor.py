@@ -9,26 +9,123 @@ from __future__ import annotations
 import selectors
 import threading
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol, spawn
-from talkcli.engine.dying import Dying
-from talkcli.engine.handed import Handed
 from talkcli.engine.inbox import NEVER, Inbox
-from talkcli.engine.limits import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
-from talkcli.engine.murmur import Murmur
-from talkcli.engine.reports import EngineDied, EngineMissing, EngineSaid, ThreadDied
+from talkcli.engine.protocol import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
 from talkcli.engine.restarts import Restarts
-from talkcli.frozen import replace
+from talkcli.engine.spawn import EngineProcess, Murmur
+from talkcli.frozen import frozen, replace
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
-    from talkcli.engine.reports import Report
+
+@frozen
+class EngineDied:
+    """The engine process ended, or had to be ended; for the log."""
+
+    words: str
+
+
+@frozen
+class EngineMissing:
+    """There has been no ready engine process for long, and one more start failed: the next goal ends for it."""
+
+    words: str
+
+
+@frozen
+class EngineSaid:
+    """A line that the engine process wrote to standard error; for the log. It may hold what a goal's text says."""
+
+    words: str
+
+
+@frozen
+class ThreadDied:
+    """A bug ended the engine thread: nothing will be spoken any more."""
+
+    words: str
+
+
+Report = protocol.Event | EngineDied | EngineMissing | EngineSaid | ThreadDied
+
+
+class Dying:
+    """The killed processes, each with the time by which it must be gone."""
+
+    def __init__(self) -> None:
+        self._limits: dict[EngineProcess, float] = {}
+
+    def __iter__(self) -> Iterator[EngineProcess]:
+        return iter(list(self._limits))
+
+    def __bool__(self) -> bool:
+        return bool(self._limits)
+
+    def add(self, process: EngineProcess, limit: float) -> None:
+        """Take a process that was killed just now, and when it must be gone."""
+        self._limits[process] = limit
+
+    def deadlines(self) -> list[float]:
+        """Return the times at which one is overdue."""
+        return [limit for limit in self._limits.values() if limit != NEVER]
+
+    def overdue(self, now: float) -> list[EngineProcess]:
+        """Return those that should have been gone by now, each once; they are kept, to be reaped when they go."""
+        found = [process for process, limit in self._limits.items() if now >= limit]
+        for process in found:
+            self._limits[process] = NEVER
+        return found
+
+    def remove(self, process: EngineProcess) -> bool:
+        """Forget a process that is gone, and return whether it went in time."""
+        return self._limits.pop(process) != NEVER
+
+
+@dataclass(slots=True, eq=False)
+class Handed:
+    """A goal from the moment it is handed in until its `Ended` is posted."""
+
+    say: protocol.Say
+    #: when the process last gave a sign of life for it; None while it waits for a process
+    heard_at: float | None = None
+    #: whether the process said that it has begun with it
+    started: bool = False
+    #: whether a process that had it died before it began with it
+    again: bool = False
+    #: when the process was told to stop it
+    stop_at: float | None = None
+    #: the number of the pause that it is to be held for, by the process that speaks it, else by the thread
+    pause: int | None = None
+    #: when a process was told of it, until it is confirmed
+    pause_at: float | None = None
+    #: how it ended, once the process that spoke it is known to be gone
+    verdict: protocol.Ended | None = None
+    #: … and that process
+    verdict_on: EngineProcess | None = None
+
+    @property
+    def id(self) -> str:
+        """The goal's id."""
+        return self.say.id
+
+    @property
+    def spoken(self) -> bool:
+        """Whether a process has it."""
+        return self.heard_at is not None
+
+    @property
+    def ending(self) -> bool:
+        """Whether it was told to stop, or has lost its process."""
+        return self.stop_at is not None or self.verdict is not None
 
 
 class Supervisor:
-    """`post` is called in this thread, with what the engine process says and with an `Ended` for each goal."""
+    """Owns the engine process. `post` is called in its thread: with what the process says, an `Ended` for each goal."""
 
     def __init__(self, configure: protocol.Configure, post: Callable[[Report], None]) -> None:
         # Held, not inherited from: a Thread has private names of its own, and others in each version of Python.

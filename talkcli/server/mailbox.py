@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
-    from talkcli.engine.reports import Report
+    from talkcli.engine.supervisor import Report
 
 #: Reports that are taken before the loop looks at the clients again: to tell fifty watchers of so many words takes it
 #: some milliseconds, on a busy machine a hundredth of a second or two.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import resources
 from talkcli.engine import protocol
-from talkcli.engine.limits import START_LIMIT
+from talkcli.engine.protocol import START_LIMIT
 from talkcli.engine.supervisor import Supervisor
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
 from talkcli.goals.goal import Sender

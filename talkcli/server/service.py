@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from talkcli import __version__, peers
 from talkcli.engine import protocol
-from talkcli.engine.reports import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
+from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.goals.admission import DEFAULT_VOICE

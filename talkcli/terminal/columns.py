@@ -22,6 +22,15 @@ LONGEST_ID = 20
 #: A terminal that says it is narrower is not believed: a line of less would show nothing.
 NARROWEST = 40
 
+#: East Asian wide and full-width characters, most emoji among them, take two columns.
+_WIDE = frozenset({"W", "F"})
+#: Marks that are drawn over the character before them.
+_OVER = frozenset({"Mn", "Me"})
+#: Asks for the character before it to be drawn as an emoji, which is two columns wide.
+_AS_EMOJI = "\ufe0f"
+#: Letters for flags: a terminal draws a pair of them, or each alone, in two columns.
+_FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
+
 _COLOURING = re.compile("\x1b\\[[0-9;]*m")
 _COLOURS = {
     State.PENDING: "36",
@@ -55,7 +64,10 @@ class Screen:
 
 
 def width(text: str) -> int:
-    """Return how many columns the text takes; colours take none."""
+    """Return how many columns the text takes; colours take none.
+
+    Where that is in doubt it is the larger: a line that is too short looks odd, one that is too long breaks.
+    """
     if "\x1b" in text:
         text = _COLOURING.sub("", text)
     return len(text) if text.isascii() else sum(map(_columns, text))
@@ -156,6 +168,9 @@ def _lines(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
 
 
 def _columns(character: str) -> int:
-    if unicodedata.combining(character):
-        return 0
-    return 2 if unicodedata.east_asian_width(character) in "WF" else 1
+    if character.isascii():
+        return 1
+    if unicodedata.category(character) in _OVER:
+        return int(character == _AS_EMOJI)
+    wide = unicodedata.east_asian_width(character) in _WIDE or _FLAG_LETTERS[0] <= character <= _FLAG_LETTERS[1]
+    return 2 if wide else 1

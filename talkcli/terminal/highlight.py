@@ -1,27 +1,18 @@
 """How a sentence looks, in so many columns of a terminal, while one of its words is being heard.
 
-Pure: it knows neither the terminal nor its colours, only how wide a character is. Where a width is in doubt it takes
-the larger: a line that is too short looks odd, one that is too long breaks.
+Pure: it knows neither the terminal nor its colours, only how wide a character is.
 """
 
 from __future__ import annotations
 
-import unicodedata
 from bisect import bisect_right
 
 from talkcli.frozen import frozen
+from talkcli.terminal.columns import width
 from talkcli.terminal.printable import printable
 
 #: Stands for what is left out at either end.
 MORE = "…"
-#: East Asian wide and full-width characters, most emoji among them, take two columns.
-_WIDE = frozenset({"W", "F"})
-#: Marks that are drawn over the character before them.
-_OVER = frozenset({"Mn", "Me"})
-#: Asks for the character before it to be drawn as an emoji, which is two columns wide.
-_AS_EMOJI = "\ufe0f"
-#: Letters for flags: a terminal draws a pair of them, or each alone, in two columns.
-_FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
 
 
 @frozen
@@ -31,20 +22,6 @@ class View:
     heard: str
     word: str
     ahead: str
-
-
-def width(text: str) -> int:
-    """Return the columns that a text takes which is printable."""
-    return sum(map(_width, text))
-
-
-def _width(character: str) -> int:
-    if character.isascii():
-        return 1
-    if unicodedata.category(character) in _OVER:
-        return int(character == _AS_EMOJI)
-    wide = unicodedata.east_asian_width(character) in _WIDE or _FLAG_LETTERS[0] <= character <= _FLAG_LETTERS[1]
-    return 2 if wide else 1
 
 
 class Sentence:

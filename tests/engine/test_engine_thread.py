@@ -12,8 +12,8 @@ import pytest
 import talkcli
 from talkcli.engine import protocol, restarts, spawn
 from talkcli.engine import supervisor as engine_thread
-from talkcli.engine.murmur import LINES
-from talkcli.engine.reports import EngineDied, EngineMissing, EngineSaid
+from talkcli.engine.spawn import LINES
+from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid
 from tests.engine.threads import Thread, start
 
 if TYPE_CHECKING:

@@ -13,8 +13,7 @@ import pytest
 import talkcli
 from talkcli.engine import protocol, spawn
 from talkcli.engine import supervisor as engine_thread
-from talkcli.engine.reports import EngineDied
-from talkcli.engine.supervisor import Supervisor
+from talkcli.engine.supervisor import EngineDied, Supervisor
 from tests.engine.threads import PATIENCE, Thread, start
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from talkcli.engine.reports import Report
+    from talkcli.engine.supervisor import Report
 
 __all__ = ["start"]
 

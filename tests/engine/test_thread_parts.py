@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from talkcli.engine.dying import Dying
-from talkcli.engine.murmur import LINES, LONGEST, WHILE, Murmur
 from talkcli.engine.restarts import BACK_OFF, PATIENCE, SHORT_LIFE, Restarts
+from talkcli.engine.spawn import LINES, LONGEST, WHILE, Murmur
+from talkcli.engine.supervisor import Dying
 
 if TYPE_CHECKING:
     from talkcli.engine.spawn import EngineProcess

@@ -17,7 +17,7 @@ from tests.support import scripted_engine
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from talkcli.engine.reports import Report
+    from talkcli.engine.supervisor import Report
 
 _R = TypeVar("_R")
 

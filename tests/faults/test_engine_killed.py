@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.limits import START_LIMIT
+from talkcli.engine.protocol import START_LIMIT
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, player_process, send
 from tests.faults.broken import (
     SLOW_START,
@@ -49,8 +49,8 @@ DEEP = "sh -c 'cat | cat | cat | aplay -q -t raw -f S16_LE -c 1 -r {rate} --buff
 RATE = 450
 #: Shortens the time in which an engine must be ready; behind `SLOW_START`.
 IMPATIENT = """
-from talkcli.engine import limits
-limits.START_LIMIT = {limit}
+from talkcli.engine import protocol
+protocol.START_LIMIT = {limit}
 """
 
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.limits import HANG_AFTER, SILENCE_LIMIT, STOP_LIMIT
 from talkcli.engine.playback import GONE_WITHIN, STALLED_AFTER
+from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, STOP_LIMIT
 from tests.conformance.hearing import LONG, LOW, assert_aborted, await_word, begin, engine_process, player_process, send
 from tests.faults import trapped
 from tests.faults.broken import (
@@ -54,8 +54,8 @@ HELD = 20.0
 #: A library that never comes back from a sentence with a certain word in it, and never calls back either.
 #: The server gives it up after some seconds without a sign of life.
 STUCK_SYNTHESIS = """
-from talkcli.engine import limits
-limits.HANG_AFTER = {limit}
+from talkcli.engine import protocol
+protocol.HANG_AFTER = {limit}
 import sys, time
 if "talkcli.engine.main" in "".join(sys.orig_argv):
     from pyttsx3.drivers import _espeak

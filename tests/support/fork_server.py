@@ -27,23 +27,13 @@ from typing import Any
 
 _KILLED_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 #: What belongs to the engine process alone, or writes files when it is run: no client and no server imports it.
-_LEFT_OUT = {
-    f"talkcli.{each}" for each in ("__main__", "cli.tabulate", "engine.espeak", "engine.library", "engine.process")
-}
-
+_LEFT_OUT = {f"talkcli.{each}" for each in ("__main__", "cli.tabulate", "engine.main")}
 _PACKAGES = ("cli", "client", "doctor", "engine", "engine.players", "goals", "protocol", "server", "terminal")
 
 
 def _import_talk() -> None:
-    for package in (
-        "talkcli",
-        "talkcli.cli",
-        "talkcli.client.client",
-        "talkcli.doctor",
-        "talkcli.engine",
-        "talkcli.server",
-    ):
-        for each in pkgutil.iter_modules(getattr(importlib.import_module(package), "__path__", ())):
+    for package in ("talkcli", *(f"talkcli.{each}" for each in _PACKAGES)):
+        for each in pkgutil.iter_modules(importlib.import_module(package).__path__):
             name = f"{package}.{each.name}"
             if name not in _LEFT_OUT:
                 importlib.import_module(name)

@@ -36,7 +36,6 @@ PURE = [
     "client.backlog",
     "client.outgoing",
     "engine.gap",
-    "engine.murmur",
     "engine.restarts",
     "engine.synthesizers.guard",
 ]
