@@ -1,21 +1,29 @@
-"""Goals that have ended, kept so that `talk wait ID` works after the fact and from another process.
+"""What the scheduler remembers: goals that have ended, what was said when, cancels that came before their goal.
 
-Pure: it keeps what it is given and drops the oldest by fixed limits.
+Pure: it keeps what it is given and drops the oldest by fixed limits; the time comes in as an argument (monotonic
+seconds). Goals are kept so that `talk wait ID` works after the fact and from another process, what was said so as not
+to say it again.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections import OrderedDict
 from heapq import merge
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from talkcli.goals.goal import By
+    from talkcli.goals.queue import Pending
     from talkcli.goals.record import Record
+    from talkcli.goals.requests import Say
+
+_Name = TypeVar("_Name", str, bytes)
 
 #: Results kept: a robot that speaks ten times a minute has more than an hour and a half to ask.
 MAX_ENDED = 1_000
@@ -23,6 +31,13 @@ MAX_ENDED = 1_000
 MAX_REJECTED = 200
 #: Bytes of all the texts kept together: the limits above times the longest text would be 40 MB.
 MAX_TEXT_BYTES = 8 * 1024 * 1024
+#: Keys whose last beginning is remembered, and as many texts.
+MAX_SAID = 10_000
+#: Seconds for which the cancel of an id that no goal has yet is remembered: the goal and its cancel are sent by two
+#: programs, which start one after the other.
+EARLY_CANCEL = 60.0
+#: Such ids.
+MAX_EARLY_CANCELS = 1_000
 
 
 class History:
@@ -69,3 +84,69 @@ class History:
     def _forget_text(self, record: Record) -> None:
         if self._with_text.pop(record.id, None) is not None:
             self._text_bytes -= record.text_bytes
+
+
+class Said:
+    """When a goal of a key, or of a text, last began to be spoken."""
+
+    def __init__(self) -> None:
+        self._by_key: OrderedDict[str, tuple[float, str]] = OrderedDict()
+        self._by_text: OrderedDict[bytes, tuple[float, str]] = OrderedDict()
+
+    def note(self, record: Record) -> None:
+        """Remember a goal of which something was heard."""
+        began = (record.began, record.id)
+        if record.key is not None:
+            _keep(self._by_key, record.key, began)
+        _keep(self._by_text, _digest(record.text or ""), began)
+
+    def within(self, seconds: float, key: str | None, text: str, now: float) -> str | None:
+        """Return the id of the last goal of this key, or without one of this text, if it began since."""
+        last = self._by_text.get(_digest(text)) if key is None else self._by_key.get(key)
+        return last[1] if last is not None and now - last[0] < seconds else None
+
+
+def throttling(say: Say, active: Record | None, pending: Pending, said: Said, now: float) -> tuple[str, str] | None:
+    """Return the id of the goal because of which this one is not to be spoken, and what is so with it; or None."""
+    if say.throttle is None:
+        return None
+    if active and (active.text == say.text if say.key is None else active.key == say.key):
+        return active.id, "is being said"
+    waiting = pending.with_text(say.text) if say.key is None else None
+    if waiting:
+        return waiting.id, "is waiting already"
+    last = said.within(say.throttle, say.key, say.text, now)
+    return None if last is None else (last, f"was said less than {say.throttle:g} s ago")
+
+
+class EarlyCancels:
+    """Ids of which a cancel came before the goal did, and by whom."""
+
+    def __init__(self) -> None:
+        self._until: OrderedDict[str, tuple[float, By]] = OrderedDict()
+
+    def note(self, goal_id: str, by: By, now: float) -> None:
+        """Remember the cancel of an id."""
+        self._until.pop(goal_id, None)
+        self._until[goal_id] = (now + EARLY_CANCEL, by)
+        if len(self._until) > MAX_EARLY_CANCELS:
+            self._until.popitem(last=False)
+
+    def find(self, goal_id: str | None, now: float) -> By | None:
+        """Return who cancelled this id."""
+        if goal_id is None:
+            return None
+        until, by = self._until.get(goal_id, (now, None))
+        return by if now < until else None
+
+
+def _keep(names: OrderedDict[_Name, tuple[float, str]], name: _Name, began: tuple[float, str]) -> None:
+    names[name] = began
+    names.move_to_end(name)
+    if len(names) > MAX_SAID:
+        names.popitem(last=False)
+
+
+def _digest(text: str) -> bytes:
+    """Return what stands for a text: ten thousand of the longest would be 400 MB."""
+    return hashlib.blake2b(text.encode(errors="surrogatepass"), digest_size=16).digest()

@@ -15,9 +15,8 @@ from talkcli.goals import text as texts
 from talkcli.goals.admission import bad_option, is_clients_id
 from talkcli.goals.effects import Cancelled, Changed, GiveUp, Hold, Resume, Start, Stop, Submitted
 from talkcli.goals.goal import By
-from talkcli.goals.history import History
+from talkcli.goals.history import EarlyCancels, History, Said, throttling
 from talkcli.goals.queue import Pending
-from talkcli.goals.recent import EarlyCancels, Said, throttling
 from talkcli.goals.record import Record
 from talkcli.goals.selection import making_way, select
 from talkcli.goals.states import IllegalTransition, State
