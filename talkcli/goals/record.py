@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal
 from talkcli.goals.states import State, follow
 
 if TYPE_CHECKING:
-    from talkcli.goals.goal import JsonObject, Sender
+    from talkcli.goals.goal import Sender
     from talkcli.goals.requests import Say
 
 
@@ -23,25 +24,20 @@ class Record:
         "began",
         "behind",
         "by",
-        "data",
         "duration",
         "ended_at",
         "expires_at",
-        "format",
         "holds",
         "id",
-        "key",
         "message",
         "newer",
         "number",
         "older",
         "paused",
-        "pitch",
         "preempt",
-        "priority",
         "queued_at",
-        "rate",
         "reason",
+        "say",
         "sender",
         "spoken_end",
         "started_at",
@@ -51,42 +47,34 @@ class Record:
         "text_bytes",
         "text_hash",
         "ttl",
-        "voice",
-        "volume",
         "waits",
     )
 
-    def __init__(self, goal_id: str, number: int, text: str, sender: Sender, queued_at: float) -> None:
+    def __init__(self, goal_id: str, number: int, say: Say, sender: Sender, queued_at: float) -> None:
         self.id = goal_id
         #: order of acceptance
         self.number = number
-        self.text: str | None = text
+        #: what its sender asked for; what the server decides stands beside it: preempt and ttl
+        self.say = say
+        #: its text; None once that is dropped
+        self.text: str | None = say.text
         #: stands for the text once that is dropped
         self.text_hash = 0
         #: what the text takes in the history
-        self.text_bytes = len(text.encode(errors="surrogatepass"))
+        self.text_bytes = len(say.text.encode(errors="surrogatepass"))
         self.sender = sender
         self.queued_at = queued_at
         self.state = State.PENDING
         self.preempt = False
-        self.priority = 0
-        self.key: str | None = None
         #: seconds from acceptance in which it must begin, and the monotonic time at which they are over
         self.ttl: float | None = None
         self.expires_at: float | None = None
-        #: its own settings, None where it has the server's
-        self.rate: int | None = None
-        self.volume: float | None = None
-        self.voice: str | None = None
-        self.pitch: int | None = None
         #: whether it is in the queue, and its neighbours there, by turn and by acceptance; the queue's business alone
         self.waits = False
         self.ahead: Record | None = None
         self.behind: Record | None = None
         self.older: Record | None = None
         self.newer: Record | None = None
-        self.format = "text"
-        self.data: JsonObject | None = None
         self.reason: str | None = None
         self.by: By | None = None
         self.message: str | None = None
@@ -104,6 +92,14 @@ class Record:
         #: monotonic time of the first stop
         self.stop_since: float | None = None
 
+    @property
+    def priority(self) -> int:
+        return self.say.priority
+
+    @property
+    def key(self) -> str | None:
+        return self.say.key
+
     def become(self, state: State) -> None:
         """Change the state as the table allows, or raise IllegalTransition and change nothing."""
         self.state = follow(self.state, state)
@@ -113,16 +109,10 @@ class Record:
         self.paused = True
         self.holds += 1
 
-    def take_options(self, say: Say) -> None:
-        """Take over what the goal's sender asked for, but for what the server decides: preempt and ttl."""
-        self.priority, self.key = say.priority, say.key
-        self.rate, self.volume, self.voice, self.pitch = say.rate, say.volume, say.voice, say.pitch
-        self.format, self.data = say.format, say.data
-
     def drop_text(self) -> None:
         """Forget the text, to make room; the result stays."""
         self.text_hash = hash(self.text)
-        self.text = None
+        self.text, self.say = None, replace(self.say, text="")
 
     def has_text(self, text: str) -> bool:
         """Whether this was the goal's text, also where it is not kept any more."""
@@ -143,12 +133,12 @@ class Record:
             reason=None if accepted else self.reason,
             by=None if accepted else self.by,
             message=None if accepted else self.message,
-            format=self.format,
+            format=self.say.format,
             spoken=spoken,
             priority=self.priority,
             key=self.key,
             ttl=self.ttl,
-            data=self.data,
+            data=self.say.data,
             client=self.sender,
             paused=self.paused and state is self.state,
             queued_at=self.queued_at,

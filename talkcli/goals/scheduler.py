@@ -262,11 +262,10 @@ class Scheduler:
     # -- inside
 
     def _record(self, say: Say, sender: Sender, now: Now) -> Record:
-        record = Record(f"{self.boot}-{self._count}", self._count, say.text, sender, now.wall)
+        record = Record(f"{self.boot}-{self._count}", self._count, say, sender, now.wall)
         record.preempt = self._preempts(say)
         record.ttl = (self.ttl if say.ttl is None else say.ttl) or None
         record.expires_at = None if record.ttl is None else now.monotonic + record.ttl
-        record.take_options(say)
         return record
 
     def _refuse(self, say: Say, fault: tuple[str, str] | None, first: Record | None) -> tuple[str, str] | None:

@@ -240,7 +240,7 @@ class Service:
     def _start(self, record: Record) -> None:
         self._started[record.id] = time.monotonic()
         self._followed = self.scheduler.pending_count > 0
-        own, general = record, self.settings
+        own, general = record.say, self.settings
         voice = general.voice if own.voice is None else own.voice
         self.engine.say(
             protocol.Say(

@@ -180,7 +180,7 @@ def test_a_time_to_live_finds_its_place_in_few_comparisons() -> None:
     for size in (FEW, MANY // 4):
         queue = Pending()
         for number in range(size + 1):
-            record = Record(f"4k7f-{number}", number, "battery low", ARM, 1.0)
+            record = Record(f"4k7f-{number}", number, Say("battery low"), ARM, 1.0)
             # The last one is over first, so that it has the longest way.
             record.expires_at = Comparisons(size + number * 7 % size if number < size else 0.0)
             Comparisons.made = 0

@@ -10,11 +10,12 @@ from talkcli.goals import history as module
 from talkcli.goals.goal import Sender
 from talkcli.goals.history import History
 from talkcli.goals.record import Record
+from talkcli.goals.requests import Say
 from talkcli.goals.states import State
 
 
 def ended(number: int, state: State = State.SUCCEEDED, text: str = "door open") -> Record:
-    record = Record(f"4k7f-{number}", number, text, Sender(), 1.0)
+    record = Record(f"4k7f-{number}", number, Say(text), Sender(), 1.0)
     record.state = state
     record.reason = "canceled"
     return record

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from talkcli.goals.goal import Sender
 from talkcli.goals.queue import Pending
 from talkcli.goals.record import Record
+from talkcli.goals.requests import Say
 
 steps = st.lists(
     st.tuples(
@@ -23,8 +24,8 @@ steps = st.lists(
 
 
 def goal(number: int, priority: int = 0, *, preempt: bool = False, key: str | None = None) -> Record:
-    record = Record(f"4k7f-{number}", number, f"text {number % 3}", Sender(), 1.0)
-    record.priority, record.preempt, record.key = priority, preempt, key
+    record = Record(f"4k7f-{number}", number, Say(f"text {number % 3}", priority=priority, key=key), Sender(), 1.0)
+    record.preempt = preempt
     return record
 
 
@@ -38,13 +39,14 @@ class Both:
 
     def step(self, what: str, priority: int, key: str | None, seconds: int | None) -> None:
         self.count += 1
+        old = self.queue.with_key(key)
+        if what == "replace" and old is not None:
+            priority = old.priority
         record = goal(self.count, priority, preempt=what == "preempt", key=key)
         record.expires_at = None if seconds is None else float(seconds)
-        old = self.queue.with_key(key)
         if what in {"remove", "expire"}:
             self.take_out(what, seconds)
         elif what == "replace" and old is not None:
-            record.priority = old.priority
             self.told[self.told.index(old)] = record
             self.queue.replace(old, record)
         else:

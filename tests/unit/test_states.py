@@ -8,6 +8,7 @@ import pytest
 
 from talkcli.goals.goal import Sender
 from talkcli.goals.record import Record
+from talkcli.goals.requests import Say
 from talkcli.goals.states import EXIT_CODES, TRANSITIONS, IllegalTransition, State, follow
 
 #: actionlib's names and numbers.
@@ -43,7 +44,7 @@ PAIRS = list(itertools.product(NUMBERS, repeat=2))
 
 
 def record_in(state: State) -> Record:
-    record = Record("4k7f-1", 1, "door open", Sender(), 1.0)
+    record = Record("4k7f-1", 1, Say("door open"), Sender(), 1.0)
     record.state = state
     return record
 
