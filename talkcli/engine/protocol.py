@@ -27,7 +27,7 @@ ALIVE_EVERY = 0.5
 
 #: Seconds until a process that was started must be ready: a cold start from an SD card takes two or three.
 START_LIMIT = 10.0
-#: Seconds without a sign of life from a process that has a goal in hand; it sends one each `protocol.ALIVE_EVERY`.
+#: Seconds without a sign of life from a process that has a goal in hand; it sends one each `ALIVE_EVERY`.
 HANG_AFTER = 3.0
 #: Seconds after which a stop that isn't confirmed becomes a kill.
 STOP_LIMIT = 0.15

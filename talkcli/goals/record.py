@@ -94,10 +94,12 @@ class Record:
 
     @property
     def priority(self) -> int:
+        """Higher goes first."""
         return self.say.priority
 
     @property
     def key(self) -> str | None:
+        """What a later goal replaces it by; None for nothing."""
         return self.say.key
 
     def become(self, state: State) -> None:
