@@ -6,7 +6,7 @@ import copy
 import subprocess
 import sys
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pytest
 
@@ -64,6 +64,31 @@ def test_what_does_not_fit_is_refused_as_by_a_dataclass(given: tuple[int, ...], 
     for each in (Model, Point):
         with pytest.raises(TypeError, match="__init__"):
             each(*given, **named)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("before", [0, 1, 1_000], ids=["the first", "another", "one of many"])
+def test_the_first_values_of_a_class_are_made_as_all_others_are(before: int) -> None:
+    @frozen
+    class Fresh:
+        x: int
+        y: int = 2
+        name: str | None = None
+
+    for number in range(before):
+        Fresh(number)
+    make: Any = Fresh
+    assert fields(make(1, name="a")) == fields(make(x=1, name="a")) == {"x": 1, "y": 2, "name": "a"}
+    for given, named in (
+        ((), {}),
+        ((), {"y": 1}),
+        ((1, 2, "a", 4), {}),
+        ((1,), {"x": 1}),
+        ((1,), {"z": 1}),
+        ((), {"z": 1}),
+    ):
+        with pytest.raises(TypeError, match=r"argument"):
+            make(*given, **named)
+    assert make(3) == make(3, 2)
 
 
 def test_it_keeps_its_class_s_own_and_has_nothing_else() -> None:
