@@ -57,7 +57,7 @@ def test_version_and_help() -> None:
     helps = [alone(*words) for words in (["-h"], ["--help"], [])]
     assert helps[0].out == helps[1].out
     assert [each.code for each in helps] == [0, 0, 0]
-    for command, words in COMMANDS.items():
+    for command, words in [(each.name, each.summary) for each in COMMANDS.values()]:
         for each in helps:
             assert re.search(rf"(?m)^  {command} +{re.escape(words)}$", each.out)
 

@@ -147,7 +147,7 @@ def test_every_option_is_offered_with_its_help(tmp_path: pathlib.Path, command: 
 
 def test_commands_are_offered_with_the_line_that_help_has_for_them(tmp_path: pathlib.Path) -> None:
     env = environment(str(tmp_path), TALK_SOCKET=f"{tmp_path}/none")
-    assert dict(offered("talk ", env)) == COMMANDS
+    assert dict(offered("talk ", env)) == {each.name: each.summary for each in COMMANDS.values()}
     assert {value for value, _ in offered("talk --", env)} >= {"--socket", "--json", "--version"}
 
 

@@ -12,10 +12,11 @@ import click
 import pytest
 
 from talkcli import errors
-from talkcli.cli import commands, serve, show
-from talkcli.cli.usage import Command
+from talkcli.cli import commands, shells, show, units
+from talkcli.cli.click_app import ClickCommand, talk
+from talkcli.cli.command import ALL_EXIT_CODES
 from talkcli.engine import devices
-from talkcli.goals import admission, states
+from talkcli.goals import states
 from tests.conformance.bareserve import TALK, environment, run
 from tests.support.surroundings import short_directory
 from tests.support.terminal import Terminal
@@ -40,9 +41,9 @@ def alone(*words: str, **extra: str) -> tuple[int, str, str]:
     return done.code, done.out, done.err
 
 
-def command(name: str) -> Command:
-    found = commands.talk.get_command(click.Context(commands.talk), name)
-    assert isinstance(found, Command), name
+def command(name: str) -> ClickCommand:
+    found = talk.get_command(click.Context(talk), name)
+    assert isinstance(found, ClickCommand), name
     return found
 
 
@@ -89,9 +90,9 @@ def test_help_of_each_command_has_a_purpose_examples_options_and_exit_codes(name
     assert len(purpose) > 30
     for option in ("--socket PATH", "--json", "--quiet", "--help"):
         assert option in out.partition("Options of every command:")[2]
-    codes = command(name).exit_codes
+    codes = command(name).row.exit_codes
     assert 2 in codes
-    assert codes.keys() <= commands.ALL_EXIT_CODES.keys()
+    assert codes.keys() <= ALL_EXIT_CODES.keys()
     assert re.findall(r"(?m)^  (\d\S*) +\S", out.partition("\nExit codes:\n")[2]) == [
         *map(str, sorted(each for each in codes if isinstance(each, int))),
         *(each for each in codes if isinstance(each, str)),
@@ -109,19 +110,20 @@ def test_every_option_says_what_it_is_for(name: str) -> None:
             assert named in {"-", "N", "X"} or each.metavar, f"{each.name} shows click's own word for its value"
 
 
-def test_limits_of_the_server_s_defaults_are_those_of_a_goal() -> None:
-    assert (serve.RATES, serve.VOLUMES, serve.PITCHES) == (admission.RATES, admission.VOLUMES, admission.PITCHES)
+def test_a_choice_is_one_of_what_there_is() -> None:
+    assert tuple(shells.SHELLS) == commands.SHELLS
+    assert tuple(units.UNITS) == commands.UNITS
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)
 def test_the_examples_can_be_typed(name: str) -> None:
     """The words of each `talk` in them are read as the command line would be; nothing is carried out."""
     seen = []
-    for line in command(name).examples.strip().splitlines():
+    for line in command(name).row.examples.strip().splitlines():
         for part in re.findall(r"\btalk ((?:\"[^\"]*\"|[^|;&)\"])*)", re.split(r"(?<=\S)   +", line.strip())[0]):
             words = [each for each in shlex.split(part.partition("'")[0]) if each != "--json"]
             seen.append(words[0])
-            with command(words[0]).make_context(words[0], words[1:], parent=click.Context(commands.talk)) as context:
+            with command(words[0]).make_context(words[0], words[1:], parent=click.Context(talk)) as context:
                 assert context.params is not None
     assert name in seen
 

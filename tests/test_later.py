@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from talkcli.goals.requests import Cancel, Say, Wait
+from talkcli.goals.options import Cancel, Say
+from talkcli.protocol.requests import Wait
 from talkcli.server import later
 from talkcli.server.later import ALL_WAITING, EACH, Later
 

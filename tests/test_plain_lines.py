@@ -7,25 +7,31 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import pytest
+from click.core import ParameterSource
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from talkcli.cli import early, plain, tabulate
-from talkcli.cli.commands import talk
-from talkcli.cli.plain_table import COMMANDS, COMMON
-from talkcli.cli.saying import GOAL_OPTIONS
+from talkcli.cli import early, plain
+from talkcli.cli.click_app import talk
+from talkcli.cli.command import COMMON
+from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import Common
 from talkcli.client.opening import GREETING
-from talkcli.goals.requests import Cancel, Hello, Pause, Resume, Say, Status, write_request
+from talkcli.goals.option import FLAG
+from talkcli.goals.options import GIVEN, Cancel, Say
 from talkcli.protocol import wire
+from talkcli.protocol.requests import Hello, Pause, Resume, Status, write_request
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from talkcli.goals.requests import Request
+    from talkcli.protocol.requests import Request
 
-TABLES = [COMMON, *(each["options"] for each in COMMANDS.values())]
-OPTIONS = sorted({name for each in TABLES for name in each})
+PLAIN = [each.name for each in COMMANDS.values() if each.plain]
+TYPED = ParameterSource.COMMANDLINE
+ROWS = [*COMMON, *(option for each in COMMANDS.values() if each.plain for option in each.options)]
+SPELLINGS = {form: each for each in ROWS for part in each.flags.split("/") for form in part.split(", ")}
+OPTIONS = sorted(SPELLINGS)
 VALUES = [
     "0",
     "1",
@@ -50,7 +56,7 @@ VALUES = [
 WORDS = [
     *OPTIONS,
     *OPTIONS,
-    *COMMANDS,
+    *PLAIN,
     *(f"{option}={value}" for option in OPTIONS for value in ("", "5", "a b", "-x")),
     *VALUES,
     *("-wq", "-wf", "-t5", "-qt", "--", "-", "--wai", "--help", "-h", "--version", "--lines", "-o", "x.wav", "serve"),
@@ -67,7 +73,7 @@ WORDS = [
         "\x1b[1m",
     ),
 ]
-FLAGS = [name for name in OPTIONS if all(name not in each or each[name][1] in (True, False) for each in TABLES)]
+FLAGS = [form for form, each in SPELLINGS.items() if each.kind is FLAG]
 #: Mostly what is plain: a flag, an option with a value that fits most, words; and now and then anything.
 PIECES = st.one_of(
     st.sampled_from(FLAGS).map(lambda each: [each]),
@@ -81,7 +87,7 @@ PIECES = st.one_of(
 LINES = st.builds(
     lambda before, command, after: [*before, *command, *(word for piece in after for word in piece)],
     st.sampled_from([[], [], ["--json"], ["-q", "--socket", "/run/x"], ["--socket=/run/y"], ["--version"]]),
-    st.sampled_from([[each] for each in COMMANDS] * 4 + [[], ["watch"], ["sya"]]),
+    st.sampled_from([[each] for each in PLAIN] * 4 + [[], ["watch"], ["sya"]]),
     st.lists(PIECES, max_size=4),
 )
 ENVIRONMENTS = st.sampled_from([{}, {"TALK_NAME": "patrol"}, {"TALK_NAME": ""}])
@@ -95,6 +101,7 @@ def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], Common]:
         assert name
         assert command
         with command.make_context(name, rest, parent=group) as context:
+            options.typed = {each for each in context.params if context.get_parameter_source(each) is TYPED}
             return name, context.params, options
 
 
@@ -107,9 +114,8 @@ def assert_read_alike(arguments: list[str], environment: Mapping[str, str]) -> N
         if not found:
             return
         command, params, options = by_click(arguments)
-    if command == "say":
-        params["wait"] = params["wait"] or params["feedback"]
-    assert (found.command, found.given) == (command, params)
+    assert (found.command.name, found.given) == (command, params)
+    assert {*found.typed} == {each.name for each in found.command.options if each.name in options.typed}
     assert found.common.get("socket") == options.socket
     assert (found.common.get("json", False), found.common.get("quiet", False)) == (options.json, options.quiet)
 
@@ -149,7 +155,7 @@ def test_what_scripts_say_is_plain(line: list[str]) -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        *([], ["serve"], ["sya", "hello"], ["--version"], ["say", "-h"], ["say"], ["say", "-"], ["say", "--lines"]),
+        *([], ["serve"], ["sya", "hello"], ["--version"], ["say", "-h"], ["say"], ["say", "--lines", "x"]),
         *(
             ["say", "--wiat", "x"],
             ["say", "-x"],
@@ -161,6 +167,8 @@ def test_what_scripts_say_is_plain(line: list[str]) -> None:
         *(
             ["say", "x", "--ttl", "nan"],
             ["say", "x", "--key", ""],
+            ["say", "x", "--key", "k" * 65],
+            ["say", "x", "--priority", "1000001"],
             ["say", "x", "--wait=1"],
             ["say", "-o", "x.wav", "x"],
         ),
@@ -170,22 +178,18 @@ def test_anything_else_is_click_s(line: list[str]) -> None:
     assert plain.read(line, {}) is None
 
 
-def test_the_table_is_what_click_s_commands_say() -> None:
-    """`python -m talkcli.cli.tabulate` writes it."""
-    assert tabulate.TABLE.read_text("utf-8") == tabulate.table()
-
-
 def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
     """Return what the client library says for a command, with no way of its own around `requests`."""
-    name = found.given.get("name") or os.environ.get("TALK_NAME") or None
-    hello = Hello(name, urgent=found.command in {"cancel", "status"})
-    if found.command == "say":
-        text, options = " ".join(found.given["text"]), {each: found.given[each] for each in GOAL_OPTIONS}
-        return hello, Say(text, wait=found.given["wait"], feedback=found.given["feedback"], **options)
-    if found.command == "cancel":
+    name, command = found.given.get("name") or os.environ.get("TALK_NAME") or None, found.command.name
+    hello = Hello(name, urgent=command in {"cancel", "status"})
+    if command == "say":
+        text, options = " ".join(found.given["text"]), {each: found.given[each] for each in GIVEN}
+        feedback = found.given["feedback"]
+        return hello, Say(text, wait=found.given["wait"] or feedback, feedback=feedback, **options)
+    if command == "cancel":
         return hello, Cancel(None, found.given["current"], found.given["before"], found.given["key"])
     others: dict[str, Request] = {"status": Status(), "pause": Pause(), "resume": Resume()}
-    return hello, others[found.command]
+    return hello, others[command]
 
 
 def assert_sent_as_by_the_library(arguments: list[str], environment: Mapping[str, str]) -> None:
@@ -227,14 +231,9 @@ def test_a_text_goes_early_as_it_is_or_not_at_all(text: str) -> None:
 @pytest.mark.parametrize(
     "line",
     [
+        *(["say", "x" * 10_001], ["say", "x", "--id", "a"], ["say", "x", "--as", "n" * 65], ["say", "-"]),
         *(
-            ["say", "x" * 10_001],
-            ["say", "x", "--key", "k" * 65],
-            ["say", "x", "--id", "a"],
-            ["say", "x", "--as", "n" * 65],
-        ),
-        *(
-            ["say", "x", "--priority", "1000001"],
+            ["say", "--lines"],
             ["say", 'a "quoted" word'],
             ["cancel", "12"],
             ["cancel", "--before", "x"],

@@ -331,9 +331,11 @@ def test_no_server_is_told_before_anything_is_read() -> None:
         assert b"talk serve" in err
 
 
-def piped(talk: Talk, *words: str) -> tuple[Forked, int]:
-    """Start `say --lines` with its output in a pipe; return it, and the end to read."""
+def piped(talk: Talk, *words: str, read: bool = True) -> tuple[Forked, int]:
+    """Start `say --lines` with its output in a pipe; return it, and the end to read; `read`: whether that is open."""
     reader, writer = os.pipe()
+    if not read:
+        os.close(reader)
     client = Forked(["say", "--lines", *words], talk.env, stdin=subprocess.PIPE, stdout=writer, stderr=subprocess.PIPE)
     os.close(writer)
     return client, reader
@@ -341,8 +343,7 @@ def piped(talk: Talk, *words: str) -> tuple[Forked, int]:
 
 @pytest.mark.parametrize("words", [[], ["--json"], ["--wait", "--json"], ["-f"]])
 def test_standard_output_that_was_closed_from_the_start_matters_to_nothing(scripted: Talk, words: list[str]) -> None:
-    client, reader = piped(scripted, *words)
-    os.close(reader)
+    client, _ = piped(scripted, *words, read=False)
     assert client.communicate("length=0 a\n\0\nlength=0 b\n", 10)[1].startswith("talk: line 2: ")
     assert client.returncode == 5
     scripted.watcher.wait_until(lambda _: texts(scripted, "SUCCEEDED") == ["length=0 a", "length=0 b"])

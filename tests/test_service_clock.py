@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.frozen import replace
 from talkcli.goals.goal import Sender
-from talkcli.goals.requests import Say
+from talkcli.goals.options import INITIAL, Say
 from talkcli.goals.states import State
 from talkcli.server import clock, service
 from talkcli.server.answers import Answers
@@ -45,7 +46,7 @@ class _Clock:
 
 
 async def _queued_behind_another(ttl: float) -> Service:
-    served = Service("4k7f", Settings(ttl=ttl), "unused", 0o600)
+    served = Service("4k7f", Settings(goals=replace(INITIAL, ttl=ttl)), "unused", 0o600)
     served.requests = Answers(served)
     served.engine = _BusyEngine()  # type: ignore[assignment]
     served.scheduler.engine_ready(served.now())

@@ -46,13 +46,13 @@ def _run_plain(arguments: list[str]) -> int | None:
         return None
     from talkcli.cli.early import carry_out
 
-    return carry_out(plain, arguments)
+    return carry_out(plain)
 
 
 def _run_by_click(arguments: list[str]) -> int:
     import _signal
 
-    from talkcli.cli.commands import run as run_by_click
+    from talkcli.cli.click_app import run as run_by_click
     from talkcli.cli.show import Common
 
     # Whoever started this may ignore it, and then no process that is started here leaves an exit status.

@@ -1,198 +1,533 @@
-"""The group of all commands, for click: help, completion, errors, and every command line that is not a plain one.
+"""The commands, a row each: what it is for, what it takes, what its exit codes mean, and what carries it out.
 
-A command's module is imported when the command is run, so that no command pays for another.
+Rules for this file: it is imported before anything is sent, so it imports nothing heavy, and it carries out nothing.
+The options of goals and servers are in `goals.options`; how two options go together is the rule beside a command's row.
 """
 
 from __future__ import annotations
 
-import importlib
-import os
-from typing import TYPE_CHECKING, Any
-
-import click
-
-from talkcli import __version__
-from talkcli.cli.common import common_options
-from talkcli.cli.ends import OutputClosed, ended
-from talkcli.cli.show import Common, note, show_error
-from talkcli.cli.usage import (
-    told,
-    unknown_command,
-    with_short_help,
-    write_examples,
-    write_exit_codes,
-    write_lines,
-    write_options,
-)
-from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, UsageError
-from talkcli.terminal.printable import printable
+from talkcli.cli.command import ASKING, FILE, MODE, Argument, Command, spelt
+from talkcli.frozen import TYPE_CHECKING, replace
+from talkcli.goals.option import FLAG, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
+from talkcli.goals.options import FOR_ENGINE, MAX_CHARACTERS, OPTIONS, SETTINGS, Cancel
 
 if TYPE_CHECKING:
-    from click.shell_completion import CompletionItem
+    from collections.abc import Mapping
+    from collections.abc import Set as AbstractSet
+    from typing import Any
+
+#: The shells that there is a completion script for, and the units of systemd's.
+SHELLS = ("bash", "zsh", "fish")
+UNITS = ("user", "system", "user-socket", "system-socket")
+#: Milliseconds of silence before a sentence: no output needs longer to wake.
+MAX_LEAD_IN = 5000
+
+
+def _timeout(words: str) -> Option:
+    """Return the option --timeout; `words` is its help: what the command does when the time is over."""
+    limits = (0, None)
+    return Option("timeout", NUMBER, limits=limits, above=True, flags="-t, --timeout", metavar="SEC", help=words)
+
+
+def _to_say() -> tuple[Option, ...]:
+    """Return the options of `say`: those of a goal, and its own."""
+    found: list[Option] = []
+    for each in OPTIONS:
+        if each.flags and each.env:
+            found.append(replace(each, env="", help=f"{each.help}  [env var, with -o: {each.env}]"))
+        elif each.flags:
+            found.append(each)
+        if each.name == "wait":
+            words = "With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124."
+            found.append(_timeout(words))
+        elif each.name == "id":
+            what = "What the sender calls itself."
+            found.append(Option("name", WORD, flags="--as", metavar="NAME", help=what, env="TALK_NAME"))
+    return (
+        *found,
+        Option(
+            "lines",
+            FLAG,
+            default=False,
+            flags="--lines",
+            help="Speak each line of standard input, as it comes; no TEXT then.",
+        ),
+        Option(
+            "output",
+            FILE,
+            flags="-o, --output",
+            metavar="FILE.wav",
+            help="Write it into a file instead; '-' is standard output. Needs no server.",
+        ),
+    )
+
+
+_SAY = _to_say()
+#: Options of `say` that mean something without a server, too.
+_WITHOUT_SERVER = {"timeout", "output", *FOR_ENGINE}
+#: Endings by which a file of another format than WAV would be meant.
+_OTHER_FORMATS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
+
+
+def _say_rule(given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
+    output, text, waits = given["output"], given["text"], given["wait"] or given["feedback"]
+    if output is not None:
+        named = [spelt(each, given[each.name]) for each in _SAY if each.name in typed - _WITHOUT_SERVER]
+        if named:
+            return f"--output writes a file, without a server: leave out {', '.join(named)}"
+        ending = next((each for each in _OTHER_FORMATS if output.lower().endswith(each)), "")
+        if ending:
+            return f"--output writes WAV, not {output[-len(ending) :]}: name it .wav, and convert it with ffmpeg or sox"
+    if given["lines"] and text:
+        return "--lines reads standard input: leave out TEXT"
+    if given["lines"] and given["id"] is not None:
+        return "--lines makes a goal of each line, and --id names one: leave out one of them"
+    if not given["lines"] and not text:
+        return "TEXT is missing: what is to be said, or '-' for standard input"
+    if given["flush"] and given["preempt"] is False:
+        return "--flush goes first, and --queue does not: leave out one of them"
+    if given["timeout"] is not None and not waits and output is None:
+        return "--timeout needs --wait: without it, nothing is waited for"
+    return None
+
+
+def _to_set(option: Option) -> Option:
+    """Return a setting as `talk set` takes it: without a default, as what isn't given stays."""
+    assert option.setting
+    setting = option.setting
+    return replace(option, env="", flags=setting.flags or option.flags, help=setting.to_set or option.help)
+
+
+def _to_serve(option: Option) -> Option:
+    """Return a setting as `talk serve` takes it."""
+    assert option.setting
+    setting = option.setting
+    flags = (setting.flags or option.flags).split("/")[0]
+    return replace(option, default=setting.initial, flags=flags, help=setting.at_start or option.help)
+
+
+_SERVE = (
+    *map(_to_serve, SETTINGS),
+    # At two seconds a sentence, more than three minutes of speech that nobody can still want to hear.
+    Option("max_queue", INTEGER, default=100, limits=(1, None), flags="--max-queue", help="Goals that may wait."),
+    Option(
+        "max_text",
+        INTEGER,
+        default=MAX_CHARACTERS,
+        limits=(1, MAX_CHARACTERS),
+        flags="--max-text",
+        help="Characters of one text.",
+    ),
+    # Each takes a descriptor of the 1,024 that a process usually has.
+    Option("max_clients", INTEGER, default=256, limits=(1, None), flags="--max-clients", help="Clients at once."),
+    Option(
+        "player",
+        TEXT,
+        flags="--player",
+        metavar="PLAYER",
+        help="What plays the sound. One of aplay, pacat and pw-cat; null (silent, in real time); file:PATH.wav; or a "
+        "command that reads 16-bit mono PCM, with {rate} for its rate and {device} for the --device. [default: the "
+        "first of the three that works]",
+        env="TALK_PLAYER",
+        offers="players",
+    ),
+    Option(
+        "device",
+        TEXT,
+        flags="--device",
+        metavar="NAME",
+        help="Device, by the player's own name for it. For aplay one that 'aplay -L' lists, such as plughw:1,0; for "
+        "pacat one of 'pactl list short sinks'; for pw-cat the name of a node, as in 'pw-cli ls Node'. Name the "
+        "--player, too.",
+    ),
+    Option(
+        "lead_in",
+        INTEGER,
+        default=0,
+        limits=(0, MAX_LEAD_IN),
+        flags="--lead-in",
+        metavar="MS",
+        help="Milliseconds of silence before a sentence; only where the output was idle: HDMI, USB and Bluetooth "
+        "outputs fall asleep, and swallow what comes while they wake.",
+    ),
+    Option(
+        "driver",
+        TEXT,
+        flags="--driver",
+        metavar="NAME",
+        help="A driver of pyttsx3's. [default: the one for this system]",
+    ),
+    Option(
+        "socket_mode",
+        MODE,
+        default="0600",
+        flags="--socket-mode",
+        help="Who may connect: the socket's file mode.",
+    ),
+    Option("greeting", TEXT, flags="--greeting", help="A sentence to speak at the start."),
+    Option(
+        "print_unit",
+        TEXT,
+        flags="--print-unit",
+        metavar="UNIT",
+        help=f"Print a systemd unit with these options, and end. One of {', '.join(UNITS)}; it says where it goes.",
+        choices=UNITS,
+    ),
+)
+
+
+def _serve_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
+    player = given["player"] or ""
+    if given["device"] and player.startswith(("null", "file:")):
+        return f"--device means nothing to the player {player}"
+    if player == "file:":
+        return "--player file: names no file: write file:PATH.wav"
+    return None
+
+
+_IDS = Argument("ids", "[ID]...", many=True, offers="goal_ids")
 
 #: The commands, in the order in which help lists them: what a newcomer needs first comes first.
-COMMANDS = {
-    "serve": "Run the server, in the foreground.",
-    "say": "Speak a sentence.",
-    "wait": "Wait until goals have ended.",
-    "cancel": "Stop speaking: everything, or what is named.",
-    "status": "What is being said, what will be, what was.",
-    "watch": "Follow all goals as they happen.",
-    "log": "What was said: when, by whom, how it ended.",
-    "pause": "Hold speech where it is.",
-    "resume": "Go on where speech was held.",
-    "set": "Change the running server's settings, or print them.",
-    "voices": "List the voices.",
-    "doctor": "Check everything between a sentence and a loudspeaker.",
-    "completion": "Print the completion script of a shell.",
-}
+_ROWS = (
+    Command(
+        name="serve",
+        summary="Run the server, in the foreground.",
+        about="""
+        Run the server, in the foreground, until SIGTERM or Ctrl-C.
 
+        It queues sentences and speaks one at a time; its log is on standard error. For systemd it prints its own
+        units.
+        """,
+        runs="serve:serve",
+        examples="""
+        talk serve --rate 150
+        talk serve --player null       no sound, same timing: for simulation and CI
+        talk serve --print-unit user   a service for systemd, with how to install it
+        """,
+        exit_codes={
+            0: "ended by SIGTERM or SIGINT; by a second one 128+n",
+            1: "anything not named here; a bug says so",
+            2: "usage: an option or a voice that there isn't",
+            11: "this socket is served already, or its directory is not safe",
+        },
+        options=_SERVE,
+        rule=_serve_rule,
+    ),
+    Command(
+        name="say",
+        summary="Speak a sentence.",
+        about="""
+        Speak TEXT: its words, joined by blanks; or standard input, as one sentence, where TEXT is '-'.
 
-_EXAMPLES = """
-    talk serve &                      one server on the robot
-    talk say --wait -- "battery low"  the exit code tells whether it was heard
-    talk cancel                       silence, now
-    talk doctor                       silent? what to do next
-"""
-#: All of them, as the README's table has them; each command's help says which are its own.
-ALL_EXIT_CODES: dict[int | str, str] = {
-    0: "accepted; with --wait succeeded: all of it was played",
-    1: "anything not named here; a bug says so, and TALK_DEBUG=1 where",
-    2: "usage",
-    3: "no server: nothing was sent, so it is safe to try again",
-    4: "aborted: engine or audio failed, or nothing in the text can be spoken",
-    5: "rejected: never queued",
-    6: "recalled: taken out of the queue before it was spoken",
-    7: "preempted: stopped while it was spoken",
-    8: "unknown goal",
-    9: "client and server speak different versions of the protocol",
-    10: "permission denied",
-    11: "the socket is served already, or its directory is not safe",
-    12: "lost: it was sent, then the server went away; it may still be spoken",
-    124: "timed out",
-    "128+n": "ended by signal n; 141: standard output is closed, or its reader went away",
-}
+        Prints the goal's id. Without --wait it returns as soon as the goal is accepted. With --wait it owns the
+        goal: Ctrl-C, SIGTERM and SIGHUP cancel it, and so does a reader of its output that goes away, as ssh does.
+        With --lines its exit code is that of the first line that did not succeed.
+        """,
+        runs="say:say",
+        examples="""
+        talk say "battery low"
+        talk say --wait -- "$text" || echo "nobody heard it"
+        talk say -wf "please step back"         each word as it is heard
+        talk say --key battery --throttle 60 "battery low"
+        fortune | talk say -
+        tail -n 0 -F log | talk say --lines --ttl 10
+        talk say -o hello.wav "hello"           needs no server
+        talk say -o - "hello" | aplay
+        """,
+        exit_codes={
+            **ASKING,
+            0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
+            4: "aborted: engine or audio failed; 'talk doctor' says more",
+            5: "rejected: never queued (bad text, full queue or full server)",
+            6: "recalled: taken out of the queue before it was spoken",
+            7: "preempted: stopped while it was spoken",
+            12: "lost: it was sent, then the server went away; it may still be spoken",
+            124: "timed out, and cancelled",
+            "128+n": "ended by signal n, and cancelled; 141: whoever read its output went away while it waited",
+        },
+        options=_SAY,
+        argument=Argument("text", "TEXT...", many=True),
+        plain=True,
+        rule=_say_rule,
+    ),
+    Command(
+        name="wait",
+        summary="Wait until goals have ended.",
+        about="""
+        Wait until these goals have ended, whoever sent them; without an ID, all that are active or pending now.
 
+        It only watches: Ctrl-C and --timeout cancel nothing. A goal that has ended already is answered at once.
+        """,
+        runs="wait:wait",
+        examples="""
+        id=$(talk say "moving back")
+        move_back
+        talk wait "$id"
+        """,
+        exit_codes={
+            **ASKING,
+            0: "all succeeded; or no ID was given, and all have ended",
+            4: "aborted; 4 to 7 are those of the first goal in order that did not succeed",
+            5: "rejected; or the server has as many clients as it takes",
+            6: "recalled",
+            7: "preempted",
+            8: "unknown goal",
+            12: "lost: the server went away",
+            124: "timed out; the goals go on",
+            "128+n": "ended by signal n, 141: whoever read its output went away meanwhile; the goals go on",
+        },
+        options=(
+            _timeout("Wait no longer than SEC seconds; the goals go on; exit code 124."),
+            Option("feedback", FLAG, default=False, flags="-f, --feedback", help="Show each word as it is heard."),
+        ),
+        argument=_IDS,
+        plain=True,
+    ),
+    Command(
+        name="cancel",
+        summary="Stop speaking: everything, or what is named.",
+        about="""
+        Stop speaking: the goals that are named, or everything, from every client. Returns when it is silent.
 
-class _Commands(click.Group):
-    """Loads the module of a command when it is needed; lists them all without."""
+        Prints the ids of the goals that ended because of it. Nothing to cancel is success. Selectors add up.
+        """,
+        runs="ask:cancel",
+        examples="""
+        talk cancel                 everything, now
+        talk cancel --current       this sentence; the next one follows
+        talk cancel --key battery   what was sent with --key battery
+        talk cancel 12 13           these goals of this server
+        """,
+        exit_codes={
+            **ASKING,
+            0: "it is silent, or was already",
+            8: "an ID is unknown; the others are cancelled all the same",
+        },
+        options=tuple(each for each in Cancel.options if each.flags),
+        argument=_IDS,
+        plain=True,
+    ),
+    Command(
+        name="status",
+        summary="What is being said, what will be, what was.",
+        about="""
+        Show what is being said, what will be and what was; with an ID, all that is known of that goal.
+        """,
+        runs="ask:status",
+        examples="""
+        talk status
+        talk status 12                          goal 12 of this server
+        talk --json status | jq .active.text
+        """,
+        exit_codes={
+            **ASKING,
+            0: "the server runs",
+            8: "unknown goal",
+        },
+        argument=Argument("goal_id", "[ID]", offers="known_ids"),
+        plain=True,
+    ),
+    Command(
+        name="watch",
+        summary="Follow all goals as they happen.",
+        about="""
+        Show all goals as they happen, from now on: who says what, how it ends and why. Ctrl-C ends it.
 
-    def make_context(self, *arguments: Any, **extra: Any) -> click.Context:
-        try:
-            return super().make_context(*arguments, **extra)
-        except BrokenPipeError as error:
-            raise OutputClosed from error
+        It begins with what is being said and what waits. On a terminal, what is over at once is left out: that a
+        goal waits where nothing is before it, that one is being stopped. In a pipe, each event is a line.
 
-    def invoke(self, ctx: click.Context) -> object:
-        try:
-            return super().invoke(ctx)
-        except BrokenPipeError as error:
-            raise OutputClosed from error
+        With --json each event is an object a line, words included; the first is {"event": "snapshot", ...}.
+        """,
+        runs="watch:watch",
+        examples="""
+        talk watch
+        ssh robot talk watch
+        talk --json watch | jq -r 'select(.event == "word").word'
+        """,
+        exit_codes={
+            **ASKING,
+            12: "lost: the server went away",
+            "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
+        },
+        options=(
+            Option("words", FLAG, default=False, flags="-f, --words", help="A line for each word as it is heard, too."),
+        ),
+    ),
+    Command(
+        name="log",
+        summary="What was said: when, by whom, how it ended.",
+        about="""
+        Show what was said: when and how each goal ended, its text, who sent it, and why it ended; the newest last.
 
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
-        return list(COMMANDS)
+        Who sent it is the program that called talk, the process id of talk itself, and after "as" what the sender
+        calls itself. Rejected goals are listed, too.
+        """,
+        runs="ask:log",
+        examples="""
+        talk log
+        talk log -n 100 | grep patrol
+        talk --json log | jq -r 'select(.state == "ABORTED").message'
+        """,
+        exit_codes={
+            **ASKING,
+            0: "listed",
+        },
+        options=(
+            Option(
+                "count",
+                INTEGER,
+                default=20,
+                limits=(1, MAX_LOG),
+                flags="-n, --count",
+                help="The last N goals that ended.",
+            ),
+        ),
+        plain=True,
+    ),
+    Command(
+        name="pause",
+        summary="Hold speech where it is.",
+        about="""
+        Hold speech where it is, until 'talk resume'. Returns when it is silent; twice is success.
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
-        if cmd_name not in COMMANDS:
-            return None
-        command: click.Command = importlib.import_module(f"talkcli.cli.{cmd_name}").command
-        return command
+        Nothing is spoken until then, whoever sends it and however urgent it is. Goals can be sent and cancelled.
+        """,
+        runs="ask:pause",
+        examples="""
+        talk pause; listen_to_the_operator; talk resume
+        """,
+        exit_codes={
+            **ASKING,
+            0: "speech is held, and it is silent",
+            1: "speech is held, but that it is silent was not known within 2 seconds",
+        },
+        plain=True,
+    ),
+    Command(
+        name="resume",
+        summary="Go on where speech was held.",
+        about="""
+        Go on where 'talk pause' held speech. Twice is success, and so is without a pause.
+        """,
+        runs="ask:resume",
+        examples="""
+        talk resume
+        """,
+        exit_codes={
+            **ASKING,
+            0: "speech goes on",
+        },
+        plain=True,
+    ),
+    Command(
+        name="set",
+        summary="Change the running server's settings, or print them.",
+        about="""
+        Change settings of the running server; without an option, print them.
 
-    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        from click.shell_completion import CompletionItem
+        They hold for each goal that doesn't bring its own, from the next one that begins; --preempt and --ttl from
+        the next one that is sent. A server that is started anew has those of its command line.
+        """,
+        runs="ask:change",
+        examples="""
+        talk set
+        talk set --rate 150 --volume 0.5
+        talk set --voice en-us --no-preempt
+        """,
+        exit_codes={
+            **ASKING,
+            0: "changed, or printed",
+            2: "usage: a value out of its range, or an unknown voice; nothing was changed",
+        },
+        options=tuple(map(_to_set, SETTINGS)),
+        plain=True,
+    ),
+    Command(
+        name="voices",
+        summary="List the voices.",
+        about="""
+        List the voices of the server's engine: id, language, name. Any of the three can be given as a voice.
 
-        named = [CompletionItem(name, help=words) for name, words in COMMANDS.items() if name.startswith(incomplete)]
-        return named + with_short_help(click.Command.shell_complete(self, ctx, incomplete))
+        At the end of the list are variants: each goes behind any voice.
+        """,
+        runs="ask:voices",
+        examples="""
+        talk voices --language en
+        talk serve --voice en-us
+        talk say --voice en-us+f3 "a variant"
+        """,
+        exit_codes={
+            **ASKING,
+            0: "listed",
+            1: "no voice speaks that language, or the engine can't list them",
+        },
+        options=(
+            Option(
+                "language",
+                TEXT,
+                flags="--language",
+                metavar="CODE",
+                help="Only this language, with its variants: en, pt-br.",
+            ),
+        ),
+        plain=True,
+    ),
+    Command(
+        name="doctor",
+        summary="Check everything between a sentence and a loudspeaker.",
+        about="""
+        Check everything between a sentence and a loudspeaker, in order, and say the one thing to do next.
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        name = args[0] if args else ""
-        if ctx.resilient_parsing:  # a shell asks for completion: nothing may be said
-            return super().resolve_command(ctx, args)
-        if name and not name.startswith("-") and name not in COMMANDS:
-            raise click.UsageError(unknown_command(args, COMMANDS), ctx)
-        return super().resolve_command(ctx, args)
+        Each check is a line: done, warning or failed. At last a sentence is played: by the server, where it waits
+        its turn (20 seconds at most), or without a server by an engine of this command's own, with TALK_PLAYER and
+        TALK_VOICE. With --silent it is always that engine, which plays zeros by the server's player: no goal waits,
+        and none is in the log.
+        """,
+        runs="doctor:doctor",
+        examples="""
+        talk doctor
+        talk doctor --silent                    at night: all of it, without a sound
+        ssh robot talk doctor                   the exit code comes back
+        talk --json doctor | jq 'select(.state != "done")'
+        """,
+        exit_codes={
+            0: "a sentence would be heard",
+            1: "anything not named here; a bug says so",
+            2: "usage",
+            4: "it would not, as without a server",
+            "128+n": "ended by signal n",
+        },
+        options=(
+            Option(
+                "silent",
+                FLAG,
+                default=False,
+                flags="--silent",
+                help="Play half a second of zeros, which is no goal and no sound.",
+            ),
+        ),
+    ),
+    Command(
+        name="completion",
+        summary="Print the completion script of a shell.",
+        about="""
+        Print the completion script of a shell: bash, zsh or fish. Its start file loads it.
 
-    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        super().format_help_text(ctx, formatter)
-        write_examples(_EXAMPLES, formatter)
-
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        self.format_commands(ctx, formatter)
-        write_options(self, ctx, formatter, "Options, before or after the command")
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        write_exit_codes(ALL_EXIT_CODES, formatter)
-
-
-@click.group(
-    cls=_Commands,
-    invoke_without_command=True,
-    subcommand_metavar="COMMAND [ARGS]...",
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+        Tab then completes commands, options and their values, and what the running server knows: goals, keys,
+        voices.
+        """,
+        runs="completion:completion",
+        examples="""
+        eval "$(talk completion bash)"   the last line of ~/.bashrc
+        eval "$(talk completion zsh)"    the last line of ~/.zshrc
+        talk completion fish | source    the last line of ~/.config/fish/config.fish
+        """,
+        exit_codes={
+            0: "printed",
+            1: "anything not named here; a bug says so",
+            2: "usage: a shell that there is no script for",
+        },
+        argument=Argument("shell", "SHELL", choices=SHELLS),
+    ),
 )
-@common_options
-@click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
-@click.pass_context
-def talk(context: click.Context) -> None:
-    """Speech for robots: sentences that can be awaited, cancelled and preempted."""
-    context.ensure_object(Common)
-    if context.invoked_subcommand is None:
-        click.echo(_first_screen(context))
-
-
-def _first_screen(context: click.Context) -> str:
-    """Return what a newcomer needs first; with the prompt below it, it fits a terminal of 24 lines."""
-    formatter = context.make_formatter()
-    formatter.write(f"{talk.help}\n\n")
-    with formatter.indentation():
-        write_lines(_EXAMPLES, formatter)
-    talk.format_commands(context, formatter)
-    formatter.write("\n'talk COMMAND --help' says more of each, 'talk --help' has the exit codes.")
-    return formatter.getvalue()
-
-
-def run(arguments: list[str], options: Common) -> int:
-    """Run a command line, or answer a shell that asks for completion, and return the exit code."""
-    return _complete(options) if "_TALK_COMPLETE" in os.environ else ended(lambda: _main(arguments, options), options)
-
-
-def _main(arguments: list[str], options: Common) -> object:
-    try:
-        return talk.main(arguments, prog_name="talk", standalone_mode=False, obj=options)
-    except click.Abort:
-        return EXIT_SIGINT
-    except click.ClickException as error:
-        # The options may not have been read as far as --json when the error was found.
-        _show_click_error(error, json=options.json or "--json" in arguments)
-        return error.exit_code
-
-
-def _complete(options: Common) -> int:
-    """Answer a shell that asks for completion: what there is to offer, and never a word besides."""
-    from talkcli.cli import shells
-
-    shells.register()
-    try:
-        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # ends by itself
-    except Exception:
-        if os.environ.get("TALK_DEBUG"):
-            raise
-    return EXIT_ERROR
-
-
-def _show_click_error(error: click.ClickException, *, json: bool) -> None:
-    """Show a usage error. What was typed may be text of somebody else's, so its controls are escaped."""
-    words = printable(told(error))
-    if json:
-        show_error(UsageError(words), json=True)
-        return
-    note(words)
-    if "--help" not in words:
-        context = getattr(error, "ctx", None)
-        note(f"see '{context.command_path if context else 'talk'} --help'")
+COMMANDS = {each.name: each for each in _ROWS}

@@ -2,49 +2,26 @@
 
 from __future__ import annotations
 
-import click
+from typing import TYPE_CHECKING
 
-from talkcli.cli.common import common, common_options, talk_command
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, screen, show, show_json
 from talkcli.client.dial import Interrupted
 from talkcli.goals.states import EXIT_CODES, State
 
+if TYPE_CHECKING:
+    from talkcli.cli.show import Common
+
 #: What nobody would hear ends as a goal that nobody hears.
 _NOT_HEARD = EXIT_CODES[State.ABORTED]
 
 
-@talk_command(
-    "doctor",
-    examples="""
-        talk doctor
-        talk doctor --silent                    at night: all of it, without a sound
-        ssh robot talk doctor                   the exit code comes back
-        talk --json doctor | jq 'select(.state != "done")'
-    """,
-    exit_codes={
-        0: "a sentence would be heard",
-        1: "anything not named here; a bug says so",
-        2: "usage",
-        4: "it would not, as without a server",
-        "128+n": "ended by signal n",
-    },
-)
-@click.option("--silent", is_flag=True, help="Play half a second of zeros, which is no goal and no sound.")
-@common_options
-@click.pass_context
-def command(context: click.Context, silent: bool) -> int:
-    """Check everything between a sentence and a loudspeaker, in order, and say the one thing to do next.
-
-    Each check is a line: done, warning or failed. At last a sentence is played: by the server, where it waits its turn
-    (20 seconds at most), or without a server by an engine of this command's own, with TALK_PLAYER and TALK_VOICE. With
-    --silent it is always that engine, which plays zeros by the server's player: no goal waits, and none is in the log.
-    """
+def doctor(options: Common, silent: bool) -> int:
+    """Show each finding and, at last, the one thing to do next; return the exit code."""
     from talkcli.doctor.examine import Examination
     from talkcli.doctor.findings import heard
     from talkcli.doctor.report import lines, verdict
 
-    options = common(context)
     found = []
     with Interrupts() as interrupts:
         try:

@@ -13,50 +13,44 @@ import time
 
 from talkcli.client.opening import open_early, stand_back
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.options import Cancel, Say
 
 if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.cli.plain import Plain
-    from talkcli.cli.show import Common
-    from talkcli.client.opening import Opened
+    from talkcli.goals.option import Option
 
-#: Fields of the requests that are sent early, in their order, as `requests` has them.
-_FIELDS = {
-    "say": (
-        *("text", "wait", "feedback", "preempt", "flush", "priority", "ttl", "key", "throttle"),
-        *("rate", "volume", "voice", "pitch"),
-    ),
-    "cancel": ("current", "key"),
+#: The requests that are sent early, by their commands: the rows of their fields.
+_FIELDS: dict[str, tuple[Option, ...]] = {
+    "say": Say.options,
+    "cancel": Cancel.options,
     "status": (),
     "pause": (),
     "resume": (),
 }
-#: Those that are left out of a request where they are this; the others where they are None.
-_DEFAULTS = {"wait": False, "feedback": False, "flush": False, "priority": 0, "current": False}
+#: What a server may refuse for more than its form: only the library knows the whole id, reads a file, or counts lines.
+_LATE = ("id", "ids", "before", "goal_id", "lines")
 #: Characters of a label and of a text that are surely not too many.
 _LABEL, _TEXT = 64, 10_000
-_PRIORITIES = range(-1_000_000, 1_000_001)
 
 
 def lines(plain: Plain) -> tuple[bytes, bytes] | None:
     """Return the lines of `hello` and of the request; None where something about them is not plain."""
-    given = plain.given
-    if plain.command not in _FIELDS or given.get("id") or given.get("ids") or given.get("before"):
+    command, given = plain.command.name, dict(plain.given)
+    if command not in _FIELDS or any(given.pop(each, None) for each in _LATE):
         return None
-    if given.get("goal_id") or given.get("priority", 0) not in _PRIORITIES:
-        return None
+    if command == "say":
+        given["wait"] = given["wait"] or given["feedback"]
+        given["text"] = "" if given["text"] == ("-",) else " ".join(given["text"])
+        if not given["text"]:
+            return None
     name = given.get("name") or os.environ.get("TALK_NAME") or None
-    if plain.command == "say":
-        given = {**given, "text": " ".join(given["text"])}
-        hello = _line({"request": "hello", "name": name})
-    elif plain.command in ("cancel", "status"):
-        hello = _line({"request": "hello", "name": name, "urgent": True})
-    else:
-        hello = _line({"request": "hello", "name": name})
-    fields = {name: given[name] for name in _FIELDS[plain.command]}
-    asked = {name: each for name, each in fields.items() if each is not None and each != _DEFAULTS.get(name)}
-    request = _line({"seq": 1, "request": plain.command, **asked})
+    urgent = {"urgent": True} if command in ("cancel", "status") else {}
+    hello = _line({"request": "hello", "name": name, **urgent})
+    fields = {each.name: given.get(each.name, each.default) for each in _FIELDS[command]}
+    asked = {each.name: fields[each.name] for each in _FIELDS[command] if fields[each.name] != each.default}
+    request = _line({"seq": 1, "request": command, **asked})
     return (hello, request) if hello and request else None
 
 
@@ -74,7 +68,7 @@ def _line(fields: dict[str, Any]) -> bytes | None:
     return f"{{{', '.join(shown)}}}\n".encode()
 
 
-def carry_out(plain: Plain, arguments: list[str]) -> int:
+def carry_out(plain: Plain) -> int:
     """Carry out a plain command line, and return its exit code."""
     began = time.monotonic()
     said = lines(plain)
@@ -82,7 +76,7 @@ def carry_out(plain: Plain, arguments: list[str]) -> int:
 
     def hold() -> None:
         # A goal that is on its way is this command's to cancel: a signal waits until there is somebody to do so.
-        asked = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if plain.command == "say" else set()
+        asked = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if plain.command.name == "say" else set()
         held.update(asked - _signal.pthread_sigmask(_signal.SIG_BLOCK, asked))
 
     named = plain.common.get("socket") or os.environ.get("TALK_SOCKET") or None
@@ -95,32 +89,5 @@ def carry_out(plain: Plain, arguments: list[str]) -> int:
     from talkcli.cli.ends import ended
     from talkcli.cli.show import Common
 
-    options = Common(**plain.common)
-    return ended(lambda: _command(plain, arguments, options, began, opened, held), options)
-
-
-def _command(
-    plain: Plain, arguments: list[str], options: Common, began: float, opened: Opened | None, held: set[int]
-) -> int:
-    given = plain.given
-    if plain.command == "say":
-        from talkcli.cli.interrupts import give_up_unread
-        from talkcli.cli.saying import GOAL_OPTIONS, say
-        from talkcli.goals.admission import bad_option
-        from talkcli.goals.requests import Say
-
-        if bad_option(Say("", **{name: given[name] for name in GOAL_OPTIONS})):
-            from talkcli.cli import commands
-            from talkcli.cli.show import Common
-
-            return commands.run(arguments, Common())  # which knows how to say it
-        end = None if given["timeout"] is None else began + given["timeout"]
-        give_up_unread()
-        return say(options, " ".join(given["text"]), given, end, opened, held)
-    if plain.command == "wait":
-        from talkcli.cli.waiting import wait
-
-        return wait(options, given["ids"], given["timeout"], feedback=given["feedback"])
-    from talkcli.cli.asking import COMMANDS
-
-    return COMMANDS[plain.command](options, **given, opened=opened)
+    options = Common(began=began, opened=opened, held=held, typed=plain.typed, **plain.common)
+    return ended(lambda: plain.command.carry_out(options, plain.given), options)

@@ -1,109 +1,113 @@
 """Reads plain command lines, those that there is nothing to say about, as click would. Pure: it carries out nothing.
 
-What it knows of the commands is `plain_table`, which is made from click's own declarations. Whatever it does not know
-for certain, it leaves to click: an option that isn't in the table, flags in one word, a number in another form, options
-that contradict each other. A test shows that both read any command line alike.
+Both read the same rows, and a value by the same function. Whatever this does not know for certain, it leaves to click:
+a word that is no option, flags in one word, a value that is none, options that contradict each other.
 """
 
 from __future__ import annotations
 
-from talkcli.cli.plain_table import COMMANDS, COMMON
+from talkcli.cli import values
+from talkcli.cli.command import COMMON, FILE
+from talkcli.cli.commands import COMMANDS
 from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.goals.option import FLAG
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from typing import Any
 
-#: More digits are left to click: they are within no range.
-_MAX_DIGITS = 9
+    from talkcli.cli.command import Command
+    from talkcli.goals.option import Option
+
+    #: By each spelling: the option, and the value of a flag.
+    Spellings = dict[str, tuple[Option, bool]]
+
+_COMMON = {each.name for each in COMMON}
 
 
 @frozen
 class Plain:
     """A command line that was read."""
 
-    command: str
-    #: the command's options and arguments, by click's names for them
+    command: Command
+    #: the command's options and arguments, by their names
     given: dict[str, Any]
-    #: socket, json, quiet: those that were given
+    #: those of every command that were given
     common: dict[str, Any]
+    #: the options that stand on the command line
+    typed: frozenset[str]
 
 
 def read(arguments: list[str], environment: Mapping[str, str]) -> Plain | None:
     """Return what a command line says; None where click has to read it."""
-    command = None
+    try:
+        return _read(arguments, environment)
+    except ValueError:
+        return None
+
+
+def _read(arguments: list[str], environment: Mapping[str, str]) -> Plain | None:
+    command: Command | None = None
     words: list[str] = []
     given: dict[str, Any] = {}
-    common: dict[str, Any] = {}
-    options, rest = COMMON, iter(arguments)
+    options, rest = _spellings(COMMON), iter(arguments)
     for word in rest:
         if command is None and word in COMMANDS:
-            command = word
-            options = {**COMMON, **COMMANDS[word]["options"]}
+            command = COMMANDS[word]
+            if not command.plain:
+                return None
+            options |= _spellings(command.options)
         elif word == "--" and command:
             words += rest
         elif word[:1] != "-" or word == "-":
             if command is None:
                 return None
             words.append(word)
-        else:
-            found = _option(options, word, rest)
-            if found is None:
-                return None
-            (common if found[0] in ("socket", "json", "quiet") else given)[found[0]] = found[1]
-    if command is None:
-        return None
-    return _complete(command, given, common, words, environment)
+        elif not _take(options, word, rest, given):
+            return None
+    return None if command is None else _complete(command, given, words, environment)
 
 
-def _option(options: dict[str, Any], word: str, rest: Iterator[str]) -> tuple[str, Any] | None:
-    """Return the name and the value of an option, which may be the next word."""
+def _spellings(options: Iterable[Option]) -> Spellings:
+    found: Spellings = {}
+    for option in options:
+        yes, _, no = option.flags.partition("/")
+        found |= dict.fromkeys(yes.split(", "), (option, True))
+        if no:
+            found[no] = option, False
+    return found
+
+
+def _take(options: Spellings, word: str, rest: Iterator[str], given: dict[str, Any]) -> bool:
+    """Take an option, whose value may be the next word; False, or ValueError for its value, where it isn't plain."""
     name, equals, text = word.partition("=")
     if name not in options or (equals and name[:2] != "--"):
-        return None
-    destination, kind, *limits = options[name]
-    if kind is True or kind is False:
-        return None if equals else (destination, kind)
-    value = _value(kind, limits, text if equals else next(rest, ""))
-    return None if value is None else (destination, value)
-
-
-def _value(kind: str, limits: list[float | None], text: str) -> Any:
-    """Return the value of an option, None where it isn't plain."""
-    if kind == "text":
-        return text if text and text[:1] != "-" and text.isprintable() else None  # else it may be no UTF-8
-    whole, point, part = text.partition(".")
-    digits = whole.removeprefix("-") if kind == "int" else whole
-    for each in (digits, part) if point else (digits,):
-        if not (each.isascii() and each.isdecimal() and len(each) <= _MAX_DIGITS):
-            return None
-    if kind == "int" and point:
-        return None
-    number = int(text) if kind == "int" else float(text)
-    low, high = limits
-    return number if (low is None or low <= number) and (high is None or number <= high) else None
+        return False
+    option, value = options[name]
+    if option.kind is FILE or (option.kind is FLAG and equals):
+        return False
+    try:
+        given[option.name] = value if option.kind is FLAG else values.read(option, text if equals else next(rest))
+    except StopIteration:
+        return False
+    return True
 
 
 def _complete(
-    command: str, given: dict[str, Any], common: dict[str, Any], words: list[str], environment: Mapping[str, str]
+    command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> Plain | None:
     """Fill in what was not given; None where something contradicts itself, is missing or too much."""
-    table = COMMANDS[command]
-    for name, variable in table["environment"].items():
-        if name not in given and environment.get(variable):
-            given[name] = environment[variable]
-            if not given[name].isprintable():
-                return None
-    given = {**table["defaults"], **given}
-    argument, count = table["argument"] or (None, 0)
-    if len(words) > count >= 0:
-        return None
+    common = {name: given.pop(name) for name in _COMMON & given.keys()}
+    typed = frozenset(given)
+    for option in command.options:
+        if option.name not in given:
+            text = environment.get(option.env) if option.env else None
+            given[option.name] = values.read(option, text) if text else option.default
+    argument = command.argument
     if argument:
-        given[argument] = tuple(words) if count < 0 else (words[0] if words else None)
-    if command == "say":
-        given["wait"] = given["wait"] or given["feedback"]
-        unclear = not words or words == ["-"]
-        contradicts = (given["flush"] and given["preempt"] is False) or (given["timeout"] and not given["wait"])
-        if unclear or contradicts:
+        if len(words) > 1 and not argument.many:
             return None
-    return Plain(command, given, common)
+        given[argument.name] = tuple(words) if argument.many else next(iter(words), None)
+    elif words:
+        return None
+    return None if command.fault(given, typed) else Plain(command, given, common, typed)

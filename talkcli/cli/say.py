@@ -1,219 +1,196 @@
-"""`talk say` as click reads it: its options, how they go together, its help.
+"""`talk say`: one sentence is sent, waited for, and how it ended is told; of lines and files others take care.
 
-What it does is in `saying`, `lines`, `rendering`.
+It knows no click: plain command lines come here without it.
 """
 
 from __future__ import annotations
 
-import os
 import time
-from typing import Any
 
-import click
-from click.core import ParameterSource
+from talkcli.cli.interrupts import Interrupts, give_up_unread, watched_output
+from talkcli.cli.outcome import (
+    SPEECH_IS_PAUSED,
+    give_up,
+    regardless,
+    report,
+    rest,
+    show_if_possible,
+    until_ended,
+)
+from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.client.dial import ANSWER_LIMIT, Interrupted
+from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost
+from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.states import State
 
-from talkcli.cli import complete
-from talkcli.cli.common import common, common_options, number, seconds, talk_command, timeout_option, word
-from talkcli.cli.interrupts import give_up_unread, watched_output
-from talkcli.cli.outcome import rest
-from talkcli.cli.saying import GOAL_OPTIONS, refuse, say
-from talkcli.cli.usage import ASKING, Command, Number, WholeNumber, told
-from talkcli.client.dial import Interrupted
-from talkcli.errors import EXIT_SIGPIPE
-from talkcli.goals.admission import MAX_KEY, PITCHES, RATES, VOLUMES, bad_option
-from talkcli.goals.requests import Say
+if TYPE_CHECKING:
+    from typing import Any
 
-#: Options that mean something to a server alone.
-_SERVER_ONLY = ("wait", "feedback", "lines", "preempt", "flush", "priority", "ttl", "key", "throttle", "id", "name")
-
-#: Endings by which a file of another format than WAV would be meant.
-_OTHER_FORMATS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
-
-
-class _SayCommand(Command):
-    """Says how to speak a text that looks like an option."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        try:
-            return super().parse_args(ctx, args)
-        except click.NoSuchOption as error:
-            words = told(error)
-            words += (
-                f"{'' if words.endswith('?') else '.'} To speak a text that starts with '-', write: talk say -- TEXT"
-            )
-            raise click.UsageError(words, ctx) from error
+    from talkcli.cli.feedback import Feedback
+    from talkcli.cli.show import Common
+    from talkcli.client.client import GoalHandle
 
 
-@talk_command(
-    "say",
-    cls=_SayCommand,
-    examples="""
-        talk say "battery low"
-        talk say --wait -- "$text" || echo "nobody heard it"
-        talk say -wf "please step back"         each word as it is heard
-        talk say --key battery --throttle 60 "battery low"
-        fortune | talk say -
-        tail -n 0 -F log | talk say --lines --ttl 10
-        talk say -o hello.wav "hello"           needs no server
-        talk say -o - "hello" | aplay
-    """,
-    exit_codes={
-        **ASKING,
-        0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
-        4: "aborted: engine or audio failed; 'talk doctor' says more",
-        5: "rejected: never queued (bad text, full queue or full server)",
-        6: "recalled: taken out of the queue before it was spoken",
-        7: "preempted: stopped while it was spoken",
-        12: "lost: it was sent, then the server went away; it may still be spoken",
-        124: "timed out, and cancelled",
-        "128+n": "ended by signal n, and cancelled; 141: whoever read its output went away while it waited",
-    },
-)
-@click.argument("text", nargs=-1, metavar="TEXT...")
-@click.option("-w", "--wait", is_flag=True, help="Wait until it has ended; the exit code tells how.")
-@timeout_option("With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124.")
-@click.option("-f", "--feedback", is_flag=True, help="Show each word as it is heard; implies --wait.")
-@click.option(
-    "--preempt/--queue",
-    default=None,
-    help="Stop what is spoken and go first, or wait in the queue. [default: as 'talk serve' was told]",
-)
-@click.option("--flush", is_flag=True, help="As --preempt, and drop what is in the queue.")
-@click.option(
-    "--priority",
-    type=int,
-    metavar="N",
-    default=0,
-    show_default=True,
-    help="Higher goes first; what has a higher one is neither stopped nor dropped.",
-)
-@click.option(
-    "--ttl",
-    type=Number(0),
-    callback=seconds,
-    metavar="SEC",
-    help="Drop it if it has not begun within SEC seconds; 0: no limit.",
-)
-@click.option(
-    "--key",
-    metavar="KEY",
-    callback=word,
-    shell_complete=complete.keys,
-    help=f"A label of up to {MAX_KEY} characters; replaces what waits under the same one.",
-)
-@click.option(
-    "--throttle",
-    type=Number(0),
-    callback=seconds,
-    metavar="SEC",
-    help="Don't say the same again within SEC seconds; what is the same, --key says, or else the text.",
-)
-@click.option("--id", metavar="ID", callback=word, help="An id of your own: sent twice, it is spoken once.")
-@click.option(
-    "--as",
-    "name",
-    metavar="NAME",
-    callback=word,
-    envvar="TALK_NAME",
-    show_envvar=True,
-    help="What the sender calls itself.",
-)
-@click.option("--rate", type=WholeNumber(*RATES), metavar="N", help="Words per minute.  [env var, with -o: TALK_RATE]")
-@click.option(
-    "--volume",
-    type=Number(*VOLUMES),
-    callback=number,
-    metavar="X",
-    help="Loudness.  [env var, with -o: TALK_VOLUME]",
-)
-@click.option(
-    "--voice",
-    metavar="VOICE",
-    callback=word,
-    shell_complete=complete.voices,
-    help="Voice by id, name or language: see 'talk voices'.  [env var, with -o: TALK_VOICE]",
-)
-@click.option("--pitch", type=WholeNumber(*PITCHES), metavar="N", help="Pitch of the voice; 50 is its own.")
-@click.option("--lines", is_flag=True, help="Speak each line of standard input, as it comes; no TEXT then.")
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(dir_okay=False),
-    metavar="FILE.wav",
-    help="Write it into a file instead; '-' is standard output. Needs no server.",
-)
-@common_options
-@click.pass_context
-def command(context: click.Context, /, text: tuple[str, ...], **given: Any) -> int:
-    """Speak TEXT: its words, joined by blanks; or standard input, as one sentence, where TEXT is '-'.
+def say(
+    options: Common,
+    text: tuple[str, ...],
+    wait: bool,
+    feedback: bool,
+    timeout: float | None,
+    name: str | None,
+    lines: bool,
+    output: str | None,
+    **chosen: Any,
+) -> int:
+    """Speak a text, each line of standard input, or into a file, and return the exit code.
 
-    Prints the goal's id. Without --wait it returns as soon as the goal is accepted. With --wait it owns the goal:
-    Ctrl-C, SIGTERM and SIGHUP cancel it, and so does a reader of its output that goes away, as ssh does. With --lines
-    its exit code is that of the first line that did not succeed.
+    `text`: words, or "-" for standard input; `timeout`: seconds; `name`: what the sender calls itself; `chosen`: the
+    options of the goal, by their names.
     """
-    began = time.monotonic()
-    given["wait"] = given["wait"] or given["feedback"]
-    _check(context, text, given)
-    timeout, options = given["timeout"], common(context)
-    end = None if timeout is None else began + timeout
-    goal_options = {name: given[name] for name in GOAL_OPTIONS}
-    fault = bad_option(Say("", **goal_options))
-    if fault is not None:
-        raise click.UsageError(fault, context)
-    if given["output"] is None:
+    wait = wait or feedback
+    end = None if timeout is None else options.began + timeout
+    if output is None:
         give_up_unread()
-    if given["lines"]:
-        from talkcli.cli.lines import say_lines
+    if lines:
+        from talkcli.cli.say_lines import say_lines
 
-        return say_lines(options, given["name"], goal_options, given["wait"], given["feedback"], timeout)
+        return say_lines(options, name, chosen, wait, feedback, timeout)
     sentence = " ".join(text)
     if text == ("-",):
         from talkcli.cli.stdin import InputTooLong, read_text
 
         try:
-            watched = watched_output() if given["wait"] else {}
-            sentence = read_text(end, watched, whole=given["output"] is not None)
+            sentence = read_text(end, watched_output() if wait else {}, whole=output is not None)
         except InputTooLong as error:
-            return refuse(f"Talk rejected: {error}", error.code, options, feedback=given["feedback"])
+            return _refuse(f"Talk rejected: {error}", error.code, options, feedback=feedback)
         except Interrupted:  # nothing was sent
             return EXIT_SIGPIPE
-    if given["output"] is not None:
-        from talkcli.cli.rendering import render_to, settings
+    if output is not None:
+        from talkcli.cli.render import render_to
 
-        return render_to(given["output"], sentence, settings(context, given), rest(end), options)
-    return say(options, sentence, given, end)
-
-
-def _check(context: click.Context, text: tuple[str, ...], given: dict[str, Any]) -> None:
-    """Refuse what contradicts itself, or says nothing."""
-
-    def refuse(words: str) -> None:
-        raise click.UsageError(words, context)
-
-    if given["output"] is not None:
-        named = [_spelt(context, each, given[each]) for each in _SERVER_ONLY if _typed(context, each)]
-        if named:
-            refuse(f"--output writes a file, without a server: leave out {', '.join(named)}")
-        ending = os.path.splitext(given["output"])[1]
-        if ending.lower() in _OTHER_FORMATS:
-            refuse(f"--output writes WAV, not {ending}: name it .wav, and convert it with ffmpeg or sox")
-    if given["lines"] and text:
-        refuse("--lines reads standard input: leave out TEXT")
-    if given["lines"] and given["id"] is not None:
-        refuse("--lines makes a goal of each line, and --id names one: leave out one of them")
-    if not given["lines"] and not text:
-        refuse("TEXT is missing: what is to be said, or '-' for standard input")
-    if given["flush"] and given["preempt"] is False:
-        refuse("--flush goes first, and --queue does not: leave out one of them")
-    if given["timeout"] is not None and not given["wait"] and given["output"] is None:
-        refuse("--timeout needs --wait: without it, nothing is waited for")
+        return render_to(output, sentence, chosen, rest(end), options)
+    return _say(options, sentence, chosen, name, timeout, wait=wait, feedback=feedback)
 
 
-def _typed(context: click.Context, name: str) -> bool:
-    return context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+def _say(
+    options: Common,
+    text: str,
+    chosen: dict[str, Any],
+    name: str | None,
+    timeout: float | None,
+    *,
+    wait: bool,
+    feedback: bool,
+) -> int:
+    """Speak one text."""
+    end = None if timeout is None else options.began + timeout
+    if not text.isascii():
+        from talkcli.cli.utf8 import readable
+
+        text, unreadable = readable(text)
+        if unreadable and not options.quiet:
+            note(unreadable)
+    with Interrupts(held=options.held) as interrupts:
+        if wait:
+            interrupts.watch_output()
+        try:
+            patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
+            with options.connect(name=name, interrupt=interrupts.watched, patience=patience) as client:
+                if interrupts.number is not None and not (options.opened and options.opened.sent):
+                    raise Interrupted  # what has been sent is cancelled, once its id is known
+                goal = client.say(text, follow=wait, feedback=feedback, **chosen)
+                shown = _feedback(options) if feedback else None
+                if not wait or goal.state is State.REJECTED:
+                    return regardless(_tell, goal, options, shown)
+                return _wait(goal, interrupts, end, options, shown)
+        except Interrupted:
+            interrupts.look()
+            return interrupts.exit_code
+        except Lost as error:
+            if interrupts.number is None and (end is None or time.monotonic() < end):
+                raise
+            show_error(error, json=options.json)
+            return interrupts.exit_code
 
 
-def _spelt(context: click.Context, name: str, value: object) -> str:
-    """Return an option as it was typed, in its long form."""
-    parameter = next(each for each in context.command.params if each.name == name)
-    return (parameter.secondary_opts if value is False and parameter.secondary_opts else parameter.opts)[-1]
+def _refuse(message: str, reason: str, options: Common, *, feedback: bool) -> int:
+    """Tell of a goal that is REJECTED before it is sent, as if a server had done so, and return the exit code."""
+    from talkcli.goals.goal import Goal
+    from talkcli.protocol.events import Result
+
+    goal = Goal("", State.REJECTED, reason=reason, message=message)
+    shown = _feedback(options) if feedback else None
+    if shown and options.json:
+        regardless(show_if_possible, shown.show, goal, Result(goal))
+    return regardless(report, goal, options, shown)
+
+
+def _feedback(options: Common) -> Feedback:
+    from talkcli.cli.feedback import feedback
+
+    return feedback(options)
+
+
+def _tell(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
+    """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
+    if goal.state is State.REJECTED:
+        if shown and options.json:
+            until_ended(goal, None, shown)
+        code = report(goal.goal, options, shown)
+        if goal.goal.reason == "text_too_long" and not options.quiet:
+            note("'talk say --lines' speaks standard input line by line, each line a goal of its own")
+        return code
+    _introduce(goal, options, shown)
+    if goal.state.terminal:
+        return report(goal.goal, options)
+    if options.json:
+        show_if_possible(show_json, goal.goal.to_json())
+    return EXIT_OK
+
+
+def _introduce(goal: GoalHandle, options: Common, shown: Feedback | None) -> None:
+    """Print the id of a goal that was accepted, and why it may take long."""
+    if options.quiet:
+        return
+    if not options.json and shown is None:
+        show_if_possible(show, goal.id)
+    if goal.speech_paused and not goal.state.terminal:
+        note(SPEECH_IS_PAUSED)
+
+
+def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common, shown: Feedback | None) -> int:
+    """Wait for a goal. It is this command's own: where it can't wait any longer, the goal ends too; unless another
+    `say` had sent it before, with the same id.
+    """
+    try:
+        _introduce(goal, options, shown)
+        if shown:
+            shown.begin([goal.goal])
+        until_ended(goal, rest(end), shown)
+    except (Interrupted, OSError) as error:
+        if isinstance(error, OSError) and not isinstance(error, TimeoutError):
+            if not reader_is_gone(error):
+                raise
+            interrupts.gone = True
+        interrupts.look()
+        timed_out = interrupts.number is None and not interrupts.gone
+        if interrupts.gone:
+            give_up_output()
+        if goal.attached:
+            return _leave(goal, interrupts, shown)
+        code = give_up(goal, interrupts, options, shown)
+        if not timed_out:
+            return interrupts.exit_code
+        return code if goal.state is State.SUCCEEDED else EXIT_TIMEOUT
+    finally:
+        if shown:
+            regardless(shown.close)
+    return report(goal.goal, options, shown)
+
+
+def _leave(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> int:
+    """Stop watching a goal that is another's, which goes on."""
+    if interrupts.number is None and not interrupts.gone:
+        tell = shown.aside if shown else note
+        tell(f"{goal.id} has not ended within the time, and goes on: it was sent before")
+    return interrupts.exit_code

@@ -1,25 +1,19 @@
-"""`talk serve`: its options and its help; it runs the server, or prints a unit. No other module imports the server."""
+"""`talk serve`: it runs the server, or prints a unit. No other module imports the server."""
 
 from __future__ import annotations
 
 import os
-import re
 import sys
-
-import click
-from click.core import ParameterSource
+from typing import TYPE_CHECKING, Any
 
 from talkcli.cli import complete, units
-from talkcli.cli.common import common, common_options, number, seconds, talk_command, word
+from talkcli.cli.command import MODE, spelt
+from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import note, show
-from talkcli.cli.usage import Number, WholeNumber
-from talkcli.goals.text import MAX_CHARACTERS
-from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE, Settings
 
-#: As `admission` has them, which imports what printing a unit doesn't need; a test compares the two.
-RATES, VOLUMES, PITCHES = (80, 450), (0.0, 1.0), (0, 100)
-#: Milliseconds of silence before a sentence: no output needs longer to wake.
-MAX_LEAD_IN = 5000
+if TYPE_CHECKING:
+    from talkcli.cli.show import Common
+    from talkcli.goals.option import Option
 
 #: What is said at the start where nothing could sound.
 NO_DEVICE = (
@@ -29,156 +23,23 @@ NO_DEVICE = (
 )
 
 
-def _mode(context: click.Context, parameter: click.Parameter, value: str) -> int:
-    """Return the mode of a file; the owner must be able to use the socket, and nobody executes it."""
-    mode = int(value, 8) if re.fullmatch("[0-7]{3,4}", value) else 0
-    if mode & ~0o666 or mode & 0o600 != 0o600:
-        words = f"{value!r} is not a mode such as 0600 (mine alone), 0660 (my group's) or 0666"
-        raise click.BadParameter(words, context, parameter)
-    return mode
-
-
-@talk_command(
-    "serve",
-    examples="""
-        talk serve --rate 150
-        talk serve --player null       no sound, same timing: for simulation and CI
-        talk serve --print-unit user   a service for systemd, with how to install it
-    """,
-    exit_codes={
-        0: "ended by SIGTERM or SIGINT; by a second one 128+n",
-        1: "anything not named here; a bug says so",
-        2: "usage: an option or a voice that there isn't",
-        11: "this socket is served already, or its directory is not safe",
-    },
-)
-@click.option(
-    "--rate",
-    type=WholeNumber(*RATES),
-    default=200,
-    show_default=True,
-    envvar="TALK_RATE",
-    show_envvar=True,
-    help="Words per minute.",
-)
-@click.option(
-    "--volume",
-    type=Number(*VOLUMES),
-    callback=number,
-    default=1.0,
-    show_default=True,
-    envvar="TALK_VOLUME",
-    show_envvar=True,
-    help="Loudness.",
-)
-@click.option(
-    "--voice",
-    metavar="VOICE",
-    envvar="TALK_VOICE",
-    show_envvar=True,
-    callback=word,
-    shell_complete=complete.voices,
-    help="Voice by id, name or language: see 'talk voices'.",
-)
-@click.option(
-    "--pitch", type=WholeNumber(*PITCHES), default=50, show_default=True, help="Pitch of the voice; 50 is its own."
-)
-@click.option("--preempt", is_flag=True, help="Every goal stops the one before it, unless it says --queue.")
-@click.option(
-    "--ttl",
-    type=Number(0),
-    callback=seconds,
-    default=0,
-    show_default=True,
-    metavar="SEC",
-    help="A goal that has not begun after SEC seconds is recalled; it may bring its own --ttl; 0: no limit.",
-)
-@click.option(
-    "--max-queue",
-    type=WholeNumber(1),
-    default=MAX_QUEUE,
-    show_default=True,
-    help="Goals that may wait.",
-)
-@click.option(
-    "--max-text",
-    type=WholeNumber(1, MAX_CHARACTERS),
-    default=MAX_CHARACTERS,
-    show_default=True,
-    help="Characters of one text.",
-)
-@click.option(
-    "--max-clients",
-    type=WholeNumber(1),
-    default=MAX_CLIENTS,
-    show_default=True,
-    help="Clients at once.",
-)
-@click.option(
-    "--player",
-    metavar="PLAYER",
-    envvar="TALK_PLAYER",
-    show_envvar=True,
-    shell_complete=complete.players,
-    help="What plays the sound. One of aplay, pacat and pw-cat; null (silent, in real time); file:PATH.wav; or a "
-    "command that reads 16-bit mono PCM, with {rate} for its rate and {device} for the --device. [default: the first "
-    "of the three that works]",
-)
-@click.option(
-    "--device",
-    metavar="NAME",
-    help="Device, by the player's own name for it. For aplay one that 'aplay -L' lists, such as plughw:1,0; for pacat "
-    "one of 'pactl list short sinks'; for pw-cat the name of a node, as in 'pw-cli ls Node'. Name the --player, too.",
-)
-@click.option(
-    "--lead-in",
-    type=WholeNumber(0, MAX_LEAD_IN),
-    default=0,
-    show_default=True,
-    metavar="MS",
-    help="Milliseconds of silence before a sentence; only where the output was idle: HDMI, USB and Bluetooth outputs "
-    "fall asleep, and swallow what comes while they wake.",
-)
-@click.option("--driver", metavar="NAME", help="A driver of pyttsx3's. [default: the one for this system]")
-@click.option(
-    "--socket-mode",
-    metavar="MODE",
-    callback=_mode,
-    default="0600",
-    show_default=True,
-    help="Who may connect: the socket's file mode.",
-)
-@click.option("--greeting", metavar="TEXT", help="A sentence to speak at the start.")
-@click.option(
-    "--print-unit",
-    type=click.Choice(list(units.UNITS)),
-    metavar="UNIT",
-    help=f"Print a systemd unit with these options, and end. One of {', '.join(units.UNITS)}; it says where it goes.",
-)
-@common_options
-@click.pass_context
-def command(context: click.Context, /, print_unit: str | None, **options: object) -> int:
-    """Run the server, in the foreground, until SIGTERM or Ctrl-C.
-
-    It queues sentences and speaks one at a time; its log is on standard error. For systemd it prints its own units.
-    """
-    player = str(options["player"] or "")
-    if options["device"] and player.startswith(("null", "file:")):
-        raise click.UsageError(f"--device means nothing to the player {player}", context)
-    if player == "file:":
-        raise click.UsageError("--player file: names no file: write file:PATH.wav", context)
+def serve(options: Common, print_unit: str | None, **given: Any) -> int:
+    """Run the server, or print a unit that would; return the exit code. `given`: the other options, by their names."""
     if print_unit:
-        _print_unit(context, print_unit)
+        _print_unit(options, print_unit, given)
         return 0
-    if not common(context).quiet:
-        _warn_of_sound(player, options["driver"])
+    if not options.quiet:
+        _warn_of_sound(given["player"] or "", given["driver"])
     from talkcli import paths
-    from talkcli.server.run import serve
+    from talkcli.goals.options import SETTINGS, Set
+    from talkcli.server.run import serve as run
+    from talkcli.server.settings import Settings
 
-    return serve(Settings(socket=paths.named_socket(common(context).socket), **options))  # type: ignore[arg-type]
+    goals = Set(**{each.name: given.pop(each.name) for each in SETTINGS})
+    return run(Settings(socket=paths.named_socket(options.socket), goals=goals, **given))
 
 
-def _warn_of_sound(player: str, driver: object) -> None:
+def _warn_of_sound(player: str, driver: str | None) -> None:
     """Tell what would be in the way of every sentence: no device, or a player that there isn't.
 
     With a device and no player named it only looks at the names of files, so that the start is not kept waiting.
@@ -192,7 +53,7 @@ def _warn_of_sound(player: str, driver: object) -> None:
         return
     from talkcli.engine.start import is_own
 
-    if not is_own(None if driver is None else str(driver)):
+    if not is_own(driver):
         return  # it plays by itself, and the server says so
     if silent:
         note(NO_DEVICE)
@@ -215,13 +76,12 @@ def _warn_of_player(player: str) -> None:
         note(f"{printable(str(error))}: {hint}nothing can be heard until it is there")
 
 
-def _print_unit(context: click.Context, name: str) -> None:
+def _print_unit(options: Common, name: str, given: dict[str, Any]) -> None:
     from talkcli.terminal.printable import printable
 
-    given = {each.name: each for each in context.command.params if _is_given(context, each)}
-    mode = context.params["socket_mode"] if "socket_mode" in given else None
-    options = [_written(each, context.params[each.name or ""]) for each in given.values()]
-    wanted = units.wanted(sys.argv[0], options, common(context).socket, mode)
+    typed = [each for each in COMMANDS["serve"].options if each.name in options.typed and each.name in given]
+    mode = given["socket_mode"] if "socket_mode" in options.typed else None
+    wanted = units.wanted(sys.argv[0], [_written(each, given[each.name]) for each in typed], options.socket, mode)
     show(units.UNITS[name](wanted).rstrip("\n"))
     hidden = units.hidden_from_others(wanted.files) if name == "system" else None
     if hidden:
@@ -233,15 +93,8 @@ def _print_unit(context: click.Context, name: str) -> None:
         )
 
 
-def _is_given(context: click.Context, parameter: click.Parameter) -> bool:
-    """Return whether an option of the server's stands on the command line."""
-    source = context.get_parameter_source(parameter.name or "")
-    return parameter.expose_value and parameter.name != "print_unit" and source is ParameterSource.COMMANDLINE
-
-
-def _written(parameter: click.Parameter, value: object) -> str:
+def _written(option: Option, value: object) -> str:
     """Return an option as it is written on a command line."""
-    option = parameter.opts[-1]
     if value is True:
-        return option
-    return f"{option}={value:04o}" if parameter.name == "socket_mode" else f"{option}={value}"
+        return spelt(option)
+    return f"{spelt(option)}={value:04o}" if option.kind is MODE else f"{spelt(option)}={value}"

@@ -6,13 +6,17 @@ import errno
 import os
 import stat
 import sys
+import time
 
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from collections.abc import Set as AbstractSet
     from typing import Any, TextIO
 
     from talkcli.client.client import Client
+    from talkcli.client.opening import Opened
     from talkcli.errors import TalkError
     from talkcli.goals.goal import JsonObject
     from talkcli.terminal.columns import Screen
@@ -32,20 +36,38 @@ _NO_BREAK = "\0"
 
 
 class Common:
-    """The options that every command has."""
+    """What every command is given: the options that all have, and what was done before it is carried out."""
 
-    __slots__ = ("json", "quiet", "socket")
+    __slots__ = ("began", "held", "json", "opened", "quiet", "socket", "typed")
 
-    def __init__(self, socket: str | None = None, *, json: bool = False, quiet: bool = False) -> None:
+    def __init__(
+        self,
+        socket: str | None = None,
+        *,
+        json: bool = False,
+        quiet: bool = False,
+        began: float | None = None,
+        opened: Opened | None = None,
+        held: Iterable[int] = (),
+        typed: AbstractSet[str] = frozenset(),
+    ) -> None:
+        """`typed`: the options that stand on the command line; for `began`, `opened` and `held` see `early`."""
         self.socket = socket
         self.json = json
         self.quiet = quiet
+        #: when the command began, by the monotonic clock
+        self.began = time.monotonic() if began is None else began
+        #: a connection on which its request was sent already
+        self.opened = opened
+        #: signals that wait for somebody to take them
+        self.held = held
+        self.typed = typed
 
     def connect(self, **options: Any) -> Client:
         """Return a client connected to the server; see `Client` for the options."""
         from talkcli.client.client import Client
 
-        return Client(self.socket, **options)
+        return Client(self.socket, opened=self.opened, **options)
 
 
 def give_up_output() -> None:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from talkcli.client.dial import ready
 from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.frozen import frozen
+from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
 from talkcli.goals.states import EXIT_CODES, State
-from talkcli.goals.text import MAX_BYTES, MAX_CHARACTERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

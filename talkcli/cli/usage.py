@@ -6,28 +6,19 @@ It knows nothing of any one command: those bring their examples and exit codes a
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from talkcli.cli.nearest import nearest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Iterable
 
     from click.shell_completion import CompletionItem
 
-    Codes = Mapping[int | str, str]
+    from talkcli.cli.command import Codes
 
-#: Exit codes of every command that asks the server for something; a command says more of those that mean more to it.
-ASKING: dict[int | str, str] = {
-    1: "anything not named here; a bug says so",
-    2: "usage: what is wrong stands on standard error",
-    3: "no server: nothing was sent, so it is safe to try again",
-    5: "the server has as many clients as it takes",
-    9: "this command and the server speak different versions of the protocol",
-    10: "permission denied",
-}
 #: What a command is called elsewhere, where that isn't near to its name here.
 _ELSEWHERE = {
     "check": "doctor",
@@ -40,85 +31,6 @@ _ELSEWHERE = {
     "stop": "cancel",
     "unpause": "resume",
 }
-
-
-class Number(click.FloatRange):
-    """A number from a limit on, or within two, or any."""
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str | None:  # noqa: ARG002
-        return "X"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        return _convert(super().convert, f"a number {_limits(self)}".rstrip(), value, param, ctx)
-
-    def _describe_range(self) -> str:
-        return _limits(self)
-
-
-class WholeNumber(click.IntRange):
-    """As Number, without a fraction."""
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str | None:  # noqa: ARG002
-        return "N"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        return _convert(super().convert, f"a whole number {_limits(self)}".rstrip(), value, param, ctx)
-
-    def _describe_range(self) -> str:
-        return _limits(self)
-
-
-def _limits(kind: Number | WholeNumber) -> str:
-    if kind.min is None:
-        return ""
-    if kind.max is not None:
-        return f"from {kind.min:g} to {kind.max:g}"
-    return f"above {kind.min:g}" if kind.min_open else f"from {kind.min:g} on"
-
-
-def _convert(
-    convert: Callable[..., Any], wanted: str, value: Any, param: click.Parameter | None, ctx: click.Context | None
-) -> Any:
-    try:
-        return convert(value, param, ctx)
-    except click.BadParameter as error:
-        raise click.BadParameter(f"'{value}' is not {wanted}", ctx, param) from error
-
-
-class Command(click.Command):
-    """A command of talk's: what it is for, examples, options, exit codes."""
-
-    def __init__(self, *arguments: Any, examples: str, exit_codes: Codes, **extra: Any) -> None:
-        """`examples`: lines, each a command line; `exit_codes`: what each means after this command."""
-        super().__init__(*arguments, **extra)
-        self.examples = examples
-        self.exit_codes = exit_codes
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        ctx.allow_extra_args = True  # so that it is said here what is too much
-        try:
-            rest = super().parse_args(ctx, args)
-        except click.UsageError as error:
-            error.ctx = error.ctx or ctx  # the help to look at is this command's
-            raise
-        if rest and not ctx.resilient_parsing:
-            names = [each.make_metavar(ctx) for each in self.params if isinstance(each, click.Argument)]
-            takes = f"nothing after {names[0]}" if names else "options alone"
-            raise click.UsageError(f"'{ctx.command_path}' takes {takes}: what is '{' '.join(rest)}'?", ctx)
-        return rest
-
-    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        return with_short_help(super().shell_complete(ctx, incomplete))
-
-    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        super().format_help_text(ctx, formatter)
-        write_examples(self.examples, formatter)
-
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        write_options(self, ctx, formatter, "Options of every command")
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        write_exit_codes(self.exit_codes, formatter)
 
 
 def with_short_help(options: list[CompletionItem]) -> list[CompletionItem]:

@@ -1,43 +1,66 @@
-"""`talk wait` as click reads it: its options and its help. What it does is in `waiting`."""
+"""`talk wait`: waits for goals, whoever sent them. It knows no click: plain command lines come here without it."""
 
 from __future__ import annotations
 
-import click
+from talkcli.cli.interrupts import Interrupts, give_up_unread
+from talkcli.cli.outcome import regardless, report, rest, show_if_possible
+from talkcli.cli.show import note
+from talkcli.client.dial import ANSWER_LIMIT, Interrupted
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
+from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.states import State
 
-from talkcli.cli import complete
-from talkcli.cli.common import common, common_options, talk_command, timeout_option
-from talkcli.cli.usage import ASKING
-from talkcli.cli.waiting import wait
+if TYPE_CHECKING:
+    from talkcli.cli.feedback import Feedback
+    from talkcli.cli.show import Common
+    from talkcli.client.client import GoalHandle
 
 
-@talk_command(
-    "wait",
-    examples="""
-        id=$(talk say "moving back")
-        move_back
-        talk wait "$id"
-    """,
-    exit_codes={
-        **ASKING,
-        0: "all succeeded; or no ID was given, and all have ended",
-        4: "aborted; 4 to 7 are those of the first goal in order that did not succeed",
-        5: "rejected; or the server has as many clients as it takes",
-        6: "recalled",
-        7: "preempted",
-        8: "unknown goal",
-        12: "lost: the server went away",
-        124: "timed out; the goals go on",
-        "128+n": "ended by signal n, 141: whoever read its output went away meanwhile; the goals go on",
-    },
-)
-@click.argument("ids", nargs=-1, metavar="[ID]...", shell_complete=complete.goal_ids)
-@timeout_option("Wait no longer than SEC seconds; the goals go on; exit code 124.")
-@click.option("-f", "--feedback", is_flag=True, help="Show each word as it is heard.")
-@common_options
-@click.pass_context
-def command(context: click.Context, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
-    """Wait until these goals have ended, whoever sent them; without an ID, all that are active or pending now.
+def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
+    """Wait until these goals have ended, or all that have not, and return the exit code; `timeout` in seconds."""
+    end = None if timeout is None else options.began + timeout
+    patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
+    give_up_unread()
+    with Interrupts() as interrupts:
+        interrupts.watch_output()
+        try:
+            with options.connect(interrupt=interrupts.watched, patience=patience) as client:
+                goals = client.follow(ids or None, feedback=feedback)
+                shown = _show(goals, end, interrupts, options) if feedback else None
+                return _wait(goals, end, options, shown, named=bool(ids))
+        except Interrupted:
+            interrupts.look()
+            return interrupts.exit_code
+        except TimeoutError as error:
+            note(str(error))
+            return EXIT_TIMEOUT
 
-    It only watches: Ctrl-C and --timeout cancel nothing. A goal that has ended already is answered at once.
-    """
-    return wait(common(context), ids, timeout, feedback=feedback)
+
+def _show(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, options: Common) -> Feedback:
+    """Show what happens to the goals until all have ended."""
+    from talkcli.cli.feedback import feedback
+    from talkcli.client.following import merged
+
+    shown = feedback(options)
+    try:
+        shown.begin([each.goal for each in goals])
+        for goal, event in merged(goals, rest(end)):
+            show_if_possible(shown.show, goal.goal, event)
+    except Interrupted:
+        interrupts.look()  # while standard output is what it was
+        raise
+    finally:
+        regardless(shown.close)
+    return shown
+
+
+def _wait(goals: list[GoalHandle], end: float | None, options: Common, shown: Feedback | None, *, named: bool) -> int:
+    """Wait for the goals in their order; how those ended that were not named is nobody's failure."""
+    first_failure = EXIT_OK
+    for goal in goals:
+        ended = goal.wait(rest(end))
+        counts = named or ended.state is State.LOST
+        code = report(ended, options, shown) if counts or options.json else EXIT_OK
+        if counts:
+            first_failure = first_failure or code
+    return first_failure

@@ -24,24 +24,12 @@ from talkcli.client.outgoing import batches, check, check_key, full_id, too_long
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
-from talkcli.goals.requests import (
-    MAX_LOG,
-    MAX_NAME,
-    Cancel,
-    Hello,
-    Log,
-    Pause,
-    Resume,
-    Say,
-    Set,
-    Status,
-    Voices,
-    Wait,
-    Watch,
-)
+from talkcli.goals.option import MAX_LOG
+from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
 from talkcli.protocol.events import Snapshot
 from talkcli.protocol.replies import Canceled, ServerStatus, goal_in, goals
+from talkcli.protocol.requests import MAX_NAME, Hello, Log, Pause, Resume, Status, Voices, Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

@@ -19,8 +19,9 @@ from collections.abc import Callable
 from talkcli.client.dial import ANSWER_LIMIT, dial, ready
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.requests import Say, write_request
+from talkcli.goals.options import Say
 from talkcli.protocol import wire
+from talkcli.protocol.requests import write_request
 from talkcli.terminal.printable import printable
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from talkcli.client.opening import Opened
     from talkcli.goals.goal import JsonObject
-    from talkcli.goals.requests import Hello, Request
+    from talkcli.protocol.requests import Hello, Request
 
 #: Seconds of silence from a server that somebody waits for; it says that it is alive every 5.
 SILENCE_LIMIT = 15.0

@@ -14,8 +14,8 @@ import time
 from talkcli import paths, peers
 from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.requests import Hello, write_request
 from talkcli.protocol import wire
+from talkcli.protocol.requests import Hello, write_request
 from talkcli.terminal.printable import printable
 from talkcli.unreachable import DIRECTORY, FILE, FORBIDDEN
 

@@ -12,7 +12,7 @@ from talkcli.client.backlog import Backlog
 from talkcli.client.connection import SILENCE_LIMIT
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
-from talkcli.goals.requests import Cancel
+from talkcli.goals.options import Cancel
 from talkcli.goals.states import State
 from talkcli.protocol import events
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from talkcli.errors import UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.admission import MAX_KEY, bad_option, bad_setting
 from talkcli.goals.goal import Goal
-from talkcli.goals.requests import MAX_ID, MAX_IDS, Say, write_request
+from talkcli.goals.option import MAX_ID, MAX_IDS
+from talkcli.goals.options import Say, bad_key, bad_option
 from talkcli.goals.states import State
 from talkcli.protocol import wire
+from talkcli.protocol.requests import write_request
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from talkcli.goals.requests import Set
+    from talkcli.goals.options import Set
 
 #: Bytes of a request's line that are left for what isn't its list of ids: another id, a key, the names of the fields.
 _REST_OF_LINE = 4096
@@ -57,22 +58,23 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
 
 def check_key(key: str | None) -> None:
     """Raise UsageError for a key that no goal can have."""
-    if key is not None and not 0 < len(key) <= MAX_KEY:
-        raise UsageError(f"a key has 1 to {MAX_KEY} characters, this one has {len(key)}")
+    words = None if key is None else bad_key(key)
+    if words:
+        raise UsageError(words)
 
 
 def check(request: Say | Set) -> None:
     """Raise UsageError for options of the wrong kind, or out of their range: as the server would, without asking it."""
-    for name, check_field in request.fields.items():
+    for option in request.options:
         try:
-            check_field(getattr(request, name))
-        except ValueError as error:
-            raise UsageError(f"{name!r} {error}") from None
-        except TypeError as error:  # something in `data`
-            raise UsageError(f"{name!r} is no JSON: {error}") from None
-    fault = bad_option(request) if isinstance(request, Say) else bad_setting(request)
-    if fault:
-        raise UsageError(fault)
+            fault = option.fault(getattr(request, option.name))
+        except (TypeError, ValueError) as error:  # something in `data`
+            fault = f"is no JSON: {error}"
+        if fault:
+            raise UsageError(f"{option.name!r} {fault}")
+    words = bad_option(request)
+    if words:
+        raise UsageError(words)
 
 
 def too_long(request: Say) -> Goal | None:

@@ -8,6 +8,7 @@ from talkcli import __version__
 from talkcli.doctor.findings import Finding, done, failed, warning
 from talkcli.doctor.sentence import remedy
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.options import told
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
@@ -47,18 +48,8 @@ def _itself(server: JsonObject) -> Finding:
 
 def _settings(server: JsonObject) -> Finding:
     volume = server.get("volume")
-    voice, ttl = server.get("voice") or "the driver's own", server.get("ttl")
-    preempt = "goals preempt" if server.get("preempt") else "goals queue"
-    parts = [
-        f"rate {server.get('rate')}",
-        f"volume {volume}",
-        f"voice {voice}",
-        f"pitch {server.get('pitch')}",
-        preempt,
-        f"ttl {ttl} s" if ttl else "no ttl",
-        *([f"lead-in {server['lead_in']} ms"] if server.get("lead_in") else []),
-    ]
-    words = ", ".join(parts)
+    lead_in = [f"lead-in {server['lead_in']} ms"] if server.get("lead_in") else []
+    words = ", ".join([*told(server), *lead_in])
     if isinstance(volume, int | float) and volume < _FAINT:
         broken = failed if volume <= 0 else warning
         return broken("settings", words, "talk set --volume 1")

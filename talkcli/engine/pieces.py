@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from talkcli.goals.text import MAX_CHARACTERS
+from talkcli.goals.options import MAX_CHARACTERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from talkcli.goals.goal import By
+    from talkcli.goals.options import Say
     from talkcli.goals.queue import Pending
     from talkcli.goals.record import Record
-    from talkcli.goals.requests import Say
 
 _Name = TypeVar("_Name", str, bytes)
 

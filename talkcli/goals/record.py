@@ -13,7 +13,7 @@ from talkcli.goals.states import State, follow
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import Sender
-    from talkcli.goals.requests import Say
+    from talkcli.goals.options import Say
 
 
 class Record:
@@ -46,7 +46,6 @@ class Record:
         "text",
         "text_bytes",
         "text_hash",
-        "ttl",
         "waits",
     )
 
@@ -54,7 +53,7 @@ class Record:
         self.id = goal_id
         #: order of acceptance
         self.number = number
-        #: what its sender asked for; what the server decides stands beside it: preempt and ttl
+        #: what its sender asked for, with the server's own time to live where it brought none
         self.say = say
         #: its text; None once that is dropped
         self.text: str | None = say.text
@@ -66,8 +65,7 @@ class Record:
         self.queued_at = queued_at
         self.state = State.PENDING
         self.preempt = False
-        #: seconds from acceptance in which it must begin, and the monotonic time at which they are over
-        self.ttl: float | None = None
+        #: the monotonic time by which it must have begun
         self.expires_at: float | None = None
         #: whether it is in the queue, and its neighbours there, by turn and by acceptance; the queue's business alone
         self.waits = False
@@ -135,16 +133,12 @@ class Record:
             reason=None if accepted else self.reason,
             by=None if accepted else self.by,
             message=None if accepted else self.message,
-            format=self.say.format,
             spoken=spoken,
-            priority=self.priority,
-            key=self.key,
-            ttl=self.ttl,
-            data=self.say.data,
             client=self.sender,
             paused=self.paused and state is self.state,
             queued_at=self.queued_at,
             started_at=started_at,
             ended_at=None if accepted else self.ended_at,
             duration=None if accepted else self.duration,
+            **self.say.shown,
         )

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from talkcli.frozen import replace
 from talkcli.goals import text as texts
-from talkcli.goals.admission import bad_option, is_clients_id
 from talkcli.goals.effects import Cancelled, Changed, GiveUp, Hold, Resume, Start, Stop, Submitted
 from talkcli.goals.goal import By
 from talkcli.goals.history import EarlyCancels, History, Said, throttling
+from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option, is_clients_id
 from talkcli.goals.queue import Pending
 from talkcli.goals.record import Record
 from talkcli.goals.selection import making_way, select
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
     from talkcli.goals.effects import Effect, Now
     from talkcli.goals.goal import Sender
-    from talkcli.goals.requests import Cancel, Say
+    from talkcli.goals.options import Cancel, Say, Set
 
 #: Seconds after a stop in which silence must be confirmed: `cancel` is answered within 2 s whatever happens.
 SILENCE_LIMIT = 1.9
@@ -42,16 +43,13 @@ class Scheduler:
         self,
         boot: str,
         *,
-        preempt: bool,
         max_queue: int,
-        max_text: int = texts.MAX_CHARACTERS,
-        ttl: float = 0.0,
+        max_text: int = MAX_CHARACTERS,
+        settings: Set = INITIAL,
     ) -> None:
         self.boot = boot
-        #: whether goals that don't say preempt
-        self.preempt = preempt
-        #: time to live of goals that don't say, in seconds; 0 for no limit
-        self.ttl = ttl
+        #: what holds for goals that don't say; all of them are given
+        self.settings = settings
         self.max_queue = max_queue
         self.max_text = max_text
         self.history = History()
@@ -262,10 +260,12 @@ class Scheduler:
     # -- inside
 
     def _record(self, say: Say, sender: Sender, now: Now) -> Record:
+        ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
+        if ttl != say.ttl:
+            say = replace(say, ttl=ttl)
         record = Record(f"{self.boot}-{self._count}", self._count, say, sender, now.wall)
         record.preempt = self._preempts(say)
-        record.ttl = (self.ttl if say.ttl is None else say.ttl) or None
-        record.expires_at = None if record.ttl is None else now.monotonic + record.ttl
+        record.expires_at = None if ttl is None else now.monotonic + ttl
         return record
 
     def _refuse(self, say: Say, fault: tuple[str, str] | None, first: Record | None) -> tuple[str, str] | None:
@@ -291,7 +291,7 @@ class Scheduler:
         return making_way(say, self._pending, self.max_queue, preempts=self._preempts(say))
 
     def _preempts(self, say: Say) -> bool:
-        return say.flush or (self.preempt if say.preempt is None else say.preempt)
+        return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _make_way(self, record: Record, ended: list[tuple[Record, str]], now: Now) -> list[Effect]:
         """Queue a goal that was accepted, and end what it replaces, preempts or displaces."""
@@ -314,7 +314,7 @@ class Scheduler:
     def _expire(self, now: Now) -> list[Effect]:
         effects: list[Effect] = []
         for record in self._pending.expired(now.monotonic):
-            words = f"its time to live of {record.ttl:g} s was over before it was spoken"
+            words = f"its time to live of {record.say.ttl:g} s was over before it was spoken"
             effects += self._recall(record, "expired", words, None, now)
         return effects
 

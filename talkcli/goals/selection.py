@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from typing import Protocol
 
     from talkcli.goals.effects import Cancelled
+    from talkcli.goals.options import Cancel, Say
     from talkcli.goals.queue import Pending
     from talkcli.goals.record import Record
-    from talkcli.goals.requests import Cancel, Say
 
     class Goals(Protocol):
         """What there is to select from: the scheduler's goals."""

@@ -7,11 +7,7 @@ from __future__ import annotations
 
 import unicodedata
 
-#: Characters of one text: some minutes of speech. More is a document, not a sentence, and could not be stopped halfway
-#: by anybody who waits for its end.
-MAX_CHARACTERS = 10_000
-#: Bytes of one text in UTF-8: 10,000 characters of four bytes fit, and so does its request line.
-MAX_BYTES = 40_000
+from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
 
 #: Categories that make no sound by themselves: separators, controls, format characters such as the zero-width space,
 #: and code points that are not assigned or private.

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from talkcli import __version__
 from talkcli.errors import UnknownGoal
 from talkcli.frozen import replace
-from talkcli.goals.admission import DEFAULT_VOICE, bad_setting
 from talkcli.goals.goal import By
-from talkcli.goals.requests import Cancel, Log, Pause, Request, Resume, Say, Set, Status, Voices, Wait, Watch
+from talkcli.goals.options import Cancel, Say, Set, as_shown, bad_option, given
 from talkcli.goals.states import State
 from talkcli.protocol import wire
+from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
 from talkcli.server import log
 from talkcli.server.pauses import Pauses
 
@@ -108,7 +108,7 @@ class Answers:
         if isinstance(request, Voices):
             return self._voices_awaited()
         if isinstance(request, Set):
-            return request.voice is not None and self._voices_awaited() and not bad_setting(request)
+            return request.voice is not None and self._voices_awaited() and not bad_option(request)
         if isinstance(request, Say):
             return self._service.later.awaits_voices or (request.voice is not None and self._voices_awaited())
         return False
@@ -224,7 +224,7 @@ class Answers:
         connection.stream(items, wire.ok(seq, count=len(records)))
 
     def _set(self, connection: Connection, seq: int | None, request: Set) -> None:
-        words = bad_setting(request)
+        words = bad_option(request)
         if words:
             connection.reply(wire.failure(seq, "bad_option", words))
         else:
@@ -236,28 +236,13 @@ class Answers:
         if fault:
             connection.reply(wire.failure(seq, *fault))
             return
-        changed = {name: getattr(request, name) for name in request.fields if getattr(request, name) is not None}
-        scheduler.preempt = changed.get("preempt", scheduler.preempt)
-        scheduler.ttl = changed.get("ttl", scheduler.ttl)
+        changed = given(request)
+        scheduler.settings = replace(scheduler.settings, **changed)
         service.later.look()  # what preempts may have room
-        service.settings = replace(service.settings, **changed)
         if changed:
             values = ", ".join(f"{name} {value}" for name, value in changed.items())
             log.line(f"set to {log.shown(values)} by {log.who(connection.sender)}")
-        settings = service.settings
-        connection.reply(
-            wire.ok(
-                seq,
-                settings={
-                    "rate": settings.rate,
-                    "volume": settings.volume,
-                    "voice": None if settings.voice == DEFAULT_VOICE else settings.voice,
-                    "pitch": settings.pitch,
-                    "preempt": scheduler.preempt,
-                    "ttl": scheduler.ttl or None,
-                },
-            )
-        )
+        connection.reply(wire.ok(seq, settings=as_shown(scheduler.settings)))
 
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)
@@ -297,12 +282,7 @@ class Answers:
             "player": ready.player if ready else settings.player,
             "device": settings.device,
             "lead_in": settings.lead_in,
-            "rate": settings.rate,
-            "volume": settings.volume,
-            "voice": None if settings.voice == DEFAULT_VOICE else settings.voice,
-            "pitch": settings.pitch,
-            "preempt": self._scheduler.preempt,
-            "ttl": self._scheduler.ttl or None,
+            **as_shown(self._scheduler.settings),
             "paused": self._scheduler.paused,
             "pending": self._scheduler.pending_count,
             "max_queue": settings.max_queue,

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Protocol
 
 from talkcli.errors import BadRequest, LineTooLong
 from talkcli.frozen import replace
-from talkcli.goals.requests import Cancel, Hello, Request, Status, read_request
+from talkcli.goals.options import Cancel
 from talkcli.protocol import wire
+from talkcli.protocol.requests import Hello, Request, Status, read_request
 from talkcli.server.stream import Stream
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from talkcli.goals.requests import Say
+from talkcli.frozen import fields
+from talkcli.goals.options import Say
 from talkcli.goals.selection import select_waiting
 
 if TYPE_CHECKING:
@@ -19,8 +20,9 @@ if TYPE_CHECKING:
 
     from talkcli.goals.effects import Submitted
     from talkcli.goals.goal import By
+    from talkcli.goals.options import Cancel
     from talkcli.goals.record import Record
-    from talkcli.goals.requests import Cancel, Request
+    from talkcli.protocol.requests import Request
     from talkcli.server.connection import Connection
     from talkcli.server.stream import Streams
     from talkcli.server.subscribers import Subscribers
@@ -296,7 +298,7 @@ class Later:
 
 
 def _size_of(request: Request) -> int:
-    return EACH + sum(_bytes_of(getattr(request, name)) for name in request.fields)
+    return EACH + sum(map(_bytes_of, fields(request).values()))
 
 
 def _bytes_of(value: object) -> int:

@@ -14,7 +14,7 @@ import sys
 from talkcli import __version__, paths, peers
 from talkcli.client import dial
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
-from talkcli.goals.requests import Hello
+from talkcli.protocol.requests import Hello
 from talkcli.server.lock import Lock, identity, serves_already
 
 #: Connections that may wait to be accepted; the system's own limit applies too (net.core.somaxconn).

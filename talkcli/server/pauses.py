@@ -13,7 +13,7 @@ from talkcli.server import log
 
 if TYPE_CHECKING:
     from talkcli.goals.record import Record
-    from talkcli.goals.requests import Pause, Resume
+    from talkcli.protocol.requests import Pause, Resume
     from talkcli.server.connection import Connection
     from talkcli.server.service import Service
 

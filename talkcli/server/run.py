@@ -17,7 +17,7 @@ from talkcli.engine.protocol import START_LIMIT
 from talkcli.engine.supervisor import Supervisor
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
 from talkcli.goals.goal import Sender
-from talkcli.goals.requests import Say
+from talkcli.goals.options import Say
 from talkcli.server import log
 from talkcli.server.accept import Acceptor, make_room
 from talkcli.server.answers import Answers
@@ -53,7 +53,7 @@ def serve(settings: Settings) -> int:
 
 
 def _boot() -> str:
-    """Return the four characters that set this server's goals apart from those of one before; see `admission`."""
+    """Return the four characters that set this server's goals apart from those of one before; see `goals.options`."""
     choice = random.SystemRandom().choice
     return "".join(choice(each) for each in (string.digits, string.ascii_lowercase) * 2)
 
@@ -87,7 +87,7 @@ class _Server:
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # whoever started this may have had some of them blocked
         service.engine = Supervisor(
             protocol.Configure(
-                os.getpid(), settings.driver, settings.player, settings.device, settings.voice, settings.lead_in
+                os.getpid(), settings.driver, settings.player, settings.device, settings.goals.voice, settings.lead_in
             ),
             service.report,
         )
@@ -95,7 +95,7 @@ class _Server:
         try:
             acceptor.open(self._listener.socket)
             upkeep.begin()
-            if settings.voice or settings.driver:
+            if settings.goals.voice or settings.driver:
                 # Who asked for what can't be had is told so, and nothing else.
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(service.engine_known.wait(), START_LIMIT)

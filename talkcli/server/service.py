@@ -17,10 +17,9 @@ from talkcli.engine import protocol
 from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
-from talkcli.goals.admission import DEFAULT_VOICE
 from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
 from talkcli.goals.goal import Sender
-from talkcli.goals.requests import Cancel
+from talkcli.goals.options import DEFAULT_VOICE, Cancel, for_engine
 from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.states import State
 from talkcli.protocol import wire
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
     from talkcli.engine.supervisor import Supervisor
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.record import Record
-    from talkcli.goals.requests import Request
+    from talkcli.protocol.requests import Request
     from talkcli.server.connection import Connection
     from talkcli.server.settings import Settings
     from talkcli.server.stream import Stream
@@ -79,10 +78,9 @@ class Service:
         self.changed: Callable[[], None] = lambda: None
         self.scheduler = Scheduler(
             boot,
-            preempt=settings.preempt,
             max_queue=settings.max_queue,
             max_text=settings.max_text,
-            ttl=settings.ttl,
+            settings=settings.goals,
         )
         self.scheduler.engine_lost()  # none is ready yet
         self.connections: set[Connection] = set()
@@ -240,19 +238,8 @@ class Service:
     def _start(self, record: Record) -> None:
         self._started[record.id] = time.monotonic()
         self._followed = self.scheduler.pending_count > 0
-        own, general = record.say, self.settings
-        voice = general.voice if own.voice is None else own.voice
-        self.engine.say(
-            protocol.Say(
-                id=record.id,
-                text=record.text or "",
-                rate=general.rate if own.rate is None else own.rate,
-                volume=general.volume if own.volume is None else own.volume,
-                voice=None if voice == DEFAULT_VOICE else voice,
-                pitch=general.pitch if own.pitch is None else own.pitch,
-                followed=self._followed,
-            )
-        )
+        chosen = for_engine(record.say, self.scheduler.settings)
+        self.engine.say(protocol.Say(record.id, record.text or "", followed=self._followed, **chosen))
 
     def _tell_followed(self) -> None:
         """Have the engine know that a goal waits behind the one it speaks: it makes good what the change will take."""

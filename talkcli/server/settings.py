@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from talkcli.frozen import frozen
+from talkcli.goals.options import INITIAL, Set
 
 #: Clients at once. Each takes a descriptor of the 1,024 that a process usually has.
 MAX_CLIENTS = 256
@@ -14,12 +15,8 @@ MAX_QUEUE = 100
 class Settings:
     """Options of `serve`, with their defaults."""
 
-    rate: int = 200  # words per minute
-    volume: float = 1.0  # 0.0 to 1.0
-    voice: str | None = None  # id, name or language
-    pitch: int = 50  # 0 to 100
-    preempt: bool = False
-    ttl: float = 0.0  # seconds in which a goal must begin; 0 for no limit
+    #: of goals that bring none of their own; all of them are given
+    goals: Set = INITIAL
     max_queue: int = MAX_QUEUE
     max_text: int = 10_000  # characters
     max_clients: int = MAX_CLIENTS

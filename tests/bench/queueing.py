@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.goals.effects import Now
 from talkcli.goals.goal import Sender
-from talkcli.goals.requests import Cancel, Say
+from talkcli.goals.options import Cancel, Say
 from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol import wire
 from tests.bench.installed import serve
@@ -39,7 +39,7 @@ class Crowd:
     """A scheduler that is saying something while so many goals wait, and the steps whose cost is measured."""
 
     def __init__(self, size: int) -> None:
-        self.scheduler = Scheduler("4k7f", preempt=False, max_queue=size + TIMES + 1)
+        self.scheduler = Scheduler("4k7f", max_queue=size + TIMES + 1)
         self._names = count()
         self._ids: list[str] = []
         self.enqueue()  # it is being spoken

@@ -1,19 +1,23 @@
-"""The README's list of options, made from click's declarations: `python -m tests.readme.reference` writes it.
+"""The README's lists of options and requests, made from the rows: `python -m tests.readme.reference` writes them.
 
-A test shows that the README has it as it is now.
+A test shows that the README has them as they are now.
 """
 
 from __future__ import annotations
 
+import json
 import re
 
 import click
 
-from talkcli.cli.commands import COMMANDS, talk
+from talkcli.cli.click_app import talk
+from talkcli.cli.commands import COMMANDS
+from talkcli.goals.option import IDS, SECONDS, Option
+from talkcli.goals.options import Set
+from talkcli.protocol.requests import KINDS
 from tests.wire.readme import ROOT
 
 README = ROOT / "README.md"
-BEGIN, END = "<!-- options: begin -->\n", "<!-- options: end -->\n"
 
 
 def options() -> str:
@@ -31,11 +35,47 @@ def options() -> str:
     return "\n".join(parts)
 
 
+def requests() -> str:
+    """Return the table of requests and their fields."""
+    lines = ["| request | field | type | default | meaning |\n| --- | --- | --- | --- | --- |\n"]
+    for kind, request in KINDS.items():
+        meaning = re.split(r"\.(?:\s|$)", request.__doc__ or "")[0]
+        lines.append(f"| `{kind}` | | | | {meaning[0].lower()}{meaning[1:]} |\n")
+        lines += [_field(each, changes=request is Set) for each in request.options]
+    return "".join(lines)
+
+
+def _field(option: Option, *, changes: bool) -> str:
+    """Return the row of a field; `changes`: of a request that changes settings, where what isn't given stays."""
+    null = "null" if option.default is None else json.dumps(option.default)
+    default = f"`{option.default}`" if option.default and isinstance(option.default, str) else null
+    meaning = (changes and option.setting and option.setting.meaning) or option.meaning
+    absent = "" if changes else option.absent
+    return f"| | `{option.name}` | {_values(option)} | {absent or default} | {meaning} |\n"
+
+
+def _values(option: Option) -> str:
+    low, high = option.limits
+    if option.kind is SECONDS:
+        return f"{option.kind.name} from 0 on, or null"
+    if option.kind is IDS:
+        return f"{option.kind.name} {option.form}, or null"
+    form = option.form if low is None else f"{low:g} to {high:g}"
+    return option.kind.name + (" or null" if option.default is None else "") + (f", {form}" if form else "")
+
+
+#: What is made, by the name that stands around it in the README.
+MADE = {"options": options, "requests": requests}
+
+
 def current(text: str) -> str:
-    """Return the README's text with the list as it is now."""
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    return f"{before}{BEGIN}\n{options()}\n{END}{after}"
+    """Return the README's text with the lists as they are now."""
+    for name, make in MADE.items():
+        begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->\n"
+        before, rest = text.split(begin)
+        _, after = rest.split(end)
+        text = f"{before}{begin}\n{make()}\n{end}{after}"
+    return text
 
 
 def _table(parameters: list[click.Parameter], context: click.Context) -> str:

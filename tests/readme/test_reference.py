@@ -9,7 +9,8 @@ import shlex
 import click
 import pytest
 
-from talkcli.cli.commands import COMMANDS, talk
+from talkcli.cli.click_app import talk
+from talkcli.cli.commands import COMMANDS
 from tests.readme import reference
 from tests.wire.readme import ROOT, TEXT, section, tables, words
 
@@ -70,7 +71,7 @@ def variables() -> set[str]:
                 found |= {
                     str(each.value.value)
                     for each in node.keywords
-                    if each.arg == "envvar" and isinstance(each.value, ast.Constant)
+                    if each.arg == "env" and isinstance(each.value, ast.Constant)
                 }
                 if (
                     isinstance(node.func, ast.Attribute)

@@ -27,7 +27,7 @@ from typing import Any
 
 _KILLED_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 #: What belongs to the engine process alone, or writes files when it is run: no client and no server imports it.
-_LEFT_OUT = {f"talkcli.{each}" for each in ("__main__", "cli.tabulate", "engine.main")}
+_LEFT_OUT = {f"talkcli.{each}" for each in ("__main__", "engine.main")}
 _PACKAGES = ("cli", "client", "doctor", "engine", "engine.players", "goals", "protocol", "server", "terminal")
 
 

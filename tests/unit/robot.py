@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from talkcli.frozen import replace
 from talkcli.goals.effects import Cancelled, Changed, Effect, Now, Submitted
 from talkcli.goals.goal import By, Sender
-from talkcli.goals.requests import Cancel, Say
+from talkcli.goals.options import INITIAL, Cancel, Say
 from talkcli.goals.scheduler import Scheduler
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ class Robot:
     seen: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.scheduler = Scheduler("4k7f", preempt=self.preempt, max_queue=self.max_queue, ttl=self.ttl)
+        settings = replace(INITIAL, preempt=self.preempt, ttl=self.ttl)
+        self.scheduler = Scheduler("4k7f", max_queue=self.max_queue, settings=settings)
 
     @property
     def now(self) -> Now:

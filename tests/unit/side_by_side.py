@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.frozen import replace
 from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start, Stop
-from talkcli.goals.requests import Cancel, Say
+from talkcli.goals.options import INITIAL, Cancel, Say
 from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.states import IllegalTransition, State
 from tests.unit.random_goals import BOOT, MAX_TEXT
@@ -22,6 +23,8 @@ from tests.unit.slow_model import Refused, SlowModel
 from tests.unit.witness import Witness
 
 if TYPE_CHECKING:
+    from typing import Any
+
     from talkcli.goals.effects import Submitted
     from talkcli.goals.goal import By, Goal, Sender
     from talkcli.goals.record import Record
@@ -33,7 +36,8 @@ class SideBySide:
     """Both, and the one clock that they share."""
 
     def __init__(self, *, preempt: bool, max_queue: int, ttl: float) -> None:
-        self.real = Scheduler(BOOT, preempt=preempt, max_queue=max_queue, max_text=MAX_TEXT, ttl=ttl)
+        settings = replace(INITIAL, preempt=preempt, ttl=ttl)
+        self.real = Scheduler(BOOT, max_queue=max_queue, max_text=MAX_TEXT, settings=settings)
         self.model = SlowModel(preempt=preempt, max_queue=max_queue, ttl=ttl)
         self.witness = Witness()
         self.records: dict[str, Record] = {}
@@ -43,6 +47,11 @@ class SideBySide:
         self.amidst = False
 
     # Requests
+
+    def change(self, **settings: Any) -> None:
+        self.real.settings = replace(self.real.settings, **settings)
+        for name, value in settings.items():
+            setattr(self.model, name, value)
 
     def submit(self, say: Say, sender: Sender, fault: str | None = None) -> str:
         self.begin()

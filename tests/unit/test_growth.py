@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.goals.options import Say
 from talkcli.goals.queue import Pending
 from talkcli.goals.record import Record
-from talkcli.goals.requests import Say
 from talkcli.protocol import wire
 from tests.unit.robot import ARM, Robot
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from talkcli.goals import history as module
 from talkcli.goals.goal import Sender
 from talkcli.goals.history import History
+from talkcli.goals.options import Say
 from talkcli.goals.record import Record
-from talkcli.goals.requests import Say
 from talkcli.goals.states import State
 
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.goals.goal import Sender
+from talkcli.goals.options import Say
 from talkcli.goals.queue import Pending
 from talkcli.goals.record import Record
-from talkcli.goals.requests import Say
 
 steps = st.lists(
     st.tuples(

@@ -9,21 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest
-from talkcli.goals.requests import (
+from talkcli.goals.option import MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG
+from talkcli.goals.options import Cancel, Say, Set
+from talkcli.protocol.requests import (
     KINDS,
-    MAX_DATA,
-    MAX_ID,
-    MAX_IDS,
-    MAX_LOG,
     MAX_NAME,
-    Cancel,
     Hello,
     Log,
     Pause,
     Request,
     Resume,
-    Say,
-    Set,
     Status,
     Voices,
     Wait,

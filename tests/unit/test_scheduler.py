@@ -6,7 +6,7 @@ import pytest
 
 from talkcli.goals.effects import Cancelled, Changed, Now
 from talkcli.goals.goal import By
-from talkcli.goals.requests import Say
+from talkcli.goals.options import Say
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending, numbers
 

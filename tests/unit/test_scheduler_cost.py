@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.goals.requests import Say
+from talkcli.goals.options import Say
 from tests.unit.robot import Robot
 from tests.unit.stopwatch import least_seconds
 

@@ -6,7 +6,7 @@ import pytest
 
 from talkcli.goals.effects import GiveUp, Now, Start, Stop
 from talkcli.goals.goal import By
-from talkcli.goals.requests import Say
+from talkcli.goals.options import Say
 from talkcli.goals.scheduler import SILENCE_LIMIT
 from talkcli.goals.states import IllegalTransition, State
 from tests.unit.robot import DOOR, Robot, ending

@@ -14,7 +14,7 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invar
 
 from talkcli.goals.effects import Now
 from talkcli.goals.goal import Sender
-from talkcli.goals.requests import Say
+from talkcli.goals.options import Say
 from tests.unit.random_goals import BAD_SAYS, BOOT, OPTIONS, OWN_IDS, TEXTS, says_with
 from tests.unit.side_by_side import SideBySide
 
@@ -136,11 +136,11 @@ class SchedulerMachine(RuleBasedStateMachine):
 
     @rule(preempt=st.booleans())
     def set_preempt(self, *, preempt: bool) -> None:
-        self.both.real.preempt = self.both.model.preempt = preempt
+        self.both.change(preempt=preempt)
 
     @rule(ttl=st.sampled_from([0.0, 1.0, 3.0]))
     def set_ttl(self, ttl: float) -> None:
-        self.both.real.ttl = self.both.model.ttl = ttl
+        self.both.change(ttl=ttl)
 
     @rule()
     def pause(self) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from talkcli.frozen import replace
 from talkcli.goals.effects import Changed
 from talkcli.goals.goal import By
-from talkcli.goals.requests import Cancel, Say
+from talkcli.goals.options import Cancel, Say
 from talkcli.goals.selection import select_waiting
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending
@@ -81,7 +82,7 @@ def test_the_servers_default_may_change_and_goals_that_wait_keep_what_they_were_
     robot = Robot(preempt=True)
     robot.says("active")
     preempting = robot.says("preempting")
-    robot.scheduler.preempt = False
+    robot.scheduler.settings = replace(robot.scheduler.settings, preempt=False)
     robot.says("plain")
     newcomer = robot.says("newcomer", preempt=True)
     assert ending(preempting) == (State.RECALLED, "preempted", By(goal=newcomer.id))

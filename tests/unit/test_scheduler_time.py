@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from talkcli.frozen import replace
 from talkcli.goals.effects import Hold, Now, Resume
 from talkcli.goals.goal import By
-from talkcli.goals.requests import Say
+from talkcli.goals.options import Say
 from talkcli.goals.scheduler import SILENCE_LIMIT
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending
@@ -64,7 +65,7 @@ def test_the_servers_time_to_live_may_change_and_goals_that_wait_keep_theirs() -
     robot = Robot(ttl=5)
     robot.says()
     robot.says()
-    robot.scheduler.ttl = 1
+    robot.scheduler.settings = replace(robot.scheduler.settings, ttl=1)
     robot.says()
     robot.waits(1)
     assert robot.waiting() == [2]

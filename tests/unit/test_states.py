@@ -7,8 +7,8 @@ import itertools
 import pytest
 
 from talkcli.goals.goal import Sender
+from talkcli.goals.options import Say
 from talkcli.goals.record import Record
-from talkcli.goals.requests import Say
 from talkcli.goals.states import EXIT_CODES, TRANSITIONS, IllegalTransition, State, follow
 
 #: actionlib's names and numbers.

@@ -15,9 +15,9 @@ import pytest
 
 from talkcli.errors import RequestRefused, refusal
 from talkcli.goals.goal import Goal
-from talkcli.goals.requests import KINDS
 from talkcli.protocol import events, wire
 from talkcli.protocol.replies import ServerStatus
+from talkcli.protocol.requests import KINDS
 from tests.conformance.rawsocket import Raw
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def test_every_request_and_field_is_recorded() -> None:
         except ValueError:
             continue  # a line that is no request was recorded, too
         recorded.setdefault(message.get("request", ""), set()).update(message)
-    missing = {kind: set(KINDS[kind].fields) - recorded[kind] for kind in KINDS}
+    missing = {kind: {each.name for each in KINDS[kind].options} - recorded[kind] for kind in KINDS}
     assert not any(missing.values()), f"record these in a file of their own beside {RECORDINGS[0].name}: {missing}"
     assert all("request" in recorded[kind] for kind in KINDS)
 

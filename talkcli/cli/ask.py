@@ -1,4 +1,4 @@
-"""The commands that ask the server for one thing and show what it says, once their command line has been read.
+"""The commands that ask the server one thing and show what it says: cancel, status, log, voices, set, pause, resume.
 
 They know no click: plain command lines come here without it.
 """
@@ -12,12 +12,11 @@ from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
     from typing import Any
 
     from talkcli.cli.show import Common
     from talkcli.client.client import Client
-    from talkcli.client.opening import Opened
     from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.replies import Canceled
 
@@ -25,16 +24,9 @@ if TYPE_CHECKING:
 _MAX_SPOKEN = 40
 
 
-def cancel(
-    options: Common,
-    ids: tuple[str, ...],
-    current: bool,
-    before: str | None,
-    key: str | None,
-    opened: Opened | None = None,
-) -> int:
-    """Cancel what these select, or everything, and return the exit code. `opened`: the connection, if it has been."""
-    with options.connect(urgent=True, opened=opened) as client:
+def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
+    """Cancel what these select, or everything, and return the exit code."""
+    with options.connect(urgent=True) as client:
         try:
             done = client.cancel(ids or None, current=current, before=before, key=key)
             _show_canceled(done, options)
@@ -48,12 +40,12 @@ def cancel(
     return EXIT_OK
 
 
-def status(options: Common, goal_id: str | None, opened: Opened | None = None) -> int:
+def status(options: Common, goal_id: str | None) -> int:
     """Show how the server stands, or one goal, and return the exit code."""
     from talkcli.goals.goal import Goal
     from talkcli.terminal import output
 
-    with options.connect(urgent=True, opened=opened) as client:
+    with options.connect(urgent=True) as client:
         found = client.status() if goal_id is None else client.goal(goal_id)
     if options.json:
         show_json(found.to_json())
@@ -64,11 +56,11 @@ def status(options: Common, goal_id: str | None, opened: Opened | None = None) -
     return EXIT_OK
 
 
-def log(options: Common, count: int, opened: Opened | None = None) -> int:
+def log(options: Common, count: int) -> int:
     """Show the goals that ended last, and return the exit code."""
     from talkcli.terminal.transcript import log_lines
 
-    with options.connect(opened=opened) as client:
+    with options.connect() as client:
         goals = client.log(count)
     if options.json:
         for goal in goals:
@@ -78,11 +70,11 @@ def log(options: Common, count: int, opened: Opened | None = None) -> int:
     return EXIT_OK
 
 
-def voices(options: Common, language: str | None, opened: Opened | None = None) -> int:
+def voices(options: Common, language: str | None) -> int:
     """Show the engine's voices, or those of a language with its variants, and return the exit code."""
     from talkcli.terminal import output
 
-    with options.connect(opened=opened) as client:
+    with options.connect() as client:
         found = every = client.voices()
     if language:
         wanted = language.lower()
@@ -97,12 +89,12 @@ def voices(options: Common, language: str | None, opened: Opened | None = None) 
     return EXIT_OK
 
 
-def change(options: Common, opened: Opened | None = None, **settings: Any) -> int:
+def change(options: Common, **settings: Any) -> int:
     """Change those settings of the server that aren't None, or show them all, and return the exit code."""
     from talkcli.terminal import output
 
     asked = {name: value for name, value in settings.items() if value is not None}
-    with options.connect(opened=opened) as client:
+    with options.connect() as client:
         found = client.set(**asked) if asked else client.settings()
     if options.json:
         show_json(found)
@@ -111,9 +103,9 @@ def change(options: Common, opened: Opened | None = None, **settings: Any) -> in
     return EXIT_OK
 
 
-def pause(options: Common, opened: Opened | None = None) -> int:
+def pause(options: Common) -> int:
     """Hold speech, and return the exit code."""
-    with options.connect(opened=opened) as client:
+    with options.connect() as client:
         held = client.pause()
     from talkcli.terminal.printable import printable
 
@@ -124,27 +116,15 @@ def pause(options: Common, opened: Opened | None = None) -> int:
     return EXIT_OK
 
 
-def resume(options: Common, opened: Opened | None = None) -> int:
+def resume(options: Common) -> int:
     """Go on where speech is held, and return the exit code."""
-    with options.connect(opened=opened) as client:
+    with options.connect() as client:
         goal = client.resume()
     from talkcli.terminal.printable import printable
 
     words = f"speech goes on with {printable(goal.id)}" if goal else "speech goes on"
     _tell(options, goal, paused=False, words=words)
     return EXIT_OK
-
-
-#: Each of them by its command's name; called with the options that click or `plain` has read, by their names.
-COMMANDS: dict[str, Callable[..., int]] = {
-    "cancel": cancel,
-    "status": status,
-    "log": log,
-    "voices": voices,
-    "set": change,
-    "pause": pause,
-    "resume": resume,
-}
 
 
 def _show_canceled(done: Canceled, options: Common) -> None:

@@ -27,8 +27,8 @@ from talkcli.cli.utf8 import readable
 from talkcli.client.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
 from talkcli.goals.goal import Goal
+from talkcli.goals.options import MAX_BYTES
 from talkcli.goals.states import State
-from talkcli.goals.text import MAX_BYTES
 from talkcli.protocol.replies import Canceled
 from talkcli.terminal import output
 

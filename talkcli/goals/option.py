@@ -1,0 +1,151 @@
+"""What an option is: one row, of a goal's options or of a command's, from which all that is said of it is made.
+
+It knows no single option; those of goals and servers are in `options`, those of a command beside it. A client imports
+it before it sends anything, so it imports nothing heavy.
+"""
+
+from __future__ import annotations
+
+from talkcli.frozen import TYPE_CHECKING, frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
+    from talkcli.goals.goal import JsonObject
+
+#: An id is at most this long; a longer one names no goal that could exist.
+MAX_ID = 64
+#: Ids in one request; more would not fit into a line anyway.
+MAX_IDS = 4096
+#: `data` that travels with a goal, in bytes of JSON: a label for programs, not something that the server has to store.
+MAX_DATA = 1024
+#: Goals that one request for the log asks for: as many as are kept.
+MAX_LOG = 1_200
+#: sys.float_info.max: NaN is no number of seconds, nor is an integer that is past every float.
+_LARGEST = 1.7976931348623157e308
+
+
+@frozen
+class Kind:
+    """A kind of value."""
+
+    #: as the wire's table has it
+    name: str
+    types: tuple[type, ...]
+    #: what is said of a value of another type
+    wrong: str
+    #: what stands for the value in help
+    metavar: str = ""
+    #: what is wrong with a value of these types wherever it stands, for people, or None
+    fault: Callable[[Any], str | None] | None = None
+
+
+def _bad_id(value: str) -> str | None:
+    return None if 0 < len(value) <= MAX_ID else f"must be an id of 1 to {MAX_ID} characters"
+
+
+def _bad_ids(value: list[object]) -> str | None:
+    if len(value) > MAX_IDS:
+        return IDS.wrong
+    return next((words for each in value if (words := _bad_id(each) if isinstance(each, str) else ID.wrong)), None)
+
+
+def _bad_data(value: JsonObject) -> str | None:
+    import json
+
+    try:
+        return None if len(json.dumps(value)) <= MAX_DATA else DATA.wrong
+    except RecursionError:
+        return DATA.wrong
+
+
+FLAG = Kind("boolean", (bool,), "must be true or false")
+TEXT = Kind("string", (str,), "must be a string", "TEXT")
+#: a text that names something: on a command line it is never empty, and it is UTF-8
+WORD = Kind("string", (str,), "must be a string", "WORD")
+#: a file or a socket by its path, which may be any bytes but not empty
+PATH = Kind("string", (str,), "must be a string", "PATH")
+INTEGER = Kind("integer", (int,), "must be an integer", "N")
+NUMBER = Kind("number", (int, float), "must be a number", "X")
+#: a length of time from 0 on
+SECONDS = Kind("number", (int, float), "must be a number", "SEC")
+DATA = Kind("object", (dict,), f"must be an object of at most {MAX_DATA} bytes", fault=_bad_data)
+ID = Kind("id", (str,), "must be a string", "ID", _bad_id)
+IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[ID]...", _bad_ids)
+
+
+@frozen
+class Setting:
+    """The server's own value of an option, for goals that bring none."""
+
+    initial: Any
+    #: the value that is shown as null: there is none
+    none: Any = None
+    #: what `set` on the wire makes of it, where that isn't what the option means
+    meaning: str = ""
+    #: help of `talk set` and of `talk serve`, where they don't say what `talk say` does; the spellings for `talk set`
+    to_set: str = ""
+    at_start: str = ""
+    flags: str = ""
+    #: how people are told its value, and that there is none
+    told: str = ""
+    told_none: str = ""
+
+
+@frozen
+class Option:
+    """An option, of a goal or of a command: what it is called, what it may be, what is said of it."""
+
+    name: str
+    kind: Kind
+    #: what it means on the wire
+    meaning: str = ""
+    #: what it is where it isn't given; where that is None, a request may have null, too
+    default: Any = None
+    #: the least and the most that it may be; None for no limit
+    limits: tuple[float | None, float | None] = (None, None)
+    #: whether it must be more than the least
+    above: bool = False
+    unit: str = ""
+    #: the only values that there are
+    choices: tuple[str, ...] = ()
+    #: what else is wrong with its value, for people, or None
+    refuses: Callable[[Any], str | None] | None = None
+    #: of the wire's table: what its value may be besides; what holds where it isn't given
+    form: str = ""
+    absent: str = ""
+    #: spellings on a command line, "-w, --wait"; the first for yes, the second for no: "--preempt/--queue"
+    flags: str = ""
+    metavar: str = ""
+    help: str = ""
+    #: the variable of the environment that stands for it
+    env: str = ""
+    #: what a shell offers for its value: a function of `cli.complete`
+    offers: str = ""
+    #: what it is for a server, where one has a value of its own for it
+    setting: Setting | None = None
+    #: whether the engine is told; whether a goal shows it
+    engine: bool = False
+    shown: bool = False
+
+    def fault(self, value: Any) -> str | None:
+        """Return what is wrong with the form of a value, as in "'rate' of say must be an integer", or None."""
+        if value is None and self.default is None:
+            return None
+        kind = self.kind
+        if not isinstance(value, kind.types) or (isinstance(value, bool) and kind is not FLAG):
+            return kind.wrong
+        return kind.fault(value) if kind.fault else None
+
+    def refusal(self, value: Any) -> str | None:
+        """Return why a value of the right form can't be had, for people, or None."""
+        if value is None:
+            return None
+        low, high = self.limits
+        # Written so that NaN, which compares with nothing, is outside.
+        if self.kind is SECONDS and not 0 <= value <= _LARGEST:
+            return f"the {self.name} {value} is no number of seconds from 0 on"
+        if low is not None and high is not None and not low <= value <= high:
+            return f"the {self.name} {value} is not within {low:g} to {high:g}{self.unit}"
+        return self.refuses(value) if self.refuses else None

@@ -1,0 +1,225 @@
+"""The options of a goal: their limits, the form of ids, and what else names them and must say the same."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given as given_any
+from hypothesis import strategies as st
+
+from talkcli import Client, Goal
+from talkcli.cli.command import MODE
+from talkcli.cli.commands import COMMANDS
+from talkcli.cli.values import read
+from talkcli.engine import protocol
+from talkcli.frozen import fields, replace
+from talkcli.goals.options import (
+    DEFAULT_VOICE,
+    FOR_ENGINE,
+    GIVEN,
+    INITIAL,
+    MAX_KEY,
+    MAX_PRIORITY,
+    OPTIONS,
+    SETTINGS,
+    SHOWN,
+    Say,
+    Set,
+    as_shown,
+    bad_option,
+    for_engine,
+    given,
+    is_clients_id,
+    told,
+)
+from talkcli.protocol.requests import KINDS
+from talkcli.server import run
+from talkcli.server.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+NO_SECONDS: list[object] = [-1, -0.001, math.nan, math.inf, -math.inf, 10**400, -(10**400)]
+GOOD: list[tuple[str, list[object]]] = [
+    ("rate", [80, 200, 450]),
+    ("volume", [0, 0.0, 0.5, 1, 1.0]),
+    ("pitch", [0, 50, 100]),
+    ("voice", ["en", "default", "French (France)"]),
+    ("ttl", [0, 0.0, 0.001, 5, 86_400.0]),
+    ("throttle", [0, 0.0, 0.5, 60]),
+    ("priority", [0, -1, 1, MAX_PRIORITY, -MAX_PRIORITY]),
+    ("key", ["b", "a" * MAX_KEY, "battery low!", "é日"]),
+]
+BAD: list[tuple[str, list[object]]] = [
+    ("rate", [79, 451, 0, -200, 10**400]),
+    ("volume", [-0.001, 1.001, 2, -1, math.nan, math.inf, 10**400]),
+    ("pitch", [-1, 101, 10**400]),
+    ("voice", [""]),
+    ("ttl", NO_SECONDS),
+    ("throttle", NO_SECONDS),
+    ("priority", [MAX_PRIORITY + 1, -MAX_PRIORITY - 1, 10**400]),
+    ("key", ["", "a" * (MAX_KEY + 1)]),
+]
+OWN_IDS = [
+    *("a", "A", ".", "_", ":", "/", "a" * 64, "1.", "1-1", "_-_", "a/b", "/patrol/goal-1", "/arm-1-1712.5"),
+    *("arm-1", "goal-1", "task-2", "move-10", "wp01-3", "2024-12", "k3fz-12"),  # of four characters and a number
+    *("4K7F-1", "4k7f-", "4k7f-x", "4k7f", "4k7-1", "4k7ff-1", "4k7f-1-1", "a4k7f-1", "44k7-1", "4k77-1", "4kf7-1"),
+]
+OTHER_IDS = [
+    *("", "1", "007", "4k7f-1", "0a0a-0", "9z9z-00012", "-", "-a", "-1", "a" * 65),
+    *("a b", "a\n", "4k7f-1\n", "é", "a\0", "１", "٣", "ａ", "a,b", "a\\b", "\ud800"),
+]
+
+
+def short(value: object) -> str:
+    return ascii(value)[:24]
+
+
+def options(table: list[tuple[str, list[object]]]) -> list[tuple[str, object]]:
+    return [(name, value) for name, values in table for value in values]
+
+
+@pytest.mark.parametrize(("name", "value"), [*options(GOOD), *[("id", each) for each in OWN_IDS]], ids=short)
+def test_an_option_within_its_limits_is_taken(name: str, value: object) -> None:
+    assert bad_option(Say("hi", **{name: value})) is None  # type: ignore[arg-type]
+    if name in annotated(Set):
+        assert bad_option(Set(**{name: value})) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("name", "value"), [*options(BAD), *[("id", each) for each in OTHER_IDS]], ids=short)
+def test_an_option_out_of_its_limits_is_refused_and_named(name: str, value: object) -> None:
+    for preempt in (None, True):
+        words = bad_option(Say("hi", preempt=preempt, **{name: value}))  # type: ignore[arg-type]
+        assert words is not None
+        assert name in words
+    if name in annotated(Set):
+        assert name in str(bad_option(Set(**{name: value})))  # type: ignore[arg-type]
+
+
+def test_nothing_asked_for_is_nothing_wrong() -> None:
+    assert bad_option(Say("hi")) is None
+    assert bad_option(Set()) is None
+
+
+def test_flush_without_preempt_is_a_contradiction() -> None:
+    assert bad_option(Say("hi", flush=True)) is None
+    assert bad_option(Say("hi", flush=True, preempt=True)) is None
+    assert "flush" in str(bad_option(Say("hi", flush=True, preempt=False)))
+
+
+@pytest.mark.parametrize("format_", ["ssml", "", "TEXT", "a" * 5_000])
+def test_no_other_format_than_text(format_: str) -> None:
+    words = bad_option(Say("hi", format=format_))
+    assert words is not None
+    assert len(words) < 200
+
+
+@given_any(
+    st.text(alphabet=st.sampled_from("aZ09._:/-") | st.characters(), max_size=70)
+    | st.from_regex(r"[0-9a-z]{4}-[0-9]{1,3}", fullmatch=True)
+)
+def test_an_id_is_the_servers_or_a_clients_and_never_both(goal_id: str) -> None:
+    plain = re.fullmatch(r"[A-Za-z0-9._:/-]{1,64}", goal_id) is not None and not goal_id.startswith("-")
+    servers = re.fullmatch(r"[0-9][a-z][0-9][a-z]-[0-9]+|[0-9]+", goal_id) is not None
+    assert is_clients_id(goal_id) == (plain and not servers)
+
+
+def test_an_id_of_a_server_is_no_client_s() -> None:
+    assert not [boot for boot in (run._boot() for _ in range(1_000)) if is_clients_id(f"{boot}-1")]
+
+
+# What stands twice, for type checkers and readers, is what the rows say
+
+
+def declared(function: Callable[..., object]) -> dict[str, tuple[str, object]]:
+    """Return the parameters of a function but the first: what each is annotated with, and its default."""
+    parameters = list(inspect.signature(function).parameters.values())[1:]
+    return {each.name: (str(each.annotation), each.default) for each in parameters}
+
+
+def annotated(message: type[object]) -> dict[str, str]:
+    return {name: kind for name, kind in message.__annotations__.items() if not kind.startswith("ClassVar")}
+
+
+#: How Python's type checkers are told of a kind.
+TYPES = {
+    "boolean": "bool",
+    "string": "str",
+    "integer": "int",
+    "number": "float",
+    "object": "JsonObject",
+    "id": "str",
+    "list": "tuple[str, ...]",
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_fields_of_a_request_are_its_rows(kind: str) -> None:
+    request = KINDS[kind]
+    empty = Say("") if issubclass(request, Say) else request()
+    own = annotated(request)
+    assert list(own) == [each.name for each in request.options]
+    for each in request.options:
+        nothing = " | None" if each.default is None else ""
+        assert own[each.name] == TYPES[each.kind.name] + nothing, each.name
+        assert getattr(empty, each.name) == each.default, each.name
+        assert each.fault(each.default) is None, each.name
+        assert each.meaning, each.name
+
+
+def test_what_the_library_takes_is_what_the_rows_say() -> None:
+    asked = declared(Client.say)
+    # `wait` is called `follow` there, and is what one mostly wants; no other format than text can be asked for.
+    assert asked.pop("follow") == ("bool", True)
+    assert asked.pop("text") == ("str", inspect.Parameter.empty)
+    fields = annotated(Say)
+    rows = {
+        each.name: (fields[each.name], each.default) for each in OPTIONS if each.name not in {"text", "wait", "format"}
+    }
+    assert asked == rows
+    assert [each for each in asked if each in GIVEN] == [*GIVEN]
+    assert list(declared(Client.set).items()) == [(each.name, (annotated(Set)[each.name], None)) for each in SETTINGS]
+
+
+def test_what_a_goal_shows_and_what_the_engine_is_told_are_what_the_rows_say() -> None:
+    goal, say, engine = annotated(Goal), annotated(Say), annotated(protocol.Say)
+    assert {name: goal[name] for name in SHOWN} == {name: say[name] for name in SHOWN}
+    told = {name: kind for name, kind in engine.items() if name not in {"id", "text", "followed"}}
+    assert set(told) == set(FOR_ENGINE)
+    assert {name: kind.removesuffix(" | None") for name, kind in told.items()} == {
+        name: say[name].removesuffix(" | None") for name in FOR_ENGINE
+    }
+
+
+def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_there_is_not() -> None:
+    assert list(annotated(Set)) == [each.name for each in SETTINGS]
+    shown = as_shown(INITIAL)
+    assert shown == {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
+    assert as_shown(replace(INITIAL, voice=DEFAULT_VOICE, ttl=0.0)) == shown
+    assert told(shown) == ["rate 200", "volume 1.0", "voice the driver's own", "pitch 50", "goals queue", "no ttl"]
+    changed = as_shown(replace(INITIAL, voice="de", ttl=2.5, preempt=True))
+    assert told(changed)[2:] == ["voice de", "pitch 50", "goals preempt", "ttl 2.5 s"]
+
+
+def test_the_engine_is_told_the_goal_s_own_value_else_the_server_s() -> None:
+    settings = replace(INITIAL, voice="de", rate=150)
+    assert for_engine(Say("hi"), settings) == {"rate": 150, "volume": 1.0, "voice": "de", "pitch": 50}
+    own = Say("hi", rate=80, volume=0.0, voice=DEFAULT_VOICE, pitch=0)
+    assert for_engine(own, settings) == {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0}
+    assert given(Set(preempt=False, ttl=0)) == {"preempt": False, "ttl": 0}
+
+
+def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
+    rows = {each.name: each for each in COMMANDS["serve"].options}
+    server = fields(Settings())
+    assert server.pop("goals") == Set(**{name: row.default for name, row in rows.items() if row.setting})
+    assert server.pop("socket") is None
+    assert server == {
+        name: read(row, row.default) if row.kind is MODE else row.default
+        for name, row in rows.items()
+        if not row.setting and name != "print_unit"
+    }
