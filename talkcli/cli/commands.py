@@ -9,7 +9,7 @@ from __future__ import annotations
 from talkcli.cli.command import ASKING, FILE, MODE, Argument, Command, spelt
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.option import FLAG, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
-from talkcli.goals.options import FOR_ENGINE, MAX_CHARACTERS, OPTIONS, SETTINGS, Cancel
+from talkcli.goals.options import MAX_CHARACTERS, OPTIONS, SETTINGS, SOUND, Cancel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,7 +64,7 @@ def _to_say() -> tuple[Option, ...]:
 
 _SAY = _to_say()
 #: Options of `say` that mean something without a server, too.
-_WITHOUT_SERVER = {"timeout", "output", *FOR_ENGINE}
+_WITHOUT_SERVER = {"timeout", "output", *(each.name for each in SOUND)}
 #: Endings by which a file of another format than WAV would be meant.
 _OTHER_FORMATS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 

@@ -15,7 +15,7 @@ from talkcli.cli.utf8 import readable
 from talkcli.cli.values import read
 from talkcli.client.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, UsageError
-from talkcli.goals.options import OPTIONS
+from talkcli.goals.options import SOUND
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -56,9 +56,8 @@ def render_to(path: str, text: str, chosen: Mapping[str, Any], timeout: float | 
 def _settings(chosen: Mapping[str, Any]) -> dict[str, Any]:
     """Return what to speak with: the options, else the environment, as a server has its own; none that neither has."""
     found = {}
-    for option in OPTIONS:
-        value = chosen[option.name] if option.engine else None
-        text = os.environ.get(option.env) if option.engine and option.env else None
+    for option in SOUND:
+        value, text = chosen[option.name], os.environ.get(option.env) if option.env else None
         if value is None and text:
             try:
                 value = read(option, text)

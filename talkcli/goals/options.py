@@ -284,6 +284,8 @@ OPTIONS = (
 GIVEN = tuple(each.name for each in OPTIONS if each.flags and each.name not in {"wait", "feedback"})
 #: What the engine is told of a goal, and what everybody is.
 FOR_ENGINE = tuple(each.name for each in OPTIONS if each.engine)
+#: How it sounds, in a file, too: of these a server has a value of its own.
+SOUND = tuple(each for each in OPTIONS if each.engine and each.setting)
 SHOWN = tuple(each.name for each in OPTIONS if each.shown)
 #: The options of which a server has a value of its own: first what the engine is told, then what decides who is spoken.
 SETTINGS = tuple(sorted((each for each in OPTIONS if each.setting), key=lambda each: not each.engine))
