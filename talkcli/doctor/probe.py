@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from talkcli.engine import protocol
-    from talkcli.engine.spawn import EngineProcess
 
 _ID = "doctor"
 _ENGINE_FAILED = "engine_failed"
@@ -99,12 +98,13 @@ class _Talked:
         self._end = None if limit is None else time.monotonic() + limit
 
     def __enter__(self) -> _Talked:
-        from talkcli.engine import protocol, spawn
+        from talkcli.engine import protocol
+        from talkcli.engine.spawn import EngineProcess
 
         one = self._setting
         configure = protocol.Configure(os.getpid(), one.driver, one.player, one.device, one.voice, list_voices=True)
         try:
-            self.process: EngineProcess = spawn.EngineProcess(spawn.engine_command(), configure, env=one.env)
+            self.process = EngineProcess(configure, env=one.env)
         except OSError as error:
             raise _Broken(_ENGINE_FAILED, f"the engine process cannot be started: {error}") from error
         return self

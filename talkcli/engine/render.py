@@ -17,10 +17,11 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.client.dial import ready
-from talkcli.engine import protocol, spawn
+from talkcli.engine import protocol
 from talkcli.engine.pieces import pieces
 from talkcli.engine.players.wavestream import WavStream
 from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
+from talkcli.engine.spawn import EngineProcess
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
 
@@ -223,7 +224,7 @@ def _speak_into(
 ) -> float:
     """Speak all pieces, and return the seconds of audio. What the engine calls `name` is `path` to the user."""
     try:
-        process = spawn.EngineProcess(spawn.engine_command(), configure)
+        process = EngineProcess(configure)
     except OSError as error:
         raise RenderFailed("engine_failed", f"the engine process cannot be started: {error}") from error
     conversation = _Conversation(process, deadline, interrupt)
@@ -254,7 +255,7 @@ def _failure(ended: protocol.Ended, name: str, path: str) -> RenderFailed:
     return RenderFailed(reason, message)
 
 
-def _end(process: spawn.EngineProcess) -> None:
+def _end(process: EngineProcess) -> None:
     """Kill the process and see it gone: it could make the hidden file once more."""
     process.kill()
     if ready({process.liveness: select.POLLIN}, SILENCE_LIMIT):
@@ -265,9 +266,7 @@ def _end(process: spawn.EngineProcess) -> None:
 class _Conversation:
     """What is said to the engine process and heard of it, piece by piece; it has the thread's limits."""
 
-    def __init__(
-        self, process: spawn.EngineProcess, deadline: float | None, interrupt: Mapping[int, int] | None
-    ) -> None:
+    def __init__(self, process: EngineProcess, deadline: float | None, interrupt: Mapping[int, int] | None) -> None:
         self._process = process
         self._say: protocol.Say | None = None
         self._deadline = deadline

@@ -56,12 +56,15 @@ class EngineProcess:
 
     def __init__(
         self,
-        command: list[str],
         configure: protocol.Configure,
         on_stderr: Callable[[bytes], None] = lambda _: None,
         env: Mapping[str, str] | None = None,
+        command: list[str] | None = None,
     ) -> None:
-        """`on_stderr` is called with what is read of its standard error, empty at the end; `env`: if not this one's."""
+        """`on_stderr` is called with what is read of its standard error, empty at the end.
+
+        `env`: if not this process's; `command`: its command line, if not `engine_command`'s.
+        """
         self.ready = False
         #: what the process said itself of why it cannot start
         self.failed: protocol.StartFailed | None = None
@@ -85,7 +88,7 @@ class EngineProcess:
             self.socket.setblocking(False)
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
             self._process: subprocess.Popen[bytes] = subprocess.Popen(
-                command,
+                command or engine_command(),
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,

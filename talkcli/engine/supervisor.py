@@ -12,7 +12,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from talkcli.engine import protocol, spawn
+from talkcli.engine import protocol
 from talkcli.engine.inbox import NEVER, Inbox
 from talkcli.engine.protocol import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
 from talkcli.engine.restarts import Restarts
@@ -134,9 +134,9 @@ class Supervisor:
         self._post = post
         self._inbox = Inbox(doze=HANG_AFTER)
         self._selector = self._inbox.selector
-        self._process: spawn.EngineProcess | None = None
+        self._process: EngineProcess | None = None
         #: the process that takes the next goal, from whichever thread; None where only this thread may decide
-        self._open: spawn.EngineProcess | None = None
+        self._open: EngineProcess | None = None
         self._started_at = 0.0
         self._restarts = Restarts(time.monotonic())
         self._goal: Handed | None = None
@@ -242,7 +242,7 @@ class Supervisor:
     def _handle(self, key: selectors.SelectorKey) -> None:
         if key.fd not in self._selector.get_map():
             return  # closed by what was handled before it
-        process: spawn.EngineProcess = key.data
+        process: EngineProcess = key.data
         if key.fd == process.liveness:
             if process is self._process:
                 self._hear(process)  # its last messages, before its end is acted upon
@@ -258,7 +258,7 @@ class Supervisor:
 
     # -- goals
 
-    def _take(self, say: protocol.Say, sent: spawn.EngineProcess | None = None, at: float = 0.0) -> None:
+    def _take(self, say: protocol.Say, sent: EngineProcess | None = None, at: float = 0.0) -> None:
         """Take a goal in hand, one that was sent to a process already, or is to be: where that one is lost since."""
         self._goal = Handed(say)
         if sent is not None and sent is self._process:
@@ -268,14 +268,14 @@ class Supervisor:
         else:
             self._hand_over()
 
-    def _not_taken(self, goal_id: str, process: spawn.EngineProcess) -> None:
+    def _not_taken(self, goal_id: str, process: EngineProcess) -> None:
         """Let a goal wait for the next process: this one doesn't have it."""
         if process is self._process:
             if self._goal and self._goal.id == goal_id:
                 self._goal.heard_at = None
             self._refused(process)
 
-    def _refused(self, process: spawn.EngineProcess) -> None:
+    def _refused(self, process: EngineProcess) -> None:
         self._hear(process)  # where it is dead, it is known how it died
         if process is self._process:
             self._lose_process("the engine takes no commands", "engine_hung")
@@ -338,7 +338,7 @@ class Supervisor:
     def _start(self) -> None:
         self._started_at = time.monotonic()
         try:
-            process = spawn.EngineProcess(spawn.engine_command(), self._configure, self._murmured)
+            process = EngineProcess(self._configure, self._murmured)
         except OSError as error:
             words = f"the engine process cannot be started: {error.strerror or error}"
             self._post(EngineDied(words))
@@ -348,7 +348,7 @@ class Supervisor:
         for fd in (process.socket.fileno(), process.liveness, process.stderr):
             self._selector.register(fd, selectors.EVENT_READ, process)
 
-    def _hear(self, process: spawn.EngineProcess) -> None:
+    def _hear(self, process: EngineProcess) -> None:
         for event in process.receive():
             self._inbox.run()  # what it answers to was left there before it was sent
             if process is not self._process:
@@ -358,7 +358,7 @@ class Supervisor:
                 return
             self._note(process, event)
 
-    def _crashed(self, process: spawn.EngineProcess) -> None:
+    def _crashed(self, process: EngineProcess) -> None:
         self._open = None
         self._lose_process(f"the engine crashed: {process.last_words()}", "engine_crashed")
 
@@ -366,7 +366,7 @@ class Supervisor:
         for words in self._murmur.take(data, time.monotonic()):
             self._post(EngineSaid(words))
 
-    def _note(self, process: spawn.EngineProcess, event: protocol.Event) -> None:
+    def _note(self, process: EngineProcess, event: protocol.Event) -> None:
         if isinstance(event, protocol.OF_A_GOAL):
             goal = self._goal
             if goal is None or not goal.spoken or event.id != goal.id:
@@ -415,7 +415,7 @@ class Supervisor:
         else:
             self._start_failed(words)
 
-    def _take_back(self, goal: Handed, process: spawn.EngineProcess, words: str, reason: str) -> None:
+    def _take_back(self, goal: Handed, process: EngineProcess, words: str, reason: str) -> None:
         """Decide what becomes of a goal whose process is lost.
 
         One that died before it began with the goal, so that nothing of it was heard, leaves it to the next; not twice.
@@ -440,7 +440,7 @@ class Supervisor:
         elif costs_a_goal:
             self._post(EngineMissing(words))
 
-    def _bury(self, process: spawn.EngineProcess) -> None:
+    def _bury(self, process: EngineProcess) -> None:
         """Process and player are gone: what was being spoken is silent."""
         self._selector.unregister(process.liveness)
         if process.stderr in self._selector.get_map():

@@ -169,7 +169,7 @@ def test_what_a_link_points_to_is_replaced_and_the_link_stays(tmp_path: Path) ->
 def test_what_cannot_be_written_is_told_before_anything_is_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, words: str
 ) -> None:
-    monkeypatch.setattr(spawn, "EngineProcess", None)  # calling it would be a TypeError
+    monkeypatch.setattr(rendering, "EngineProcess", None)  # calling it would be a TypeError
     (tmp_path / "file").touch()
     with socket.socket(socket.AF_UNIX) as listening, monkeypatch.context() as there:
         there.chdir(tmp_path)

@@ -121,7 +121,7 @@ class Speaker:
     def _start(self) -> None:
         first = not self.voices
         configure = protocol.Configure(os.getpid(), None, f"file:{self._file}", None, None, list_voices=first)
-        self._process = spawn.EngineProcess(self._command, configure)
+        self._process = spawn.EngineProcess(configure, command=self._command)
         limit = time.monotonic() + _START
         assert isinstance(self._until(protocol.Ready, limit), protocol.Ready)
         if first:
