@@ -99,7 +99,7 @@ class _Talked:
 
     def __enter__(self) -> _Talked:
         from talkcli.engine import protocol
-        from talkcli.engine.spawn import EngineProcess
+        from talkcli.engine.process import EngineProcess
 
         one = self._setting
         configure = protocol.Configure(os.getpid(), one.driver, one.player, one.device, one.voice, list_voices=True)

@@ -20,8 +20,8 @@ from talkcli.client.dial import ready
 from talkcli.engine import protocol
 from talkcli.engine.pieces import pieces
 from talkcli.engine.players.wavestream import WavStream
+from talkcli.engine.process import EngineProcess
 from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
-from talkcli.engine.spawn import EngineProcess
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
 

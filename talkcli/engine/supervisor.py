@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.inbox import NEVER, Inbox
+from talkcli.engine.process import EngineProcess, Murmur
 from talkcli.engine.protocol import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
 from talkcli.engine.restarts import Restarts
-from talkcli.engine.spawn import EngineProcess, Murmur
 from talkcli.frozen import frozen, replace
 
 if TYPE_CHECKING:

@@ -75,9 +75,9 @@ SERVE = """
 import sys
 sys.path.insert(0, {root!r})
 from talkcli.cli import main
-from talkcli.engine import spawn
+from talkcli.engine import process
 
-spawn.engine_command = lambda: [sys.executable, {engine!r}]
+process.engine_command = lambda: [sys.executable, {engine!r}]
 sys.argv = ["talk", "serve", *sys.argv[1:]]
 main()
 """

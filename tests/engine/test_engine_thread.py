@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 import talkcli
-from talkcli.engine import protocol, restarts, spawn
+from talkcli.engine import protocol, restarts
 from talkcli.engine import supervisor as engine_thread
-from talkcli.engine.spawn import LINES
+from talkcli.engine.process import LINES
 from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid
 from tests.engine.threads import Thread, start
 
@@ -240,7 +240,7 @@ for line in os.fdopen(0, "rb"):
 def complaining(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Thread]:
     program = tmp_path / "engine.py"
     program.write_text(COMPLAINS.format(root=os.path.dirname(os.path.dirname(talkcli.__file__))))
-    monkeypatch.setattr(spawn, "engine_command", lambda: [sys.executable, str(program)])
+    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, str(program)])
     thread = Thread()
     yield thread
     thread.close()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import pytest
 
 import talkcli
-from talkcli.engine import protocol, spawn
+from talkcli.engine import protocol
 from talkcli.engine import supervisor as engine_thread
 from talkcli.engine.supervisor import EngineDied, Supervisor
 from tests.engine.threads import PATIENCE, Thread, start
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from talkcli.engine.process import EngineProcess
     from talkcli.engine.supervisor import Report
 
 __all__ = ["start"]
@@ -44,7 +45,7 @@ for line in os.fdopen(0, "rb"):
 def test_a_goal_behind_another_wakes_the_thread_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     program = tmp_path / "engine.py"
     program.write_text(PROMPT.format(root=os.path.dirname(os.path.dirname(talkcli.__file__))))
-    monkeypatch.setattr(spawn, "engine_command", lambda: [sys.executable, str(program)])
+    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, str(program)])
     monkeypatch.setattr(engine_thread, "HANG_AFTER", 600.0)  # so that no goal is slow enough on any machine
     thread = Thread()
     try:
@@ -112,7 +113,7 @@ def test_the_answer_to_a_goal_is_understood_although_the_goal_has_not_been_noted
     for name in ("_process", "_open"):
         monkeypatch.setattr(engine, name, process)
     engine.say(protocol.Say("g1", "yes", 200, 1.0, None, 50))
-    engine._hear(cast("spawn.EngineProcess", process))
+    engine._hear(cast("EngineProcess", process))
     assert posted == [protocol.Ended("g1", protocol.COMPLETED)]
     engine._inbox.close()
 

@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 
 from talkcli.client.dial import Interrupted
 from talkcli.engine import render as rendering
-from talkcli.engine import spawn
 from talkcli.engine.pieces import pieces
+from talkcli.engine.process import engine_command
 from talkcli.engine.render import CannotWrite, RenderFailed, render
 from talkcli.errors import TalkError, UsageError
 from tests.support.reference import RATE, Sentence
@@ -218,9 +218,11 @@ def test_standard_output_gets_it_as_it_is_made(tmp_path: Path, path: str) -> Non
 def test_a_reader_that_takes_its_time_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """More than a pipe holds, and it is read later than a player that is stuck would be given up."""
     limits = "from talkcli.engine import playback; playback.FIRST_WITHIN = playback.STALLED_AFTER = 0.1"
-    interpreter, option, code = spawn.engine_command()
+    interpreter, option, code = engine_command()
     path, rest = code.split("; from ", 1)
-    monkeypatch.setattr(spawn, "engine_command", lambda: [interpreter, option, f"{path}\n{limits}\nfrom {rest}"])
+    monkeypatch.setattr(
+        "talkcli.engine.process.engine_command", lambda: [interpreter, option, f"{path}\n{limits}\nfrom {rest}"]
+    )
     text = TEXT * 4
     (expected,) = reference([text])
     assert len(expected) * 2 > 3 * 65536
@@ -417,9 +419,11 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path) -> None:
 def test_an_engine_that_is_of_no_use_is_told_and_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, reason: str, words: str
 ) -> None:
-    interpreter, option, code = spawn.engine_command()
+    interpreter, option, code = engine_command()
     path, rest = code.split("; from ", 1)
-    monkeypatch.setattr(spawn, "engine_command", lambda: [interpreter, option, f"{path}\n{before}\nfrom {rest}"])
+    monkeypatch.setattr(
+        "talkcli.engine.process.engine_command", lambda: [interpreter, option, f"{path}\n{before}\nfrom {rest}"]
+    )
     monkeypatch.setattr(rendering, "START_LIMIT", 0.3 if reason == "engine_failed" else 10)
     monkeypatch.setattr(rendering, "HANG_AFTER", 0.5)
     error = failed("yes", tmp_path / "x.wav")
@@ -428,6 +432,6 @@ def test_an_engine_that_is_of_no_use_is_told_and_killed(
 
 
 def test_an_interpreter_that_cannot_be_started_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(spawn, "engine_command", lambda: ["/nonesuch"])
+    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: ["/nonesuch"])
     error = failed("yes", tmp_path / "x.wav")
     assert (error.code, "/nonesuch" in str(error)) == ("engine_failed", True)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
+from talkcli.engine.process import LINES, LONGEST, WHILE, Murmur
 from talkcli.engine.restarts import BACK_OFF, PATIENCE, SHORT_LIFE, Restarts
-from talkcli.engine.spawn import LINES, LONGEST, WHILE, Murmur
 from talkcli.engine.supervisor import Dying
 
 if TYPE_CHECKING:
-    from talkcli.engine.spawn import EngineProcess
+    from talkcli.engine.process import EngineProcess
 
 
 LACKING = "no library"

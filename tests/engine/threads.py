@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 
-from talkcli.engine import protocol, spawn
+from talkcli.engine import protocol
 from talkcli.engine.supervisor import Supervisor
 from tests.support import scripted_engine
 
@@ -58,7 +58,7 @@ class Thread:
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], Thread]]:
     """Starts an engine thread with the scripted engine as its process."""
-    monkeypatch.setattr(spawn, "engine_command", lambda: [sys.executable, scripted_engine.__file__])
+    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, scripted_engine.__file__])
     with contextlib.ExitStack() as stack:
 
         def make() -> Thread:

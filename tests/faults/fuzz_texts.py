@@ -19,7 +19,7 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from talkcli.engine import protocol, spawn
+from talkcli.engine import process, protocol
 from tests.faults.fuzz_texts_generator import Case, cases, dated
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Tally:
 
 def engine_command(guarded: bool) -> list[str]:
     """Return the command line of an engine process, with or without the guard before the library."""
-    *program, code = spawn.engine_command()
+    *program, code = process.engine_command()
     return [*program, code if guarded else code.replace("from talkcli", f"{_UNGUARDED}from talkcli", 1)]
 
 
@@ -78,7 +78,7 @@ class Speaker:
         self._file = os.path.join(directory, f"{id(self)}.wav")
         self._command = engine_command(guarded)
         self._tally = tally
-        self._process: spawn.EngineProcess | None = None
+        self._process: process.EngineProcess | None = None
         self._events: list[protocol.Event | None] = []
         self._said = 0
         self.voices: list[str] = []
@@ -121,7 +121,7 @@ class Speaker:
     def _start(self) -> None:
         first = not self.voices
         configure = protocol.Configure(os.getpid(), None, f"file:{self._file}", None, None, list_voices=first)
-        self._process = spawn.EngineProcess(configure, command=self._command)
+        self._process = process.EngineProcess(configure, command=self._command)
         limit = time.monotonic() + _START
         assert isinstance(self._until(protocol.Ready, limit), protocol.Ready)
         if first:

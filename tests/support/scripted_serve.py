@@ -6,7 +6,7 @@ import os
 import sys
 
 from talkcli.cli import main as run_talk
-from talkcli.engine import spawn
+from talkcli.engine import process
 
 _ENGINE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "scripted_engine.py")
 
@@ -18,7 +18,7 @@ def engine_command() -> list[str]:
 
 def replace_engine() -> None:
     """Have this process start the scripted engine."""
-    spawn.engine_command = engine_command
+    process.engine_command = engine_command
 
 
 def main() -> None:
