@@ -11,7 +11,7 @@ import pytest
 
 import talkcli
 from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard
-from talkcli.client.backlog import MAX_FEEDBACK, MAX_STATES, Backlog
+from talkcli.client.event_buffer import MAX_FEEDBACK, MAX_STATES, EventBuffer
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.protocol import events
@@ -105,26 +105,26 @@ def test_library_is_imported_from_one_place() -> None:
         _ = talkcli.Speaker
 
 
-def test_backlog_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
-    backlog = Backlog()
+def test_buffer_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
+    buffer = EventBuffer()
     state, word = StateChanged("g", State.ACTIVE), WordHeard("g", "a", 0, 1, 1, 0.0)
     for number in range(MAX_FEEDBACK + 2):
-        backlog.add(WordHeard("g", "a", 0, 1, number, 0.0))
+        buffer.add(WordHeard("g", "a", 0, 1, number, 0.0))
         if number == 5:
-            backlog.add(state)
-    assert backlog.take() == WordHeard("g", "a", 0, 1, 2, 0.0)  # 0 and 1 were dropped
-    assert [backlog.take() for _ in range(4)][3] == state
-    assert backlog.take() == WordHeard("g", "a", 0, 1, 6, 0.0)
-    while backlog.take():
+            buffer.add(state)
+    assert buffer.take() == WordHeard("g", "a", 0, 1, 2, 0.0)  # 0 and 1 were dropped
+    assert [buffer.take() for _ in range(4)][3] == state
+    assert buffer.take() == WordHeard("g", "a", 0, 1, 6, 0.0)
+    while buffer.take():
         pass
     for _ in range(MAX_STATES):
-        backlog.add(state)
-    assert not backlog.overrun
-    backlog.add(state)
-    backlog.add(word)
-    assert backlog.overrun
+        buffer.add(state)
+    assert not buffer.overrun
+    buffer.add(state)
+    buffer.add(word)
+    assert buffer.overrun
     taken = 0
-    while backlog.take():
+    while buffer.take():
         taken += 1
     assert taken == MAX_STATES  # nothing that came after what is missing
 

@@ -16,9 +16,9 @@ import os
 import select
 
 from talkcli import __version__
-from talkcli.client.backlog import MAX_STATES, Backlog
 from talkcli.client.connection import SILENCE_LIMIT, Connection
 from talkcli.client.dial import ANSWER_LIMIT
+from talkcli.client.event_buffer import MAX_STATES, EventBuffer
 from talkcli.client.goal import Followed, GoalHandle
 from talkcli.client.outgoing import batches, check, check_key, full_id, too_long
 from talkcli.errors import Lost, UnknownGoal, UsageError
@@ -294,27 +294,27 @@ class Client:
         Words that nobody takes in time are dropped, the oldest first (`n` has gaps then). States are not: where 10,000
         wait, because other threads use this client and none takes these, it ends with Lost, too.
         """
-        backlog = Backlog()
+        buffer = EventBuffer()
 
         def accepted(reply: JsonObject, items: list[JsonObject]) -> None:
-            backlog.add(Snapshot(ServerStatus.from_reply(reply, items)))
-            self._followed.watch(backlog)
+            buffer.add(Snapshot(ServerStatus.from_reply(reply, items)))
+            self._followed.watch(buffer)
 
         self._connection.request(Watch(), accepted)
-        return self._take_all(backlog)
+        return self._take_all(buffer)
 
     # -- inside
 
     def _full_id(self, goal_id: str) -> str:
         return full_id(goal_id, self._connection.line.boot)
 
-    def _take_all(self, backlog: Backlog) -> Iterator[Event]:
+    def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
         event: Event | None = None
 
         def arrived() -> bool:
             nonlocal event
-            event = backlog.take()
-            return event is not None or backlog.overrun
+            event = buffer.take()
+            return event is not None or buffer.overrun
 
         while self._connection.wait_until(arrived, lambda: None, SILENCE_LIMIT):
             if event is None:

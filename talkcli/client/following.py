@@ -57,7 +57,7 @@ class _Stream:
     def arrived(self) -> bool:
         """Take what has come for all of them, and tell whether there is something; under the connection's lock."""
         for handle in self.going:
-            while (event := handle._backlog.take()) is not None:
+            while (event := handle._buffer.take()) is not None:
                 self._add(handle, event)
             if handle.state.terminal:
                 self._found.append((self._last[handle.id], handle, Result(handle.goal)))

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import time
 
-from talkcli.client.backlog import Backlog
 from talkcli.client.connection import SILENCE_LIMIT
+from talkcli.client.event_buffer import EventBuffer
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.options import Cancel
@@ -61,7 +61,7 @@ class GoalHandle:
         self._fed = False
         #: since when the server has said that it is alive, by the monotonic clock
         self._followed_at = 0.0
-        self._backlog = Backlog()
+        self._buffer = EventBuffer()
         #: whether its Result has been handed out
         self._told = False
 
@@ -118,7 +118,7 @@ class GoalHandle:
 
         def arrived() -> bool:
             nonlocal event
-            event = self._backlog.take()
+            event = self._buffer.take()
             return event is not None or self.state.terminal
 
         if not (self._followed or self.state.terminal):
@@ -155,14 +155,14 @@ class GoalHandle:
             # Its end comes with the result, which says how and why.
             if not event.state.terminal:
                 self.goal = replace(self.goal, state=event.state)
-            self._backlog.add(event)
+            self._buffer.add(event)
         else:
             if isinstance(event, PausedChanged):
                 self.speech_paused = event.paused
                 held = event.paused and event.id == self.id and self.state is State.ACTIVE
                 self.goal = replace(self.goal, paused=held)
             if self._fed:
-                self._backlog.add(event)
+                self._buffer.add(event)
 
     def _settle(self, goal: Goal) -> None:
         """Take up what the server says of the goal now, unless it is known to have ended."""
@@ -175,7 +175,7 @@ class GoalHandle:
 
         def arrived() -> bool:
             nonlocal event
-            event = self._backlog.take()
+            event = self._buffer.take()
             return event is not None or self.state.terminal
 
         late = False
@@ -221,7 +221,7 @@ class Followed:
 
     def __init__(self) -> None:
         self._handles: dict[str, list[GoalHandle]] = {}
-        self._watches: WeakSet[Backlog] | None = None
+        self._watches: WeakSet[EventBuffer] | None = None
 
     def add(self, handle: GoalHandle, *, feedback: bool) -> None:
         """Tell a handle of its goal from now on."""
@@ -231,13 +231,13 @@ class Followed:
             handle._followed_at = time.monotonic()
         handle._followed = True
 
-    def watch(self, backlog: Backlog) -> None:
-        """Put everything that happens into this backlog, as long as somebody holds it."""
+    def watch(self, buffer: EventBuffer) -> None:
+        """Put everything that happens into this buffer, as long as somebody holds it."""
         from weakref import WeakSet  # few watch, and all would wait for the import
 
         # A watch ends when nobody holds its iterator any more.
         self._watches = WeakSet() if self._watches is None else self._watches
-        self._watches.add(backlog)
+        self._watches.add(buffer)
 
     def hear(self, message: JsonObject) -> None:
         """Hand on an event; ValueError where it is none."""
@@ -249,8 +249,8 @@ class Followed:
             self._tell_handles(event)
             # Of the goals that are waited for the states come twice: with the whole goal to those who watch.
             if not isinstance(event, StateChanged) or event.goal or not _tells_all(event.state):
-                for backlog in self._watches or ():
-                    backlog.add(event)
+                for buffer in self._watches or ():
+                    buffer.add(event)
 
     def _tell_handles(self, event: StateChanged | WordHeard | PausedChanged) -> None:
         if isinstance(event, PausedChanged):

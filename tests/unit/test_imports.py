@@ -33,7 +33,7 @@ PURE = [
     "errors",
     "unreachable",
     "frozen",
-    "client.backlog",
+    "client.event_buffer",
     "client.outgoing",
     "engine.gap",
     "engine.restarts",

@@ -18,7 +18,7 @@ MAX_FEEDBACK = 5_000
 MAX_STATES = 10_000
 
 
-class Backlog:
+class EventBuffer:
     """What waits for one reader. Its users hold a lock of theirs."""
 
     __slots__ = ("__weakref__", "_count", "_feedback", "_last", "_states", "overrun")
