@@ -9,7 +9,7 @@ from talkcli.client.event_buffer import MAX_FEEDBACK, MAX_STATES
 from talkcli.errors import Lost, UnknownGoal
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, Result, Snapshot, StateChanged, WordHeard
-from talkcli.protocol.wire import MAX_LINE
+from talkcli.protocol.lines import MAX_LINE
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import OVERVIEW, Peer, goal, result, serving
 

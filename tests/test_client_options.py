@@ -14,7 +14,7 @@ import pytest
 from talkcli import Client, PausedChanged, State, StateChanged
 from talkcli.client.outgoing import batches
 from talkcli.errors import BadOption, RequestRefused, UnknownGoal, UsageError
-from talkcli.protocol.wire import MAX_LINE, encode
+from talkcli.protocol.lines import MAX_LINE, encode
 from talkcli.server import subscribers
 from tests.support.processes import Talk
 

@@ -19,7 +19,8 @@ from talkcli.cli.show import Common
 from talkcli.client.opening import GREETING
 from talkcli.goals.option import FLAG
 from talkcli.goals.options import GIVEN, Cancel, Say
-from talkcli.protocol import wire
+from talkcli.protocol import replies
+from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Hello, Pause, Resume, Status, write_request
 
 if TYPE_CHECKING:
@@ -202,7 +203,7 @@ def assert_sent_as_by_the_library(arguments: list[str], environment: Mapping[str
         if not found or not sent:
             return
         hello, request = library_sends(found)
-    assert sent == (wire.encode(write_request(hello)), wire.encode({"seq": 1, **write_request(request)}))
+    assert sent == (encode(write_request(hello)), encode({"seq": 1, **write_request(request)}))
 
 
 @settings(max_examples=200, deadline=None)
@@ -225,7 +226,7 @@ def test_a_text_goes_early_as_it_is_or_not_at_all(text: str) -> None:
     found = plain.read(["say", "--", text], {})
     sent = found and early.lines(found)
     if sent:
-        assert sent[1] == wire.encode({"seq": 1, "request": "say", "text": text})
+        assert sent[1] == encode({"seq": 1, "request": "say", "text": text})
 
 
 @pytest.mark.parametrize(
@@ -248,8 +249,8 @@ def test_what_may_be_refused_is_not_sent_early(line: list[str]) -> None:
 
 
 def test_the_greeting_that_is_looked_for_is_the_server_s() -> None:
-    assert wire.encode(wire.greeting("0.1.0", 1, "4k7f")).startswith(GREETING)
-    assert not wire.encode(wire.busy_greeting()).startswith(GREETING)
+    assert encode(replies.greeting("0.1.0", 1, "4k7f")).startswith(GREETING)
+    assert not encode(replies.busy_greeting()).startswith(GREETING)
 
 
 def test_click_is_what_is_compared_with() -> None:

@@ -136,9 +136,9 @@ def show_json(message: JsonObject) -> None:
 
 
 def _write_json(stream: TextIO, message: JsonObject) -> None:
-    from talkcli.protocol import wire  # help and completion have nothing to do with JSON
+    from talkcli.protocol.lines import encode  # help and completion have nothing to do with JSON
 
-    line = wire.encode(message)
+    line = encode(message)
     if stream.isatty():
         from talkcli.terminal.printable import printable_json
 

@@ -20,7 +20,7 @@ from talkcli.client.dial import ANSWER_LIMIT, dial, ready
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import Say
-from talkcli.protocol import wire
+from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import write_request
 from talkcli.terminal.printable import printable
 
@@ -124,7 +124,7 @@ class Connection:
         # waits for room isn't accepted yet: who hangs up takes it back.
         interruptible = slow or not isinstance(request, Say)
         try:
-            self._send(wire.encode({"seq": number, **write_request(request)}))
+            self._send(encode({"seq": number, **write_request(request)}))
             self.wait_until(
                 lambda: exchange.reply is not None,
                 lambda: None if slow else exchange.touched + self._patience,
@@ -141,7 +141,7 @@ class Connection:
 
     def post(self, request: Request) -> None:
         """Send a request whose reply nobody waits for."""
-        self._send(wire.encode({"seq": next(self._numbers), **write_request(request)}))
+        self._send(encode({"seq": next(self._numbers), **write_request(request)}))
 
     def _no_reply(self, request: Request) -> TalkError:
         why = self.ended or f"it did not reply within {self._patience:g} s"
@@ -201,7 +201,7 @@ class Connection:
             return
         while self._lines:
             try:
-                message = wire.decode(self._lines.popleft())
+                message = decode(self._lines.popleft())
                 with self.changed:
                     self._dispatch(message)
             except (BadRequest, ValueError) as error:  # ValueError: a goal or an event that is none

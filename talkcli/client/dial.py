@@ -14,7 +14,8 @@ import time
 from talkcli import paths, peers
 from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.protocol import wire
+from talkcli.protocol import replies
+from talkcli.protocol.lines import LineSplitter, decode, encode
 from talkcli.protocol.requests import Hello, write_request
 from talkcli.terminal.printable import printable
 from talkcli.unreachable import DIRECTORY, FILE, FORBIDDEN
@@ -47,7 +48,7 @@ class Line:
     #: the server's process id and version
     pid: int | None
     version: str | None
-    splitter: wire.LineSplitter
+    splitter: LineSplitter
     #: lines that came with the greeting
     lines: list[bytes]
 
@@ -174,12 +175,12 @@ def _greet(
     received: bytes = b"",
 ) -> Line:
     """Greet, unless that has been done, and be greeted; `received`: what has been read of that."""
-    splitter = wire.LineSplitter(limit=None)
+    splitter = LineSplitter(limit=None)
     lines = splitter.feed(received)
     try:
         try:
             if hello:
-                connected.send(wire.encode(write_request(hello)))
+                connected.send(encode(write_request(hello)))
         except BrokenPipeError:
             pass  # it has hung up already, but it may have said why
         end = time.monotonic() + patience
@@ -193,12 +194,12 @@ def _greet(
     except (BrokenPipeError, ConnectionResetError):
         raise ServerUnavailable(f"the server at {path} closed the connection before it answered") from None
     try:
-        greeting = wire.decode(lines.pop(0))
+        greeting = decode(lines.pop(0))
     except BadRequest:
         raise ServerUnavailable(f"what answers at {path} is no talk server") from None
     if "talk" not in greeting:
         raise ServerUnavailable(f"what answers at {path} is no talk server")
-    wire.check_greeting(greeting, version)
+    replies.check_greeting(greeting, version)
     if "error" in greeting:
         raise AccessDenied(f"the server refuses: {printable(str(greeting.get('message') or greeting['error']))}")
     boot, pid, server_version = greeting.get("boot"), greeting.get("pid"), greeting.get("version")

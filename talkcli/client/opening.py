@@ -18,7 +18,7 @@ from talkcli.frozen import TYPE_CHECKING, frozen, replace
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-#: How a server of this protocol begins its greeting, as `wire.encode` writes it; a test compares the two.
+#: How a server of this protocol begins its greeting, as `protocol.lines` writes it; a test compares the two.
 GREETING = b'{"talk": 1, "version": '
 #: Seconds in which a server greets that is up and has time; whoever waits longer wants to be able to interrupt it.
 AT_ONCE = 0.2

@@ -11,7 +11,7 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.option import MAX_ID, MAX_IDS
 from talkcli.goals.options import Say, bad_key, bad_option
 from talkcli.goals.states import State
-from talkcli.protocol import wire
+from talkcli.protocol.lines import MAX_LINE, encode
 from talkcli.protocol.requests import write_request
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
         size = (_LONGEST_ASCII if plain else _LONGEST_CHARACTER) * len(each) + len('"", ')
         if not parts or size > room or len(parts[-1]) == MAX_IDS:
             parts.append([])
-            room = wire.MAX_LINE - _REST_OF_LINE
+            room = MAX_LINE - _REST_OF_LINE
         room -= size
         parts[-1].append(each)
     return [tuple(each) for each in parts]
@@ -80,10 +80,10 @@ def check(request: Say | Set) -> None:
 def too_long(request: Say) -> Goal | None:
     """Return the goal that the server would have made of a text that doesn't fit into a request, None if it fits."""
     try:
-        line = wire.encode({"seq": _LONGEST_NUMBER, **write_request(request)})
+        line = encode({"seq": _LONGEST_NUMBER, **write_request(request)})
     except ValueError as error:  # NaN in `data`
         raise UsageError(f"'data' is no JSON: {error}") from None
-    if len(line) <= wire.MAX_LINE:
+    if len(line) <= MAX_LINE:
         return None
     message = f"Talk rejected: the text has {len(request.text):,} characters, more than a request can hold"
     return Goal("", State.REJECTED, request.text, reason="text_too_long", message=message)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.players.holders import kill_holders
-from talkcli.protocol.wire import LineSplitter
+from talkcli.protocol.lines import LineSplitter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

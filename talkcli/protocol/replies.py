@@ -1,7 +1,12 @@
-"""What a server's replies and their lists say, as frozen values. Form only, no I/O."""
+"""What a server says to one client: the greeting, the replies, and what they and their lists say, as frozen values.
+
+Form only, no I/O. A change that an older peer could not read needs another PROTOCOL number; `{"request": "cancel"}` and
+`{"request": "status"}` stay the same in all of them.
+"""
 
 from __future__ import annotations
 
+from talkcli.errors import BadRequest, Busy, ProtocolMismatch
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
 
@@ -9,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from talkcli.goals.goal import JsonObject
+
+PROTOCOL = 1
 
 
 @frozen
@@ -75,3 +82,55 @@ def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
 def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
     """Return the goal in a reply, None where it is null; ValueError where it is no goal."""
     return None if reply.get(name) is None else Goal.from_json(reply[name])
+
+
+def greeting(version: str, pid: int, boot: str) -> JsonObject:
+    """Return what a server says first."""
+    return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": []}
+
+
+def busy_greeting() -> JsonObject:
+    """Return what a server says first, and last, that takes no more clients."""
+    return {"talk": PROTOCOL, "error": "busy"}
+
+
+def check_greeting(message: JsonObject, version: str) -> None:
+    """Raise ProtocolMismatch or Busy where a client of `version` can't go on after this greeting."""
+    theirs = message.get("talk")
+    if theirs != PROTOCOL or isinstance(theirs, bool):
+        server = ascii(message.get("version", "unknown"))
+        older = isinstance(theirs, int) and theirs < PROTOCOL
+        side = "restart the server with the newer version" if older else "upgrade this command"
+        raise ProtocolMismatch(
+            f"this command (version {version}) speaks protocol {PROTOCOL}, the server (version {server}) speaks "
+            f"{theirs!a}: {side}"
+        )
+    if message.get("error") == "busy":
+        raise Busy("the server has as many clients as it takes (`talk serve --max-clients`)", "busy")
+
+
+def ok(seq: int | None, **fields: object) -> JsonObject:
+    """Return the reply that closes a request that was carried out."""
+    return {**_numbered(seq), "ok": True, **fields}
+
+
+def item(seq: int | None, **fields: object) -> JsonObject:
+    """Return one line of a list; the list's reply follows."""
+    return {**_numbered(seq), **fields}
+
+
+def failure(seq: int | None, code: str, message: str) -> JsonObject:
+    """Return the reply to a request that was not carried out."""
+    return {**_numbered(seq), "ok": False, "error": {"code": code, "message": message}}
+
+
+def take_seq(message: JsonObject) -> int | None:
+    """Take the number of a request out of it; BadRequest where it is no number."""
+    seq = message.pop("seq", None)
+    if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
+        raise BadRequest('"seq" must be an integer', "bad_field")
+    return seq
+
+
+def _numbered(seq: int | None) -> JsonObject:
+    return {} if seq is None else {"seq": seq}

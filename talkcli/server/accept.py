@@ -10,7 +10,8 @@ import errno
 import resource
 from typing import TYPE_CHECKING
 
-from talkcli.protocol import wire
+from talkcli.protocol import replies
+from talkcli.protocol.lines import encode
 from talkcli.server import log
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ class Acceptor:
             f"clients are turned away: only {self._limit} files may be open (raise LimitNOFILE= or ulimit -n)",
         )
         with connected, contextlib.suppress(OSError):  # it is gone again
-            connected.send(wire.encode(wire.busy_greeting()))
+            connected.send(encode(replies.busy_greeting()))
 
     def _pause(self, error: OSError) -> None:
         """Leave the connections waiting for a while: the loop would ask for them without end."""

@@ -13,7 +13,8 @@ from talkcli.frozen import replace
 from talkcli.goals.goal import By
 from talkcli.goals.options import Cancel, Say, Set, as_shown, bad_option, given
 from talkcli.goals.states import State
-from talkcli.protocol import wire
+from talkcli.protocol import replies
+from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
 from talkcli.server import log
 from talkcli.server.pauses import Pauses
@@ -101,7 +102,7 @@ class Answers:
         try:
             self._by_kind[type(request)](connection, seq, request)
         except UnknownGoal as error:
-            connection.reply(wire.failure(seq, error.code, str(error)))
+            connection.reply(replies.failure(seq, error.code, str(error)))
 
     def _awaits_voices(self, request: Request) -> bool:
         """Whether it can't be carried out yet: the voices are needed, or a goal that came before it needs them."""
@@ -151,9 +152,9 @@ class Answers:
         ended = submitted.attached and state.terminal
         if (request.wait or request.feedback) and not ended:
             self._service.subscribers.await_result(record.id, connection, feedback=request.feedback)
-        connection.reply(wire.ok(seq, goal=goal, **extra))
+        connection.reply(replies.ok(seq, goal=goal, **extra))
         if ended and (request.wait or request.feedback):
-            connection.publish(wire.encode({"event": "result", "goal": goal}))
+            connection.publish(encode({"event": "result", "goal": goal}))
         self._service.apply(submitted.effects)
         return submitted
 
@@ -174,14 +175,14 @@ class Answers:
         def goals() -> Iterator[JsonObject]:
             for record, state in zip(records, states, strict=True):
                 goal = spoken if spoken and record is active else record.snapshot(state)
-                yield wire.item(seq, goal=goal.to_json())
+                yield replies.item(seq, goal=goal.to_json())
 
         def results() -> Iterator[JsonObject]:
             for record, state in zip(records, states, strict=True):
                 if state.terminal:  # the subscribers are told of the others
                     yield {"event": "result", "goal": record.snapshot().to_json()}
 
-        connection.stream(goals(), wire.ok(seq, count=len(records)), results())
+        connection.stream(goals(), replies.ok(seq, count=len(records)), results())
 
     def _cancel(self, connection: Connection, seq: int | None, request: Cancel) -> None:
         later, now = self._service.later, self._service.now()
@@ -206,7 +207,7 @@ class Answers:
         if request.id is None:
             self._send_overview(connection, seq)
         else:
-            connection.reply(wire.ok(seq, goal=self._find(request.id).snapshot().to_json()))
+            connection.reply(replies.ok(seq, goal=self._find(request.id).snapshot().to_json()))
 
     def _watch(self, connection: Connection, seq: int | None, _: Watch) -> None:
         self._send_overview(connection, seq)
@@ -220,13 +221,13 @@ class Answers:
 
     def _log(self, connection: Connection, seq: int | None, request: Log) -> None:
         records = list(self._scheduler.history.log(request.count))
-        items = (wire.item(seq, goal=each.snapshot().to_json()) for each in reversed(records))
-        connection.stream(items, wire.ok(seq, count=len(records)))
+        items = (replies.item(seq, goal=each.snapshot().to_json()) for each in reversed(records))
+        connection.stream(items, replies.ok(seq, count=len(records)))
 
     def _set(self, connection: Connection, seq: int | None, request: Set) -> None:
         words = bad_option(request)
         if words:
-            connection.reply(wire.failure(seq, "bad_option", words))
+            connection.reply(replies.failure(seq, "bad_option", words))
         else:
             self._change_settings(connection, seq, request)
 
@@ -234,7 +235,7 @@ class Answers:
         service, scheduler = self._service, self._scheduler
         fault = service.voice_fault(request.voice)
         if fault:
-            connection.reply(wire.failure(seq, *fault))
+            connection.reply(replies.failure(seq, *fault))
             return
         changed = given(request)
         scheduler.settings = replace(scheduler.settings, **changed)
@@ -242,7 +243,7 @@ class Answers:
         if changed:
             values = ", ".join(f"{name} {value}" for name, value in changed.items())
             log.line(f"set to {log.shown(values)} by {log.who(connection.sender)}")
-        connection.reply(wire.ok(seq, settings=as_shown(scheduler.settings)))
+        connection.reply(replies.ok(seq, settings=as_shown(scheduler.settings)))
 
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)
@@ -258,13 +259,13 @@ class Answers:
 
         def items() -> Iterator[JsonObject]:
             for record in pending:
-                yield wire.item(seq, pending=record.snapshot().to_json())
+                yield replies.item(seq, pending=record.snapshot().to_json())
             for record in reversed(recent):
-                yield wire.item(seq, recent=record.snapshot().to_json())
+                yield replies.item(seq, recent=record.snapshot().to_json())
 
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
-        connection.stream(items(), wire.ok(seq, server=self._describe(), active=now))
+        connection.stream(items(), replies.ok(seq, server=self._describe(), active=now))
 
     def _describe(self) -> JsonObject:
         service, settings = self._service, self._service.settings
@@ -296,20 +297,22 @@ class Answers:
             words = f"the engine can't list its voices now: it is {self._service.engine_words}"
             if self._scheduler.active:
                 words += ", and busy with its first sentence: ask again after that"
-            connection.reply(wire.failure(seq, "engine_failed", words))
+            connection.reply(replies.failure(seq, "engine_failed", words))
             return
-        items = (wire.item(seq, voice={"id": each.id, "language": each.language, "name": each.name}) for each in voices)
-        connection.stream(items, wire.ok(seq, count=len(voices)))
+        items = (
+            replies.item(seq, voice={"id": each.id, "language": each.language, "name": each.name}) for each in voices
+        )
+        connection.stream(items, replies.ok(seq, count=len(voices)))
 
     def _report_cancel(self, connection: Connection, seq: int | None, done: Cancelled) -> None:
         ended = list(done.recalled)
         if done.stopping and done.stopping.state is not State.SUCCEEDED:
             ended.append(done.stopping)
-        canceled = (wire.item(seq, canceled=each.snapshot().to_json()) for each in ended)
-        before = (wire.item(seq, ended=each.snapshot().to_json()) for each in done.ended)
+        canceled = (replies.item(seq, canceled=each.snapshot().to_json()) for each in ended)
+        before = (replies.item(seq, ended=each.snapshot().to_json()) for each in done.ended)
         if done.unknown:
             words = ", ".join(repr(each) for each in done.unknown)
-            reply = wire.failure(seq, UnknownGoal.code, f"no goal {words} is known: see `talk status`")
+            reply = replies.failure(seq, UnknownGoal.code, f"no goal {words} is known: see `talk status`")
         else:
-            reply = wire.ok(seq, count=len(ended))
+            reply = replies.ok(seq, count=len(ended))
         connection.stream(chain(canceled, before), reply)

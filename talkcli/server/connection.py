@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Protocol
 from talkcli.errors import BadRequest, LineTooLong
 from talkcli.frozen import replace
 from talkcli.goals.options import Cancel
-from talkcli.protocol import wire
+from talkcli.protocol import replies
+from talkcli.protocol.lines import LineSplitter, decode, encode
 from talkcli.protocol.requests import Hello, Request, Status, read_request
 from talkcli.server.stream import Stream
 
@@ -80,7 +81,7 @@ class Connection:
         self._handler = handler
         self._loop = loop
         self._stream = Stream(loop, handler.streams, connected, self, SOFT_OUTPUT)
-        self._splitter = wire.LineSplitter()
+        self._splitter = LineSplitter()
         self._lines: deque[bytes] = deque()
         #: what has to be sent in its order while a list is on its way: lists, and what came after them
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
@@ -185,7 +186,7 @@ class Connection:
 
     def refuse(self, code: str, words: str) -> None:
         """Say why, and close."""
-        self._write(wire.failure(None, code, words))
+        self._write(replies.failure(None, code, words))
         self.close()
 
     def close(self) -> None:
@@ -208,7 +209,7 @@ class Connection:
         if not self._outbox:
             self._write(message)
         elif len(self._outbox) < MAX_HELD:
-            line = message if isinstance(message, bytes) else wire.encode(message)
+            line = message if isinstance(message, bytes) else encode(message)
             self._outbox.append(line)
             self._stream.hold(len(line))
         else:
@@ -236,7 +237,7 @@ class Connection:
             self._line_limit = None
 
     def _write(self, message: JsonObject | bytes) -> None:
-        self._stream.write(message if isinstance(message, bytes) else wire.encode(message))
+        self._stream.write(message if isinstance(message, bytes) else encode(message))
         if self._stream.size > HARD_OUTPUT:
             self.drop()
 
@@ -296,13 +297,13 @@ class Connection:
     def _take(self, line: bytes) -> None:
         seq = None
         try:
-            message = wire.decode(line)
+            message = decode(line)
             self._bad_lines = 0
-            seq = wire.take_seq(message)
+            seq = replies.take_seq(message)
             request = read_request(message)
         except BadRequest as error:
             self._bad_lines += 1
-            self.reply(wire.failure(seq, error.code, str(error)))
+            self.reply(replies.failure(seq, error.code, str(error)))
             if self._bad_lines >= MAX_BAD_LINES or not self.admitted:
                 self.close()
             return
@@ -315,20 +316,20 @@ class Connection:
             self._carry_out(seq, request)
         except Exception as error:  # noqa: BLE001 - one client's request must not take the voice from the others
             self._handler.failed(request.kind, error)
-            self.reply(wire.failure(seq, "internal_error", f"{request.kind} failed: a bug of talk's, see its log"))
+            self.reply(replies.failure(seq, "internal_error", f"{request.kind} failed: a bug of talk's, see its log"))
 
     def _let_in(self, request: Request) -> bool:
         """Let a client in whose business is urgent; send the others away from a full server."""
         if isinstance(request, Status | Cancel) or (isinstance(request, Hello) and request.urgent):
             self.admit()
             return True
-        self._write(wire.busy_greeting())
+        self._write(replies.busy_greeting())
         self.close()
         return False
 
     def _carry_out(self, seq: int | None, request: Request) -> None:
         if isinstance(request, Hello):
             self.sender = replace(self.sender, name=request.name)
-            self.reply(wire.ok(seq))
+            self.reply(replies.ok(seq))
         else:
             self._handler.handle(self, seq, request)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.goals.goal import By
 from talkcli.goals.states import State
-from talkcli.protocol import wire
+from talkcli.protocol import replies
 from talkcli.server import log
 
 if TYPE_CHECKING:
@@ -108,9 +108,9 @@ class Pauses:
             return
         self._awaited.remove(awaited)
         words = f"speech is paused, but {awaited.record.id} was not known to be silent within {PAUSE_LIMIT:g} s"
-        awaited.connection.reply(wire.failure(awaited.seq, "not_silent", words))
+        awaited.connection.reply(replies.failure(awaited.seq, "not_silent", words))
         awaited.connection.settle()
 
     def _report(self, connection: Connection, seq: int | None, goal: Record | None) -> None:
         told = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
-        connection.reply(wire.ok(seq, paused=self._scheduler.paused, goal=told))
+        connection.reply(replies.ok(seq, paused=self._scheduler.paused, goal=told))

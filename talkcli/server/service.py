@@ -22,7 +22,8 @@ from talkcli.goals.goal import Sender
 from talkcli.goals.options import DEFAULT_VOICE, Cancel, for_engine
 from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.states import State
-from talkcli.protocol import wire
+from talkcli.protocol import replies
+from talkcli.protocol.lines import encode
 from talkcli.server import log
 from talkcli.server.clock import LOOK_EVERY, elapsed
 from talkcli.server.later import Later
@@ -130,11 +131,11 @@ class Service:
         pid, uid = peers.credentials(stream.socket)
         if uid not in {os.getuid(), 0} and not self._open_to_others:
             words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
-            stream.write(wire.encode({"talk": wire.PROTOCOL, "error": "permission_denied", "message": words}))
+            stream.write(encode({"talk": replies.PROTOCOL, "error": "permission_denied", "message": words}))
             stream.close()
             return
         if len(self.connections) >= self.settings.max_clients + DOOR:
-            stream.write(wire.encode(wire.busy_greeting()))
+            stream.write(encode(replies.busy_greeting()))
             stream.close()
             return
         connection.sender = Sender(pid or None, uid, peers.command_of(pid), peers.parent_command_of(pid))
@@ -143,7 +144,7 @@ class Service:
         self.deserted.clear()
 
     def greeting(self) -> JsonObject:
-        return wire.greeting(__version__, os.getpid(), self.boot)
+        return replies.greeting(__version__, os.getpid(), self.boot)
 
     def left(self, connection: Connection) -> None:
         """Forget a client; its goals go on."""

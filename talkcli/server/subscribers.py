@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from talkcli.goals.states import State
-from talkcli.protocol import wire
+from talkcli.protocol.lines import encode
 
 if TYPE_CHECKING:
     import asyncio
@@ -83,7 +83,7 @@ class Subscribers:
         event: JsonObject = {"event": "state", "id": record.id, "state": state.name, "n": self._count, "at": at}
         self._tell_watchers(record, state, event)
         if state.terminal and waiting:
-            self._send_result(record, wire.encode(event))
+            self._send_result(record, encode(event))
         elif waiting:
             _publish(event, waiting)
 
@@ -114,7 +114,7 @@ class Subscribers:
 
     def _send_result(self, record: Record, last: bytes) -> None:
         """Send a goal's last state and its result, in one piece: a thousand may wait for it."""
-        piece = last + wire.encode({"event": "result", "goal": record.snapshot().to_json()})
+        piece = last + encode({"event": "result", "goal": record.snapshot().to_json()})
         for connection in self._waiters.pop(record.id):
             connection.publish(piece)
             awaited = self._awaited[connection]
@@ -136,6 +136,6 @@ class Subscribers:
 
 
 def _publish(event: JsonObject, connections: Iterable[Connection], *, feedback: bool = False) -> None:
-    line = wire.encode(event)
+    line = encode(event)
     for connection in list(connections):
         connection.publish(line, feedback=feedback)

@@ -213,9 +213,9 @@ def _value(value: object) -> str:
 
 
 def _json(data: JsonObject) -> str:
-    from talkcli.protocol import wire
+    from talkcli.protocol.lines import encode
 
-    return wire.encode(data).decode().rstrip("\n")
+    return encode(data).decode().rstrip("\n")
 
 
 def _clock(seconds: float | None) -> str:

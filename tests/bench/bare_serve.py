@@ -21,7 +21,8 @@ from collections import deque
 
 from talkcli.goals.goal import Goal, Sender
 from talkcli.goals.states import State
-from talkcli.protocol import wire
+from talkcli.protocol import replies
+from talkcli.protocol.lines import LineSplitter, encode
 
 #: An engine process that ends each sentence at once.
 _ENGINE = "import os\nwhile data := os.read(0, 65536):\n    os.write(0, data)"
@@ -96,12 +97,12 @@ class Client(asyncio.Protocol):
     def __init__(self, server: Server) -> None:
         self._server = server
         self._transport: asyncio.Transport
-        self._lines = wire.LineSplitter()
+        self._lines = LineSplitter()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        self.send(wire.greeting("0", os.getpid(), "bare"))
+        self.send(replies.greeting("0", os.getpid(), "bare"))
 
     def data_received(self, data: bytes) -> None:
         for line in self._lines.feed(data):
@@ -109,11 +110,11 @@ class Client(asyncio.Protocol):
             if request["request"] == "say":
                 self._server.submit(self, request["seq"])
             else:
-                self.send(wire.ok(request.get("seq"), **_READY))
+                self.send(replies.ok(request.get("seq"), **_READY))
 
     def send(self, *messages: dict[str, object]) -> None:
         """Write these lines in one piece."""
-        self._transport.write(b"".join(map(wire.encode, messages)))
+        self._transport.write(b"".join(map(encode, messages)))
 
 
 def _goal(goal_id: str, state: State) -> dict[str, object]:

@@ -14,7 +14,8 @@ from talkcli.goals.effects import Now
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Cancel, Say
 from talkcli.goals.scheduler import Scheduler
-from talkcli.protocol import wire
+from talkcli.protocol import replies
+from talkcli.protocol.lines import encode
 from tests.bench.installed import serve
 from tests.bench.table import Limit, Row
 from tests.bench.wires import Wires
@@ -60,7 +61,7 @@ class Crowd:
     def status(self, lines: int) -> None:
         """Make so many lines of a status."""
         for record in islice(self.scheduler.pending(), lines):
-            wire.encode(wire.item(1, pending=record.snapshot().to_json()))
+            encode(replies.item(1, pending=record.snapshot().to_json()))
 
 
 def queueing(stage: Stage) -> list[Row]:
@@ -124,9 +125,7 @@ def memory(stage: Stage) -> Row:
 
 
 def _goals(texts: list[str]) -> bytes:
-    return b"".join(
-        wire.encode({"seq": number, "request": "say", "text": text}) for number, text in enumerate(texts, 1)
-    )
+    return b"".join(encode({"seq": number, "request": "say", "text": text}) for number, text in enumerate(texts, 1))
 
 
 def _microseconds(seconds: list[float]) -> tuple[float, ...]:

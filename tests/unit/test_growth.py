@@ -16,7 +16,8 @@ import pytest
 from talkcli.goals.options import Say
 from talkcli.goals.queue import Pending
 from talkcli.goals.record import Record
-from talkcli.protocol import wire
+from talkcli.protocol import replies
+from talkcli.protocol.lines import encode
 from tests.unit.robot import ARM, Robot
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ def start_the_next(crowd: Crowd) -> int:
 def a_status_line(crowd: Crowd) -> int:
     goals = crowd.scheduler.pending()
     next(goals)
-    return steps(lambda: wire.encode(wire.item(7, pending=next(goals).snapshot().to_json())))
+    return steps(lambda: encode(replies.item(7, pending=next(goals).snapshot().to_json())))
 
 
 def look_at_the_clock(crowd: Crowd) -> int:

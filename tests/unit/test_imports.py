@@ -68,7 +68,7 @@ class Import:
 
 
 def module_name(path: Path) -> str:
-    """Return a file's name within the package: `wire`, `engine.supervisor`, and "" for the package itself."""
+    """Return a file's name within the package: `paths`, `engine.supervisor`, and "" for the package itself."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from talkcli.errors import BadRequest
 from talkcli.goals.option import MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG
 from talkcli.goals.options import Cancel, Say, Set
+from talkcli.protocol.lines import decode, encode
+from talkcli.protocol.replies import failure
 from talkcli.protocol.requests import (
     KINDS,
     MAX_NAME,
@@ -26,7 +28,6 @@ from talkcli.protocol.requests import (
     read_request,
     write_request,
 )
-from talkcli.protocol.wire import decode, encode, failure
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject

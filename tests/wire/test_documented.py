@@ -18,7 +18,7 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.history import MAX_ENDED, MAX_REJECTED
 from talkcli.goals.options import Cancel
 from talkcli.goals.states import State
-from talkcli.protocol import wire
+from talkcli.protocol.lines import MAX_LINE
 from talkcli.protocol.requests import KINDS, read_request
 from talkcli.server import connection, stream
 from talkcli.server.answers import RECENT
@@ -149,7 +149,7 @@ def test_what_is_kept_is_what_the_text_says() -> None:
 
 def test_limits_are_those_of_the_code() -> None:
     limits = {row[0]: row[1] for row in tables(section("Errors and limits"))[1][1:]}
-    assert limits["a request"].startswith(f"{wire.MAX_LINE:,} bytes")
+    assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")
     assert f"within {connection.FIRST_REQUEST:g} s" in limits["the first request"]
     assert f"within {connection.LINE_LIMIT:g} s" in limits["a line"]
     assert limits["lines that are no requests"].startswith(f"{connection.MAX_BAD_LINES} ")

@@ -15,7 +15,8 @@ import pytest
 
 from talkcli.errors import RequestRefused, refusal
 from talkcli.goals.goal import Goal
-from talkcli.protocol import events, wire
+from talkcli.protocol import events, replies
+from talkcli.protocol.lines import decode
 from talkcli.protocol.replies import ServerStatus
 from talkcli.protocol.requests import KINDS
 from tests.conformance.rawsocket import Raw
@@ -159,10 +160,10 @@ def test_every_request_and_field_is_recorded() -> None:
 def test_client_of_today_understands_every_recorded_line() -> None:
     known = 0
     for line in said_by_server():
-        message = wire.decode(line.text.encode())
+        message = decode(line.text.encode())
         assert message == line.message
         if "talk" in message:
-            wire.check_greeting(message, "any")
+            replies.check_greeting(message, "any")
         elif "event" in message:
             event = events.from_json(message)
             assert event is not None, line

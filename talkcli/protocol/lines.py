@@ -1,8 +1,7 @@
-"""The wire: one JSON object a line, UTF-8, and the greeting. No I/O: bytes go in, objects come out, and back.
+"""Lines: one JSON object each, UTF-8. No I/O: bytes go in, objects come out, and back.
 
 Rules for this file: it knows lines and their limits, never what a request means. Anything that comes from outside ends
-as an object or as a BadRequest, whatever bytes they were. A change that an older peer could not read needs another
-PROTOCOL number; `{"request": "cancel"}` and `{"request": "status"}` stay the same in all of them.
+as an object or as a BadRequest, whatever bytes they were.
 """
 
 from __future__ import annotations
@@ -10,13 +9,11 @@ from __future__ import annotations
 import json
 import math
 
-from talkcli.errors import BadRequest, Busy, LineTooLong, ProtocolMismatch
+from talkcli.errors import BadRequest, LineTooLong
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
-
-PROTOCOL = 1
 
 #: Bytes of one request line, its newline included: the longest text (40,000 bytes of UTF-8) fits with room for quotes,
 #: and so do 10,000 characters that are all escaped as \uXXXX.
@@ -117,55 +114,3 @@ class LineSplitter:
     def _check(self, line: bytearray, before: list[bytes]) -> None:
         if self._limit is not None and len(line) + 1 > self._limit:
             raise LineTooLong(self._limit, before)
-
-
-def greeting(version: str, pid: int, boot: str) -> JsonObject:
-    """Return what a server says first."""
-    return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": []}
-
-
-def busy_greeting() -> JsonObject:
-    """Return what a server says first, and last, that takes no more clients."""
-    return {"talk": PROTOCOL, "error": "busy"}
-
-
-def check_greeting(message: JsonObject, version: str) -> None:
-    """Raise ProtocolMismatch or Busy where a client of `version` can't go on after this greeting."""
-    theirs = message.get("talk")
-    if theirs != PROTOCOL or isinstance(theirs, bool):
-        server = ascii(message.get("version", "unknown"))
-        older = isinstance(theirs, int) and theirs < PROTOCOL
-        side = "restart the server with the newer version" if older else "upgrade this command"
-        raise ProtocolMismatch(
-            f"this command (version {version}) speaks protocol {PROTOCOL}, the server (version {server}) speaks "
-            f"{theirs!a}: {side}"
-        )
-    if message.get("error") == "busy":
-        raise Busy("the server has as many clients as it takes (`talk serve --max-clients`)", "busy")
-
-
-def ok(seq: int | None, **fields: object) -> JsonObject:
-    """Return the reply that closes a request that was carried out."""
-    return {**_numbered(seq), "ok": True, **fields}
-
-
-def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return one line of a list; the list's reply follows."""
-    return {**_numbered(seq), **fields}
-
-
-def failure(seq: int | None, code: str, message: str) -> JsonObject:
-    """Return the reply to a request that was not carried out."""
-    return {**_numbered(seq), "ok": False, "error": {"code": code, "message": message}}
-
-
-def take_seq(message: JsonObject) -> int | None:
-    """Take the number of a request out of it; BadRequest where it is no number."""
-    seq = message.pop("seq", None)
-    if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
-        raise BadRequest('"seq" must be an integer', "bad_field")
-    return seq
-
-
-def _numbered(seq: int | None) -> JsonObject:
-    return {} if seq is None else {"seq": seq}

@@ -1,0 +1,97 @@
+"""The greeting, and the form of replies."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+
+from talkcli.errors import BadRequest, Busy, ProtocolMismatch
+from talkcli.protocol.lines import decode, encode
+from talkcli.protocol.replies import (
+    PROTOCOL,
+    busy_greeting,
+    check_greeting,
+    failure,
+    greeting,
+    item,
+    ok,
+    take_seq,
+)
+from tests.unit.test_lines import objects
+
+if TYPE_CHECKING:
+    from talkcli.goals.goal import JsonObject
+
+
+def test_greeting_says_protocol_version_process_and_boot() -> None:
+    message = greeting("1.2.3", 4711, "4k7f")
+    assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "4k7f", "features": []}
+    assert PROTOCOL == 1
+    check_greeting(decode(encode(message)), "0.9")
+
+
+def test_greeting_with_features_and_fields_of_the_future_is_accepted() -> None:
+    check_greeting({**greeting("9.9", 1, "abcd"), "features": ["pause"], "new": {"a": 1}}, "0.1")
+
+
+@pytest.mark.parametrize(
+    ("theirs", "side"),
+    [(2, "upgrade this command"), (99, "upgrade this command"), (0, "restart the server"), (-1, "restart the server")],
+)
+def test_another_protocol_is_a_mismatch_that_says_which_side_to_upgrade(theirs: int, side: str) -> None:
+    with pytest.raises(ProtocolMismatch, match=side) as mismatch:
+        check_greeting({**greeting("3.0", 1, "4k7f"), "talk": theirs}, "0.1")
+    assert mismatch.value.exit_code == 9
+    assert "0.1" in mismatch.value.message
+    assert "3.0" in mismatch.value.message
+
+
+@pytest.mark.parametrize("message", [{}, {"talk": None}, {"talk": "1"}, {"talk": True}, {"talk": [1]}, {"ok": True}])
+def test_what_is_no_greeting_is_a_mismatch(message: JsonObject) -> None:
+    with pytest.raises(ProtocolMismatch):
+        check_greeting(message, "0.1")
+
+
+@given(objects)
+def test_any_object_for_a_greeting_is_accepted_or_a_mismatch(message: JsonObject) -> None:
+    with contextlib.suppress(ProtocolMismatch):
+        check_greeting(message, "0.1")
+        assert message.get("talk") == 1
+
+
+def test_a_server_that_is_full_is_busy() -> None:
+    assert busy_greeting() == {"talk": 1, "error": "busy"}
+    with pytest.raises(Busy) as busy:
+        check_greeting(busy_greeting(), "0.1")
+    assert (busy.value.code, busy.value.exit_code) == ("busy", 5)
+
+
+def test_replies_carry_the_number_of_their_request() -> None:
+    assert ok(3, goal={}) == {"seq": 3, "ok": True, "goal": {}}
+    assert ok(None) == {"ok": True}
+    assert item(3, voice={}) == {"seq": 3, "voice": {}}
+    assert item(None, voice={}) == {"voice": {}}
+    assert failure(3, "unknown_goal", "no") == {
+        "seq": 3,
+        "ok": False,
+        "error": {"code": "unknown_goal", "message": "no"},
+    }
+    assert failure(0, "busy", "no")["seq"] == 0
+
+
+def test_number_of_a_request_is_taken_out_of_it() -> None:
+    message: JsonObject = {"seq": 7, "request": "status"}
+    assert take_seq(message) == 7
+    assert message == {"request": "status"}
+    assert take_seq(message) is None
+    assert take_seq({"seq": None}) is None
+
+
+@pytest.mark.parametrize("seq", ["1", 1.0, True, [], {}])
+def test_number_of_a_request_that_is_no_integer_is_refused(seq: object) -> None:
+    with pytest.raises(BadRequest) as refused:
+        take_seq({"seq": seq})
+    assert refused.value.code == "bad_field"
