@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.terminal.columns import width
 from talkcli.terminal.highlight import MORE, Sentence, View
-from talkcli.terminal.printable import printable
+from talkcli.terminal.text import printable, width
 
 LONG = "the quick brown fox jumps over the lazy dog"
 #: Plain, wide, combining, joined, escaped: what widths go wrong with.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.terminal.columns import width
+from talkcli.terminal.text import width
 from tests.conformance.bareserve import TALK
 from tests.support.terminal import Terminal
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.terminal.columns import width
+from talkcli.terminal.text import width
 from tests.conformance.bareserve import TALK, environment, run
 from tests.support.surroundings import short_directory
 from tests.support.terminal import Terminal

@@ -107,7 +107,7 @@ def pause(options: Common) -> int:
     """Hold speech, and return the exit code."""
     with options.connect() as client:
         held = client.pause()
-    from talkcli.terminal.printable import printable
+    from talkcli.terminal.text import printable
 
     heard = held.spoken[-_MAX_SPOKEN:] if held and held.spoken else ""
     where = f', after "{printable(heard)}"' if heard else ""
@@ -120,7 +120,7 @@ def resume(options: Common) -> int:
     """Go on where speech is held, and return the exit code."""
     with options.connect() as client:
         goal = client.resume()
-    from talkcli.terminal.printable import printable
+    from talkcli.terminal.text import printable
 
     words = f"speech goes on with {printable(goal.id)}" if goal else "speech goes on"
     _tell(options, goal, paused=False, words=words)
@@ -141,7 +141,7 @@ def _show_canceled(done: Canceled, options: Common) -> None:
 def _suggest_key(key: str, client: Client) -> None:
     """Where nothing has this key, but something a similar one, tell whoever typed it."""
     from talkcli.cli.nearest import nearest
-    from talkcli.terminal.printable import printable
+    from talkcli.terminal.text import printable
 
     try:
         status = client.status()
@@ -156,7 +156,7 @@ def _suggest_key(key: str, client: Client) -> None:
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     """Return what is said where no voice speaks a language, which may have been given by its name."""
     from talkcli.cli.nearest import nearest
-    from talkcli.terminal.printable import printable
+    from talkcli.terminal.text import printable
 
     codes = {_language(each): _language(each) for each in voices}
     # "German", "English_(America)": all that speak it are listed by the first part of its code

@@ -29,7 +29,6 @@ from talkcli.cli.usage import (
 )
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, UsageError
 from talkcli.goals.option import FLAG, INTEGER, NUMBER, SECONDS
-from talkcli.terminal.printable import printable
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -294,6 +293,8 @@ def _complete(options: Common) -> int:
 
 def _show_click_error(error: click.ClickException, *, json: bool) -> None:
     """Show a usage error. What was typed may be text of somebody else's, so its controls are escaped."""
+    from talkcli.terminal.text import printable
+
     words = printable(told(error))
     if json:
         show_error(UsageError(words), json=True)

@@ -141,14 +141,14 @@ def _fits(value: str, incomplete: str) -> bool:
 
 
 def _goal_help(goal: Goal) -> str:
-    from talkcli.terminal.printable import printable
+    from talkcli.terminal.text import printable
 
     text = "" if goal.text is None else printable(goal.text, _MAX_TEXT)
     return f"{goal.state.name} {text}"
 
 
 def _voice_help(voice: JsonObject, field: str) -> str:
-    from talkcli.terminal.printable import printable
+    from talkcli.terminal.text import printable
 
     parts = [printable(str(voice.get(each) or ""), _MAX_TEXT) for each in ("name", "language") if each != field]
     return ", ".join(filter(None, parts)) or "voice"

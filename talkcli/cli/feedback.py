@@ -18,9 +18,8 @@ from talkcli.client.dial import ready
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
-from talkcli.terminal.columns import Screen
 from talkcli.terminal.highlight import Sentence
-from talkcli.terminal.printable import printable
+from talkcli.terminal.text import Screen, printable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

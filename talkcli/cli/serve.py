@@ -66,7 +66,7 @@ def _warn_of_player(player: str) -> None:
     from talkcli.cli.nearest import nearest
     from talkcli.engine.players.base import AudioFailed
     from talkcli.engine.players.programs import commands, on_path
-    from talkcli.terminal.printable import printable
+    from talkcli.terminal.text import printable
 
     try:
         commands(player, None, 0, on_path, None)
@@ -77,7 +77,7 @@ def _warn_of_player(player: str) -> None:
 
 
 def _print_unit(options: Common, name: str, given: dict[str, Any]) -> None:
-    from talkcli.terminal.printable import printable
+    from talkcli.terminal.text import printable
 
     typed = [each for each in COMMANDS["serve"].options if each.name in options.typed and each.name in given]
     mode = given["socket_mode"] if "socket_mode" in options.typed else None

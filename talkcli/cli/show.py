@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from talkcli.client.opening import Opened
     from talkcli.errors import TalkError
     from talkcli.goals.goal import JsonObject
-    from talkcli.terminal.columns import Screen
+    from talkcli.terminal.text import Screen
 
 #: Standard output's descriptor.
 OUTPUT = 1
@@ -140,7 +140,7 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 
     line = encode(message)
     if stream.isatty():
-        from talkcli.terminal.printable import printable_json
+        from talkcli.terminal.text import printable_json
 
         line = printable_json(line.decode()[:-1]).encode() + b"\n"
     stream.flush()
@@ -200,7 +200,7 @@ def colourful() -> bool:
 
 def screen() -> Screen:
     """Return what standard output is at this moment: how wide, if it is a terminal, and whether it takes colour."""
-    from talkcli.terminal.columns import Screen
+    from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():
         return Screen()

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from talkcli import paths
 from talkcli.errors import UsageError
 from talkcli.frozen import frozen, replace
-from talkcli.terminal.printable import printable
+from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

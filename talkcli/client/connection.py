@@ -22,7 +22,6 @@ from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import Say
 from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import write_request
-from talkcli.terminal.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,6 +40,8 @@ OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
 def _refusal(reply: JsonObject, items: list[JsonObject]) -> RequestRefused:
     error = reply.get("error")
     code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
+    from talkcli.terminal.text import printable  # no start pays for it
+
     refused = refusal(str(code), printable(str(message)))
     refused.items = items
     return refused

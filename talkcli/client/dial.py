@@ -17,7 +17,6 @@ from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.protocol import replies
 from talkcli.protocol.lines import LineSplitter, decode, encode
 from talkcli.protocol.requests import Hello, write_request
-from talkcli.terminal.printable import printable
 from talkcli.unreachable import DIRECTORY, FILE, FORBIDDEN
 
 if TYPE_CHECKING:
@@ -201,6 +200,8 @@ def _greet(
         raise ServerUnavailable(f"what answers at {path} is no talk server")
     replies.check_greeting(greeting, version)
     if "error" in greeting:
+        from talkcli.terminal.text import printable  # no start pays for it
+
         raise AccessDenied(f"the server refuses: {printable(str(greeting.get('message') or greeting['error']))}")
     boot, pid, server_version = greeting.get("boot"), greeting.get("pid"), greeting.get("version")
     return Line(
@@ -234,6 +235,8 @@ def _nobody(failures: list[str], named: str | None, found: str, *, denied: bool)
 def _named_step(named: str, found: str, *, denied: bool) -> str:
     """Return what to do next where the only place was one that the user named."""
     import shlex  # it loads `re`
+
+    from talkcli.terminal.text import printable
 
     by_variable = named == os.environ.get("TALK_SOCKET")
     place = shlex.quote(printable(_inside(named) if found == DIRECTORY else named))

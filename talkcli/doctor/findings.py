@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.terminal.printable import printable
+from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

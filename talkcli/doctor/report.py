@@ -7,7 +7,7 @@ import textwrap
 from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding, heard, next_step
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
-from talkcli.terminal.columns import GAP, Screen, pad
+from talkcli.terminal.text import GAP, Screen, pad
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

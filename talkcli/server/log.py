@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine.players.programs import NO_PLAYER
 from talkcli.goals.states import State
-from talkcli.terminal.printable import printable
+from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

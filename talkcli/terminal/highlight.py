@@ -8,8 +8,7 @@ from __future__ import annotations
 from bisect import bisect_right
 
 from talkcli.frozen import frozen
-from talkcli.terminal.columns import width
-from talkcli.terminal.printable import printable
+from talkcli.terminal.text import printable, width
 
 #: Stands for what is left out at either end.
 MORE = "…"

@@ -10,10 +10,8 @@ import time
 
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
-from talkcli.terminal import columns
-from talkcli.terminal.columns import GAP, Screen
-from talkcli.terminal.printable import printable
 from talkcli.terminal.senders import by_whom, who, who_forms, why_forms
+from talkcli.terminal.text import GAP, LONGEST_ID, Screen, cut, fitted, folded, id_room, pad, printable, width, wrapped
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -62,7 +60,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float | None = None) -> list[str
         line
         for name, value in rows
         if value
-        for line in columns.folded(value, f"{name:<{_LABEL}}", Screen() if name == "data" else screen)
+        for line in folded(value, f"{name:<{_LABEL}}", Screen() if name == "data" else screen)
     ]
 
 
@@ -76,14 +74,14 @@ def status_lines(status: ServerStatus, screen: Screen, now: float | None = None)
         f"up {span(float(uptime) if isinstance(uptime, int | float) else 0.0)}",
         f"{_field(server, 'clients')} of {_field(server, 'max_clients')} clients",
     ]
-    lines = columns.wrapped(about, f"{'server':<{_LABEL}}", screen)
-    lines += columns.wrapped(_engine(server), f"{'engine':<{_LABEL}}", screen)
-    lines += columns.wrapped(_settings(server), f"{'settings':<{_LABEL}}", screen)
+    lines = wrapped(about, f"{'server':<{_LABEL}}", screen)
+    lines += wrapped(_engine(server), f"{'engine':<{_LABEL}}", screen)
+    lines += wrapped(_settings(server), f"{'settings':<{_LABEL}}", screen)
     if server.get("paused"):
         lines.append(f"{'paused':<{_LABEL}}{screen.painted('speech is held', State.PREEMPTING)}: talk resume")
     goals = [*([status.active] if status.active else []), *status.pending, *status.recent]
-    widest = max((columns.width(printable(goal.id)) for goal in goals), default=0)
-    table = _Table(screen, now, min(widest, columns.id_room(screen) or columns.LONGEST_ID))
+    widest = max((width(printable(goal.id)) for goal in goals), default=0)
+    table = _Table(screen, now, min(widest, id_room(screen) or LONGEST_ID))
     lines += table.rows("now", [status.active] if status.active else [], "silent")
     lines += table.rows("queue", status.pending, "nothing")
     lines += table.rows("said", status.recent, "nothing")
@@ -101,8 +99,8 @@ def setting_lines(settings: Mapping[str, object]) -> list[str]:
 def voice_lines(voices: list[JsonObject]) -> list[str]:
     """Return the voices in columns: id, language, name."""
     rows = [[printable(str(each.get(name) or "-")) for name in ("id", "language", "name")] for each in voices]
-    widths = [max((columns.width(row[place]) for row in rows), default=0) for place in (0, 1)]
-    return [GAP.join((columns.pad(row[0], widths[0]), columns.pad(row[1], widths[1]), row[2])) for row in rows]
+    widths = [max((width(row[place]) for row in rows), default=0) for place in (0, 1)]
+    return [GAP.join((pad(row[0], widths[0]), pad(row[1], widths[1]), row[2])) for row in rows]
 
 
 def span(seconds: float) -> str:
@@ -129,16 +127,16 @@ class _Table:
         heads = [f"{'' if number else label:<{_LABEL}}{self._head(goal)}" for number, goal in enumerate(goals)]
         tails = [self._tails(goal) for goal in goals]
         texts = [_text(goal) for goal in goals]
-        room = self._screen.room(max(map(columns.width, heads)))
+        room = self._screen.room(max(map(width, heads)))
         if room is None:
             return [GAP.join([head + text, *tail[:1]]) for head, text, tail in zip(heads, texts, tails, strict=True)]
-        said = columns.fitted(texts, [tail or [""] for tail in tails], weights=(1, 1), room=room)
+        said = fitted(texts, [tail or [""] for tail in tails], weights=(1, 1), room=room)
         return [head + words for head, words in zip(heads, said, strict=True)]
 
     def _head(self, goal: Goal) -> str:
         """Return what stands before a goal's text."""
-        goal_id = columns.pad(columns.cut(printable(goal.id), columns.id_room(self._screen)), self._id_columns)
-        state = self._screen.painted(columns.pad(goal.state.name, 9), goal.state)
+        goal_id = pad(cut(printable(goal.id), id_room(self._screen)), self._id_columns)
+        state = self._screen.painted(pad(goal.state.name, 9), goal.state)
         head = f"{goal_id}{GAP}{state}{GAP}"
         return f"{_clock(goal.ended_at)}{GAP}{head}" if goal.state.terminal else head
 

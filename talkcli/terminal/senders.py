@@ -9,7 +9,7 @@ import re
 
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
-from talkcli.terminal.printable import printable
+from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import By, Goal, Sender

@@ -11,10 +11,20 @@ import time
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
-from talkcli.terminal import columns
-from talkcli.terminal.columns import GAP, Screen, pad
-from talkcli.terminal.printable import printable
 from talkcli.terminal.senders import who_forms, why_forms
+from talkcli.terminal.text import (
+    GAP,
+    LONGEST_ID,
+    Screen,
+    cut,
+    fitted,
+    id_room,
+    longest_that_fits,
+    pad,
+    printable,
+    shortened,
+    width,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -102,8 +112,8 @@ class Transcript:
         head = self._head(event.at or now, name, State.PREEMPTING, event.id or "", screen)
         by = event.by.client if event.by else None
         who = [f"by {each}" for each in who_forms(by)] if by else [""]
-        room = screen.room(columns.width(head))
-        return [(head + columns.longest_that_fits(who, room)).rstrip()]
+        room = screen.room(width(head))
+        return [(head + longest_that_fits(who, room)).rstrip()]
 
     def _goal(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
         head = self._head(at, state.name, state, goal.id, screen)
@@ -111,29 +121,29 @@ class Transcript:
         forms = why_forms(goal) if ended else who_forms(goal.client)
         if state is State.REJECTED:  # it had no line before that told who sent it
             forms = [f"{forms[0]}, from {each}" for each in who_forms(goal.client)] + forms
-        room = screen.room(columns.width(head))
+        room = screen.room(width(head))
         if room is None:
             return [(head + pad(_text(goal), _TEXT_COLUMNS) + GAP + forms[0]).rstrip()]
         tail_room = room // 3
         # Who ended it must not give way to its column; who sent it was told when it began.
         whole = forms[:-1] if ended and goal.by is not None and len(forms) > 1 else forms
-        tail = next((each for each in whole if columns.width(each) <= tail_room), None)
+        tail = next((each for each in whole if width(each) <= tail_room), None)
         if tail is None and ended:
             return self._ending(head, goal, whole, screen)
-        tail = columns.cut(forms[-1], tail_room) if tail is None else tail
+        tail = cut(forms[-1], tail_room) if tail is None else tail
         text_room = room - tail_room - len(GAP)
-        return [(head + pad(columns.shortened(_text(goal), text_room), text_room) + GAP + tail).rstrip()]
+        return [(head + pad(shortened(_text(goal), text_room), text_room) + GAP + tail).rstrip()]
 
     def _ending(self, head: str, goal: Goal, forms: list[str], screen: Screen) -> list[str]:
         """Return the end of a goal whose reason is too long for its column: beside the text, or else under it."""
         text = _text(goal)
-        room = screen.room(columns.width(head)) or 0
-        beside = room - len(GAP) - min(columns.width(text), _LEAST_TEXT)
-        tail = next((each for each in forms if columns.width(each) <= beside), None)
+        room = screen.room(width(head)) or 0
+        beside = room - len(GAP) - min(width(text), _LEAST_TEXT)
+        tail = next((each for each in forms if width(each) <= beside), None)
         if tail is not None:
-            return [head + columns.shortened(text, room - len(GAP) - columns.width(tail)) + GAP + tail]
-        tail = columns.longest_that_fits(forms, screen.room(_INDENT))
-        return [head + columns.shortened(text, room), " " * _INDENT + tail]
+            return [head + shortened(text, room - len(GAP) - width(tail)) + GAP + tail]
+        tail = longest_that_fits(forms, screen.room(_INDENT))
+        return [head + shortened(text, room), " " * _INDENT + tail]
 
     def _head(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
         shown = self._make_room(goal_id, screen)
@@ -141,19 +151,16 @@ class Transcript:
 
     def _make_room(self, goal_id: str, screen: Screen) -> str:
         """Widen the column of the ids for this one, and return it as it is shown."""
-        shown = columns.cut(printable(goal_id), columns.id_room(screen))
-        self._id_columns = max(self._id_columns, min(columns.width(shown), columns.LONGEST_ID))
+        shown = cut(printable(goal_id), id_room(screen))
+        self._id_columns = max(self._id_columns, min(width(shown), LONGEST_ID))
         return shown
 
 
 def log_lines(goals: Sequence[Goal], screen: Screen, now: float | None = None) -> list[str]:
     """Return goals that have ended, a line each: when, how, who said what, and why it ended."""
     today = time.localtime(time.time() if now is None else now)[:3]
-    heads = [
-        (_when(goal.ended_at, today), goal.state.name, columns.cut(printable(goal.id), columns.id_room(screen)))
-        for goal in goals
-    ]
-    widths = [max((columns.width(head[place]) for head in heads), default=0) for place in range(3)]
+    heads = [(_when(goal.ended_at, today), goal.state.name, cut(printable(goal.id), id_room(screen))) for goal in goals]
+    widths = [max((width(head[place]) for head in heads), default=0) for place in range(3)]
     texts = [_text(goal) for goal in goals]
     who = [who_forms(goal.client) for goal in goals]
     why = [why_forms(goal) for goal in goals]
@@ -165,7 +172,7 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float | None = None) -
             for text, sender, reason in zip(texts, who, why, strict=True)
         ]
     else:
-        said = columns.fitted(texts, who, why, weights=(4, 2, 3), room=room) if goals else []
+        said = fitted(texts, who, why, weights=(4, 2, 3), room=room) if goals else []
     return [
         GAP.join(
             (f"{when:>{widths[0]}}", screen.painted(pad(state, widths[1]), goal.state), pad(goal_id, widths[2]), words)
@@ -179,7 +186,7 @@ def _text(goal: Goal) -> str:
 
 
 def _fitted(line: str, screen: Screen) -> str:
-    return columns.cut(line, screen.room(0))
+    return cut(line, screen.room(0))
 
 
 def _since(goal: Goal, now: float) -> float:

@@ -12,7 +12,7 @@ from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Engine, Python
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
-from talkcli.terminal.columns import Screen, width
+from talkcli.terminal.text import Screen, width
 from talkcli.unreachable import ABSENT, FORBIDDEN, STALE
 
 PYTHON = Python("3.11.2", "/usr/bin/python3", "2.99")

@@ -271,10 +271,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 #: The doctor's modules that judge facts; they read a clock's format at most, and gather nothing.
 JUDGING = ["findings", "session", "voice", "sound", "level", "places", "sentence", "serving", "report"]
 #: What those may import of the package besides each other.
-FOR_JUDGING = {
-    *("", "goals.goal", "goals.options", "goals.states", "terminal.columns", "terminal.printable", "unreachable"),
-    "frozen",
-}
+FOR_JUDGING = {"", "goals.goal", "goals.options", "goals.states", "terminal.text", "unreachable", "frozen"}
 
 
 def test_the_doctor_judges_without_looking() -> None:

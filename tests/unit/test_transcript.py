@@ -14,9 +14,9 @@ from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, PausedChanged, Snapshot, StateChanged, WordHeard
 from talkcli.protocol.replies import ServerStatus
-from talkcli.terminal import columns, output
-from talkcli.terminal.columns import Screen, width
+from talkcli.terminal import output
 from talkcli.terminal.senders import who_forms, why_forms
+from talkcli.terminal.text import Screen, cut, share, width
 from talkcli.terminal.transcript import Transcript, log_lines
 
 PATROL = Sender(812, 1000, "talk", "/bin/bash /home/robot/bin/patrol.sh --fast", "night watch")
@@ -61,18 +61,18 @@ def test_width_counts_columns() -> None:
 
 @given(TEXTS, st.integers(1, 100))
 def test_cut_fits_and_is_no_shorter_than_it_must_be(text: str, room: int) -> None:
-    cut = columns.cut(text, room)
-    assert width(cut) <= room
-    assert cut == text or cut.endswith("…")
-    if cut != text:
-        assert text.startswith(cut[:-1])
-        assert width(cut) >= room - 1  # the one that did not fit may have taken two columns
+    shown = cut(text, room)
+    assert width(shown) <= room
+    assert shown == text or shown.endswith("…")
+    if shown != text:
+        assert text.startswith(shown[:-1])
+        assert width(shown) >= room - 1  # the one that did not fit may have taken two columns
 
 
 @given(st.lists(st.tuples(st.integers(0, 200), st.integers(1, 5)), min_size=1, max_size=5), st.integers(0, 200))
 def test_shares_are_within_what_is_wanted_and_what_is_there(asked: list[tuple[int, int]], room: int) -> None:
     wanted, weights = zip(*asked, strict=True)
-    given_out = columns.share(wanted, weights, room)
+    given_out = share(wanted, weights, room)
     assert all(0 <= got <= each for got, each in zip(given_out, wanted, strict=True))
     assert sum(given_out) <= room
     if sum(wanted) <= room:

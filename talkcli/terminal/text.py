@@ -1,7 +1,7 @@
-"""Text in the columns of a terminal: how wide it is, cut to fit, padded, coloured, shared out.
+"""Text on a terminal: made fit to be shown, measured in columns, cut, padded, coloured, shared out.
 
-Pure: the terminal's width and whether it takes colour come from the caller. What is given is fit to be shown already;
-see `printable`.
+Text from others goes through `printable` first: it moves no cursor then, forges no line, turns no direction of reading.
+Pure: the terminal's width and whether it takes colour come from the caller.
 """
 
 from __future__ import annotations
@@ -30,6 +30,11 @@ _OVER = frozenset({"Mn", "Me"})
 _AS_EMOJI = "\ufe0f"
 #: Letters for flags: a terminal draws a pair of them, or each alone, in two columns.
 _FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
+
+#: Controls, format characters (bidi marks and overrides, zero-width), line and paragraph separators, halves of pairs,
+#: and what is not assigned.
+_ESCAPED = frozenset({"Cc", "Cf", "Zl", "Zp", "Cs", "Co", "Cn"})
+_SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t", "\\": "\\\\"}
 
 _COLOURING = re.compile("\x1b\\[[0-9;]*m")
 _COLOURS = {
@@ -61,6 +66,19 @@ class Screen:
         """Return the text in the colour of a state."""
         code = _COLOURS.get(state) if state is not None else "1"
         return f"\x1b[{code}m{text}\x1b[0m" if self.colour and code else text
+
+
+def printable(text: str, limit: int | None = None) -> str:
+    """Return the text with everything that isn't plainly visible escaped, cut after `limit` characters with an …."""
+    kept = text if limit is None or len(text) <= limit else text[:limit]
+    if not (kept.isascii() and kept.isprintable() and "\\" not in kept):
+        kept = "".join(map(_shown, kept))
+    return kept if limit is None or len(text) <= limit else f"{kept}…"
+
+
+def printable_json(line: str) -> str:
+    """Return a line of JSON, which stays the same JSON, with everything that isn't plainly visible escaped."""
+    return line if line.isascii() and line.isprintable() else "".join(map(_escaped, line))
 
 
 def width(text: str) -> int:
@@ -165,6 +183,25 @@ def _lines(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
             line += f" {piece}"
     lines.append(line)
     return [f"{' ' * width(first) if number else first}{each}" for number, each in enumerate(lines)]
+
+
+def _escaped(character: str) -> str:
+    """Return a character of a JSON line as it is, or as JSON escapes it: none of those stands outside of a string."""
+    if unicodedata.category(character) not in _ESCAPED:
+        return character
+    units = character.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[at]:02x}{units[at + 1]:02x}" for at in range(0, len(units), 2))
+
+
+def _shown(character: str) -> str:
+    if character in _SHORT:
+        return _SHORT[character]
+    if unicodedata.category(character) not in _ESCAPED:
+        return character
+    code = ord(character)
+    if code < 0x100:
+        return f"\\x{code:02x}"
+    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 def _columns(character: str) -> int:
