@@ -68,6 +68,8 @@ class EngineProcess:
         self.ready = False
         #: what the process said itself of why it cannot start
         self.failed: protocol.StartFailed | None = None
+        #: the monotonic time by which it must be gone, once it was killed; for who watches over it
+        self.gone_by = float("inf")
         # Held for a send that doesn't wait: the descriptor must not be closed, and be another's, in the middle of one.
         self._sending = threading.Lock()
         self._lines = LineSplitter(limit=None)

@@ -16,11 +16,19 @@ from talkcli.engine import protocol
 from talkcli.engine.inbox import NEVER, Inbox
 from talkcli.engine.process import EngineProcess, Murmur
 from talkcli.engine.protocol import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
-from talkcli.engine.restarts import Restarts
 from talkcli.frozen import frozen, replace
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
+
+#: Seconds before the next start, by the number of processes in a row that died before they were of use.
+BACK_OFF = (0.0, 0.1, 0.5, 2.0, 10.0)
+
+#: A ready process that dies sooner than this, with no goal in hand, was of no use.
+SHORT_LIFE = 1.0
+
+#: Seconds without a ready process after which each start that fails costs a goal: nobody waits for ever.
+PATIENCE = 10.0
 
 
 @frozen
@@ -54,36 +62,48 @@ class ThreadDied:
 Report = protocol.Event | EngineDied | EngineMissing | EngineSaid | ThreadDied
 
 
-class Dying:
-    """The killed processes, each with the time by which it must be gone."""
+class Restarts:
+    """When the next engine process may be started, and whether goals wait for it.
 
-    def __init__(self) -> None:
-        self._limits: dict[EngineProcess, float] = {}
+    What may pass is waited out: no memory, no descriptors, a process that was killed in its start. What is known to
+    stay (no library, no such driver) ends each goal at once, until a process gets ready all the same. The time comes in
+    as an argument (monotonic seconds).
+    """
 
-    def __iter__(self) -> Iterator[EngineProcess]:
-        return iter(list(self._limits))
+    def __init__(self, now: float) -> None:
+        #: when the next process may be started
+        self.due_at = 0.0
+        #: why the last start failed, where that is known to stay: no goal waits for another one then
+        self.error: str | None = None
+        self._failures = 0
+        #: since when there has been no ready process
+        self._missing_since = now
 
-    def __bool__(self) -> bool:
-        return bool(self._limits)
+    def ready(self) -> None:
+        """Take note that a process is ready."""
+        self.error = None
 
-    def add(self, process: EngineProcess, limit: float) -> None:
-        """Take a process that was killed just now, and when it must be gone."""
-        self._limits[process] = limit
+    def died(self, now: float, *, age: float, had_goal: bool) -> None:
+        """Plan the start after a process that had been ready; one that died over a goal costs no wait."""
+        self._missing_since = now
+        if had_goal or age > SHORT_LIFE:
+            self._failures = 0
+            self.due_at = now
+        else:
+            self._wait_longer(now)
 
-    def deadlines(self) -> list[float]:
-        """Return the times at which one is overdue."""
-        return [limit for limit in self._limits.values() if limit != NEVER]
+    def failed(self, now: float, began: float, lasting: str | None) -> bool:
+        """Plan the start after one that failed, begun at that time, and return whether it costs a goal.
 
-    def overdue(self, now: float) -> list[EngineProcess]:
-        """Return those that should have been gone by now, each once; they are kept, to be reaped when they go."""
-        found = [process for process, limit in self._limits.items() if now >= limit]
-        for process in found:
-            self._limits[process] = NEVER
-        return found
+        `lasting`: the cause in words, where it is known to stay.
+        """
+        self._wait_longer(now)
+        self.error = lasting
+        return lasting is None and began >= self._missing_since + PATIENCE
 
-    def remove(self, process: EngineProcess) -> bool:
-        """Forget a process that is gone, and return whether it went in time."""
-        return self._limits.pop(process) != NEVER
+    def _wait_longer(self, now: float) -> None:
+        self.due_at = now + BACK_OFF[min(self._failures, len(BACK_OFF) - 1)]
+        self._failures += 1
 
 
 @dataclass(slots=True, eq=False)
@@ -140,7 +160,8 @@ class Supervisor:
         self._started_at = 0.0
         self._restarts = Restarts(time.monotonic())
         self._goal: Handed | None = None
-        self._dying = Dying()
+        #: the killed ones that are not known to be gone
+        self._dying: list[EngineProcess] = []
         self._murmur = Murmur()
         self._closing = False
 
@@ -211,7 +232,7 @@ class Supervisor:
             self._shut_down()
 
     def _next_deadline(self) -> float:
-        process, goal, due = self._process, self._goal, self._dying.deadlines()
+        process, goal, due = self._process, self._goal, [each.gone_by for each in self._dying]
         if process is None:
             due.append(self._restarts.due_at)
         elif not process.ready:
@@ -233,7 +254,10 @@ class Supervisor:
             self._lose_process(f"the engine gave no sign of life for {HANG_AFTER:g} s", "engine_hung")
         elif goal and goal.pause_at is not None and now >= goal.pause_at + PAUSE_LIMIT:
             self._lose_process(f"the engine did not confirm a pause within {PAUSE_LIMIT:g} s", "engine_hung")
-        for process in self._dying.overdue(now):
+        for process in self._dying:
+            if now < process.gone_by:
+                continue
+            process.gone_by = NEVER  # overdue once; it is kept, to be reaped when it goes
             process.kill()  # what could not be found before, for want of a descriptor, may be found now
             if self._goal and self._goal.verdict_on is process:
                 words = f"the player could not be ended within {SILENCE_LIMIT:g} s"
@@ -401,7 +425,8 @@ class Supervisor:
         self._process = self._open = None
         process.kill()
         self._selector.unregister(process.socket.fileno())
-        self._dying.add(process, now + SILENCE_LIMIT)
+        process.gone_by = now + SILENCE_LIMIT
+        self._dying.append(process)
         goal = self._goal
         had_goal = goal is not None and goal.spoken
         if goal and had_goal:
@@ -447,9 +472,9 @@ class Supervisor:
             process.read_stderr()
             self._selector.unregister(process.stderr)
         process.close()
-        in_time = self._dying.remove(process)
+        self._dying.remove(process)
         goal = self._goal
-        if goal and goal.verdict and goal.verdict_on is process and in_time:
+        if goal and goal.verdict and goal.verdict_on is process and process.gone_by != NEVER:
             self._finish(goal.verdict)
 
     # -- the end

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, cast
 import pytest
 
 import talkcli
-from talkcli.engine import protocol
-from talkcli.engine import supervisor as engine_thread
+from talkcli.engine import protocol, supervisor
 from talkcli.engine.supervisor import EngineDied, Supervisor
 from tests.engine.threads import PATIENCE, Thread, start
 
@@ -46,7 +45,7 @@ def test_a_goal_behind_another_wakes_the_thread_once(monkeypatch: pytest.MonkeyP
     program = tmp_path / "engine.py"
     program.write_text(PROMPT.format(root=os.path.dirname(os.path.dirname(talkcli.__file__))))
     monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, str(program)])
-    monkeypatch.setattr(engine_thread, "HANG_AFTER", 600.0)  # so that no goal is slow enough on any machine
+    monkeypatch.setattr(supervisor, "HANG_AFTER", 600.0)  # so that no goal is slow enough on any machine
     thread = Thread()
     try:
         thread.until(protocol.Ready)
@@ -77,7 +76,7 @@ def test_a_goal_behind_another_wakes_the_thread_once(monkeypatch: pytest.MonkeyP
 def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(
     start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_thread, "HANG_AFTER", 0.7)
+    monkeypatch.setattr(supervisor, "HANG_AFTER", 0.7)
     thread = start()
     thread.say("length=0")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
@@ -132,7 +131,7 @@ class Lost:
 def test_a_goal_that_was_sent_to_a_process_that_is_lost_is_spoken_by_the_next(
     start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch, takes: bool
 ) -> None:
-    monkeypatch.setattr(engine_thread, "HANG_AFTER", 1.0)  # so long a thread may doze that nothing wakes
+    monkeypatch.setattr(supervisor, "HANG_AFTER", 1.0)  # so long a thread may doze that nothing wakes
     thread = start()
     thread.until(protocol.Ready)
     monkeypatch.setattr(thread.engine, "_open", Lost(takes=takes))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import espeakng_loader
 import pytest
 
-from talkcli.engine.restarts import BACK_OFF
+from talkcli.engine.supervisor import BACK_OFF
 from tests.conformance.hearing import LOW, assert_aborted, send
 from tests.faults.broken import (
     assert_answers,

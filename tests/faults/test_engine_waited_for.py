@@ -30,8 +30,8 @@ WAITING = 20
 TOO_FEW = 12
 #: Shortens the waits of a server whose engine can't start: no second, but tenths.
 HASTY = """
-from talkcli.engine import restarts
-restarts.BACK_OFF, restarts.PATIENCE = (0.0, 0.05, 0.1), {patience}
+from talkcli.engine import supervisor
+supervisor.BACK_OFF, supervisor.PATIENCE = (0.0, 0.05, 0.1), {patience}
 """
 
 

@@ -36,7 +36,6 @@ PURE = [
     "client.event_buffer",
     "client.outgoing",
     "engine.gap",
-    "engine.restarts",
     "engine.synthesizers.guard",
 ]
 IMPURE = {

@@ -1,18 +1,23 @@
-"""The pure parts of the engine thread: when it tries again, what it passes on, what it waits for to be gone."""
+"""The parts of the engine thread, by times given: when it tries again, what it passes on, whom it waits for."""
 
 from __future__ import annotations
 
 import itertools
+import os
+import selectors
+import socket
 from typing import TYPE_CHECKING, cast
 
 import pytest
 
+from talkcli.engine import protocol
 from talkcli.engine.process import LINES, LONGEST, WHILE, Murmur
-from talkcli.engine.restarts import BACK_OFF, PATIENCE, SHORT_LIFE, Restarts
-from talkcli.engine.supervisor import Dying
+from talkcli.engine.protocol import SILENCE_LIMIT
+from talkcli.engine.supervisor import BACK_OFF, PATIENCE, SHORT_LIFE, Handed, Restarts, Supervisor
 
 if TYPE_CHECKING:
     from talkcli.engine.process import EngineProcess
+    from talkcli.engine.supervisor import Report
 
 
 LACKING = "no library"
@@ -92,17 +97,50 @@ def test_what_is_too_much_is_counted_and_told_with_the_next_lines() -> None:
     assert murmur.take(b"z\n", 2 * WHILE) == ["z"]
 
 
-def test_who_is_overdue_is_told_once_and_kept() -> None:
-    dying, process = Dying(), cast("EngineProcess", object())
-    assert not dying
-    dying.add(process, 102.0)
-    assert dying.deadlines() == [102.0]
-    assert dying.overdue(101.9) == []
-    assert dying.overdue(102.0) == [process]
-    assert dying.overdue(103.0) == []
-    assert dying.deadlines() == []
-    assert list(dying) == [process]
-    assert dying.remove(process) is False
-    dying.add(process, 102.0)
-    assert dying.remove(process) is True
-    assert not dying
+class Undying:
+    """Stands for a process that had a goal, and that no kill ends for long."""
+
+    def __init__(self) -> None:
+        self.ready, self.failed, self.gone_by = True, None, 0.0
+        self.socket, self._other = socket.socketpair()
+        self.stderr = self._other.fileno()
+        self.liveness = os.dup(self.stderr)
+        self.kills = 0
+
+    def kill(self) -> None:
+        self.kills += 1
+
+    def close(self) -> None:
+        self.socket.close()
+        self._other.close()
+        os.close(self.liveness)
+
+
+@pytest.mark.parametrize("in_time", [True, False])
+def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pytest.MonkeyPatch, in_time: bool) -> None:
+    posted: list[Report] = []
+    engine = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), posted.append)
+    monkeypatch.setattr(engine, "_start", lambda: None)
+    undying = Undying()
+    process = cast("EngineProcess", undying)
+    for descriptor in (undying.socket.fileno(), undying.liveness):
+        engine._selector.register(descriptor, selectors.EVENT_READ, process)
+    engine._process = process
+    engine._goal = Handed(protocol.Say("g1", "yes", 200, 1.0, None, 50), heard_at=0.0, started=True)
+    engine._lose_process("it hangs", "engine_hung")
+    due = process.gone_by
+    engine._keep_limits(due - SILENCE_LIMIT / 2)
+    assert [type(each).__name__ for each in posted] == ["EngineDied"]
+    assert undying.kills == 1
+    if not in_time:
+        engine._keep_limits(due)
+        assert undying.kills == 2
+        engine._keep_limits(due + 1)
+        assert undying.kills == 2, "it was overdue once"
+    engine._bury(process)
+    assert [each.reason for each in posted[1:] if isinstance(each, protocol.Ended)] == [
+        "engine_hung" if in_time else "not_silent"
+    ]
+    assert len(posted) == 2
+    assert not engine._dying
+    engine._inbox.close()

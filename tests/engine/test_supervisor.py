@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import talkcli
-from talkcli.engine import protocol, restarts
-from talkcli.engine import supervisor as engine_thread
+from talkcli.engine import protocol, supervisor
 from talkcli.engine.process import LINES
 from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid
 from tests.engine.threads import Thread, start
@@ -38,8 +37,8 @@ def test_a_goal_is_held_and_goes_on_where_it_was(start: Callable[[], Thread]) ->
 
 
 def test_a_pause_may_last_longer_than_any_limit(start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine_thread, "HANG_AFTER", 1.0)
-    monkeypatch.setattr(engine_thread, "PAUSE_LIMIT", 1.0)
+    monkeypatch.setattr(supervisor, "HANG_AFTER", 1.0)
+    monkeypatch.setattr(supervisor, "PAUSE_LIMIT", 1.0)
     thread = start()
     thread.say("length=0.3")
     thread.until(protocol.Word)
@@ -163,7 +162,7 @@ def test_the_voices_are_listed_by_the_first_process_alone(start: Callable[[], Th
 def test_a_pause_that_is_not_confirmed_ends_the_process(
     start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_thread, "PAUSE_LIMIT", 0.3)
+    monkeypatch.setattr(supervisor, "PAUSE_LIMIT", 0.3)
     thread = start()
     thread.say("never-ends ignore-pause")
     thread.until(protocol.Word)
@@ -180,7 +179,7 @@ def test_a_pause_that_is_not_confirmed_ends_the_process(
 def test_a_pause_has_no_limit_once_it_is_confirmed_or_over(
     start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch, words: str
 ) -> None:
-    monkeypatch.setattr(engine_thread, "PAUSE_LIMIT", 0.3)
+    monkeypatch.setattr(supervisor, "PAUSE_LIMIT", 0.3)
     thread = start()
     thread.say(f"length=0.5 {words}")
     thread.until(protocol.Word)
@@ -200,9 +199,9 @@ def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_wh
     behaviour = tmp_path / "start"
     behaviour.write_text("hang")
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
-    monkeypatch.setattr(engine_thread, "START_LIMIT", 0.3)
-    monkeypatch.setattr(restarts, "PATIENCE", 0.5)
-    monkeypatch.setattr(restarts, "BACK_OFF", (0.0,))
+    monkeypatch.setattr(supervisor, "START_LIMIT", 0.3)
+    monkeypatch.setattr(supervisor, "PATIENCE", 0.5)
+    monkeypatch.setattr(supervisor, "BACK_OFF", (0.0,))
     thread = start()
     began = time.monotonic()
     thread.say("battery low")
@@ -212,7 +211,7 @@ def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_wh
     assert thread.until(EngineMissing) == EngineMissing(words), "no goal is in hand: who hands them in has to end one"
     thread.say("coming home", "g2")
     behaviour.write_text("")
-    monkeypatch.setattr(engine_thread, "START_LIMIT", 10.0)
+    monkeypatch.setattr(supervisor, "START_LIMIT", 10.0)
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
 
 
