@@ -12,6 +12,7 @@ from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.frozen import frozen
 from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
 from talkcli.goals.states import EXIT_CODES, State
+from talkcli.splitter import Cut, LineSplitter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -74,8 +75,8 @@ class LineReader:
     def __init__(self, interrupt: Mapping[int, int]) -> None:
         """`interrupt`: what ends the reading with Interrupted, as in `dial.ready`."""
         self._interrupt = interrupt
-        self._begun = bytearray()
-        self._size = 0
+        # One byte above the longest text: the CR of a line that ends in CRLF.
+        self._splitter = LineSplitter(MAX_BYTES + 1)
         self._number = 0
 
     def lines(self) -> Iterator[Line]:
@@ -87,26 +88,16 @@ class LineReader:
                 continue
             if not data:
                 break
-            *ended, begun = data.split(b"\n")
-            for each in ended:
-                self._take(each)
-                yield self._end()
-            self._take(begun)
-        if self._size:
-            yield self._end()
+            for each in self._splitter.feed(data):
+                yield self._line(each)
+        if self._splitter.size:
+            yield self._line(self._splitter.end())
 
-    def _take(self, data: bytes) -> None:
-        self._size += len(data)
-        # One byte above the longest text: the CR of a line that ends in CRLF.
-        self._begun += data[: MAX_BYTES + 1 - len(self._begun)]
-
-    def _end(self) -> Line:
+    def _line(self, line: bytes) -> Line:
         self._number += 1
-        size = self._size
-        text = None if size > MAX_BYTES + 1 else _decoded(bytes(self._begun))
-        self._begun.clear()
-        self._size = 0
-        return Line(self._number, text, size)
+        if isinstance(line, Cut):
+            return Line(self._number, None, line.size)
+        return Line(self._number, _decoded(line), len(line))
 
 
 def _read(count: int) -> bytes | None:

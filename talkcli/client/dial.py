@@ -15,8 +15,9 @@ from talkcli import paths, peers
 from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.protocol import replies
-from talkcli.protocol.lines import LineSplitter, decode, encode
+from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import Hello, write_request
+from talkcli.splitter import LineSplitter
 from talkcli.unreachable import DIRECTORY, FILE, FORBIDDEN
 
 if TYPE_CHECKING:
@@ -174,7 +175,7 @@ def _greet(
     received: bytes = b"",
 ) -> Line:
     """Greet, unless that has been done, and be greeted; `received`: what has been read of that."""
-    splitter = LineSplitter(limit=None)
+    splitter = LineSplitter()
     lines = splitter.feed(received)
     try:
         try:

@@ -9,6 +9,7 @@ import os
 import time
 
 from talkcli.engine import protocol
+from talkcli.splitter import LineSplitter
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ class Channel:
         self.closed = False
         #: monotonic time of the last event.
         self.sent_at = time.monotonic()
-        self._rest = b""
+        self._lines = LineSplitter()
 
     def send(self, event: Event) -> None:
         """Send an event, waiting until the server takes it."""
@@ -48,5 +49,4 @@ class Channel:
         if not data:
             self.closed = True
             return []
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        return [protocol.decode_command(line) for line in lines]
+        return [protocol.decode_command(line) for line in self._lines.feed(data)]

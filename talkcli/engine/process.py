@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.players.holders import kill_holders
-from talkcli.protocol.lines import LineSplitter
+from talkcli.splitter import LineSplitter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -72,7 +72,7 @@ class EngineProcess:
         self.gone_by = float("inf")
         # Held for a send that doesn't wait: the descriptor must not be closed, and be another's, in the middle of one.
         self._sending = threading.Lock()
-        self._lines = LineSplitter(limit=None)
+        self._lines = LineSplitter()
         self._stderr_tail = b""
         self._on_stderr = on_stderr
         environment = {name: value for name, value in (env or os.environ).items() if name not in _NOT_INHERITED}
@@ -227,15 +227,14 @@ class Murmur:
     """Lines from standard error, of one engine process after the other."""
 
     def __init__(self) -> None:
-        self._rest = b""
+        self._lines = LineSplitter(LONGEST)
         self._since = float("-inf")
         self._passed = 0
         self._left_out = 0
 
     def take(self, data: bytes, now: float) -> list[str]:
         """Take what was written, and return the lines to pass on; no data means that the process wrote its last."""
-        *lines, rest = (self._rest + (data or b"\n")).split(b"\n")
-        self._rest = rest[:LONGEST]
+        lines = self._lines.feed(data or b"\n")
         return [words for line in lines if line.strip() for words in self._admit(line, now)]
 
     def _admit(self, line: bytes, now: float) -> list[str]:
@@ -246,7 +245,7 @@ class Murmur:
             self._since, self._passed, self._left_out = now, 0, 0
         if self._passed < LINES:
             self._passed += 1
-            admitted.append(line[:LONGEST].decode(errors="replace").rstrip())
+            admitted.append(line.decode(errors="replace").rstrip())
         else:
             self._left_out += 1
         return admitted

@@ -11,6 +11,7 @@ import math
 
 from talkcli.errors import BadRequest, LineTooLong
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.splitter import Cut, LineSplitter
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
@@ -79,15 +80,15 @@ _DECODER = json.JSONDecoder(
 )
 
 
-class LineSplitter:
-    """Cuts a stream of bytes into lines; holds no more than one line of `limit` bytes that is not finished."""
+class RequestSplitter(LineSplitter):
+    """Cuts what comes from a client into lines, none of them past a limit; a server is trusted."""
 
-    __slots__ = ("_limit", "_rest")
+    __slots__ = ("_limit",)
 
-    def __init__(self, limit: int | None = MAX_LINE) -> None:
-        """`limit` is for what comes from a client; None, for what comes from a server that is trusted."""
+    def __init__(self, limit: int = MAX_LINE) -> None:
+        """`limit`: bytes of a line, its newline included."""
+        super().__init__(limit - 1)
         self._limit = limit
-        self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
         """Return the lines that are complete now, without their newlines; LineTooLong, with those before it, past the
@@ -95,22 +96,10 @@ class LineSplitter:
 
         After that error the stream cannot be followed any further: the connection has to be closed.
         """
-        self._rest += data
-        lines: list[bytes] = []
-        if b"\n" in data:
-            *complete, rest = self._rest.split(b"\n")
-            for line in complete:
-                self._check(line, lines)
-                lines.append(bytes(line))
-            self._rest = rest
-        self._check(self._rest, lines)
+        lines = super().feed(data)
+        for place, line in enumerate(lines):
+            if isinstance(line, Cut):
+                raise LineTooLong(self._limit, lines[:place])
+        if self.size >= self._limit:
+            raise LineTooLong(self._limit, lines)
         return lines
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether a line has begun and not ended."""
-        return bool(self._rest)
-
-    def _check(self, line: bytearray, before: list[bytes]) -> None:
-        if self._limit is not None and len(line) + 1 > self._limit:
-            raise LineTooLong(self._limit, before)

@@ -15,7 +15,7 @@ from talkcli.errors import BadRequest, LineTooLong
 from talkcli.frozen import replace
 from talkcli.goals.options import Cancel
 from talkcli.protocol import replies
-from talkcli.protocol.lines import LineSplitter, decode, encode
+from talkcli.protocol.lines import RequestSplitter, decode, encode
 from talkcli.protocol.requests import Hello, Request, Status, read_request
 from talkcli.server.stream import Stream
 
@@ -81,7 +81,7 @@ class Connection:
         self._handler = handler
         self._loop = loop
         self._stream = Stream(loop, handler.streams, connected, self, SOFT_OUTPUT)
-        self._splitter = LineSplitter()
+        self._splitter = RequestSplitter()
         self._lines: deque[bytes] = deque()
         #: what has to be sent in its order while a list is on its way: lists, and what came after them
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
@@ -224,7 +224,7 @@ class Connection:
             self._stream.resume_reading()
         else:
             self._stream.pause_reading()
-        if not reading or not self._splitter.unfinished:
+        if not reading or not self._splitter.size:
             self._stop_line_limit()
         elif self._line_limit is None:
             self._line_limit = self._loop.call_later(

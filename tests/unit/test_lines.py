@@ -1,9 +1,8 @@
-"""Lines from any segmentation, limits, JSON that is bad in every way."""
+"""Lines of JSON, their limits, and JSON that is bad in every way."""
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest, LineTooLong
-from talkcli.protocol.lines import MAX_LINE, LineSplitter, decode, encode
+from talkcli.protocol.lines import MAX_LINE, RequestSplitter, decode, encode
 from talkcli.protocol.replies import failure
 
 if TYPE_CHECKING:
@@ -154,47 +153,16 @@ def test_integers_of_twenty_digits_are_read() -> None:
 # Lines
 
 
-def cut(stream: bytes, places: list[int]) -> list[bytes]:
-    edges = [0, *sorted(place % (len(stream) + 1) for place in places), len(stream)]
-    return [stream[start:end] for start, end in itertools.pairwise(edges)]
-
-
-@given(
-    st.lists(st.binary(max_size=20).map(lambda line: line.replace(b"\n", b"")), max_size=8), st.lists(st.integers(0))
-)
-def test_any_segmentation_gives_the_same_lines(lines: list[bytes], places: list[int]) -> None:
-    splitter = LineSplitter(21)
-    received: list[bytes] = []
-    for segment in cut(b"".join(line + b"\n" for line in lines), places):
-        received += splitter.feed(segment)
-    assert received == lines
-    assert not splitter.unfinished
-
-
-@given(st.binary(max_size=60).filter(lambda stream: b"\n" not in stream), st.lists(st.integers(0)))
-def test_half_a_line_is_kept_until_it_ends(stream: bytes, places: list[int]) -> None:
-    splitter = LineSplitter()
-    for segment in cut(stream, places):
-        assert splitter.feed(segment) == []
-    assert splitter.unfinished == bool(stream)
-    assert splitter.feed(b"\n") == [stream]
-    assert not splitter.unfinished
-
-
 def test_requests_in_one_segment_and_in_segments_of_one_byte_are_the_same() -> None:
     stream = encode({"request": "status"}) + encode({"request": "say", "text": "日"})
-    at_once, byte_by_byte = LineSplitter(), LineSplitter()
+    at_once, byte_by_byte = RequestSplitter(), RequestSplitter()
     lines = [line for byte in stream for line in byte_by_byte.feed(bytes([byte]))]
     assert at_once.feed(stream) == lines
     assert [decode(line).get("request") for line in lines] == ["status", "say"]
 
 
-def test_ten_thousand_blank_lines_are_ten_thousand_lines() -> None:
-    assert LineSplitter().feed(b"\n" * 10_000) == [b""] * 10_000
-
-
 def feed(stream: bytes, segment: int) -> list[bytes]:
-    splitter = LineSplitter()
+    splitter = RequestSplitter()
     return [each for at in range(0, len(stream), segment) for each in splitter.feed(stream[at : at + segment])]
 
 
@@ -216,7 +184,7 @@ def test_ten_megabytes_without_a_newline_are_refused(segment: int) -> None:
 
 
 def test_a_line_without_an_end_is_refused_as_soon_as_it_is_too_long() -> None:
-    splitter = LineSplitter()
+    splitter = RequestSplitter()
     assert splitter.feed(b"[" * (MAX_LINE - 1)) == []
     with pytest.raises(BadRequest):
         splitter.feed(b"[")
@@ -224,7 +192,7 @@ def test_a_line_without_an_end_is_refused_as_soon_as_it_is_too_long() -> None:
 
 @pytest.mark.parametrize("end", [b"", b"\n", b'\n{"request": "status"}\n'])
 def test_lines_before_one_that_is_too_long_are_not_lost(end: bytes) -> None:
-    splitter = LineSplitter()
+    splitter = RequestSplitter()
     assert splitter.feed(b'{"request":') == []
     with pytest.raises(LineTooLong) as refused:
         splitter.feed(b' "cancel"}\n\n' + b"[" * MAX_LINE + end)
@@ -234,11 +202,6 @@ def test_lines_before_one_that_is_too_long_are_not_lost(end: bytes) -> None:
 def test_a_longest_text_fits_in_a_line() -> None:
     for text in ("🤖" * 10_000, "日" * 10_000, "\x01" * 10_000, '"' * 10_000):
         assert len(encode({"seq": 1, "request": "say", "text": text, "wait": True})) <= MAX_LINE
-
-
-def test_a_trusted_servers_line_has_no_limit() -> None:
-    line = b"a" * (MAX_LINE * 3)
-    assert LineSplitter(None).feed(line + b"\n") == [line]
 
 
 def test_a_line_is_what_any_json_writer_makes() -> None:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import re
 
+from talkcli.splitter import LineSplitter
+
 #: Bytes of one line that are kept; error lines are shorter, and a message must stay readable.
 LONGEST_LINE = 300
 
@@ -29,25 +31,22 @@ class Complaint:
     """The line of a player's standard error that names the error."""
 
     def __init__(self) -> None:
-        self._rest = b""
+        self._lines = LineSplitter(LONGEST_LINE)
         self._named: str | None = None
         self._first: str | None = None
 
     def feed(self, data: bytes) -> None:
         """Take what the player wrote."""
-        *lines, rest = (self._rest + data).split(b"\n")
-        self._rest = rest[:LONGEST_LINE]
-        for line in lines:
+        for line in self._lines.feed(data):
             self._look(line)
 
     def line(self) -> str | None:
         """Return the line that names the error, None if nothing was said that could."""
-        self._look(self._rest)
-        self._rest = b""
+        self._look(self._lines.end())
         return self._named or self._first
 
     def _look(self, raw: bytes) -> None:
-        line = raw[:LONGEST_LINE].decode("utf-8", "replace").strip()
+        line = raw.decode("utf-8", "replace").strip()
         if not line or re.search(_NOISE, line, re.IGNORECASE):
             return
         line = re.sub(_PLACE, r"\g<program>: ", line)
