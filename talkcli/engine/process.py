@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.players.holders import kill_holders
+from talkcli.quota import Quota
 from talkcli.splitter import LineSplitter
 
 if TYPE_CHECKING:
@@ -228,24 +229,16 @@ class Murmur:
 
     def __init__(self) -> None:
         self._lines = LineSplitter(LONGEST)
-        self._since = float("-inf")
-        self._passed = 0
-        self._left_out = 0
+        self._quota = Quota(LINES, WHILE)
 
     def take(self, data: bytes, now: float) -> list[str]:
         """Take what was written, and return the lines to pass on; no data means that the process wrote its last."""
-        lines = self._lines.feed(data or b"\n")
-        return [words for line in lines if line.strip() for words in self._admit(line, now)]
-
-    def _admit(self, line: bytes, now: float) -> list[str]:
-        admitted = []
-        if now >= self._since + WHILE:
-            if self._left_out:
-                admitted.append(f"({self._left_out} lines were left out)")
-            self._since, self._passed, self._left_out = now, 0, 0
-        if self._passed < LINES:
-            self._passed += 1
-            admitted.append(line.decode(errors="replace").rstrip())
-        else:
-            self._left_out += 1
-        return admitted
+        passed = []
+        for line in self._lines.feed(data or b"\n"):
+            left_out = self._quota.take(now) if line.strip() else None
+            if left_out is None:
+                continue
+            if left_out:
+                passed.append(f"({left_out} lines were left out)")
+            passed.append(line.decode(errors="replace").rstrip())
+        return passed

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine.players.programs import NO_PLAYER
 from talkcli.goals.states import State
+from talkcli.quota import Quota
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -33,8 +34,7 @@ _MAX_COMMAND = 80
 _SELDOM = 60.0
 
 _lost = 0
-#: by kind: when it may be said again, and how often it happened since it was said
-_seldom: dict[str, tuple[float, int]] = {}
+_seldom: dict[str, Quota] = {}
 
 
 def line(words: str) -> None:
@@ -60,13 +60,9 @@ def line(words: str) -> None:
 
 def seldom(kind: str, words: str) -> None:
     """Write a line at most once a minute for each kind; the next one says how often it was not written."""
-    now = time.monotonic()
-    again_at, more = _seldom.get(kind, (0.0, 0))
-    if now < again_at:
-        _seldom[kind] = (again_at, more + 1)
-        return
-    _seldom[kind] = (now + _SELDOM, 0)
-    line(f"{words} ({more} more of these were not logged)" if more else words)
+    more = _seldom.setdefault(kind, Quota(1, _SELDOM)).take(time.monotonic())
+    if more is not None:
+        line(f"{words} ({more} more of these were not logged)" if more else words)
 
 
 def ended(record: Record, seconds: float | None) -> None:
