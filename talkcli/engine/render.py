@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING
 
 from talkcli.client.dial import ready
 from talkcli.engine import protocol
+from talkcli.engine.once import Conversation, EngineFailed
 from talkcli.engine.pieces import pieces
 from talkcli.engine.players.wavestream import WavStream
-from talkcli.engine.process import EngineProcess
-from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
 
@@ -79,7 +78,7 @@ def render(
     fault = texts.fault(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
-    says = [protocol.Say(f"{n}", each, rate, volume, voice, pitch) for n, each in enumerate(pieces(text), 1)]
+    says = (protocol.Say(f"{n}", each, rate, volume, voice, pitch) for n, each in enumerate(pieces(text), 1))
     if path not in STANDARD_OUTPUT and not _is_stream(path):
         target = _target(path)
         with _beside(target, path) as hidden:
@@ -218,32 +217,46 @@ def _speak_into(
     configure: protocol.Configure,
     name: str,
     path: str,
-    says: list[protocol.Say],
+    says: Iterator[protocol.Say],
     deadline: float | None,
     interrupt: Mapping[int, int] | None,
 ) -> float:
     """Speak all pieces, and return the seconds of audio. What the engine calls `name` is `path` to the user."""
-    try:
-        process = EngineProcess(configure)
-    except OSError as error:
-        raise RenderFailed("engine_failed", f"the engine process cannot be started: {error}") from error
-    conversation = _Conversation(process, deadline, interrupt)
     seconds = 0.0
     silent = None
     try:
-        for say in says:
-            ended = conversation.speak(say)
-            if ended.outcome == protocol.COMPLETED and ended.duration is not None:
-                seconds += ended.duration
-            elif ended.reason == "nothing_to_say":  # a piece of a long text may be rows of dots
-                silent = ended
-            else:
-                raise _failure(ended, name, path)
-    finally:
-        _end(process)
+        with Conversation(configure, deadline=deadline, interrupt=interrupt) as engine:
+            for ended in _endings(engine, says):
+                if ended.outcome == protocol.COMPLETED and ended.duration is not None:
+                    seconds += ended.duration
+                elif ended.reason == "nothing_to_say":  # a piece of a long text may be rows of dots
+                    silent = ended
+                else:
+                    raise _failure(ended, name, path)
+    except EngineFailed as error:
+        crashed = error.reason == "engine_crashed"
+        raise RenderFailed(error.reason, f"the engine crashed: {error}" if crashed else str(error)) from error
+    except TimeoutError:
+        raise TimeoutError("the text was not rendered in time") from None
     if silent and not seconds:
         raise _failure(silent, name, path)
     return seconds
+
+
+def _endings(engine: Conversation, says: Iterator[protocol.Say]) -> Iterator[protocol.Ended]:
+    """Have one piece spoken after the other, and give how each ended."""
+    for event in engine.events():
+        if isinstance(event, protocol.Ready):
+            if event.player is None:
+                raise UsageError(f'the driver "{event.driver}" cannot write a file: leave --driver out, on Linux')
+        elif isinstance(event, protocol.Ended):
+            yield event
+        else:
+            continue
+        say = next(says, None)
+        if say is None:
+            return
+        engine.say(say)
 
 
 def _failure(ended: protocol.Ended, name: str, path: str) -> RenderFailed:
@@ -253,82 +266,3 @@ def _failure(ended: protocol.Ended, name: str, path: str) -> RenderFailed:
         why = message.removeprefix(path)
         return CannotWrite(path, f"cannot be written{why}" if why.startswith(": ") else why.strip())
     return RenderFailed(reason, message)
-
-
-def _end(process: EngineProcess) -> None:
-    """Kill the process and see it gone: it could make the hidden file once more."""
-    process.kill()
-    if ready({process.liveness: select.POLLIN}, SILENCE_LIMIT):
-        process.silent()
-    process.close()
-
-
-class _Conversation:
-    """What is said to the engine process and heard of it, piece by piece; it has the thread's limits."""
-
-    def __init__(self, process: EngineProcess, deadline: float | None, interrupt: Mapping[int, int] | None) -> None:
-        self._process = process
-        self._say: protocol.Say | None = None
-        self._deadline = deadline
-        self._interrupt = interrupt
-        self._heard_at = time.monotonic()
-        self._ended: protocol.Ended | None = None
-
-    def speak(self, say: protocol.Say) -> protocol.Ended:
-        """Have a piece spoken, and return how that ended; RenderFailed, TimeoutError, Interrupted, UsageError."""
-        self._say, self._ended = say, None
-        if self._process.ready:
-            self._heard_at = time.monotonic()
-            self._send(say)
-        watched = {self._process.socket.fileno(): select.POLLIN, self._process.stderr: select.POLLIN}
-        while True:
-            found = ready(watched, self._wait(), self._interrupt)
-            if self._process.stderr in found and not self._process.read_stderr():
-                del watched[self._process.stderr]
-            # Before the limits: who was stopped by Ctrl-Z finds all that was said meanwhile, and the limits long past.
-            if self._process.socket.fileno() in found:
-                self._hear()
-            if self._ended is not None:
-                return self._ended
-            self._keep_limits(heard=self._process.socket.fileno() in found)
-
-    def _limit(self) -> float:
-        return HANG_AFTER if self._process.ready else START_LIMIT
-
-    def _wait(self) -> float:
-        due = self._heard_at + self._limit()
-        return max(0.0, min(due, self._deadline if self._deadline is not None else due) - time.monotonic())
-
-    def _keep_limits(self, heard: bool) -> None:
-        now = time.monotonic()
-        if self._deadline is not None and now >= self._deadline:
-            raise TimeoutError("the text was not rendered in time")
-        if heard or now < self._heard_at + self._limit():
-            return
-        if not self._process.ready:
-            raise RenderFailed("engine_failed", f"the engine was not ready after {START_LIMIT:g} s")
-        raise RenderFailed("engine_hung", f"the engine gave no sign of life for {HANG_AFTER:g} s")
-
-    def _hear(self) -> None:
-        for event in self._process.receive():
-            self._heard_at = time.monotonic()
-            if event is None:
-                raise RenderFailed("engine_crashed", f"the engine crashed: {self._process.last_words()}")
-            if isinstance(event, protocol.StartFailed):
-                raise RenderFailed(event.reason, event.message)
-            if isinstance(event, protocol.Ready):
-                self._begin(event)
-            elif isinstance(event, protocol.Ended):
-                self._ended = event
-                return
-
-    def _begin(self, event: protocol.Ready) -> None:
-        if event.player is None:
-            raise UsageError(f'the driver "{event.driver}" cannot write a file: leave --driver out, on Linux')
-        self._process.ready = True
-        if self._say is not None:
-            self._send(self._say)
-
-    def _send(self, say: protocol.Say) -> None:
-        if not self._process.send(say):
-            raise RenderFailed("engine_hung", "the engine takes no commands")
