@@ -40,15 +40,18 @@ def command_of(pid: int) -> str | None:
 
 def parent_command_of(pid: int) -> str | None:
     """Return the command line of the process that started this one, or None if it can't be known."""
-    stat = _read(f"/proc/{pid}/stat")
-    if not stat:
-        return None
-    # The second field is the program's name in brackets and may itself hold blanks and brackets: take what follows it.
-    parent = int(stat.rpartition(b")")[2].split()[1])
-    line = _read(f"/proc/{parent}/cmdline")
+    parent = stat_of(pid)[1:2]
+    line = _read(f"/proc/{int(parent[0])}/cmdline") if parent else None
     if not line:
         return None
     return line.rstrip(b"\0").replace(b"\0", b" ").decode(errors="replace")[:MAX_COMMAND]
+
+
+def stat_of(pid: int) -> list[bytes]:
+    """Return what /proc says of a process: state, parent, group, session, and more; empty if it can't be known."""
+    stat = _read(f"/proc/{pid}/stat") or b""
+    # Before these is the program's name, in brackets; it may itself hold blanks and brackets.
+    return stat.rpartition(b")")[2].split()
 
 
 def _read(path: str) -> bytes | None:
@@ -59,7 +62,7 @@ def _read(path: str) -> bytes | None:
         return None
     try:
         return os.read(fd, 4096)
-    except ProcessLookupError:
+    except OSError:  # it is gone by now
         return None
     finally:
         os.close(fd)

@@ -79,12 +79,7 @@ def _place(path: str, *, trusted: bool) -> Place:
 
 def _is_stopped(pid: int | None) -> bool:
     """Whether a process was stopped, by Ctrl-Z for one."""
-    try:
-        with open(f"/proc/{pid}/stat", "rb") as file:
-            # The name in brackets may hold anything, brackets too; then the state.
-            return file.read().rpartition(b")")[2].split()[0] == b"T"
-    except OSError:
-        return False
+    return pid is not None and peers.stat_of(pid)[:1] == [b"T"]
 
 
 def _owner(path: str) -> int | None:

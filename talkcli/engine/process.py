@@ -19,6 +19,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
+from talkcli import peers
 from talkcli.engine import protocol
 from talkcli.engine.players.holders import kill_holders
 from talkcli.quota import Quota
@@ -203,18 +204,11 @@ def _session(leader: int) -> list[int]:
 
     A player leads a group of its own; it dies with the engine process, but a pipeline that it has started would not.
     """
-    found: list[int] = []
     try:
-        names = os.listdir("/proc")
+        pids = [int(name) for name in os.listdir("/proc") if name.isdigit()]
     except OSError:
-        return found
-    for name in names:
-        if name.isdigit():
-            with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
-                # The name in brackets may hold anything, brackets too; then state, parent, group, session.
-                if int(file.read().rpartition(b")")[2].split()[3]) == leader:
-                    found.append(int(name))
-    return found
+        return []
+    return [pid for pid in pids if peers.stat_of(pid)[3:4] == [b"%d" % leader]]
 
 
 def _signal_name(number: int) -> str:
