@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import select
 import stat
 import time
@@ -19,10 +20,10 @@ from typing import TYPE_CHECKING
 from talkcli.client.dial import ready
 from talkcli.engine import protocol
 from talkcli.engine.once import Conversation, EngineFailed
-from talkcli.engine.pieces import pieces
 from talkcli.engine.players.wavestream import WavStream
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
+from talkcli.goals.options import MAX_CHARACTERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -36,6 +37,11 @@ _FROM_FILE = frozenset({"audio_device", "audio_lost"})
 STANDARD_OUTPUT = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
 #: Seconds between two looks whether somebody has opened a named pipe to read it: nothing tells of that.
 _READER_LOOK = 0.05
+#: Characters of a piece, as many as a goal may have: the engine says nothing while it prepares them.
+LONGEST_PIECE = MAX_CHARACTERS
+#: Where a text may be cut and sounds as if it were whole: behind the end of a sentence, or of a line.
+_SENTENCE_END = re.compile(r"""[.!?…]["')\]»”’]*\s+|[。！？।]|\n\s*""")
+_BLANK = re.compile(r"\s+")
 
 
 class RenderFailed(TalkError):
@@ -93,6 +99,21 @@ def render(
             if path in STANDARD_OUTPUT and ready({output: 0}, 0.0):
                 raise BrokenPipeError(errno.EPIPE, "the reader of standard output is gone") from error
             raise
+
+
+def pieces(text: str) -> Iterator[str]:
+    """Cut a text into pieces that are not too long, and that are the text when they are joined."""
+    start = 0
+    while len(text) - start > LONGEST_PIECE:
+        end = start + LONGEST_PIECE
+        for where in (_SENTENCE_END, _BLANK):
+            ends = [each.end() for each in where.finditer(text, start, end)]
+            if ends:
+                end = ends[-1]
+                break
+        yield text[start:end]
+        start = end
+    yield text[start:]
 
 
 def _named(path: str) -> str:

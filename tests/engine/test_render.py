@@ -21,9 +21,8 @@ from hypothesis import strategies as st
 
 from talkcli.client.dial import Interrupted
 from talkcli.engine import once
-from talkcli.engine.pieces import pieces
 from talkcli.engine.process import engine_command
-from talkcli.engine.render import CannotWrite, RenderFailed, render
+from talkcli.engine.render import CannotWrite, RenderFailed, pieces, render
 from talkcli.errors import TalkError, UsageError
 from tests.support.reference import RATE, Sentence
 from tests.support.reference import render as reference
@@ -87,7 +86,7 @@ def test_a_text_longer_than_a_goal_may_be_is_rendered_as_if_it_were_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "x.wav"
-    monkeypatch.setattr("talkcli.engine.pieces.LONGEST", 500)
+    monkeypatch.setattr("talkcli.engine.render.LONGEST_PIECE", 500)
     sentences = [f"This is number {number}, and so on." for number in range(20)]
     text = f"{' '.join(sentences)}\n\n{'... ' * 200}"  # and what is silent is no failure
     first, second, *rest = pieces(text)
@@ -97,7 +96,7 @@ def test_a_text_longer_than_a_goal_may_be_is_rendered_as_if_it_were_whole(
     spoken = reference([Sentence(first, 450), Sentence(second, 450)])
     assert samples(path) == b"".join(each.tobytes() for each in spoken)
     assert seconds == pytest.approx(len(samples(path)) / RATE / 2, abs=1e-3)
-    monkeypatch.setattr("talkcli.engine.pieces.LONGEST", 10_000)
+    monkeypatch.setattr("talkcli.engine.render.LONGEST_PIECE", 10_000)
     assert seconds == pytest.approx(render(first + second, str(path), rate=450), abs=0.02)
 
 
