@@ -384,7 +384,7 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path) -> None:
     path = tmp_path / "x.wav"
     path.write_bytes(BEFORE)
     began = time.monotonic()
-    with pytest.raises(TimeoutError):
+    with pytest.raises(TimeoutError, match="the text was not rendered in time"):
         render(LONGEST, str(path), timeout=0.3)
     assert time.monotonic() - began < 2
     reader, writer = os.pipe()
