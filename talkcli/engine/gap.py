@@ -23,7 +23,7 @@ MOST = 0.12
 LONGEST = 0.5
 
 
-class Changeover:
+class Gap:
     """How long it takes from one sentence to the next, by the players' names."""
 
     def __init__(self) -> None:

@@ -56,20 +56,20 @@ def _configuration(channel: Channel) -> protocol.Configure | None:
 
 def _serve(channel: Channel, configure: protocol.Configure) -> None:
     from talkcli.engine.players.base import CannotEnd
-    from talkcli.engine.players.outlet import Outlet
+    from talkcli.engine.players.which import Players
     from talkcli.engine.session import Session
     from talkcli.engine.start import CannotStart, start
 
-    outlet = Outlet(configure.player, configure.device, _inherited(), configure.lead_in / 1000, configure.output)
-    session = Session(channel, outlet.changeover)
+    players = Players(configure.player, configure.device, _inherited(), configure.lead_in / 1000, configure.output)
+    session = Session(channel, players.gap)
     try:
-        started = start(configure.driver, configure.voice, outlet, session.wait, session.hold)
+        started = start(configure.driver, configure.voice, players, session.wait, session.pause)
     except CannotStart as error:
         channel.send(protocol.StartFailed(error.reason, str(error), error.lasting, error.usage))
         return
     session.open(started.engine, started.settings, started.pump)
     own = started.pump is None
-    channel.send(protocol.Ready(started.driver, started.version, outlet.first() if own else None))
+    channel.send(protocol.Ready(started.driver, started.version, players.first() if own else None))
     try:
         session.run(configure.list_voices)
     except CannotEnd as error:  # the server sees that something is left, and speaks on with another process

@@ -26,7 +26,7 @@ SAID_AGAIN = 0.03
 RELEASE_AFTER = 10.0
 
 
-class Hold:
+class Pause:
     """A pause of the sentence in hand."""
 
     def __init__(self, on_silent: Callable[[int], None]) -> None:

@@ -1,7 +1,7 @@
 """The playback of one sentence: feeds a player, holds it where it is asked to, and judges whether all of it was heard.
 
 It waits only through the function it is given, which lets a stop and a pause come in. It knows nothing of synthesis and
-nothing of processes: a sink says what it takes, this says what that means.
+nothing of processes: a player says what it takes, this says what that means.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from talkcli.engine.clock import WordClock
 from talkcli.engine.pause import CLOCK_AHEAD, RELEASE_AFTER, SAID_AGAIN, SILENT_WITHIN
 from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
 from talkcli.engine.samples import Samples
-from talkcli.engine.stream import Feed
+from talkcli.engine.stream import Stream
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from talkcli.engine.clock import TimedWord
-    from talkcli.engine.pause import Hold
-    from talkcli.engine.players.base import Sink, Wait
-    from talkcli.engine.players.outlet import Outlet
+    from talkcli.engine.pause import Pause
+    from talkcli.engine.players.base import Player, Wait
+    from talkcli.engine.players.which import Players
 
 #: Seconds within which a player must take the first sound: a Bluetooth or USB device that sleeps needs one or two, a
 #: null sink that nobody records up to two.
@@ -52,14 +52,14 @@ GONE_WITHIN = 1.0
 class Playback:
     """One sentence on its way to the player. Every method may raise Stopped or AudioFailed, except the last two."""
 
-    def __init__(self, outlet: Outlet, wait: Wait, hold: Hold, on_word: Callable[[TimedWord], None]) -> None:
-        self._outlet = outlet
+    def __init__(self, players: Players, wait: Wait, pause: Pause, on_word: Callable[[TimedWord], None]) -> None:
+        self._players = players
         self._wait = wait
-        self._hold = hold
+        self._pause = pause
         self._on_word = on_word
         self._rate = 0
-        self._candidates: list[Callable[[], Sink]] = []
-        self._feed: Feed | None = None
+        self._candidates: list[Callable[[], Player]] = []
+        self._stream: Stream | None = None
         self._first_error: AudioFailed | None = None
         self._clock = WordClock()
         #: all of them until the player is proven, then those that were not heard yet
@@ -76,13 +76,13 @@ class Playback:
 
     def begin(self, rate: int) -> None:
         """Set the samples per second; before the first samples."""
-        if self._feed is not None and rate != self._rate:
+        if self._stream is not None and rate != self._rate:
             self._let_go(0)  # it was started for another
         self._rate = rate
 
     def prepare(self) -> None:
         """Start a player program now: it needs 5 to 15 ms, the synthesis 2. What goes wrong is told by `write`."""
-        if self._outlet.is_program and not self._hold.asked:
+        if self._players.is_program and not self._pause.asked:
             try:
                 self._try(lambda _: True)
             except AudioFailed:
@@ -109,65 +109,65 @@ class Playback:
         self._try(self._drain)
         for word in self._clock.rest():
             self._on_word(word)
-        if self._feed is not None:
-            self._outlet.worked(self._feed.sink.name)
-            self._outlet.changeover.ended(self._feed.sink.name, self._feed.over_at(time.monotonic()))
+        if self._stream is not None:
+            self._players.worked(self._stream.player.name)
+            self._players.gap.ended(self._stream.player.name, self._stream.over_at(time.monotonic()))
         return self._seconds(self._sent)
 
     def stop(self) -> None:
         """Be silent now; what waits ends with Stopped."""
         self._stopped = True
-        if self._feed is not None:
-            self._feed.sink.kill()
+        if self._stream is not None:
+            self._stream.player.kill()
 
     def silence(self) -> None:
         """Return when nothing can be heard any more, however it ended; CannotEnd where that can't be had."""
-        if self._feed is None:
+        if self._stream is None:
             return
-        sink = self._feed.sink
-        sink.kill()
+        player = self._stream.player
+        player.kill()
         limit = time.monotonic() + GONE_WITHIN
-        while not sink.gone():
+        while not player.gone():
             if time.monotonic() >= limit:
-                raise CannotEnd(f"{sink.name} could not be ended within {GONE_WITHIN:g} s")
+                raise CannotEnd(f"{player.name} could not be ended within {GONE_WITHIN:g} s")
             self._wait((), time.monotonic() + PIECE)
-        if sink.real_time and sink.proven:
-            self._outlet.let_go(self._silent_at)
+        if player.real_time and player.proven:
+            self._players.let_go(self._silent_at)
 
     # -- players
 
-    def _try(self, step: Callable[[Feed], bool]) -> None:
+    def _try(self, step: Callable[[Stream], bool]) -> None:
         """Do the step; where a player fails before any sound was taken, or is let go of, do it again with the next."""
         while True:
             self._check_stopped()
             try:
-                if self._feed is None:
+                if self._stream is None:
                     self._await_resume()
                     if 0 < self._begin == self._samples.end:  # held at its very end
                         return
-                    self._feed = self._open()
-                if step(self._feed):
+                    self._stream = self._open()
+                if step(self._stream):
                     return
             except AudioFailed as error:
                 self._next_player(error)
 
-    def _open(self) -> Feed:
+    def _open(self) -> Stream:
         if not self._candidates:
-            self._candidates = self._outlet.candidates(self._rate)
-        sink = self._candidates.pop(0)()
+            self._candidates = self._players.candidates(self._rate)
+        player = self._candidates.pop(0)()
         self._sent = self._begin
         self._silent_at = None
-        return Feed(sink, self._rate, self._clock, self._seconds(self._begin), self._outlet.lead_in())
+        return Stream(player, self._rate, self._clock, self._seconds(self._begin), self._players.lead_in())
 
     def _next_player(self, error: AudioFailed) -> None:
         """Give up on this player; raises the first player's error if there is no other, or if sound was taken."""
-        feed = self._feed
-        if feed is not None and feed.sink.real_time and self._hold.asked:
-            self._go_back(feed)  # what is held is spoken by another later, and fails then if there is none
+        stream = self._stream
+        if stream is not None and stream.player.real_time and self._pause.asked:
+            self._go_back(stream)  # what is held is spoken by another later, and fails then if there is none
             return
         first = self._first_error or error
         self._first_error = first
-        lost = feed is not None and (feed.sink.proven or error.reason == "audio_stalled")
+        lost = stream is not None and (stream.player.proven or error.reason == "audio_stalled")
         if lost or not (self._candidates or self._is_busy(first)):
             raise error if lost else first
         self._leave()
@@ -184,169 +184,169 @@ class Playback:
     def _leave(self) -> None:
         """End the player; the next one begins where `_begin` says."""
         self.silence()
-        self._feed = None
+        self._stream = None
 
     def _let_go(self, begin: int) -> None:
         """End the player of a sentence that is held; any of them may go on with it."""
-        feed, self._begin, self._sent = self._feed, begin, begin
-        if feed is not None and feed.sink.proven:
-            self._outlet.worked(feed.sink.name)  # tried first again
+        stream, self._begin, self._sent = self._stream, begin, begin
+        if stream is not None and stream.player.proven:
+            self._players.worked(stream.player.name)  # tried first again
         self._candidates = []
         self._first_error = None
         self._leave()
 
-    def _go_back(self, feed: Feed) -> None:
+    def _go_back(self, stream: Stream) -> None:
         """End a player that holds sound that wasn't heard; the next one begins there."""
-        feed.tick(time.monotonic(), last=False)  # the clock knows no better than this what was heard
-        self._let_go(self._unheard() if feed.sink.proven else self._begin)
+        stream.tick(time.monotonic(), last=False)  # the clock knows no better than this what was heard
+        self._let_go(self._unheard() if stream.player.proven else self._begin)
 
     # -- samples
 
-    def _feed_all(self, feed: Feed) -> bool:
+    def _feed_all(self, stream: Stream) -> bool:
         """Hand all samples there are to the player; False if it was let go of before."""
-        if feed.written == 0:
-            feed.progress_at = time.monotonic()  # what it was not given it could not take
+        if stream.written == 0:
+            stream.progress_at = time.monotonic()  # what it was not given it could not take
         while True:
-            if self._hold.asked and not self._stay_silent(feed):
+            if self._pause.asked and not self._stay_silent(stream):
                 return False
-            if self._sent == self._until(feed):
+            if self._sent == self._until(stream):
                 return True
-            taken = self._offer(feed)
-            self._tick(feed)
+            taken = self._offer(stream)
+            self._tick(stream)
             if taken:
                 continue
-            limit = FIRST_WITHIN if feed.taken == 0 else STALLED_AFTER
-            due = feed.progress_at + limit if feed.sink.real_time else None  # else it takes as long as its reader does
-            self._wait_for(feed, due)
-            if due and time.monotonic() >= due and not self._hold.asked and not self._offer(feed):
-                raise AudioFailed("audio_stalled", f"{feed.sink.name} took no sound for {limit:g} s")
+            limit = FIRST_WITHIN if stream.taken == 0 else STALLED_AFTER
+            due = stream.progress_at + limit if stream.player.real_time else None  # as long as a reader takes
+            self._wait_for(stream, due)
+            if due and time.monotonic() >= due and not self._pause.asked and not self._offer(stream):
+                raise AudioFailed("audio_stalled", f"{stream.player.name} took no sound for {limit:g} s")
 
-    def _drain(self, feed: Feed) -> bool:
+    def _drain(self, stream: Stream) -> bool:
         """Close the player's input and wait for its end; False if it was let go of before."""
-        if not self._feed_all(feed):
+        if not self._feed_all(stream):
             return False
-        sink = feed.sink
-        sink.close()
+        player = stream.player
+        player.close()
         now = time.monotonic()
-        limit = now + feed.ahead(now) + DRAIN_WITHIN
-        while not sink.ended():
-            self._tick(feed)
+        limit = now + stream.ahead(now) + DRAIN_WITHIN
+        while not player.ended():
+            self._tick(stream)
             now = time.monotonic()
-            if self._hold.asked and feed.ahead(now) > SILENT_WITHIN:
-                self._go_back(feed)
+            if self._pause.asked and stream.ahead(now) > SILENT_WITHIN:
+                self._go_back(stream)
                 return False  # with less than that left it has ended as soon as it could be held
             if now >= limit:
-                raise AudioFailed("audio_stalled", f"{sink.name} did not end {DRAIN_WITHIN:g} s after the sound")
-            self._wait_for(feed, limit)
-        missing = feed.missing(time.monotonic())
-        if sink.real_time and missing > EARLY_END - self._seconds(self._samples.end - self._sent):
-            raise AudioFailed("audio_lost", f"{sink.name} ended {missing:.1f} s before the sound did")
+                raise AudioFailed("audio_stalled", f"{player.name} did not end {DRAIN_WITHIN:g} s after the sound")
+            self._wait_for(stream, limit)
+        missing = stream.missing(time.monotonic())
+        if player.real_time and missing > EARLY_END - self._seconds(self._samples.end - self._sent):
+            raise AudioFailed("audio_lost", f"{player.name} ended {missing:.1f} s before the sound did")
         return True
 
-    def _offer(self, feed: Feed) -> int:
-        if feed.leading_in:
-            return feed.lead_in()
-        with self._samples.part(self._sent, min(self._until(feed), self._sent + feed.piece)) as part:
-            taken = feed.offer(part)
+    def _offer(self, stream: Stream) -> int:
+        if stream.leading_in:
+            return stream.lead_in()
+        with self._samples.part(self._sent, min(self._until(stream), self._sent + stream.piece)) as part:
+            taken = stream.offer(part)
         self._sent += taken
         return taken
 
-    def _until(self, feed: Feed) -> int:
+    def _until(self, stream: Stream) -> int:
         """Return the end of what is to be played: less silence where a goal waits, and for as long as one may come."""
-        if not feed.sink.real_time or (self._complete and not self._outlet.changeover.followed):
+        if not stream.player.real_time or (self._complete and not self._players.gap.followed):
             return self._samples.end
-        most = int(self._outlet.changeover.allowance(feed.sink.name) * self._rate) * SAMPLE
+        most = int(self._players.gap.allowance(stream.player.name) * self._rate) * SAMPLE
         return max(self._sent, self._samples.end - self._samples.quiet_end(most))
 
-    def _tick(self, feed: Feed) -> None:
+    def _tick(self, stream: Stream) -> None:
         """Bring the clock up to date, report the words that are heard, forget the samples that were heard."""
         now = time.monotonic()
-        feed.tick(now, last=self._sent == self._until(feed) and not self._hold.asked)
-        sink = feed.sink
-        if not sink.proven:
+        stream.tick(now, last=self._sent == self._until(stream) and not self._pause.asked)
+        player = stream.player
+        if not player.proven:
             return
-        if feed.taken and not self._began:
+        if stream.taken and not self._began:
             self._began = True
-            self._outlet.changeover.began(sink.name, feed.began_at(now))
-        self._samples.forget(self._unheard() if sink.real_time else self._sent)
-        for word in self._clock.due(now) if sink.real_time else self._clock.rest():
+            self._players.gap.began(player.name, stream.began_at(now))
+        self._samples.forget(self._unheard() if player.real_time else self._sent)
+        for word in self._clock.due(now) if player.real_time else self._clock.rest():
             self._on_word(word)
 
     # -- holding
 
-    def _stay_silent(self, feed: Feed) -> bool:
+    def _stay_silent(self, stream: Stream) -> bool:
         """Feed silence while the sentence is held; False if the player was let go of."""
-        if not feed.sink.real_time:
+        if not stream.player.real_time:
             self._await_resume()
             return True
-        if not self._fall_silent(feed):
+        if not self._fall_silent(stream):
             return False
-        if self._hold.asked and not self._stay_open(feed):
+        if self._pause.asked and not self._stay_open(stream):
             self._let_go(self._sent)  # what it held was heard
             return False
-        feed.progress_at = time.monotonic()
+        stream.progress_at = time.monotonic()
         return True
 
-    def _fall_silent(self, feed: Feed) -> bool:
+    def _fall_silent(self, stream: Stream) -> bool:
         """Return when all that the player has of the sentence is heard, or it may go on; False if it was let go of."""
-        self._tick(feed)
-        mark, now = feed.written, time.monotonic()
+        self._tick(stream)
+        mark, now = stream.written, time.monotonic()
         limit = now + SILENT_WITHIN
-        hopeless = feed.taken == 0 or feed.unheard(mark, now) > SILENT_WITHIN
-        while self._hold.asked and (left := feed.unheard(mark, now) + CLOCK_AHEAD) > 0:
+        hopeless = stream.taken == 0 or stream.unheard(mark, now) > SILENT_WITHIN
+        while self._pause.asked and (left := stream.unheard(mark, now) + CLOCK_AHEAD) > 0:
             if hopeless or now >= limit:
-                self._go_back(feed)
+                self._go_back(stream)
                 return False
-            if not self._feed_silence(feed):
-                self._wait_for(feed, min(limit, now + left))
-            self._tick(feed)
+            if not self._feed_silence(stream):
+                self._wait_for(stream, min(limit, now + left))
+            self._tick(stream)
             now = time.monotonic()
         return True
 
-    def _stay_open(self, feed: Feed) -> bool:
+    def _stay_open(self, stream: Stream) -> bool:
         """Keep the player that holds nothing but silence; False if it failed, or must be let go of, before the end."""
         self._silent_at = time.monotonic()
         release_at = self._silent_at + RELEASE_AFTER
-        while self._hold.asked:
-            self._hold.confirm()
+        while self._pause.asked:
+            self._pause.confirm()
             try:
-                fed = self._feed_silence(feed)
+                fed = self._feed_silence(stream)
             except AudioFailed:
                 return False  # a pause is no reason to end the sentence
-            due = min(release_at, feed.progress_at + STALLED_AFTER)
+            due = min(release_at, stream.progress_at + STALLED_AFTER)
             if time.monotonic() >= due:
                 return False
             if not fed:
-                self._wait_for(feed, due)
+                self._wait_for(stream, due)
         self._silent_at = None
         return True
 
-    def _feed_silence(self, feed: Feed) -> int:
+    def _feed_silence(self, stream: Stream) -> int:
         """Offer a piece of silence, unless the player has more than enough: one that takes all would keep us busy."""
-        feed.sink.ended()  # raises if it is gone
-        taken = 0 if self._full(feed) else feed.offer_silence(self._seconds(self._sent))
-        self._tick(feed)
+        stream.player.ended()  # raises if it is gone
+        taken = 0 if self._full(stream) else stream.offer_silence(self._seconds(self._sent))
+        self._tick(stream)
         return taken
 
-    def _full(self, feed: Feed) -> bool:
-        return self._hold.asked and feed.ahead(time.monotonic()) >= SILENT_WITHIN
+    def _full(self, stream: Stream) -> bool:
+        return self._pause.asked and stream.ahead(time.monotonic()) >= SILENT_WITHIN
 
     def _await_resume(self) -> None:
         """Wait, without a player, while the sentence is held."""
-        while self._hold.asked:
-            self._hold.confirm()
+        while self._pause.asked:
+            self._pause.confirm()
             self._wait((), None)
             self._check_stopped()
 
-    def _wait_for(self, feed: Feed, until: float | None) -> None:
-        sink, now = feed.sink, time.monotonic()
-        moments = [until, sink.wake_at(), self._clock.next_due() if sink.proven else None]
-        full = self._full(feed)
+    def _wait_for(self, stream: Stream, until: float | None) -> None:
+        player, now = stream.player, time.monotonic()
+        moments = [until, player.wake_at(), self._clock.next_due() if player.proven else None]
+        full = self._full(stream)
         if full:
             moments[1] = now + PIECE
-        if feed.taken < feed.written:  # a player that takes a part of what waits wakes nobody
+        if stream.taken < stream.written:  # a player that takes a part of what waits wakes nobody
             moments.append(now + LOOK_EVERY)
-        self._wait(feed.interests(full), min((moment for moment in moments if moment is not None), default=None))
+        self._wait(stream.interests(full), min((moment for moment in moments if moment is not None), default=None))
         self._check_stopped()
 
     def _check_stopped(self) -> None:

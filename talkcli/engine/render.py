@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from talkcli.client.dial import ready
 from talkcli.engine import protocol
 from talkcli.engine.once import Conversation, EngineFailed
-from talkcli.engine.players.wavestream import WavStream
+from talkcli.engine.players.wav_stream import WavStreamPlayer
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
 from talkcli.goals.options import MAX_CHARACTERS
@@ -94,7 +94,7 @@ def render(
     with _stream(path, deadline, ends) as output:
         configure = protocol.Configure(os.getpid(), driver, None, None, None, list_voices=False, output=output)
         try:
-            return _speak_into(configure, WavStream.name, _named(path), says, deadline, ends)
+            return _speak_into(configure, WavStreamPlayer.name, _named(path), says, deadline, ends)
         except CannotWrite as error:
             if path in STANDARD_OUTPUT and ready({output: 0}, 0.0):
                 raise BrokenPipeError(errno.EPIPE, "the reader of standard output is gone") from error

@@ -15,7 +15,7 @@ import traceback
 from collections import deque
 
 from talkcli.engine import protocol
-from talkcli.engine.pause import Hold
+from talkcli.engine.pause import Pause
 from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.settings import SettingFailed
 from talkcli.engine.synthesizers.voices import list_voices
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.channel import Channel
-    from talkcli.engine.gap import Changeover
+    from talkcli.engine.gap import Gap
     from talkcli.engine.players.base import Interest
     from talkcli.engine.protocol import Command
     from talkcli.engine.settings import Settings
@@ -74,9 +74,9 @@ class InHand:
 class Session:
     """The loop. `open` gives it its engine, `run` runs it."""
 
-    def __init__(self, channel: Channel, changeover: Changeover) -> None:
+    def __init__(self, channel: Channel, gap: Gap) -> None:
         self._channel = channel
-        self._changeover = changeover
+        self._gap = gap
         self._backlog: deque[Command] = deque()
         self._leaving = False
         self._goal: InHand | None = None
@@ -84,7 +84,7 @@ class Session:
         self._settings: Settings | None = None
         self._pump: Callable[[], None] | None = None
         #: for our own driver to obey, and what the session itself goes by with another
-        self.hold = Hold(self._tell_paused)
+        self.pause = Pause(self._tell_paused)
 
     def open(self, engine: Any, settings: Settings, pump: Callable[[], None] | None) -> None:
         """Take the engine; `pump` is called about 20 times a second while a goal is spoken by a foreign driver."""
@@ -132,7 +132,7 @@ class Session:
             self._stop(command)
         elif isinstance(command, protocol.Followed):
             if goal is not None and goal.id == command.id:
-                self._changeover.followed = command.followed
+                self._gap.followed = command.followed
         elif isinstance(command, protocol.Pause | protocol.Resume):
             if goal is not None and goal.id == command.id and not goal.stop_asked:
                 self._hold_or_go_on(goal, command)
@@ -142,9 +142,9 @@ class Session:
 
     def _hold_or_go_on(self, goal: InHand, command: protocol.Pause | protocol.Resume) -> None:
         if isinstance(command, protocol.Resume):
-            self.hold.release()
+            self.pause.release()
             return
-        self.hold.ask(command.number)
+        self.pause.ask(command.number)
         if self._pump is not None and goal.spoken and not goal.interrupted:
             goal.interrupted = True
             self._engine.stop()
@@ -183,8 +183,8 @@ class Session:
         """Speak a goal to its end."""
         assert self._settings is not None
         self._goal = goal = InHand(say, time.monotonic())
-        self.hold.release()
-        self._changeover.followed = say.followed
+        self.pause.release()
+        self._gap.followed = say.followed
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
         waiting, self._backlog = self._backlog, deque()
@@ -206,8 +206,8 @@ class Session:
         if goal.spoken:
             self._step()
             return
-        if self._pump is not None and self.hold.asked:
-            self.hold.confirm()
+        if self._pump is not None and self.pause.asked:
+            self.pause.confirm()
             self.wait((), None)
             return
         if goal.silent_at is not None:

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
-    from talkcli.engine.pause import Hold
+    from talkcli.engine.pause import Pause
     from talkcli.engine.players.base import Wait
-    from talkcli.engine.players.outlet import Outlet
+    from talkcli.engine.players.which import Players
 
 #: The drivers of macOS that speak in Apple's run loop, which somebody has to run.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
@@ -53,14 +53,14 @@ class OpenEngine:
     pump: Callable[[], None] | None
 
 
-def start(driver: str | None, voice: str | None, outlet: Outlet, wait: Wait, hold: Hold) -> OpenEngine:
+def start(driver: str | None, voice: str | None, players: Players, wait: Wait, pause: Pause) -> OpenEngine:
     """Build the engine, with its loop started; CannotStart."""
     try:
         import pyttsx3
     except ModuleNotFoundError as error:
         raise CannotStart(f"pyttsx3 is missing: pip install pyttsx3 ({error})") from error
     own = is_own(driver)
-    version = _register_own(outlet, wait, hold) if own else None
+    version = _register_own(players, wait, pause) if own else None
     from talkcli.engine.synthesizers.espeak import DRIVER
 
     name = DRIVER if own else driver or pyttsx3.engine.default_engine_by_sys_platform()
@@ -81,7 +81,7 @@ def is_own(driver: str | None) -> bool:
     return sys.platform.startswith("linux") and driver in (None, _OWN_NAME)
 
 
-def _register_own(outlet: Outlet, wait: Wait, hold: Hold) -> str:
+def _register_own(players: Players, wait: Wait, pause: Pause) -> str:
     from talkcli.engine.synthesizers.espeak import register
     from talkcli.engine.synthesizers.library import LibraryMissing, load
 
@@ -89,7 +89,7 @@ def _register_own(outlet: Outlet, wait: Wait, hold: Hold) -> str:
         library = load()
     except LibraryMissing as error:
         raise CannotStart(str(error)) from error
-    register(library, outlet, wait, hold)
+    register(library, players, wait, pause)
     return library.version
 
 

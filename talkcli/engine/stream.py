@@ -14,18 +14,18 @@ from talkcli.engine.players.base import PIECE, SAMPLE
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from talkcli.engine.clock import WordClock
-    from talkcli.engine.players.base import Interest, Sink
+    from talkcli.engine.players.base import Interest, Player
 
 #: Seconds of sound that a player holds at least between taking and playing it: of the 60 ms it is asked for, aplay was
 #: seen to hold 42 to 78, pacat 25 to 60.
 PLAYER_HOLDS = 0.02
 
 
-class Feed:
+class Stream:
     """A player's stream; `begin` is the position in the sentence's audio, in seconds, at which it takes over."""
 
-    def __init__(self, sink: Sink, rate: int, clock: WordClock, begin: float, lead_in: float) -> None:
-        self.sink = sink
+    def __init__(self, player: Player, rate: int, clock: WordClock, begin: float, lead_in: float) -> None:
+        self.player = player
         #: bytes that are offered at once
         self.piece = int(PIECE * rate) * SAMPLE
         #: bytes that the player has taken, by its own count, when it last grew; silence included, as in the next
@@ -39,7 +39,7 @@ class Feed:
         self._clock = clock
         self._first_write = 0.0
         self._begin = begin
-        self._lead_in = int(lead_in * rate) * SAMPLE if sink.real_time else 0
+        self._lead_in = int(lead_in * rate) * SAMPLE if player.real_time else 0
         clock.begin(begin)
 
     @property
@@ -55,7 +55,7 @@ class Feed:
 
     def offer(self, samples: memoryview) -> int:
         """Offer samples, no more than a piece; return the bytes that were taken."""
-        taken = self.sink.offer(samples)
+        taken = self.player.offer(samples)
         if taken:
             self._wrote(taken)
         return taken
@@ -66,14 +66,14 @@ class Feed:
 
     def tick(self, now: float, last: bool) -> None:
         """Bring the clock up to date; `last` says that nothing more waits to be written."""
-        consumed = self.sink.consumed()
+        consumed = self.player.consumed()
         if consumed > self.taken:
             if self.taken == 0:  # it has opened its device: the clock starts here, not with what waited in the pipe
                 self._clock.start(now)
             self.taken = consumed
             if consumed >= self.written:  # one that nibbles would never be done
                 self.progress_at = now
-        if self.sink.real_time and not (last and consumed >= self.written):
+        if self.player.real_time and not (last and consumed >= self.written):
             self._clock.hold(now, max(0.0, self._seconds(consumed) - PLAYER_HOLDS))
 
     def ahead(self, now: float) -> float:
@@ -98,10 +98,10 @@ class Feed:
 
     def interests(self, full: bool) -> list[Interest]:
         """Return what to poll for; where nothing is to be written, not for room to write."""
-        return [each for each in self.sink.interests() if not (full and each[1] == select.POLLOUT)]
+        return [each for each in self.player.interests() if not (full and each[1] == select.POLLOUT)]
 
     def _offer_silence(self, position: float, length: int) -> int:
-        taken = self.sink.offer(memoryview(self._zeros)[:length])
+        taken = self.player.offer(memoryview(self._zeros)[:length])
         if taken:
             self._wrote(taken)
             self._clock.insert(position, self._seconds(taken))

@@ -14,7 +14,7 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.players.child import Child
-from talkcli.engine.players.program import PlayerPipe
+from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.programs import Command
 from tests.engine.spawned import FAST, Spawned, children
 from tests.engine.test_player_faults import Player
@@ -220,7 +220,7 @@ def test_all_that_a_player_has_started_dies_with_a_killed_process(tmp_path: Path
 def test_a_player_that_starts_finds_what_it_needs_to_begin_and_later_a_piece_at_a_time(
     at_start: int, pieces: int
 ) -> None:
-    player = PlayerPipe(Command("sleep", ("sleep", "100"), read_ahead=0, at_start=at_start))
+    player = ProgramPlayer(Command("sleep", ("sleep", "100"), read_ahead=0, at_start=at_start))
     taken = []
     while size := player.offer(memoryview(bytes(882))):
         taken.append(size)

@@ -1,6 +1,6 @@
-"""What takes the samples of one sentence: the interface of a sink, and the errors that end a sentence.
+"""What takes the samples of one sentence: the interface of a player, and the errors that end a sentence.
 
-Samples are signed 16 bit, little-endian, one channel; lengths are in bytes. A sink never blocks and never waits: it
+Samples are signed 16 bit, little-endian, one channel; lengths are in bytes. A player never blocks and never waits: it
 says what it can take, and what to wait for. Nothing here opens or starts anything.
 """
 
@@ -40,7 +40,7 @@ class CannotEnd(Exception):
     """A player was killed and is not gone: nobody knows whether it is silent, and this process is of no more use."""
 
 
-class Sink(Protocol):
+class Player(Protocol):
     """Where the samples of one sentence go."""
 
     #: the player's name, for people and to find it again.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 AHEAD = 0.06
 
 
-class NullSink:
+class NullPlayer:
     """Takes samples at the pace of the clock."""
 
     name = "null"

@@ -1,4 +1,4 @@
-"""A player program at the end of a pipe: the sink that is heard.
+"""A player program at the end of a pipe: the player that is heard.
 
 It is started for one sentence and is gone after it. Nothing in here blocks, except that a killed player is given a
 moment to be reaped.
@@ -36,7 +36,7 @@ LOOK_EVERY = 0.01
 STDERR_AT_ONCE = 65536
 
 
-class PlayerPipe:
+class ProgramPlayer:
     """The running player of one sentence."""
 
     real_time = True

@@ -24,7 +24,7 @@ _UNKNOWN = 0xFFFFFFFF
 _LONGEST = _UNKNOWN - _HEADER.size
 
 
-class WavFile:
+class WavPlayer:
     """The WAV file, open for one sentence."""
 
     real_time = False

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import Any
 
-    from talkcli.engine.pause import Hold
+    from talkcli.engine.pause import Pause
     from talkcli.engine.players.base import Wait
-    from talkcli.engine.players.outlet import Outlet
+    from talkcli.engine.players.which import Players
     from talkcli.engine.synthesizers.library import Library
 
 #: Its name among pyttsx3's drivers.
@@ -49,10 +49,10 @@ class UnknownVoice(Exception):
     """The library has no such voice."""
 
 
-def register(library: Library, outlet: Outlet, wait: Wait, hold: Hold) -> None:
+def register(library: Library, players: Players, wait: Wait, pause: Pause) -> None:
     """Put the driver among pyttsx3's own, so that `pyttsx3.init(DRIVER)` finds it."""
     module: Any = types.ModuleType(f"pyttsx3.drivers.{DRIVER}")
-    module.buildDriver = lambda proxy: EspeakDriver(proxy, library, outlet, wait, hold)
+    module.buildDriver = lambda proxy: EspeakDriver(proxy, library, players, wait, pause)
     sys.modules[module.__name__] = module
 
 
@@ -63,16 +63,16 @@ class EspeakDriver:
         self,
         proxy: Any,
         library: Library,
-        outlet: Outlet,
+        players: Players,
         wait: Wait,
-        hold: Hold,
+        pause: Pause,
     ) -> None:
         self._proxy = proxy
         self._espeak = library.espeak
         self._rate = library.rate
-        self._outlet = outlet
+        self._players = players
         self._wait = wait
-        self._hold = hold
+        self._pause = pause
         self._text: str | None = None
         self._spoken = ""
         self._playback: Playback | None = None
@@ -152,7 +152,7 @@ class EspeakDriver:
     def _speak(self, text: str) -> None:
         """Speak the text, with exactly one finished-utterance at its end."""
         self._proxy.notify("started-utterance")
-        self._playback = playback = Playback(self._outlet, self._wait, self._hold, self._word_heard)
+        self._playback = playback = Playback(self._players, self._wait, self._pause, self._word_heard)
         playback.begin(self._rate)
         failure: Exception | None = None
         duration = None

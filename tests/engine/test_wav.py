@@ -10,7 +10,7 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.players.base import AudioFailed
-from talkcli.engine.players.wav import WavFile
+from talkcli.engine.players.wav import WavPlayer
 from tests.engine.spawned import Spawned
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def _write(path: Path, data: bytes, rate: int = 22050) -> None:
-    file = WavFile(str(path), rate)
+    file = WavPlayer(str(path), rate)
     assert file.offer(memoryview(data)) == len(data)
     file.close()
     assert file.ended()
@@ -40,7 +40,7 @@ def test_sentences_are_appended(tmp_path: Path) -> None:
 
 def test_a_killed_sentence_leaves_a_valid_file(tmp_path: Path) -> None:
     path = tmp_path / "x.wav"
-    file = WavFile(str(path), 22050)
+    file = WavPlayer(str(path), 22050)
     file.offer(memoryview(b"one "))
     file.kill()
     file.kill()
@@ -100,7 +100,7 @@ def test_other_content_is_refused_and_left_alone(tmp_path: Path, make: object) -
     make(path)
     before = path.read_bytes()
     with pytest.raises(AudioFailed) as caught:
-        WavFile(str(path), 22050)
+        WavPlayer(str(path), 22050)
     assert caught.value.reason == "audio_device"
     assert str(path) in str(caught.value)
     assert path.read_bytes() == before
@@ -110,14 +110,14 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path, tmp_path / "pipe", tmp_path / "missing" / "x.wav", "", "/dev/null"):
         with pytest.raises(AudioFailed) as caught:
-            WavFile(str(path), 22050)
+            WavPlayer(str(path), 22050)
         assert caught.value.reason == "audio_device"
 
 
 def test_a_full_disk_is_an_error_and_no_descriptor_is_left() -> None:
     before = os.listdir("/proc/self/fd")
     with pytest.raises(AudioFailed):
-        WavFile("/dev/full", 22050)
+        WavPlayer("/dev/full", 22050)
     assert os.listdir("/proc/self/fd") == before
 
 

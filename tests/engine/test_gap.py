@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.gap import LONGEST, MOST, REMEMBERED, Changeover
+from talkcli.engine.gap import LONGEST, MOST, REMEMBERED, Gap
 from talkcli.engine.samples import QUIET, Samples
 from tests.engine.spawned import FAST, Spawned
 from tests.engine.test_player_faults import Player
@@ -21,7 +21,7 @@ TEXTS = ["battery low", "coming home", "please help"]
 #: Seconds that are left out where a test says so, and what that is in bytes: even a fast sentence ends in as much.
 LEFT_OUT = 0.02
 _BYTES = int(LEFT_OUT * RATE) * 2
-_SAYS_SO = f"from talkcli.engine.gap import Changeover\nChangeover.allowance = lambda *_: {LEFT_OUT}"
+_SAYS_SO = f"from talkcli.engine.gap import Gap\nGap.allowance = lambda *_: {LEFT_OUT}"
 
 
 @pytest.fixture
@@ -37,56 +37,56 @@ def _sentences(rate: int = FAST) -> list[bytes]:
     return [each.tobytes() for each in render(TEXTS, rate=rate)]
 
 
-def _changed(changeover: Changeover, took: float, player: str = "aplay") -> None:
+def _changed(gap: Gap, took: float, player: str = "aplay") -> None:
     """Have one sentence follow another after so many seconds."""
-    changeover.followed = True
-    changeover.ended(player, 100.0)
-    changeover.began(player, 100.0 + took)
+    gap.followed = True
+    gap.ended(player, 100.0)
+    gap.began(player, 100.0 + took)
 
 
 # -- how much
 
 
 def test_nothing_is_left_out_before_two_sentences_have_followed_each_other() -> None:
-    changeover = Changeover()
-    changeover.began("aplay", 100.0)
-    assert changeover.allowance("aplay") == 0.0
+    gap = Gap()
+    gap.began("aplay", 100.0)
+    assert gap.allowance("aplay") == 0.0
 
 
 def test_it_is_what_the_last_changes_took_and_a_late_one_counts_for_no_more_than_another() -> None:
-    changeover = Changeover()
+    gap = Gap()
     for took in (0.03, 0.031, 0.09, 0.029, 0.032):
-        _changed(changeover, took)
-    assert changeover.allowance("aplay") == pytest.approx(0.031)
+        _changed(gap, took)
+    assert gap.allowance("aplay") == pytest.approx(0.031)
     for _ in range(REMEMBERED):
-        _changed(changeover, 0.01)
-    assert changeover.allowance("aplay") == pytest.approx(0.01)
+        _changed(gap, 0.01)
+    assert gap.allowance("aplay") == pytest.approx(0.01)
 
 
 def test_each_player_has_its_own() -> None:
-    changeover = Changeover()
-    _changed(changeover, 0.03)
-    assert changeover.allowance("pacat") == 0.0
-    changeover.ended("aplay", 200.0)
-    changeover.began("pacat", 200.1)
-    assert changeover.allowance("aplay") == pytest.approx(0.03)
-    assert changeover.allowance("pacat") == 0.0
+    gap = Gap()
+    _changed(gap, 0.03)
+    assert gap.allowance("pacat") == 0.0
+    gap.ended("aplay", 200.0)
+    gap.began("pacat", 200.1)
+    assert gap.allowance("aplay") == pytest.approx(0.03)
+    assert gap.allowance("pacat") == 0.0
 
 
 def test_it_is_never_more_than_half_of_the_pause_between_sentences() -> None:
-    changeover = Changeover()
-    _changed(changeover, 0.4)
-    assert changeover.allowance("aplay") == MOST < 0.235 / 2 + 0.01
+    gap = Gap()
+    _changed(gap, 0.4)
+    assert gap.allowance("aplay") == MOST < 0.235 / 2 + 0.01
 
 
 def test_what_was_no_change_does_not_count() -> None:
     """Nobody waited; or who waited was recalled, and another came much later."""
-    changeover = Changeover()
-    changeover.ended("aplay", 100.0)
-    changeover.began("aplay", 100.03)
-    _changed(changeover, LONGEST + 0.1)
-    changeover.began("aplay", 100.04)
-    assert changeover.allowance("aplay") == 0.0
+    gap = Gap()
+    gap.ended("aplay", 100.0)
+    gap.began("aplay", 100.03)
+    _changed(gap, LONGEST + 0.1)
+    gap.began("aplay", 100.04)
+    assert gap.allowance("aplay") == 0.0
 
 
 # -- of what
@@ -159,7 +159,7 @@ def test_a_player_that_ends_too_early_is_seen_as_before(player: Player) -> None:
     """A sentence may not end sooner than so much before its whole length, what was left out of it included."""
     rate = 200  # at which the silence at the end is that long
     length = len(_sentences(rate)[0]) / 2 / RATE
-    before = "from talkcli.engine.gap import Changeover\nChangeover.allowance = lambda *_: 0.2"
+    before = "from talkcli.engine.gap import Gap\nGap.allowance = lambda *_: 0.2"
     hurried = "import os\nwhile os.read(0, 65536): pass"  # it is over by what it gets, which is 0.2 s less
     with Spawned(player.command(hurried), before=before, limits={"EARLY_END": length - 0.2}) as engine:
         engine.until(protocol.Voices)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from talkcli.engine.players.base import Interest
 
 
-class WavStream:
+class WavStreamPlayer:
     """The stream, for one of the sentences that follow each other in it."""
 
     real_time = False

@@ -1,4 +1,4 @@
-"""Where the sound goes: opens a sink for each sentence, as `--player` and `--device` say.
+"""Where the sound goes: opens a player for each sentence, as `--player` and `--device` say.
 
 It remembers which player worked and when the device was last in use: none is open between two sentences.
 """
@@ -8,19 +8,19 @@ from __future__ import annotations
 import time
 from functools import partial
 
-from talkcli.engine.gap import Changeover
+from talkcli.engine.gap import Gap
 from talkcli.engine.players.base import AudioFailed
-from talkcli.engine.players.null import NullSink
-from talkcli.engine.players.program import PlayerPipe
+from talkcli.engine.players.null import NullPlayer
+from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.programs import commands, on_path
-from talkcli.engine.players.wav import WavFile
-from talkcli.engine.players.wavestream import WavStream
+from talkcli.engine.players.wav import WavPlayer
+from talkcli.engine.players.wav_stream import WavStreamPlayer
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from talkcli.engine.players.base import Sink
+    from talkcli.engine.players.base import Player
 
 _NULL = "null"
 _FILE = "file:"
@@ -31,7 +31,7 @@ _FILE = "file:"
 IDLE_AFTER = 1.0
 
 
-class Outlet:
+class Players:
     """The player setting of one engine process."""
 
     def __init__(
@@ -53,7 +53,7 @@ class Outlet:
         self._output = output
         self._streaming = False
         #: what lies between two sentences
-        self.changeover = Changeover()
+        self.gap = Gap()
         self._worked: str | None = None
         self._used_at: float | None = None
 
@@ -62,16 +62,16 @@ class Outlet:
         """Whether what plays is a program, which takes a while to start."""
         return self._output is None and self._player != _NULL and not (self._player or "").startswith(_FILE)
 
-    def candidates(self, rate: int) -> list[Callable[[], Sink]]:
-        """Return what opens the sinks to try for a sentence, best first; AudioFailed if there is none."""
+    def candidates(self, rate: int) -> list[Callable[[], Player]]:
+        """Return what opens the players to try for a sentence, best first; AudioFailed if there is none."""
         if self._output is not None:
             return [partial(self._stream, self._output, rate)]
         if self._player == _NULL:
-            return [partial(NullSink, rate)]
+            return [partial(NullPlayer, rate)]
         if self._player is not None and self._player.startswith(_FILE):
-            return [partial(WavFile, self._player[len(_FILE) :], rate)]
+            return [partial(WavPlayer, self._player[len(_FILE) :], rate)]
         found = commands(self._player, self._device, rate, on_path, self._worked)
-        return [partial(PlayerPipe, command, self._inherited) for command in found]
+        return [partial(ProgramPlayer, command, self._inherited) for command in found]
 
     def worked(self, name: str) -> None:
         """Take note that a sentence was played whole by the player of this name."""
@@ -89,7 +89,7 @@ class Outlet:
     def first(self) -> str | None:
         """Return the name of what is tried first, for people; None if nothing is found."""
         if self._output is not None:
-            return WavStream.name
+            return WavStreamPlayer.name
         if self._player is not None:
             return self._player
         try:
@@ -97,6 +97,6 @@ class Outlet:
         except AudioFailed:
             return None
 
-    def _stream(self, output: int, rate: int) -> WavStream:
+    def _stream(self, output: int, rate: int) -> WavStreamPlayer:
         first, self._streaming = not self._streaming, True
-        return WavStream(output, rate, first=first)
+        return WavStreamPlayer(output, rate, first=first)
