@@ -1,7 +1,7 @@
-"""What takes the samples of one sentence: the interface of a player, and the errors that end a sentence.
+"""What takes the samples of one sentence: the interface of a player, its contract, and the errors that end a sentence.
 
-Samples are signed 16 bit, little-endian, one channel; lengths are in bytes. A player never blocks and never waits: it
-says what it can take, and what to wait for. Nothing here opens or starts anything.
+Samples are signed 16 bit, little-endian, one channel; lengths are in bytes. Nothing here opens or starts anything.
+`tests/engine/test_player_contract.py` puts every player through what `Player` says.
 """
 
 from __future__ import annotations
@@ -41,38 +41,71 @@ class CannotEnd(Exception):
 
 
 class Player(Protocol):
-    """Where the samples of one sentence go."""
+    """Where the samples of one sentence go: opened for it, and never used again after it.
 
-    #: the player's name, for people and to find it again.
+    What opens a player raises AudioFailed (`no_player`, `audio_device`) where that is impossible, and leaves nothing
+    open then. From there on the playback alone calls it, in one thread: `offer` as long as there are samples, then
+    `close` once, then `ended` until it is true; `consumed` and `proven` in between, at any time. `interests` and
+    `wake_at` are asked right before each wait. A sentence may end at any point of this, by a stop or an error; last
+    comes `kill`, however it ended, and `gone` until it is true.
+
+    Nothing in a player blocks or waits: what would is done in another thread or process of its own, which wakes the
+    playback by a descriptor. But for `kill`: it may take some milliseconds where silence is certain then. It plays
+    what it took, all of it, in order and once, without silence of its own. A mistake of the world (a device that is
+    unplugged, a full disk) is AudioFailed; any other exception is a mistake of the player's.
+    """
+
+    #: the player's name, for people, and to find it again among those that worked. It never changes.
     name: str
-    #: True where sound takes as long as it lasts; False for a file, which is done at once.
+    #: True where sound takes as long as it lasts, so that a player which takes none is stuck; False for a file, which
+    #: is done at once and never heard. It never changes.
     real_time: bool
     #: True once it is sure that sound has been taken: from then on it may have been heard, and is not played again.
+    #: Before that, the sentence goes to the next player if this one fails. Up to date after `consumed`, and never False
+    #: again; a player that never lets go of what it was offered may be born with it.
     proven: bool
 
     def offer(self, data: memoryview) -> int:
-        """Take what fits now and return its length; 0 if it is full. AudioFailed if it takes nothing any more."""
+        """Take what fits now and return its length, which may end within a sample; 0 if it is full.
+
+        `data` is never empty, no longer than a piece, and is not to be kept: it is overwritten afterwards. AudioFailed
+        if the player takes nothing any more, then and each time from then on.
+        """
 
     def consumed(self) -> int:
-        """Return how much the player has taken out; the rest waits in the pipe."""
+        """Return how much of what `offer` took has left for the device; the rest waits, and could still be lost.
+
+        It never shrinks, is never more than was taken, and comes to all of it by the time that `ended` is true. The
+        word clock starts where it begins to grow, and is held back by it.
+        """
 
     def close(self) -> None:
-        """Take note that no more samples follow."""
+        """Take note that no more samples follow: what was taken is played to its end. AudioFailed if that is lost."""
 
     def ended(self) -> bool:
-        """Return True when it ended well after `close`, False while it goes on; AudioFailed in any other case."""
+        """Return True when all was played and it ended well after `close`, False while it goes on.
+
+        AudioFailed in any other case, before `close` as well: one that knows itself lost says so here, without a sample
+        to be offered.
+        """
 
     def interests(self) -> Sequence[Interest]:
-        """Return what to poll for until it can take more or ends."""
+        """Return what to poll for until it can take more, or fails, or ends: open descriptors.
+
+        Room for more is POLLOUT and nothing beside it: that is left out where there is nothing to be offered.
+        """
 
     def wake_at(self) -> float | None:
         """Return the monotonic time at which to look again, whatever poll says; None if poll will tell."""
 
     def kill(self) -> None:
-        """Be silent now, whatever is left."""
+        """Be silent now, whatever is left, and release what can be; never raises, and may be called again."""
 
     def gone(self) -> bool:
-        """Return True once it is silent for certain and everything of it is released."""
+        """Return True once it is silent for certain and everything of it is released: descriptors, processes, threads.
+
+        Asked after `kill` alone, every 20 ms; after a second the whole engine process is given up.
+        """
 
 
 #: Waits for one of the interests or a monotonic time, whatever comes first, and may return early. What the server sends

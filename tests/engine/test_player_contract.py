@@ -1,0 +1,399 @@
+"""What the engine's playback relies on in any player: each sentence of `players.base.Player`, for each of them.
+
+A new player is put through it by a row of `PLAYERS`.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed
+from talkcli.engine.players.null import NullPlayer
+from talkcli.engine.players.program import ProgramPlayer
+from talkcli.engine.players.programs import Command
+from talkcli.engine.players.wav import WavPlayer
+from talkcli.engine.players.wav_stream import WavStreamPlayer
+from tests.engine.spawned import PATIENCE, children
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from talkcli.engine.players.base import Player
+
+RATE = 22050
+_PIECE = int(PIECE * RATE) * SAMPLE
+#: A quarter of a second, of which no two pieces are alike.
+SOUND = b"".join(number.to_bytes(2, "little") for number in range(RATE // 4))
+#: Seconds within which any call returns: nothing waits in them.
+AT_ONCE = 0.05
+#: Times that one waits in a sound, or for its end: a few a piece, for what is heard is asked for as well.
+MOST_WAITS = 4 * len(SOUND) // _PIECE
+
+
+@dataclass(frozen=True)
+class Case:
+    """A player, and what of the contract can be brought about with it; `at`: a folder for what it writes."""
+
+    #: opens one that plays
+    opens: Callable[[Path], Player]
+    #: what it has played so far; None where nobody can know
+    played: Callable[[Path], bytes] | None = None
+    #: opens one whose device is lost in mid-sentence, and one whose device isn't there; None where nothing can fail
+    lost: Callable[[Path], Player] | None = None
+    refused: Callable[[Path], Player] | None = None
+    #: opens one that takes no more after a while; None where it takes all
+    stuck: Callable[[Path], Player] | None = None
+
+
+def _program(*argv: str) -> ProgramPlayer:
+    return ProgramPlayer(Command("tape", argv, read_ahead=0))
+
+
+def _stream(at: Path) -> WavStreamPlayer:
+    """Return one that writes to what a shell would have opened."""
+    output = os.open(at / "stream.wav", os.O_WRONLY | os.O_CREAT)
+    _opened.callback(os.close, output)
+    return WavStreamPlayer(output, RATE, first=True)
+
+
+def _pipe(*, reader: bool) -> WavStreamPlayer:
+    reading, writing = os.pipe()
+    _opened.callback(os.close, writing)
+    if reader:
+        _opened.callback(os.close, reading)
+    else:
+        os.close(reading)
+    return WavStreamPlayer(writing, RATE, first=True)
+
+
+def _full_disk(at: Path) -> WavPlayer:
+    """Return one whose file has become a full device meanwhile."""
+    player = WavPlayer(str(at / "speech.wav"), RATE)
+    full = os.open("/dev/full", os.O_RDWR)
+    assert player._file is not None
+    os.dup2(full, player._file)
+    os.close(full)
+    return player
+
+
+def _behind_a_header(path: Path) -> bytes:
+    return path.read_bytes()[44:] if path.exists() else b""
+
+
+PLAYERS = {
+    "null": Case(lambda _: NullPlayer(RATE), stuck=lambda _: NullPlayer(RATE, clock=lambda: 100.0)),
+    "a program": Case(
+        lambda at: _program("tee", str(at / "tape")),
+        played=lambda at: (at / "tape").read_bytes() if (at / "tape").exists() else b"",
+        lost=lambda _: _program("head", "-c", "2000"),
+        refused=lambda _: _program("no-such-player-anywhere"),
+        stuck=lambda _: _program("sleep", "100"),
+    ),
+    "a WAV file": Case(
+        lambda at: WavPlayer(str(at / "speech.wav"), RATE),
+        played=lambda at: _behind_a_header(at / "speech.wav"),
+        lost=_full_disk,
+        refused=lambda at: WavPlayer(str(at / "missing" / "speech.wav"), RATE),
+    ),
+    "a WAV stream": Case(
+        _stream,
+        played=lambda at: _behind_a_header(at / "stream.wav"),
+        lost=lambda _: _pipe(reader=False),
+        stuck=lambda _: _pipe(reader=True),
+    ),
+}
+#: What the test has opened itself, and closes after it.
+_opened = ExitStack()
+
+every = pytest.mark.parametrize("case", PLAYERS.values(), ids=PLAYERS)
+
+
+def those(what: str) -> pytest.MarkDecorator:
+    """Have the test done with those players that have this."""
+    found = {name: case for name, case in PLAYERS.items() if getattr(case, what) is not None}
+    return pytest.mark.parametrize("case", found.values(), ids=found)
+
+
+@pytest.fixture(autouse=True)
+def nothing_left() -> Iterator[None]:
+    """Assert after each test that its players have left nothing open, and nothing that runs."""
+    before = _left()
+    with _opened:
+        yield
+    assert _left() == before
+
+
+def _left() -> tuple[list[str], list[int], int]:
+    return os.listdir("/proc/self/fd"), children(os.getpid()), threading.active_count()
+
+
+@contextmanager
+def _quick(what: str) -> Iterator[None]:
+    began = time.monotonic()
+    yield
+    assert_within(time.monotonic() - began, AT_ONCE, what)
+
+
+def _await(player: Player) -> None:
+    """Wait as the playback does: for what the player says and nothing else."""
+    poll = select.poll()
+    for descriptor, events in player.interests():
+        poll.register(descriptor, events)
+    until = player.wake_at()
+    assert until is not None or player.interests(), "nothing would ever wake it"
+    end = time.monotonic() + PATIENCE
+    seconds = PATIENCE if until is None else min(PATIENCE, until - time.monotonic())
+    poll.poll(max(0.0, seconds) * 1000)
+    assert time.monotonic() < end, "nothing has woken it"
+
+
+def _offer(player: Player, sound: bytes | bytearray) -> None:
+    """Offer all pieces of a sound, waiting for room."""
+    sent = waits = 0
+    while sent < len(sound):
+        with memoryview(sound)[sent : sent + _PIECE] as piece:
+            taken = player.offer(piece)
+            assert 0 <= taken <= len(piece)
+        sent += taken
+        player.consumed()
+        if not taken:
+            _await(player)
+            waits += 1
+            assert waits < MOST_WAITS, "it is woken for nothing"
+
+
+def _finish(player: Player) -> None:
+    """Play to the end."""
+    player.close()
+    waits = 0
+    while not player.ended():
+        _await(player)
+        waits += 1
+        assert waits < MOST_WAITS, "it is woken for nothing, or does not end"
+
+
+def _fill(player: Player) -> int:
+    """Offer pieces until none is taken any more; return what was."""
+    sent = 0
+    while taken := player.offer(memoryview(bytes(_PIECE))):
+        sent += taken
+        assert sent < 10 * RATE * SAMPLE, "it is never full"
+    return sent
+
+
+def _end(player: Player) -> None:
+    player.kill()
+    end = time.monotonic() + PATIENCE
+    while not player.gone():
+        assert time.monotonic() < end, "it has not ended"
+        time.sleep(0.001)  # as the playback asks again and again
+    player.kill()
+    assert player.gone()
+
+
+def _play_for_ever(player: Player) -> None:
+    while not player.ended():
+        if not player.offer(memoryview(bytes(_PIECE))):
+            _await(player)
+        player.consumed()
+
+
+# -- what it is
+
+
+@every
+def test_it_has_a_name_and_says_whether_it_takes_time(case: Case, tmp_path: Path) -> None:
+    player = case.opens(tmp_path)
+    before = (player.name, player.real_time)
+    _offer(player, SOUND)
+    _finish(player)
+    assert before == (player.name, player.real_time)
+    assert isinstance(player.name, str)
+    assert player.name
+    assert isinstance(player.real_time, bool)
+    _end(player)
+
+
+@those("refused")
+def test_one_that_cannot_be_opened_says_so(case: Case, tmp_path: Path) -> None:
+    assert case.refused is not None
+    with pytest.raises(AudioFailed) as caught:
+        case.refused(tmp_path)
+    assert caught.value.reason in {"no_player", "audio_device"}
+    assert str(caught.value)
+
+
+# -- playing
+
+
+@those("played")
+def test_all_that_it_took_is_played_in_order_and_once(case: Case, tmp_path: Path) -> None:
+    assert case.played is not None
+    player = case.opens(tmp_path)
+    _offer(player, SOUND)
+    _finish(player)
+    assert case.played(tmp_path) == SOUND
+    _end(player)
+    assert case.played(tmp_path) == SOUND
+
+
+@every
+def test_what_it_was_offered_may_be_overwritten_afterwards(case: Case, tmp_path: Path) -> None:
+    player = case.opens(tmp_path)
+    for start in range(0, len(SOUND), _PIECE):
+        piece = bytearray(SOUND[start : start + _PIECE])
+        _offer(player, piece)
+        piece[:] = b"\xff" * len(piece)
+        piece.clear()  # BufferError if it keeps a view of it
+    _finish(player)
+    if case.played is not None:
+        assert case.played(tmp_path) == SOUND
+    _end(player)
+
+
+@every
+def test_no_sample_at_all_ends_well(case: Case, tmp_path: Path) -> None:
+    player = case.opens(tmp_path)
+    _finish(player)
+    assert player.consumed() == 0
+    _end(player)
+
+
+@every
+def test_it_has_not_ended_before_its_input_has(case: Case, tmp_path: Path) -> None:
+    player = case.opens(tmp_path)
+    assert not player.ended()
+    _offer(player, SOUND)
+    assert not player.ended()
+    _finish(player)
+    assert player.ended()
+    _end(player)
+
+
+@every
+def test_one_whose_sound_takes_time_takes_that_time(case: Case, tmp_path: Path) -> None:
+    player = case.opens(tmp_path)
+    began = time.monotonic()
+    _offer(player, SOUND)
+    _finish(player)
+    # A tape takes none, whatever plays to it.
+    assert time.monotonic() - began >= len(SOUND) / SAMPLE / RATE or not player.real_time or case.played is not None
+    _end(player)
+
+
+@every
+def test_what_it_consumed_grows_to_all_of_it_and_never_beyond(case: Case, tmp_path: Path) -> None:
+    player = case.opens(tmp_path)
+    seen = [(player.consumed(), player.proven)]
+    sent = 0
+    while sent < len(SOUND):
+        taken = player.offer(memoryview(SOUND)[sent : sent + _PIECE])
+        sent += taken
+        seen.append((player.consumed(), player.proven))
+        assert seen[-1][0] <= sent
+        if not taken:
+            _await(player)
+    player.close()
+    while not player.ended():
+        seen.append((player.consumed(), player.proven))
+        _await(player)
+    seen.append((player.consumed(), player.proven))
+    assert seen == sorted(seen)
+    assert seen[-1] == (len(SOUND), True)
+    _end(player)
+
+
+# -- waiting
+
+
+@every
+@limits()
+def test_no_call_waits(case: Case, tmp_path: Path) -> None:
+    with _quick("to open it"):
+        player = (case.stuck or case.opens)(tmp_path)
+    if case.stuck is not None:
+        _fill(player)
+    with _quick("an offer"):
+        player.offer(memoryview(bytes(_PIECE)))
+    for what in (player.consumed, player.interests, player.wake_at, player.ended, player.close, player.ended):
+        with _quick(what.__name__):
+            what()
+    with _quick("kill"):
+        player.kill()
+    with _quick("gone"):
+        player.gone()
+    _end(player)
+
+
+@those("stuck")
+def test_one_that_is_stuck_never_ends(case: Case, tmp_path: Path) -> None:
+    assert case.stuck is not None
+    player = case.stuck(tmp_path)
+    sent = _fill(player)
+    assert player.consumed() <= sent
+    assert not player.ended()
+    _end(player)
+
+
+@every
+def test_it_is_woken_when_it_can_go_on_and_not_for_nothing(case: Case, tmp_path: Path) -> None:
+    player = case.opens(tmp_path)
+    _offer(player, SOUND)
+    _finish(player)
+    _end(player)
+
+
+@every
+def test_it_waits_for_what_is_open_and_for_room_by_itself(case: Case, tmp_path: Path) -> None:
+    player = case.opens(tmp_path)
+    _offer(player, SOUND[:_PIECE])
+    found = player.interests()
+    player.close()
+    for _, events in (*found, *player.interests()):
+        assert events == select.POLLOUT or not events & select.POLLOUT
+    for descriptor, _ in player.interests():
+        os.fstat(descriptor)
+    _end(player)
+
+
+# -- ending
+
+
+@pytest.mark.parametrize("when", ["unused", "in the middle", "after its input", "after its end"])
+@every
+def test_it_is_ended_at_any_point_and_plays_no_more_than_it_took(case: Case, tmp_path: Path, when: str) -> None:
+    player = case.opens(tmp_path)
+    sound = b"" if when == "unused" else SOUND[: 3 * _PIECE]
+    _offer(player, sound)
+    if when == "after its input":
+        player.close()
+    if when == "after its end":
+        _finish(player)
+    _end(player)
+    if case.played is not None:
+        assert sound.startswith(case.played(tmp_path))
+
+
+# -- failing
+
+
+@those("lost")
+def test_one_that_is_lost_says_so_each_time_it_is_asked(case: Case, tmp_path: Path) -> None:
+    assert case.lost is not None
+    player = case.lost(tmp_path)
+    for _ in range(2):
+        with pytest.raises(AudioFailed) as caught:
+            _play_for_ever(player)
+        assert caught.value.reason in {"audio_device", "audio_lost"}
+        assert str(caught.value)
+    _end(player)
