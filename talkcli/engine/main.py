@@ -61,9 +61,9 @@ def _serve(channel: Channel, configure: protocol.Configure) -> None:
     from talkcli.engine.start import CannotStart, start
 
     players = Players(configure.player, configure.device, _inherited(), configure.lead_in / 1000, configure.output)
-    session = Session(channel, players.gap)
+    session = Session(channel, players)
     try:
-        started = start(configure.driver, configure.voice, players, session.wait, session.pause)
+        started = start(configure.driver, configure.voice, players, session)
     except CannotStart as error:
         channel.send(protocol.StartFailed(error.reason, str(error), error.lasting, error.usage))
         return

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 
-from talkcli.engine.clock import WordClock
+from talkcli.engine.clock import TimedWord, WordClock
 from talkcli.engine.pause import CLOCK_AHEAD, RELEASE_AFTER, SAID_AGAIN, SILENT_WITHIN
 from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
 from talkcli.engine.samples import Samples
@@ -18,7 +18,6 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.engine.clock import TimedWord
     from talkcli.engine.pause import Pause
     from talkcli.engine.players.base import Player, Wait
     from talkcli.engine.players.which import Players
@@ -50,7 +49,10 @@ GONE_WITHIN = 1.0
 
 
 class Playback:
-    """One sentence on its way to the player. Every method may raise Stopped or AudioFailed, except the last two."""
+    """One sentence on its way to the player: the `Output` of whoever makes it.
+
+    Every method may raise Stopped or AudioFailed, except the last two, which are for others than the synthesizer.
+    """
 
     def __init__(self, players: Players, wait: Wait, pause: Pause, on_word: Callable[[TimedWord], None]) -> None:
         self._players = players
@@ -75,23 +77,23 @@ class Playback:
         self._silent_at: float | None = None
 
     def begin(self, rate: int) -> None:
-        """Set the samples per second; before the first samples."""
+        """Set the samples per second, and start a player program for them: it needs 5 to 15 ms, the synthesis 2.
+
+        What goes wrong with it is told by `write`.
+        """
         if self._stream is not None and rate != self._rate:
             self._let_go(0)  # it was started for another
         self._rate = rate
-
-    def prepare(self) -> None:
-        """Start a player program now: it needs 5 to 15 ms, the synthesis 2. What goes wrong is told by `write`."""
         if self._players.is_program and not self._pause.asked:
             try:
                 self._try(lambda _: True)
             except AudioFailed:
                 self._candidates, self._first_error = [], None
 
-    def add_word(self, word: TimedWord) -> None:
-        """Report this word when it is heard. It comes before its samples do."""
+    def word(self, start: int, length: int, position: float) -> None:
+        """Report this word when it is heard."""
         self._samples.speaks = True
-        self._clock.add(word)
+        self._clock.add(TimedWord(start, length, position))
 
     def write(self, samples: bytes) -> None:
         """Play the samples; returns when the player has taken them, or at once if nothing audible has come yet."""

@@ -15,6 +15,7 @@ import traceback
 from collections import deque
 
 from talkcli.engine import protocol
+from talkcli.engine.clock import Times
 from talkcli.engine.pause import Pause
 from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.settings import SettingFailed
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.channel import Channel
-    from talkcli.engine.gap import Gap
     from talkcli.engine.players.base import Interest
+    from talkcli.engine.players.which import Players
     from talkcli.engine.protocol import Command
     from talkcli.engine.settings import Settings
 
@@ -74,9 +75,9 @@ class InHand:
 class Session:
     """The loop. `open` gives it its engine, `run` runs it."""
 
-    def __init__(self, channel: Channel, gap: Gap) -> None:
+    def __init__(self, channel: Channel, players: Players) -> None:
         self._channel = channel
-        self._gap = gap
+        self._players = players
         self._backlog: deque[Command] = deque()
         self._leaving = False
         self._goal: InHand | None = None
@@ -85,6 +86,8 @@ class Session:
         self._pump: Callable[[], None] | None = None
         #: for our own driver to obey, and what the session itself goes by with another
         self.pause = Pause(self._tell_paused)
+        #: what our own driver tells beside its notifications
+        self.times = Times()
 
     def open(self, engine: Any, settings: Settings, pump: Callable[[], None] | None) -> None:
         """Take the engine; `pump` is called about 20 times a second while a goal is spoken by a foreign driver."""
@@ -132,7 +135,7 @@ class Session:
             self._stop(command)
         elif isinstance(command, protocol.Followed):
             if goal is not None and goal.id == command.id:
-                self._gap.followed = command.followed
+                self._players.gap.followed = command.followed
         elif isinstance(command, protocol.Pause | protocol.Resume):
             if goal is not None and goal.id == command.id and not goal.stop_asked:
                 self._hold_or_go_on(goal, command)
@@ -184,7 +187,7 @@ class Session:
         assert self._settings is not None
         self._goal = goal = InHand(say, time.monotonic())
         self.pause.release()
-        self._gap.followed = say.followed
+        self._players.gap.followed = say.followed
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
         waiting, self._backlog = self._backlog, deque()
@@ -239,7 +242,7 @@ class Session:
             self._engine.proxy.setBusy(False)  # else pyttsx3 would keep the next sentence to itself
             self._finished(goal, completed=False)
 
-    def _word(self, location: int, length: int, time: float | None = None, **_: object) -> None:
+    def _word(self, location: int, length: int, **_: object) -> None:
         """Report a word. Other drivers give the word as the notification's name, so that says nothing."""
         goal = self._goal
         if goal is None or goal.stop_asked or goal.interrupted:
@@ -247,20 +250,21 @@ class Session:
         found = goal.words.next(goal.offset + location if location >= 0 else location, length)
         if found is not None:
             goal.last_word, goal.progress_at = found.start, _since(0.0)
-            seconds = _since(goal.began) if time is None else time
+            seconds = _since(goal.began) if self.times.word is None else self.times.word
             self._channel.send(protocol.Word(goal.id, found.start, found.end, found.number, round(seconds, 3)))
 
     def _error(self, exception: Exception, **_: object) -> None:
         if self._goal is not None and self._goal.error is None:
             self._goal.error = exception
 
-    def _finished(self, name: str | None, completed: bool, duration: float | None = None, **_: object) -> None:
+    def _finished(self, name: str | None, completed: bool, **_: object) -> None:
         goal = self._goal
         if goal is None or name != goal.id:  # of a goal that ended before
             return
         if goal.interrupted and not (completed or goal.stop_asked or goal.error):
             goal.spoken, goal.silent_at = False, time.monotonic()
         elif completed:
+            duration = self.times.duration
             self._end(protocol.COMPLETED, duration=None if duration is None else round(duration, 6))
         elif goal.stop_asked and not isinstance(goal.error, AudioFailed):
             self._end(protocol.STOPPED)

@@ -1,24 +1,20 @@
 """A goal's settings as properties of a pyttsx3 engine.
 
-A property is set only where it differs from what the driver has: the first sentence of a fresh process must be what
-the library alone would make, and a foreign driver may not know a property that nobody asked for. A voice is always set
-by an id that the driver itself lists.
+A property is set only where it differs from what the driver has: a foreign driver may not know a property that nobody
+asked for. A voice is always set by an id that the driver itself lists.
 """
 
 from __future__ import annotations
 
-from talkcli.engine.synthesizers.espeak import UnknownVoice
+from talkcli.engine.synthesizers.base import Sound, UnknownVoice
 from talkcli.engine.synthesizers.voices import find_voice, list_voices, unknown_voice
+from talkcli.frozen import fields
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.protocol import Say, Voice
-
-#: What libespeak-ng starts with, and what pyttsx3's drivers set themselves.
-LIBRARY_DEFAULTS: dict[str, object] = {"rate": 175, "volume": 1.0, "pitch": 50}
-PYTTSX3_DEFAULTS: dict[str, object] = {"rate": 200, "volume": 1.0, "pitch": 50}
 
 
 class SettingFailed(Exception):
@@ -32,12 +28,10 @@ class SettingFailed(Exception):
 class Settings:
     """What the properties of one engine were last set to."""
 
-    def __init__(self, engine: Any, driver: str, own: bool) -> None:
-        """`own` says that the driver is `talk`'s own, over libespeak-ng."""
+    def __init__(self, engine: Any, driver: str) -> None:
         self._engine = engine
         self._driver = driver
-        self._own = own
-        self._set = dict(LIBRARY_DEFAULTS if own else PYTTSX3_DEFAULTS)
+        self._set = fields(Sound())  # what pyttsx3's drivers set themselves
         self._default_voice: Any = None
         self._voices: tuple[Voice, ...] | None = None
         self._voice: str | None = None
@@ -63,12 +57,9 @@ class Settings:
         if self._voice is None:
             self._default_voice = self._engine.getProperty("voice")
         value = self._default_voice if wanted is None else self._driver_id(wanted)
-        if self._own:
-            # Some voices leave their own speed to the next one, up to a third slower, unless the rate is set after it.
-            self._set.clear()
         error = self._try("voice", value)
         if isinstance(error, UnknownVoice):
-            text = f"the voice {value} is listed, but it cannot be loaded: part of it is missing"
+            text = f"the voice {value} is listed, but it cannot be loaded: {error}"
             raise SettingFailed("unknown_voice", text) from error
         if error is not None:
             text = f"the driver {self._driver} cannot set the voice {wanted}"

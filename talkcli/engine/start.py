@@ -1,4 +1,4 @@
-"""Builds the pyttsx3 engine of an engine process: which driver, from where, and what to install if it is missing.
+"""Builds the pyttsx3 engine of an engine process: which driver or synthesizer, and what to install if it is missing.
 
 It starts no goal. Everything heavy is imported inside, so that a missing part is an answer and no traceback.
 """
@@ -15,15 +15,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
-    from talkcli.engine.pause import Pause
-    from talkcli.engine.players.base import Wait
     from talkcli.engine.players.which import Players
+    from talkcli.engine.session import Session
+    from talkcli.engine.synthesizers.base import Synthesizer
 
 #: The drivers of macOS that speak in Apple's run loop, which somebody has to run.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
-
-#: What `talk`'s own driver is called by users: it stands in for pyttsx3's driver of that name.
-_OWN_NAME = "espeak"
 
 
 class CannotStart(Exception):
@@ -53,44 +50,57 @@ class OpenEngine:
     pump: Callable[[], None] | None
 
 
-def start(driver: str | None, voice: str | None, players: Players, wait: Wait, pause: Pause) -> OpenEngine:
-    """Build the engine, with its loop started; CannotStart."""
+def _espeak() -> Synthesizer:
+    from talkcli.engine.synthesizers.espeak import Espeak
+    from talkcli.engine.synthesizers.library import load
+
+    return Espeak(load())
+
+
+#: `talk`'s own synthesizers, the usual one first: what makes each, by what users call it. It stands in for a driver of
+#: pyttsx3's of that name.
+SYNTHESIZERS: dict[str, Callable[[], Synthesizer]] = {"espeak": _espeak}
+
+
+def start(driver: str | None, voice: str | None, players: Players, session: Session) -> OpenEngine:
+    """Build the engine, with its loop started; CannotStart. What is ours speaks into the players, by the session."""
     try:
         import pyttsx3
     except ModuleNotFoundError as error:
         raise CannotStart(f"pyttsx3 is missing: pip install pyttsx3 ({error})") from error
     own = is_own(driver)
-    version = _register_own(players, wait, pause) if own else None
-    from talkcli.engine.synthesizers.espeak import DRIVER
-
-    name = DRIVER if own else driver or pyttsx3.engine.default_engine_by_sys_platform()
+    shown = driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
+    name = f"talk_{shown}" if own else shown
+    version = _register_own(shown, name, players, session) if own else None
     engine = _init(pyttsx3, name, named=driver is not None)
-    settings = Settings(engine, name, own)
+    settings = Settings(engine, name)
     _start_loop(engine, name)
     try:
         settings.set_voice(voice)
     except SettingFailed as error:
         unknown = error.reason == "unknown_voice"
         raise CannotStart(str(error), error.reason, lasting=unknown, usage=unknown) from error
-    shown = _OWN_NAME if own else name
     return OpenEngine(engine, settings, shown, version, None if own else _pump(name))
 
 
 def is_own(driver: str | None) -> bool:
     """Tell whether a driver is `talk`'s own, which plays through a player; others play by themselves."""
-    return sys.platform.startswith("linux") and driver in (None, _OWN_NAME)
+    return sys.platform.startswith("linux") and driver in (None, *SYNTHESIZERS)
 
 
-def _register_own(players: Players, wait: Wait, pause: Pause) -> str:
-    from talkcli.engine.synthesizers.espeak import register
-    from talkcli.engine.synthesizers.library import LibraryMissing, load
+def _register_own(synthesizer: str, driver: str, players: Players, session: Session) -> str | None:
+    """Make a synthesizer, and put a driver for it among pyttsx3's; return its version, for people."""
+    from talkcli.engine.synthesizers.base import NotInstalled, UnknownVoice
+    from talkcli.engine.synthesizers.driver import register
 
     try:
-        library = load()
-    except LibraryMissing as error:
+        made = SYNTHESIZERS[synthesizer]()
+    except NotInstalled as error:
         raise CannotStart(str(error)) from error
-    register(library, players, wait, pause)
-    return library.version
+    except UnknownVoice as error:  # not even its own: a part of it is missing
+        raise CannotStart(_cannot_be_started(driver, error), lasting=False) from error
+    register(driver, made, players, session.wait, session.pause, session.times)
+    return made.version
 
 
 def _init(pyttsx3: Any, name: str, *, named: bool) -> Any:
@@ -103,8 +113,11 @@ def _init(pyttsx3: Any, name: str, *, named: bool) -> Any:
             raise CannotStart(words, usage=named) from error
         raise CannotStart(f'the driver "{name}" cannot be loaded: {error}', usage=named) from error
     except Exception as error:
-        words = f'the driver "{name}" cannot be started: {type(error).__name__}: {error}'
-        raise CannotStart(words, lasting=False) from error
+        raise CannotStart(_cannot_be_started(name, error), lasting=False) from error
+
+
+def _cannot_be_started(driver: str, error: Exception) -> str:
+    return f'the driver "{driver}" cannot be started: {type(error).__name__}: {error}'
 
 
 def _start_loop(engine: Any, name: str) -> None:

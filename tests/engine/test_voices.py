@@ -13,7 +13,7 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.protocol import Voice
-from talkcli.engine.synthesizers import voices
+from talkcli.engine.synthesizers import espeak
 from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from tests.engine.spawned import USUAL, Spawned
 from tests.support.reference import Sentence, render
@@ -188,16 +188,16 @@ def test_a_plus_in_the_name_of_another_drivers_voice_is_part_of_it() -> None:
 
 
 def test_mbrolas_voices_are_there_where_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    known = [("mb/mb-de4-en", "en", "german-mbrola-4-en"), ("mb/mb-us1", "en-us", "us-mbrola-1")]
-    monkeypatch.setattr(voices, "_listed", lambda _: known)
-    monkeypatch.setattr(voices, "_MBROLA_PLACES", (f"{tmp_path}/{{0}}/{{0}}",))
+    known = [Voice("mb/mb-de4-en", "en", "german-mbrola-4-en"), Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
+    monkeypatch.setattr(espeak, "_listed", lambda *_: known)
+    monkeypatch.setattr(espeak, "_MBROLA_PLACES", (f"{tmp_path}/{{0}}/{{0}}",))
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     (tmp_path / "us1").mkdir()
     (tmp_path / "us1" / "us1").touch()
-    assert voices._mbrola_voices() == []
+    assert espeak._mbrola_voices(None) == []
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "mbrola").touch(0o755)
-    assert voices._mbrola_voices() == [Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
+    assert espeak._mbrola_voices(None) == [Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
 
 
 @pytest.mark.parametrize("voice", ["zle/be", "piqd", "en+fast", "en-us+whisper"])

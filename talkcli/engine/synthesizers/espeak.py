@@ -1,24 +1,18 @@
-"""`talk`'s own pyttsx3 driver for Linux: libespeak-ng, streamed to a player, with words in time and a stop that works.
+"""Libespeak-ng behind the interface of a synthesizer: its voices, its words, and the guard before it.
 
-It implements pyttsx3's driver interface, so everything in here is called through pyttsx3's Engine. It speaks inside
-`iterate()`; the library calls back in the same thread, and that callback waits for the player. It must not let an
-exception out: pyttsx3 would lose the sentence without a word.
-
-More than pyttsx3 asks for: the property "pitch" (0 to 100), `time` in started-word and `duration` in
-finished-utterance, in seconds of audio.
+The library speaks in one call and calls back in the same thread, with some 50 ms of samples each time; an exception
+cannot pass through it, so it is kept until the library has returned. There is one of it in a process.
 """
 
 from __future__ import annotations
 
 import ctypes
-import sys
-import time
-import types
+import os
 
-from talkcli.engine.clock import TimedWord
-from talkcli.engine.playback import Playback
-from talkcli.engine.players.base import SAMPLE, AudioFailed, Stopped
+from talkcli.engine.players.base import SAMPLE, AudioFailed
+from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import guard
+from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.engine.synthesizers.words import letters
 
 TYPE_CHECKING = False
@@ -26,13 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import Any
 
-    from talkcli.engine.pause import Pause
-    from talkcli.engine.players.base import Wait
-    from talkcli.engine.players.which import Players
+    from talkcli.engine.synthesizers.base import Output, Sound
     from talkcli.engine.synthesizers.library import Library
-
-#: Its name among pyttsx3's drivers.
-DRIVER = "talk_espeak"
 
 #: English: by its file, which saves the 4 to 40 ms in which the library reads all voices to find it by its language.
 DEFAULT_VOICE = "gmw/en"
@@ -41,174 +30,92 @@ _DEFAULT_LANGUAGE = "en"
 #: An event that pyttsx3's binding does not name: the sample rate, before the first samples.
 _EVENT_SAMPLERATE = 8
 
-#: Seconds between two steps of pyttsx3's own loop, which `talk` does not use.
-_LOOP_STEP = 0.05
+#: Two of the lists that libespeak-ng gives only when asked by these names, in the place of a language.
+_VARIANTS, _MBROLA = b"variant", b"mbrola"
+#: Where it looks for the sounds of a voice of MBROLA's, which it can speak only if these and the program are there.
+_MBROLA_PLACES = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
 
 
-class UnknownVoice(Exception):
-    """The library has no such voice."""
+class Espeak:
+    """The library as a synthesizer."""
 
-
-def register(library: Library, players: Players, wait: Wait, pause: Pause) -> None:
-    """Put the driver among pyttsx3's own, so that `pyttsx3.init(DRIVER)` finds it."""
-    module: Any = types.ModuleType(f"pyttsx3.drivers.{DRIVER}")
-    module.buildDriver = lambda proxy: EspeakDriver(proxy, library, players, wait, pause)
-    sys.modules[module.__name__] = module
-
-
-class EspeakDriver:
-    """The driver; its methods are those that pyttsx3's DriverProxy calls."""
-
-    def __init__(
-        self,
-        proxy: Any,
-        library: Library,
-        players: Players,
-        wait: Wait,
-        pause: Pause,
-    ) -> None:
-        self._proxy = proxy
-        self._espeak = library.espeak
+    def __init__(self, library: Library) -> None:
+        """Take the library that was loaded; UnknownVoice if it has no English."""
+        self.version: str | None = library.version
+        self.voice = DEFAULT_VOICE
+        self._espeak = espeak = library.espeak
         self._rate = library.rate
-        self._players = players
-        self._wait = wait
-        self._pause = pause
-        self._text: str | None = None
-        self._spoken = ""
-        self._playback: Playback | None = None
-        self._caught: BaseException | None = None
-        self._looping = False
-        self._voice = DEFAULT_VOICE
-        if self._espeak.SetVoiceByName(DEFAULT_VOICE.encode()) != self._espeak.EE_OK:
-            self.setProperty("voice", _DEFAULT_LANGUAGE)
-        self._espeak.SetSynthCallback(self._on_audio)
+        #: what its parameters were last set to; they are left alone where they need not be set, so that the first
+        #: sentence of a fresh process is what the library alone would make
+        self._set = {espeak.RATE: 175, espeak.VOLUME: 100, espeak.PITCH: 50}
+        self._text = ""
+        self._output: Output | None = None
+        self._raised: BaseException | None = None
+        if espeak.SetVoiceByName(DEFAULT_VOICE.encode()) != espeak.EE_OK:
+            self.load(_DEFAULT_LANGUAGE)
+        espeak.SetSynthCallback(self._on_audio)
 
-    def destroy(self) -> None:
-        """Be silent; called when the proxy goes away."""
-        self.stop()
-
-    def startLoop(self) -> None:  # noqa: N802 - pyttsx3's name
-        """Run pyttsx3's own loop until `endLoop`."""
-        self._looping = True
-        for _ in self.iterate():
-            if not self._looping:
-                return
-            self._wait((), time.monotonic() + _LOOP_STEP)
-
-    def endLoop(self) -> None:  # noqa: N802 - pyttsx3's name
-        """End pyttsx3's own loop."""
-        self._looping = False
-
-    def iterate(self) -> Iterator[None]:
-        """Speak what was said since the last step, to its end."""
-        while True:
-            if self._text is None:
-                self._proxy.setBusy(False)  # pyttsx3 starts busy; this hands over what waits, by a call of `say`
-            if self._text is None:
-                yield
-                continue
-            text, self._text = self._text, None
-            self._speak(text)
-
-    def say(self, text: str) -> None:
-        """Take a sentence; the next step of `iterate` speaks it."""
-        self._proxy.setBusy(True)
-        self._text = text
-
-    def stop(self) -> None:
-        """Be silent now."""
-        self._text = None
-        if self._playback is not None:
-            self._playback.stop()
-
-    def getProperty(self, name: str) -> Any:  # noqa: N802 - pyttsx3's name
-        """Return a property; KeyError if it is unknown."""
+    def voices(self) -> tuple[Voice, ...]:
+        """Return the library's voices, those of MBROLA's that can be spoken with, and the variants."""
         espeak = self._espeak
-        if name == "voices":
-            return [_voice(each) for each in espeak.ListVoices(None)]
-        if name == "voice":
-            return self._voice
-        if name == "volume":
-            return espeak.GetParameter(espeak.VOLUME) / 100
-        return espeak.GetParameter({"rate": espeak.RATE, "pitch": espeak.PITCH}[name])
+        return (*_listed(espeak, None), *_mbrola_voices(espeak), *_variants(espeak))
 
-    def setProperty(self, name: str, value: Any) -> None:  # noqa: N802 - pyttsx3's name
-        """Set a property; KeyError if it is unknown, UnknownVoice."""
-        espeak = self._espeak
-        if name == "voice":
-            self._set_voice(str(value))
-        elif name == "volume":
-            espeak.SetParameter(espeak.VOLUME, round(value * 100), 0)
-        else:
-            espeak.SetParameter({"rate": espeak.RATE, "pitch": espeak.PITCH}[name], int(value), 0)
-
-    def _set_voice(self, voice: str) -> None:
+    def load(self, voice: str) -> None:
+        """Take an id of `voices`, with a variant behind it or without, or what else the library takes for a voice."""
+        # Some voices leave their own speed to the next one, up to a third slower, unless the rate is set after it.
+        self._set.clear()
         if not voice or self._espeak.SetVoiceByName(voice.encode("utf-8", "replace")) != self._espeak.EE_OK:
             # A voice that failed half-way (its speech files are missing) is current now, and speaks nothing.
-            self._espeak.SetVoiceByName(self._voice.encode())
-            raise UnknownVoice(voice)
-        self._voice = voice
+            self._espeak.SetVoiceByName(self.voice.encode())
+            raise UnknownVoice("part of it is missing")
+        self.voice = voice
 
-    def _speak(self, text: str) -> None:
-        """Speak the text, with exactly one finished-utterance at its end."""
-        self._proxy.notify("started-utterance")
-        self._playback = playback = Playback(self._players, self._wait, self._pause, self._word_heard)
-        playback.begin(self._rate)
-        failure: Exception | None = None
-        duration = None
-        try:
-            playback.prepare()
-            self._synthesise(text)
-            duration = playback.finish()
-        except Stopped:
-            pass
-        except Exception as error:  # noqa: BLE001 - whatever it is, pyttsx3 would swallow it: it is told instead
-            failure = error
-        playback.silence()
-        self._playback = None
-        if failure is not None:
-            self._proxy.notify("error", exception=failure)
-        self._proxy.notify("finished-utterance", completed=duration is not None, duration=duration)
-
-    def _synthesise(self, text: str) -> None:
+    def speak(self, text: str, sound: Sound, output: Output) -> None:
+        """Speak as `Synthesizer` says; with this library the samples differ a little each time."""
+        output.begin(self._rate)
         espeak = self._espeak
-        self._caught = None
-        self._spoken = guard.guarded(text, self._voice)
-        encoded = self._spoken.encode("utf-8", "replace")
-        status = espeak.Synth(encoded, flags=espeak.CHARS_UTF8 | espeak.ENDPAUSE)
-        caught, self._caught = self._caught, None
-        if caught is not None:
-            raise caught
+        self._obey(sound)
+        self._text = guard.guarded(text, self.voice)
+        self._output = output
+        status = espeak.Synth(self._text.encode("utf-8", "replace"), flags=espeak.CHARS_UTF8 | espeak.ENDPAUSE)
+        raised, self._raised, self._output = self._raised, None, None
+        if raised is not None:
+            raise raised
         if status != espeak.EE_OK:
             raise AudioFailed("engine_failed", f"espeak_Synth failed with {status}")
 
+    def _obey(self, sound: Sound) -> None:
+        espeak = self._espeak
+        wanted = {espeak.RATE: sound.rate, espeak.VOLUME: round(sound.volume * 100), espeak.PITCH: sound.pitch}
+        for parameter, value in wanted.items():
+            if self._set.get(parameter) != value:
+                espeak.SetParameter(parameter, value, 0)
+                self._set[parameter] = value
+
     def _on_audio(self, samples: Any, count: int, events: Any) -> int:
-        """Take what the library made; 1 ends the synthesis. An exception cannot pass through the library."""
+        """Hand on what the library made; 1 ends the synthesis."""
+        if self._output is None or self._raised is not None:
+            return 1
         try:
-            self._take(samples, count, events)
+            self._hand_on(self._output, samples, count, events)
         except BaseException as error:  # noqa: BLE001 - raised again after the library has returned
-            self._caught = error
+            self._raised = error
             return 1
         return 0
 
-    def _take(self, samples: Any, count: int, events: Any) -> None:
-        playback = self._playback
-        if playback is None:
-            raise Stopped
+    def _hand_on(self, output: Output, samples: Any, count: int, events: Any) -> None:
         for event in _until_end(events):
             if event.type == _EVENT_SAMPLERATE:
-                self._rate = event.id.number
-                playback.begin(self._rate)
+                if event.id.number != self._rate:
+                    self._rate = event.id.number
+                    output.begin(self._rate)
             elif event.type == self._espeak.EVENT_WORD:
-                location = event.text_position - 1
-                length = event.length if event.length > 0 else letters(self._spoken, location)
+                start = event.text_position - 1
+                length = event.length if event.length > 0 else letters(self._text, start)
                 if length:
-                    playback.add_word(TimedWord(location, length, event.sample / self._rate))
+                    output.word(start, length, event.sample / self._rate)
         if samples and count > 0:
-            playback.write(ctypes.string_at(samples, count * SAMPLE))
-
-    def _word_heard(self, word: TimedWord) -> None:
-        self._proxy.notify("started-word", location=word.location, length=word.length, time=word.position)
+            output.write(ctypes.string_at(samples, count * SAMPLE))
 
 
 def _until_end(events: Any) -> Iterator[Any]:
@@ -218,11 +125,31 @@ def _until_end(events: Any) -> Iterator[Any]:
         index += 1
 
 
-def _voice(found: Any) -> Any:
-    """Return one of the library's voices in pyttsx3's form."""
-    from pyttsx3.voice import Voice
+def _variants(espeak: Any) -> list[Voice]:
+    """Return the variants, whose ids are files: "!v/f3"."""
+    found = [(each.id.rpartition("/")[2], each.name) for each in _listed(espeak, _VARIANTS)]
+    return [Voice(f"+{file}", None, f"variant {name}") for file, name in found]
 
-    # The first byte of the languages is a priority.
-    language = (found.languages or b"")[1:].decode("utf-8", "replace")
-    identifier = (found.identifier or b"").decode("utf-8", "replace")
-    return Voice(identifier, (found.name or b"").decode("utf-8", "replace"), [language] if language else [])
+
+def _mbrola_voices(espeak: Any) -> list[Voice]:
+    """Return those of MBROLA's voices that are installed; libespeak-ng lists all that it knows of."""
+    if not any(os.access(os.path.join(each, "mbrola"), os.X_OK) for each in os.get_exec_path()):
+        return []
+    return [each for each in _listed(espeak, _MBROLA) if _has_sounds(each.id)]
+
+
+def _has_sounds(identifier: str) -> bool:
+    """Tell whether the sounds of "mb/mb-de4-en", which are called "de4", are there."""
+    sounds = identifier.rpartition("/")[2].split("-")[1]
+    return any(os.path.isfile(place.format(sounds)) for place in _MBROLA_PLACES)
+
+
+def _listed(espeak: Any, kind: bytes | None) -> list[Voice]:
+    """Return what libespeak-ng lists under a name; its voices under none."""
+    found = []
+    for each in espeak.ListVoices(None if kind is None else espeak.VOICE(languages=kind)):
+        # The first byte of the languages is a priority.
+        fields = (each.identifier, (each.languages or b"")[1:], each.name)
+        identifier, language, name = ((field or b"").decode("utf-8", "replace") for field in fields)
+        found.append(Voice(identifier, language or None, name or identifier))
+    return found

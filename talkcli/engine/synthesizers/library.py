@@ -11,6 +11,7 @@ import ctypes
 import errno
 import os
 
+from talkcli.engine.synthesizers.base import NotInstalled
 from talkcli.frozen import frozen
 
 TYPE_CHECKING = False
@@ -28,10 +29,6 @@ _BUFFER_MS = 20
 _DONT_EXIT = 0x8000
 
 
-class LibraryMissing(Exception):
-    """The library or its data is not there; the text names what to install. It stays so until somebody does."""
-
-
 @frozen
 class Library:
     """libespeak-ng, loaded and initialised."""
@@ -45,14 +42,14 @@ class Library:
 
 
 def load() -> Library:
-    """Load and initialise the library, once a process; LibraryMissing, or OSError where it may be loaded later."""
+    """Load and initialise the library, once a process; NotInstalled, or OSError where it may be loaded later."""
     origin, data = _preload()
     from pyttsx3.drivers import _espeak
 
     with _no_sound_server():
         rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _BUFFER_MS, data, _DONT_EXIT)
     if rate <= 0:
-        raise LibraryMissing("there is no espeak-ng data: install espeak-ng-data, or pip install espeakng-loader")
+        raise NotInstalled("there is no espeak-ng data: install espeak-ng-data, or pip install espeakng-loader")
     version = (_espeak.Info(None) or b"").decode("utf-8", "replace").split(" ")[0]
     return Library(_espeak, f"eSpeak NG {version} ({origin})", rate)
 
@@ -96,7 +93,7 @@ def _preload_wheel(missing: OSError) -> tuple[str, bytes]:
         if _passes(error):
             raise
         text = "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader"
-        raise LibraryMissing(f"{text} ({missing})") from error
+        raise NotInstalled(f"{text} ({missing})") from error
     return "espeakng-loader", str(espeakng_loader.get_data_path()).encode()
 
 

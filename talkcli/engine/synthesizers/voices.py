@@ -7,8 +7,6 @@ its own lists, found here. This module asks the driver and sets nothing.
 
 from __future__ import annotations
 
-import os
-
 from talkcli.engine.protocol import Voice
 
 TYPE_CHECKING = False
@@ -20,10 +18,6 @@ if TYPE_CHECKING:
 #: alone it goes with the driver's default, which is English.
 VARIANT = "+"
 _DEFAULT = "en"
-#: Two of the lists that libespeak-ng gives only when asked by these names, in the place of a language.
-_VARIANTS, _MBROLA = b"variant", b"mbrola"
-#: Where it looks for the sounds of a voice of MBROLA's, which it can speak only if these and the program are there.
-_MBROLA_PLACES = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
 
 #: Words that are proposed in the place of an unknown one, and how near they must be to it.
 _NEAR, _CUTOFF = 3, 0.5
@@ -34,13 +28,8 @@ _SHOWN = 60
 
 
 def list_voices(engine: Any) -> tuple[Voice, ...]:
-    """Return all voices of the engine's driver; of `talk`'s own, after them, the variants as "+f3"."""
-    from talkcli.engine.synthesizers.espeak import DRIVER
-
-    found = [_voice(each) for each in engine.getProperty("voices") or ()]
-    if engine.driver_name == DRIVER:
-        found += [*_mbrola_voices(), *_variants()]
-    return tuple(found)
+    """Return all voices of the engine's driver; of espeak's, after them, the variants as "+f3"."""
+    return tuple(_voice(each) for each in engine.getProperty("voices") or ())
 
 
 def find_voice(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
@@ -156,35 +145,3 @@ def _voice(found: Any) -> Voice:
     if isinstance(language, bytes):  # older drivers: a priority byte, then the language
         language = language[1:].decode("utf-8", "replace")
     return Voice(id=str(found.id), language=language or None, name=str(found.name or found.id))
-
-
-def _variants() -> list[Voice]:
-    """Return the variants, whose ids are files: "!v/f3"."""
-    found = [(identifier.rpartition("/")[2], name) for identifier, _, name in _listed(_VARIANTS)]
-    return [Voice(VARIANT + file, None, f"variant {name}") for file, name in found]
-
-
-def _mbrola_voices() -> list[Voice]:
-    """Return those of MBROLA's voices that are installed; libespeak-ng lists all that it knows of."""
-    if not any(os.access(os.path.join(each, "mbrola"), os.X_OK) for each in os.get_exec_path()):
-        return []
-    return [Voice(*each) for each in _listed(_MBROLA) if _has_sounds(each[0])]
-
-
-def _has_sounds(identifier: str) -> bool:
-    """Tell whether the sounds of "mb/mb-de4-en", which are called "de4", are there."""
-    sounds = identifier.rpartition("/")[2].split("-")[1]
-    return any(os.path.isfile(place.format(sounds)) for place in _MBROLA_PLACES)
-
-
-def _listed(kind: bytes) -> list[tuple[str, str, str]]:
-    """Return id, language and name of what libespeak-ng lists under a name; `talk`'s own driver has loaded it."""
-    from pyttsx3.drivers import _espeak
-
-    found = []
-    for each in _espeak.ListVoices(_espeak.VOICE(languages=kind)):
-        # The first byte of the languages is a priority.
-        fields = (each.identifier, (each.languages or b"")[1:], each.name)
-        identifier, language, name = ((field or b"").decode("utf-8", "replace") for field in fields)
-        found.append((identifier, language, name))
-    return found
