@@ -1,0 +1,308 @@
+"""What the engine relies on in any synthesizer: each sentence of `synthesizers.base.Synthesizer`, for each of them.
+
+A new synthesizer is put through it by a row of `SYNTHESIZERS`. The scripted one keeps the suite to the contract: what
+it does is all that is asked for.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from array import array
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine.players.base import SAMPLE, AudioFailed, Stopped
+from talkcli.engine.protocol import Voice
+from talkcli.engine.synthesizers.base import Sound, UnknownVoice
+from talkcli.engine.synthesizers.espeak import Espeak
+from talkcli.engine.synthesizers.library import load
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from talkcli.engine.synthesizers.base import Output, Synthesizer
+
+TEXT = "battery low, please come home"
+#: Texts of all kinds, for what holds of any.
+TEXTS = [
+    TEXT,
+    "a",
+    "I go. This one, on the 1,000th day, is well-known: it's «hello», U.S.A.!",
+    "日本語 のテキスト, привет мир 😀 n\u0303 e\u0301",
+    "one\x01two\x00three\ttab\nline\r\n\x7f \ud800 \ufffd \u200d",
+    "word " * 200,
+]
+#: Texts in which there is nothing to be spoken.
+SILENT = ["", " ", "\n\t ", "...", "\x00"]
+#: Seconds by which two renderings of a text may differ: libespeak-ng's noise moves what follows by some samples, and
+#: after another script the pause at its first comma is 44 ms longer.
+NEAR = 0.05
+#: Seconds from the return of an output that raised to that of `speak`.
+AT_ONCE = 0.05
+#: The samples that one sentence has, at most, before the first are written: they are heard while the rest is made.
+FIRST_BY = 0.2
+
+
+class Scripted:
+    """A tone for each word, as long as the word is: the least that is a synthesizer."""
+
+    version: str | None = None
+    _RATE = 16000
+
+    def __init__(self) -> None:
+        self.voice = "one"
+
+    def voices(self) -> tuple[Voice, ...]:
+        return (Voice("one", "en", "One"), Voice("two", None, "Two"))
+
+    def load(self, voice: str) -> None:
+        if voice not in {each.id for each in self.voices()}:
+            raise UnknownVoice("there is no such thing")
+        self.voice = voice
+
+    def speak(self, text: str, sound: Sound, output: Output) -> None:
+        output.begin(self._RATE)
+        end = samples = 0
+        for word in text.split():
+            start = text.index(word, end)
+            end = start + len(word)
+            if not any(map(str.isalnum, word)):
+                continue
+            output.word(start, len(word), samples / self._RATE)
+            loud, period = int(9000 * sound.volume), (150 if self.voice == "one" else 90) - sound.pitch
+            for _ in word:
+                tone = [loud if each % period < period / 2 else -loud for each in range(800 * 200 // sound.rate)]
+                output.write(array("h", tone).tobytes())
+                samples += len(tone)
+
+
+def _espeak() -> Iterator[Synthesizer]:
+    library = load()
+    yield Espeak(library)
+    library.espeak.Terminate()  # with it the library's thread
+
+
+def _scripted() -> Iterator[Synthesizer]:
+    yield Scripted()
+
+
+SYNTHESIZERS = {"espeak": _espeak, "scripted": _scripted}
+
+
+@pytest.fixture(params=SYNTHESIZERS.values(), ids=list(SYNTHESIZERS), scope="module")
+def made(request: pytest.FixtureRequest) -> Iterator[tuple[Synthesizer, str]]:
+    """Return one for all tests, as a process has one, and its own voice."""
+    make: Callable[[], Iterator[Synthesizer]] = request.param
+    iterator = make()
+    synthesizer = next(iterator)
+    yield synthesizer, synthesizer.voice
+    next(iterator, None)
+
+
+@pytest.fixture
+def synthesizer(made: tuple[Synthesizer, str]) -> Iterator[Synthesizer]:
+    synthesizer, own = made
+    yield synthesizer
+    synthesizer.load(own)
+
+
+class Tape:
+    """An output that keeps all, checks what holds at each call, and raises what it is told to."""
+
+    def __init__(self, *, fails: Exception | None = None, at: str = "", after: int = 0) -> None:
+        """`at`: the method that raises, `after` how many calls of it."""
+        self.rate = 0
+        self.words: list[tuple[int, int, float]] = []
+        self.samples = bytearray()
+        self.writes = 0
+        self.failed_at: float | None = None
+        self._fails, self._at, self._left = fails, at, after
+        self._thread = threading.get_ident()
+
+    @property
+    def seconds(self) -> float:
+        return len(self.samples) / SAMPLE / self.rate
+
+    @property
+    def loudest(self) -> int:
+        return max(map(abs, array("h", bytes(self.samples))), default=0)
+
+    def begin(self, rate: int) -> None:
+        self._called("begin")
+        assert not [*self.words, *self.samples], "the rate comes first"
+        assert rate > 0
+        self.rate = rate
+
+    def word(self, start: int, length: int, position: float) -> None:
+        self._called("word")
+        assert self.rate, "the rate comes first"
+        assert length > 0
+        assert position >= 0
+        assert round(position * self.rate) >= len(self.samples) // SAMPLE, "a word comes before its samples"
+        assert not self.words or position >= self.words[-1][2], "positions never decrease"
+        self.words.append((start, length, position))
+
+    def write(self, samples: bytes) -> None:
+        self._called("write")
+        assert self.rate, "the rate comes first"
+        assert len(samples) % SAMPLE == 0, "samples are whole"
+        self.samples += samples
+        self.writes += bool(samples)
+
+    def _called(self, method: str) -> None:
+        assert threading.get_ident() == self._thread, "another thread"
+        assert self.failed_at is None, "it has raised"
+        if self._fails is not None and method == self._at:
+            self._left -= 1
+            if self._left < 0:
+                self.failed_at = time.monotonic()
+                raise self._fails
+
+
+def _spoken(synthesizer: Synthesizer, text: str = TEXT, sound: Sound | None = None) -> Tape:
+    tape = Tape()
+    synthesizer.speak(text, sound or Sound(), tape)
+    return tape
+
+
+def _assert_alike(first: Tape, second: Tape) -> None:
+    """Assert that two are the same sentence, but for noise."""
+    assert first.rate == second.rate
+    assert first.seconds == pytest.approx(second.seconds, abs=NEAR)
+    assert [each[:2] for each in first.words] == [each[:2] for each in second.words]
+    assert [each[2] for each in first.words] == pytest.approx([each[2] for each in second.words], abs=NEAR)
+    assert first.loudest == pytest.approx(second.loudest, rel=0.2)
+
+
+# -- voices
+
+
+def test_its_voices_have_ids_of_their_own_and_stay_the_same(synthesizer: Synthesizer) -> None:
+    voices = synthesizer.voices()
+    assert voices
+    assert len({each.id for each in voices}) == len(voices)
+    assert all(each.id and each.name and each.language != "" for each in voices)
+    assert synthesizer.voices() == voices
+
+
+def test_it_has_a_voice_from_the_start_which_is_one_of_them(made: tuple[Synthesizer, str]) -> None:
+    synthesizer, own = made
+    assert own in {each.id for each in synthesizer.voices()}
+
+
+def test_each_voice_can_be_loaded_by_its_id_with_a_variant_or_without(synthesizer: Synthesizer) -> None:
+    voices = [each.id for each in synthesizer.voices() if not each.id.startswith("+")]
+    variants = [each.id for each in synthesizer.voices() if each.id.startswith("+")]
+    for voice in [*voices, *(voices[0] + each for each in variants)]:
+        synthesizer.load(voice)
+        assert synthesizer.voice == voice
+        _spoken(synthesizer, "a")
+
+
+def test_the_voice_is_the_one_that_was_loaded_last(made: tuple[Synthesizer, str], synthesizer: Synthesizer) -> None:
+    before = _spoken(synthesizer)
+    other = next(each.id for each in reversed(synthesizer.voices()) if each.id[0] != "+" and each.id != made[1])
+    synthesizer.load(other)
+    after = _spoken(synthesizer)
+    assert after.samples != before.samples
+    synthesizer.load(made[1])
+    _assert_alike(_spoken(synthesizer), before)
+
+
+@pytest.mark.parametrize("voice", ["no such voice", "", "no/such+voice", "\ud800"])
+def test_a_voice_that_cannot_be_had_leaves_the_one_before(synthesizer: Synthesizer, voice: str) -> None:
+    before, spoken = synthesizer.voice, _spoken(synthesizer, sound=Sound(rate=300))
+    with pytest.raises(UnknownVoice) as caught:
+        synthesizer.load(voice)
+    assert str(caught.value)
+    assert synthesizer.voice == before
+    _assert_alike(_spoken(synthesizer, sound=Sound(rate=300)), spoken)
+
+
+# -- words and samples
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=range(len(TEXTS)))
+def test_any_text_is_spoken_with_its_words(synthesizer: Synthesizer, text: str) -> None:
+    """The tape holds the order: the rate, then words before their samples, at positions that never decrease."""
+    tape = _spoken(synthesizer, text)
+    assert tape.words
+    assert all(0 <= start < len(text) for start, _, _ in tape.words)
+    assert tape.words[-1][2] < tape.seconds
+    assert tape.loudest > 0
+
+
+def test_words_are_where_they_stand_in_the_text(synthesizer: Synthesizer) -> None:
+    tape = _spoken(synthesizer)
+    words = [TEXT[start : start + length].strip(",") for start, length, _ in tape.words]
+    assert words == TEXT.replace(",", "").split()
+
+
+@pytest.mark.parametrize("text", SILENT)
+def test_where_nothing_can_be_spoken_there_are_no_words_and_no_sound(synthesizer: Synthesizer, text: str) -> None:
+    tape = _spoken(synthesizer, text)
+    assert tape.rate
+    assert tape.words == []
+    assert tape.loudest == 0
+
+
+def test_the_first_samples_are_written_while_the_rest_is_made(synthesizer: Synthesizer) -> None:
+    tape = _spoken(synthesizer, "word " * 200)
+    assert tape.seconds / tape.writes < FIRST_BY
+
+
+def test_it_obeys_the_sound_of_this_sentence(synthesizer: Synthesizer) -> None:
+    usual = _spoken(synthesizer)
+    assert _spoken(synthesizer, sound=Sound(rate=400)).seconds < 0.8 * usual.seconds
+    assert _spoken(synthesizer, sound=Sound(rate=100)).seconds > 1.3 * usual.seconds
+    assert 0 < _spoken(synthesizer, sound=Sound(volume=0.5)).loudest < 0.7 * usual.loudest
+    assert _spoken(synthesizer, sound=Sound(volume=0.0)).loudest == 0
+    assert _spoken(synthesizer, sound=Sound(pitch=90)).samples != _spoken(synthesizer, sound=Sound(pitch=10)).samples
+    _assert_alike(_spoken(synthesizer), usual)
+
+
+# -- one sentence after the other
+
+
+def test_nothing_of_a_sentence_stays(synthesizer: Synthesizer) -> None:
+    alone = _spoken(synthesizer)
+    for text in (*TEXTS[1:], *SILENT):
+        _spoken(synthesizer, text, Sound(rate=450, volume=0.1, pitch=99))
+        _assert_alike(_spoken(synthesizer), alone)
+
+
+@limits()
+@pytest.mark.parametrize("fails", [Stopped(), AudioFailed("audio_lost", "unplugged")], ids=["stopped", "failed"])
+@pytest.mark.parametrize(("at", "after"), [("begin", 0), ("word", 0), ("word", 3), ("write", 0), ("write", 5)])
+def test_what_the_output_raises_comes_out_at_once_and_it_is_left_alone(
+    synthesizer: Synthesizer, fails: Exception, at: str, after: int
+) -> None:
+    alone = _spoken(synthesizer)
+    tape = Tape(fails=fails, at=at, after=after)
+    with pytest.raises(type(fails)) as caught:
+        synthesizer.speak("word " * 1000, Sound(), tape)
+    assert caught.value is fails
+    assert tape.failed_at is not None
+    assert_within(time.monotonic() - tape.failed_at, AT_ONCE, "the end of a sentence that was stopped")
+    _assert_alike(_spoken(synthesizer), alone)
+
+
+def test_an_output_that_takes_its_time_is_waited_for(synthesizer: Synthesizer) -> None:
+    """As long as it has not returned, nothing more comes: that is how a sentence is held."""
+    inside = False
+
+    class Slow(Tape):
+        def write(self, samples: bytes) -> None:
+            nonlocal inside
+            assert not inside
+            inside = True
+            time.sleep(0.001)
+            super().write(samples)
+            inside = False
+
+    tape = Slow()
+    synthesizer.speak(TEXT, Sound(), tape)
+    _assert_alike(tape, _spoken(synthesizer))
