@@ -48,7 +48,7 @@ class Output(Protocol):
         """
 
     def word(self, start: int, length: int, position: float) -> None:
-        """Take note that `length` characters (1 or more) from `start` begin `position` seconds into the samples."""
+        """Take note that `length` characters from `start`, 1 or more, begin `position` seconds into the samples."""
 
     def write(self, samples: bytes) -> None:
         """Take samples, whole ones. With none it only lets in what may have come: it raises Stopped, or returns."""

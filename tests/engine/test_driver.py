@@ -1,0 +1,167 @@
+"""Our driver as pyttsx3 sees it, with pyttsx3's own engine: what it notifies, what its properties are, how it loops."""
+
+from __future__ import annotations
+
+import re
+import select
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from pyttsx3.engine import Engine
+
+from talkcli.engine.clock import Times
+from talkcli.engine.pause import Pause
+from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.which import Players
+from talkcli.engine.synthesizers.base import UnknownVoice
+from talkcli.engine.synthesizers.driver import register
+from tests.engine.test_synthesizer_contract import Scripted
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from talkcli.engine.players.base import Interest
+
+#: What pyttsx3 documents: the keywords of each notification.
+FORM = {
+    topic: set(re.findall(r"(\w+)=<", keywords))
+    for topic, keywords in re.findall(r"^\s*([a-z-]+): (\w+=<.*)$", Engine.connect.__doc__ or "", re.MULTILINE)
+}
+_NAME = "talk_scripted"
+
+
+class Told:
+    """An engine of pyttsx3's with our driver, and all that it has notified, with the times that went beside it."""
+
+    def __init__(self, player: str = "null") -> None:
+        self.told: list[tuple[str, dict[str, Any]]] = []
+        self.times = Times()
+        self.beside: list[tuple[float | None, float | None]] = []
+        #: what happens at the first word
+        self.at_word: Callable[[], None] = lambda: None
+        register(_NAME, Scripted(), Players(player, None), _wait, Pause(lambda _: None), self.times)
+        self.engine: Any = Engine(_NAME)
+        for topic in FORM:
+            self.engine.connect(topic, self._note(topic))
+
+    def _note(self, topic: str) -> Callable[..., None]:
+        def note(**values: object) -> None:
+            self.told.append((topic, values))
+            self.beside.append((self.times.word, self.times.duration))
+            if topic == "started-word":
+                self.at_word()
+
+        return note
+
+    def spoken(self, text: str, name: str) -> list[tuple[str, dict[str, Any]]]:
+        """Speak as talk does, and return what was told of it."""
+        self.told.clear()
+        self.beside.clear()
+        self.engine.say(text, name)
+        while not any(topic == "finished-utterance" for topic, _ in self.told):
+            self.engine.iterate()
+        return self.told
+
+
+def _wait(interests: Sequence[Interest], until: float | None) -> None:
+    poll = select.poll()
+    for descriptor, events in interests:
+        poll.register(descriptor, events)
+    poll.poll(None if until is None else max(0.0, until - time.monotonic()) * 1000)
+
+
+@pytest.fixture
+def told() -> Told:
+    found = Told()
+    found.engine.startLoop(False)
+    return found
+
+
+def test_pyttsx3_documents_four_notifications() -> None:
+    assert dict(FORM) == {
+        "started-utterance": {"name"},
+        "started-word": {"name", "location", "length"},
+        "finished-utterance": {"name", "completed"},
+        "error": {"name", "exception"},
+    }
+
+
+def test_a_sentence_is_told_in_pyttsx3s_form_and_its_times_beside_that(told: Told) -> None:
+    assert told.spoken("ab c", "g1") == [
+        ("started-utterance", {"name": "g1"}),
+        ("started-word", {"name": "g1", "location": 0, "length": 2}),
+        ("started-word", {"name": "g1", "location": 3, "length": 1}),
+        ("finished-utterance", {"name": "g1", "completed": True}),
+    ]
+    assert [word for word, _ in told.beside[1:3]] == [0.0, 0.1]
+    assert told.beside[3][1] == pytest.approx(0.15)
+    assert told.spoken("a", "g2")[-1] == ("finished-utterance", {"name": "g2", "completed": True})
+    assert told.beside[-1][1] == pytest.approx(0.05)
+
+
+def test_a_sentence_that_is_stopped_is_not_completed_and_has_no_duration(told: Told) -> None:
+    told.spoken("a", "g1")
+    told.at_word = told.engine.stop
+    assert told.spoken("abcdefgh i", "g2") == [
+        ("started-utterance", {"name": "g2"}),
+        ("started-word", {"name": "g2", "location": 0, "length": 8}),
+        ("finished-utterance", {"name": "g2", "completed": False}),
+    ]
+    assert told.beside[-1][1] is None
+
+
+def test_an_error_is_told_before_the_end() -> None:
+    told = Told("no-such-player-anywhere")
+    told.engine.startLoop(False)
+    started, error, finished = told.spoken("a", "g1")
+    assert started == ("started-utterance", {"name": "g1"})
+    assert error[0] == "error"
+    assert error[1].keys() == FORM["error"]
+    assert error[1]["name"] == "g1"
+    assert isinstance(error[1]["exception"], AudioFailed)
+    assert finished == ("finished-utterance", {"name": "g1", "completed": False})
+    assert told.beside[-1][1] is None
+
+
+def test_its_properties_are_pyttsx3s_and_pitch(told: Told) -> None:
+    engine = told.engine
+    engine.iterate()
+    assert [(each.id, each.name, each.languages) for each in engine.getProperty("voices")] == [
+        ("one", "One", ["en"]),
+        ("two", "Two", []),
+    ]
+    names = ("voice", "rate", "volume", "pitch")
+    assert [engine.getProperty(each) for each in names] == ["one", 200, 1.0, 50]
+    for name, value in zip(names, ("two", 300, 0.5, 60), strict=True):
+        engine.setProperty(name, value)
+    assert [engine.getProperty(each) for each in names] == ["two", 300, 0.5, 60]
+    assert told.told == []
+    told.spoken("ab", "g1")
+    assert told.beside[-1][1] == pytest.approx(0.1 * 200 / 300, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"), [("speed", 3, KeyError), ("voice", "three", UnknownVoice), ("rate", "fast", ValueError)]
+)
+def test_what_cannot_be_set_is_an_error_and_changes_nothing(
+    told: Told, name: str, value: object, kind: type[Exception]
+) -> None:
+    told.engine.iterate()
+    told.engine.setProperty(name, value)
+    ((topic, values),) = told.told
+    assert topic == "error"
+    assert values.keys() == FORM["error"]
+    assert type(values["exception"]) is kind
+    assert [told.engine.getProperty(each) for each in ("voice", "rate")] == ["one", 200]
+
+
+def test_pyttsx3s_own_loop_speaks_all_that_was_said() -> None:
+    told = Told()
+    told.engine.say("a", "g1")
+    told.engine.say("b", "g2")
+    told.engine.runAndWait()
+    assert [values for topic, values in told.told if topic == "finished-utterance"] == [
+        {"name": "g1", "completed": True},
+        {"name": "g2", "completed": True},
+    ]
