@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from talkcli.cli import complete
 from talkcli.engine.clock import TimedWord, WordClock
 from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.players.complaint import LONGEST_LINE, Complaint
-from talkcli.engine.players.programs import commands
+from talkcli.engine.players.program import ProgramPlayer
+from talkcli.engine.players.programs import PACKAGES, PLAYERS, commands
+from talkcli.engine.players.which import Players
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.engine.synthesizers.words import Words
@@ -74,6 +79,23 @@ def test_the_device_is_given_in_the_players_own_words(player: str, expected: lis
     (command,) = commands(player, "usb", 16000, lambda _: True, None)
     assert list(command.argv[-len(expected) :]) == expected
     assert "16000" in " ".join(command.argv) or b"\x80\x3e\x00\x00" in command.preamble
+
+
+def test_a_player_with_a_name_that_is_no_program_is_built_in() -> None:
+    for name in PLAYERS.keys() - PACKAGES.keys():
+        (opens,) = Players(name, None).candidates(22050)
+        player = opens()
+        assert player.name == name
+        assert not isinstance(player, ProgramPlayer)
+        player.kill()
+        assert player.gone()
+
+
+def test_what_people_are_told_of_players_is_in_their_table() -> None:
+    assert {name: each.about for name, each in PLAYERS.items()} == complete.PLAYERS
+    told = " ".join((Path(__file__).parents[1] / "golden" / "help-serve.txt").read_text().split()).lower()
+    for name in PACKAGES:
+        assert f"for {name} {PLAYERS[name].devices}".lower() in told
 
 
 def test_a_command_line_is_split_without_a_shell() -> None:

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from talkcli.engine.players.base import Player
 
-_NULL = "null"
+#: The players that are no programs, by their names in the table: what opens one, for samples per second and a device.
+_BUILT_IN: dict[str, Callable[[int, str | None], Player]] = {"null": lambda rate, _: NullPlayer(rate)}
 _FILE = "file:"
 
 #: Seconds after which a device that was let go of counts as idle, and gets the lead-in again: the power saving of sound
@@ -60,14 +61,15 @@ class Players:
     @property
     def is_program(self) -> bool:
         """Whether what plays is a program, which takes a while to start."""
-        return self._output is None and self._player != _NULL and not (self._player or "").startswith(_FILE)
+        player = self._player or ""
+        return self._output is None and player not in _BUILT_IN and not player.startswith(_FILE)
 
     def candidates(self, rate: int) -> list[Callable[[], Player]]:
         """Return what opens the players to try for a sentence, best first; AudioFailed if there is none."""
         if self._output is not None:
             return [partial(self._stream, self._output, rate)]
-        if self._player == _NULL:
-            return [partial(NullPlayer, rate)]
+        if self._player in _BUILT_IN:
+            return [partial(_BUILT_IN[self._player], rate, self._device)]
         if self._player is not None and self._player.startswith(_FILE):
             return [partial(WavPlayer, self._player[len(_FILE) :], rate)]
         found = commands(self._player, self._device, rate, on_path, self._worked)
