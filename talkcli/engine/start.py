@@ -135,7 +135,8 @@ def _driver_names(pyttsx3: Any) -> list[str]:
     import pkgutil
 
     folder = os.path.join(os.path.dirname(pyttsx3.__file__), "drivers")
-    return sorted(module.name for module in pkgutil.iter_modules([folder]) if not module.name.startswith("_"))
+    found = {module.name for module in pkgutil.iter_modules([folder]) if not module.name.startswith("_")}
+    return sorted(found | SYNTHESIZERS.keys())
 
 
 def _pump(name: str) -> Callable[[], None]:
