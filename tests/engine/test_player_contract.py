@@ -95,7 +95,7 @@ PLAYERS = {
     "a program": Case(
         lambda at: _program("tee", str(at / "tape")),
         played=lambda at: (at / "tape").read_bytes() if (at / "tape").exists() else b"",
-        lost=lambda _: _program("head", "-c", "2000"),
+        lost=lambda _: _program("sh", "-c", "exec <&-; sleep 100"),  # what waits for it then is never read
         refused=lambda _: _program("no-such-player-anywhere"),
         stuck=lambda _: _program("sleep", "100"),
     ),
@@ -202,9 +202,12 @@ def _end(player: Player) -> None:
 
 
 def _play_for_ever(player: Player) -> None:
+    waits = 0
     while not player.ended():
         if not player.offer(memoryview(bytes(_PIECE))):
             _await(player)
+            waits += 1
+            assert waits < MOST_WAITS, "it is woken for nothing"
         player.consumed()
 
 

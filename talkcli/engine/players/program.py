@@ -15,6 +15,7 @@ import time
 from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.players.child import Child
 from talkcli.engine.players.complaint import Complaint
+from talkcli.engine.players.holders import is_held
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -60,8 +61,11 @@ class ProgramPlayer:
         """Write what fits into the pipe."""
         self.ended()  # raises if the player is gone
         # One piece at a time: what waits in the pipe would be heard late by whoever pauses.
-        waiting = 0 if self._child.stdin is None else _unread(self._child.stdin)
-        if waiting == 0:
+        if self._child.stdin is None:
+            return 0
+        waiting = _unread(self._child.stdin)
+        # A write finds out whether it has closed its input, but none is tried where something waits that it left.
+        if waiting == 0 or not is_held(self._child.stdin):
             return self._write(data)
         # But a player that has taken nothing yet is to find what it needs to begin.
         room = self._at_start - waiting if waiting == self._written else 0
