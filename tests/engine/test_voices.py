@@ -231,3 +231,13 @@ def test_an_unknown_voice_between_leaves_the_voice_as_it_was(tmp_path: Path, unk
                 assert engine.spoken(TEXT, "g2", voice=unknown).reason == "unknown_voice"
             assert engine.spoken(TEXT, "g3", voice="en-us").outcome == protocol.COMPLETED
     assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_a_voice_is_found_by_id_name_or_language() -> None:
+    voices = (Voice("gmw/en", "en-gb", "English"), Voice("gmw/en-US", "en-us", "English (America)"))
+    assert find_voice("GMW/EN-us", voices) == voices[1]
+    assert find_voice("english", voices) == voices[0]
+    assert find_voice("en-US", voices) == voices[1]
+    assert find_voice("fr", voices) is None
+    assert unknown_voice("en-uk", voices).startswith('unknown voice "en-uk": did you mean ')
+    assert unknown_voice("qqq", voices) == 'unknown voice "qqq": "talk voices" lists them'

@@ -85,3 +85,24 @@ def test_whatever_is_reported_words_go_forward_within_the_text(text: str, places
             word = text[found.start : found.end]
             assert word.split() == [word]
             end = found.end
+
+
+def test_words_only_move_forward() -> None:
+    words = Words("this one é 日本 😀 ! battery")
+    reported = [(0, 4), (0, 4), (5, 0), (9, 1), (-1, 0), (11, 2), (11, 2), (3, 2), (13, 1), (14, 1), (16, 11), (18, 7)]
+    found = [words.next(*place) for place in reported]
+    assert [(word.start, word.end) for word in found if word] == [
+        (0, 4),
+        (9, 10),
+        (11, 13),
+        (14, 15),
+        (16, 17),
+        (18, 25),
+    ]
+    assert [word.number for word in found if word] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_word_beyond_the_text_is_none() -> None:
+    words = Words("a")
+    assert words.next(5, 3) is None
+    assert words.next(0, 50) is not None
