@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from talkcli.engine.players.base import Interest
+    from talkcli.engine.synthesizers.base import Output, Sound, Synthesizer
 
 #: What pyttsx3 documents: the keywords of each notification.
 FORM = {
@@ -34,13 +35,15 @@ _NAME = "talk_scripted"
 class Told:
     """An engine of pyttsx3's with our driver, and all that it has notified, with the times that went beside it."""
 
-    def __init__(self, player: str = "null") -> None:
+    def __init__(self, player: str = "null", synthesizer: Synthesizer | None = None) -> None:
         self.told: list[tuple[str, dict[str, Any]]] = []
         self.times = Times()
         self.beside: list[tuple[float | None, float | None]] = []
-        #: what happens at the first word
+        #: what happens when a word is told, and in each wait
         self.at_word: Callable[[], None] = lambda: None
-        register(_NAME, Scripted(), Players(player, None), _wait, Pause(lambda _: None), self.times)
+        self.at_wait: Callable[[], None] = lambda: None
+        made = synthesizer or Scripted()
+        register(_NAME, made, Players(player, None), self._wait, Pause(lambda _: None), self.times)
         self.engine: Any = Engine(_NAME)
         for topic in FORM:
             self.engine.connect(topic, self._note(topic))
@@ -54,6 +57,13 @@ class Told:
 
         return note
 
+    def _wait(self, interests: Sequence[Interest], until: float | None) -> None:
+        poll = select.poll()
+        for descriptor, events in interests:
+            poll.register(descriptor, events)
+        poll.poll(None if until is None else max(0.0, until - time.monotonic()) * 1000)
+        self.at_wait()
+
     def spoken(self, text: str, name: str) -> list[tuple[str, dict[str, Any]]]:
         """Speak as talk does, and return what was told of it."""
         self.told.clear()
@@ -62,13 +72,6 @@ class Told:
         while not any(topic == "finished-utterance" for topic, _ in self.told):
             self.engine.iterate()
         return self.told
-
-
-def _wait(interests: Sequence[Interest], until: float | None) -> None:
-    poll = select.poll()
-    for descriptor, events in interests:
-        poll.register(descriptor, events)
-    poll.poll(None if until is None else max(0.0, until - time.monotonic()) * 1000)
 
 
 @pytest.fixture
@@ -109,6 +112,19 @@ def test_a_sentence_that_is_stopped_is_not_completed_and_has_no_duration(told: T
         ("finished-utterance", {"name": "g2", "completed": False}),
     ]
     assert told.beside[-1][1] is None
+
+
+def test_a_synthesizer_that_has_nothing_to_write_yet_lets_in_a_stop() -> None:
+    class Thinking(Scripted):
+        def speak(self, text: str, sound: Sound, output: Output) -> None:
+            output.begin(80 * sound.rate)
+            while text:
+                output.write(b"")
+
+    told = Told(synthesizer=Thinking())
+    told.engine.startLoop(False)
+    told.at_wait = told.engine.stop
+    assert told.spoken("a", "g1")[-1] == ("finished-utterance", {"name": "g1", "completed": False})
 
 
 def test_an_error_is_told_before_the_end() -> None:

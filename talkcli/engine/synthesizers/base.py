@@ -73,7 +73,11 @@ class Synthesizer(Protocol):
         """
 
     def load(self, voice: str) -> None:
-        """Speak with the voice of this id from now on; UnknownVoice leaves the one in force that was before."""
+        """Speak with the voice of this id from now on; UnknownVoice leaves the one in force that was before.
+
+        It returns soon, as nothing can be stopped meanwhile, and no sign of life given: what takes seconds goes on
+        behind it, and `speak` waits for that.
+        """
 
     def speak(self, text: str, sound: Sound, output: Output) -> None:
         """Make the sentence, and return when all of it was written.

@@ -13,6 +13,7 @@ from talkcli.engine.players.base import SAMPLE, AudioFailed
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import guard
 from talkcli.engine.synthesizers.base import UnknownVoice
+from talkcli.engine.synthesizers.voices import VARIANT
 from talkcli.engine.synthesizers.words import letters
 
 TYPE_CHECKING = False
@@ -128,7 +129,7 @@ def _until_end(events: Any) -> Iterator[Any]:
 def _variants(espeak: Any) -> list[Voice]:
     """Return the variants, whose ids are files: "!v/f3"."""
     found = [(each.id.rpartition("/")[2], each.name) for each in _listed(espeak, _VARIANTS)]
-    return [Voice(f"+{file}", None, f"variant {name}") for file, name in found]
+    return [Voice(VARIANT + file, None, f"variant {name}") for file, name in found]
 
 
 def _mbrola_voices(espeak: Any) -> list[Voice]:
