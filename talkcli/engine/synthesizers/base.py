@@ -58,7 +58,7 @@ class Synthesizer(Protocol):
     """Makes samples and words of texts, one at a time, in the voice that was loaded last.
 
     All of it is called in the one thread that made it, the engine process's main thread, and calls its output in no
-    other. It plays nothing, and knows of no goals. What makes one raises NotInstalled, and leaves a voice in force.
+    other. It plays nothing, and knows of no goals. What makes one raises NotInstalled where a part is missing.
     """
 
     #: what speaks, for people: "eSpeak NG 1.51 (system)"; None if there is nothing to be said
