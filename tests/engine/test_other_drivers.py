@@ -286,6 +286,21 @@ def test_no_library_at_all_says_what_to_install() -> None:
     )
 
 
+def test_a_library_without_a_voice_of_its_own_says_which() -> None:
+    before = """
+from talkcli.engine.synthesizers import library
+load = library.load
+def without_english():
+    found = load()
+    found.espeak.SetVoiceByName = lambda _: found.espeak.EE_OK + 1
+    return found
+library.load = without_english
+"""
+    failed = _start_failure(before=before)
+    assert failed.message == 'the driver "talk_espeak" cannot be started: UnknownVoice: en'
+    assert not failed.lasting
+
+
 def test_no_pyttsx3_says_what_to_install() -> None:
     failed = _start_failure(before="sys.modules['pyttsx3'] = None")
     assert failed.message.startswith("pyttsx3 is missing: pip install pyttsx3")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from array import array
+from functools import cache
 from typing import TYPE_CHECKING
 
 import pytest
@@ -81,27 +82,20 @@ class Scripted:
                 samples += len(tone)
 
 
-def _espeak() -> Iterator[Synthesizer]:
-    library = load()
-    yield Espeak(library)
-    library.espeak.Terminate()  # with it the library's thread
+@cache
+def _espeak() -> Synthesizer:
+    """Return the one that there is in a process: its library can be loaded once, and hangs where it is to end."""
+    return Espeak(load())
 
 
-def _scripted() -> Iterator[Synthesizer]:
-    yield Scripted()
+SYNTHESIZERS: dict[str, Callable[[], Synthesizer]] = {"espeak": _espeak, "scripted": Scripted}
 
 
-SYNTHESIZERS = {"espeak": _espeak, "scripted": _scripted}
-
-
-@pytest.fixture(params=SYNTHESIZERS.values(), ids=list(SYNTHESIZERS), scope="module")
-def made(request: pytest.FixtureRequest) -> Iterator[tuple[Synthesizer, str]]:
+@pytest.fixture(params=list(SYNTHESIZERS), scope="module")
+def made(request: pytest.FixtureRequest) -> tuple[Synthesizer, str]:
     """Return one for all tests, as a process has one, and its own voice."""
-    make: Callable[[], Iterator[Synthesizer]] = request.param
-    iterator = make()
-    synthesizer = next(iterator)
-    yield synthesizer, synthesizer.voice
-    next(iterator, None)
+    synthesizer = SYNTHESIZERS[request.param]()
+    return synthesizer, synthesizer.voice
 
 
 @pytest.fixture

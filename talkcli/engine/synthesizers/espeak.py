@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from talkcli.engine.synthesizers.library import Library
 
 #: English: by its file, which saves the 4 to 40 ms in which the library reads all voices to find it by its language.
-DEFAULT_VOICE = "gmw/en"
-_DEFAULT_LANGUAGE = "en"
+_DEFAULTS = ("gmw/en", "en")
 
 #: An event that pyttsx3's binding does not name: the sample rate, before the first samples.
 _EVENT_SAMPLERATE = 8
@@ -43,7 +42,6 @@ class Espeak:
     def __init__(self, library: Library) -> None:
         """Take the library that was loaded; UnknownVoice if it has no English."""
         self.version: str | None = library.version
-        self.voice = DEFAULT_VOICE
         self._espeak = espeak = library.espeak
         self._rate = library.rate
         #: what its parameters were last set to; they are left alone where they need not be set, so that the first
@@ -52,8 +50,11 @@ class Espeak:
         self._text = ""
         self._output: Output | None = None
         self._raised: BaseException | None = None
-        if espeak.SetVoiceByName(DEFAULT_VOICE.encode()) != espeak.EE_OK:
-            self.load(_DEFAULT_LANGUAGE)
+        for self.voice in _DEFAULTS:
+            if espeak.SetVoiceByName(self.voice.encode()) == espeak.EE_OK:
+                break
+        else:
+            raise UnknownVoice(self.voice)
         espeak.SetSynthCallback(self._on_audio)
 
     def voices(self) -> tuple[Voice, ...]:
