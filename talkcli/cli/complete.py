@@ -29,14 +29,6 @@ _ENDED = 100
 #: Characters of a text that stand beside an id.
 _MAX_TEXT = 60
 
-#: The players that talk knows by name.
-PLAYERS = {
-    "aplay": "ALSA",
-    "pacat": "PulseAudio",
-    "pw-cat": "PipeWire",
-    "null": "silent, in real time",
-}
-
 
 def goal_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Return the ids of goals that have not ended."""
@@ -89,7 +81,9 @@ def files(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
 
 def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
     """Return the players that talk knows by name."""
-    return _items(PLAYERS.items(), incomplete)
+    from talkcli.engine.players.programs import PLAYERS
+
+    return _items([(name, each.about) for name, each in PLAYERS.items()], incomplete)
 
 
 def _ask(context: click.Context, question: Callable[[Client], _Answer]) -> _Answer | None:

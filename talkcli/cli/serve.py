@@ -6,7 +6,7 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any
 
-from talkcli.cli import complete, units
+from talkcli.cli import units
 from talkcli.cli.command import MODE, spelt
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import note, show
@@ -48,14 +48,15 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
     if player == "null" or player.startswith("file:"):
         return
-    silent = player in {"", *complete.PLAYERS} and nothing_sounds(os.environ)
+    silent = nothing_sounds(os.environ)
     if not player and not silent:
         return
+    from talkcli.engine.players.programs import PACKAGES
     from talkcli.engine.start import is_own
 
     if not is_own(driver):
         return  # it plays by itself, and the server says so
-    if silent:
+    if silent and (not player or player in PACKAGES):
         note(NO_DEVICE)
     if player:
         _warn_of_player(player)
@@ -65,13 +66,13 @@ def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
     from talkcli.cli.nearest import nearest
     from talkcli.engine.players.base import AudioFailed
-    from talkcli.engine.players.programs import commands, on_path
+    from talkcli.engine.players.programs import PLAYERS, commands, on_path
     from talkcli.terminal.text import printable
 
     try:
         commands(player, None, 0, on_path, None)
     except AudioFailed as error:
-        near = nearest(player, set(complete.PLAYERS) - {player})
+        near = nearest(player, PLAYERS.keys() - {player})
         hint = f"did you mean '{near}'? " if near else ""
         note(f"{printable(str(error))}: {hint}nothing can be heard until it is there")
 
