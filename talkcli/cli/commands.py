@@ -9,7 +9,7 @@ from __future__ import annotations
 from talkcli.cli.command import ASKING, FILE, MODE, Argument, Command, spelt
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.option import FLAG, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
-from talkcli.goals.options import MAX_CHARACTERS, OPTIONS, SETTINGS, SOUND, Cancel
+from talkcli.goals.options import MAX_CHARACTERS, MAX_LEAD_IN, OPTIONS, SETTINGS, SOUND, Cancel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 #: The shells that there is a completion script for, and the units of systemd's.
 SHELLS = ("bash", "zsh", "fish")
 UNITS = ("user", "system", "user-socket", "system-socket")
-#: Milliseconds of silence before a sentence: no output needs longer to wake.
-MAX_LEAD_IN = 5000
 
 
 def _timeout(words: str) -> Option:

@@ -13,15 +13,16 @@ import sys
 
 from talkcli.engine import protocol
 from talkcli.engine.channel import Channel
-from talkcli.engine.orphan import die_with_parent
 
 #: Names the descriptor that the player must inherit: the server sees by its end that process and player are gone.
 LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
+#: Linux's: have this process killed when the thread that started it is gone. For what it starts, see `players.child`.
+_PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
     """Run the engine process to its end."""
-    die_with_parent()
+    _die_with_parent()
     _leave_no_core()
     # Ctrl-C in the server's terminal and the terminal's end are the server's business. A server or a player that stops
     # reading is seen by the write that fails.
@@ -35,6 +36,20 @@ def main() -> None:
     if configure is None or os.getppid() != configure.server:
         return
     _serve(channel, configure)
+
+
+def _die_with_parent() -> None:
+    """Have the kernel kill this process as soon as its parent's starting thread ends; afterwards, see who that is.
+
+    Linux alone can do that; elsewhere the end of the socket to the server has to do.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    import ctypes
+
+    prctl = ctypes.CDLL(None, use_errno=True).prctl
+    if prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
 
 
 def _leave_no_core() -> None:

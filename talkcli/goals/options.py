@@ -42,6 +42,8 @@ MAX_BYTES = 40_000
 MAX_PRIORITY = 1_000_000
 #: A key is a label, shown on one line.
 MAX_KEY = 64
+#: Milliseconds of silence before a sentence: no output needs longer to wake.
+MAX_LEAD_IN = 5000
 #: What stands for the driver's own voice, where a voice is named.
 DEFAULT_VOICE = "default"
 
