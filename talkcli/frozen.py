@@ -26,7 +26,7 @@ else:
 
 
 #: Values of a class that are made before an `__init__` of its own is worth what it takes to compile.
-_FEW = 50
+_FEW = 100
 
 
 @dataclass_transform(frozen_default=True)

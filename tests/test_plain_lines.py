@@ -18,7 +18,7 @@ from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import Common
 from talkcli.client.opening import GREETING
 from talkcli.goals.option import FLAG
-from talkcli.goals.options import GIVEN, Cancel, Say
+from talkcli.goals.options import Cancel, Say
 from talkcli.protocol import replies
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Hello, Pause, Resume, Status, write_request
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from talkcli.protocol.requests import Request
 
 PLAIN = [each.name for each in COMMANDS.values() if each.plain]
+#: What a goal is given on a command line.
+GIVEN = [each.name for each in Say.options if each.flags and each.name not in {"wait", "feedback"}]
 TYPED = ParameterSource.COMMANDLINE
 ROWS = [*COMMON, *(option for each in COMMANDS.values() if each.plain for option in each.options)]
 SPELLINGS = {form: each for each in ROWS for part in each.flags.split("/") for form in part.split(", ")}

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib.util
 import json
 import os
 import re
 import shlex
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import time
 import wave
 from typing import TYPE_CHECKING, Any
@@ -168,6 +171,28 @@ def test_settings_of_a_goal_are_sent_and_the_environment_is_not(make_talk: MakeT
     unknown = talk.run("say", "--voice", "nobody-speaks-it", "length=0")
     assert (unknown.code, unknown.out) == (5, "")
     assert "nobody-speaks-it" in unknown.err
+
+
+@pytest.mark.parametrize("name", [".mp3", "..ogg", ".wav"])
+def test_a_file_s_name_is_no_ending(tmp_path: Path, name: str) -> None:
+    done = alone("say", "-o", str(tmp_path / name), "--rate", "450", "hi")
+    assert (done.code, done.err) == (0, "")
+    assert (tmp_path / name).read_bytes()[:4] == b"RIFF"
+
+
+def test_ctrl_c_while_the_text_is_read_ends_the_terminal_s_line(scripted: Talk) -> None:
+    with subprocess.Popen(
+        [*TALK, "say", "-"], env=scripted.env, stdin=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as client:
+        assert client.stdin
+        client.stdin.write(b"battery")
+        client.stdin.flush()
+        while struct.unpack("i", fcntl.ioctl(client.stdin, termios.FIONREAD, bytes(4)))[0]:
+            time.sleep(0.005)  # that another process has read is no event
+        client.send_signal(signal.SIGINT)
+        assert client.stderr
+        assert client.stderr.read() == b"\n"
+    assert client.returncode == 130
 
 
 def test_speech_that_is_paused_is_noted(scripted: Talk) -> None:

@@ -14,7 +14,7 @@ from click.core import ParameterSource
 
 from talkcli import __version__
 from talkcli.cli import complete, values
-from talkcli.cli.command import ALL_EXIT_CODES, COMMON, FILE
+from talkcli.cli.command import ALL_EXIT_CODES, COMMON, FILE, spelt
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.ends import OutputClosed, ended
 from talkcli.cli.show import Common, note, show_error
@@ -53,16 +53,15 @@ class _Value(click.ParamType):  # type: ignore[type-arg,unused-ignore]
         self._option = option
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        if not isinstance(value, str):
-            return value  # a default
         try:
-            return values.read(self._option, value)
+            return values.read(self._option, str(value))
         except ValueError as error:
-            # Where the value came from: the option, or a variable instead of it.
-            source = ctx and ctx.get_parameter_source(self._option.name)
-            variable = f"{self._option.env} in the environment" if source is ParameterSource.ENVIRONMENT else None
-            hint = variable or f"--{self._option.flags.split('--')[-1]}"
-            raise click.BadParameter(str(error), ctx, param, hint) from error
+            raise click.BadParameter(str(error), ctx, param, self._came_from(ctx)) from error
+
+    def _came_from(self, ctx: click.Context | None) -> str | None:
+        """Return where the value came from: the option, or a variable instead of it; None for click's own words."""
+        typed = ctx and ctx.get_parameter_source(self._option.name) is not ParameterSource.ENVIRONMENT
+        return spelt(self._option) if typed else f"{self._option.env} in the environment"
 
 
 class _Number(_Value, click.FloatRange):
@@ -72,11 +71,8 @@ class _Number(_Value, click.FloatRange):
         _Value.__init__(self, option)
         click.FloatRange.__init__(self, *option.limits, min_open=option.above)
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        try:
-            return values.read(self._option, str(value))
-        except ValueError as error:
-            raise click.BadParameter(str(error), ctx, param) from error
+    def _came_from(self, ctx: click.Context | None) -> str | None:  # noqa: ARG002
+        return None
 
     def _describe_range(self) -> str:
         return values.limits(self._option)
@@ -155,11 +151,10 @@ class ClickCommand(click.Command):
             rest = super().parse_args(ctx, args)
         except click.UsageError as error:
             error.ctx = error.ctx or ctx  # the help to look at is this command's
-            if isinstance(error, click.NoSuchOption) and self.name == "say":
+            if isinstance(error, click.NoSuchOption) and self.row.no_such_option:
                 words = told(error)
                 stop = "" if words.endswith("?") else "."
-                words += f"{stop} To speak a text that starts with '-', write: talk say -- TEXT"
-                raise click.UsageError(words, ctx) from error
+                raise click.UsageError(f"{words}{stop} {self.row.no_such_option}", ctx) from error
             raise
         if rest and not ctx.resilient_parsing:
             names = [each.make_metavar(ctx) for each in self.params if isinstance(each, click.Argument)]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     Rule = Callable[[Mapping[str, Any], AbstractSet[str]], str | None]
 
 #: A file that is to be written, and the mode of one.
-FILE = Kind("string", (str,), "must be a string", "FILE")
+FILE = Kind("string", (str,), "must be a string")
 MODE = Kind("string", (str,), "must be a string", "MODE")
 
 #: Exit codes of every command that asks the server for something; a command says more of those that mean more to it.
@@ -82,6 +82,8 @@ class Command:
     exit_codes: Codes
     options: tuple[Option, ...] = ()
     argument: Argument | None = None
+    #: what is said besides of an option that there isn't
+    no_such_option: str = ""
     #: whether scripts call it all the time: a plain line of it is read without click
     plain: bool = False
     rule: Rule | None = None

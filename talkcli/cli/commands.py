@@ -6,9 +6,11 @@ The options of goals and servers are in `goals.options`; how two options go toge
 
 from __future__ import annotations
 
+import os
+
 from talkcli.cli.command import ASKING, FILE, MODE, Argument, Command, spelt
 from talkcli.frozen import TYPE_CHECKING, replace
-from talkcli.goals.option import FLAG, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
+from talkcli.goals.option import FLAG, IDS, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
 from talkcli.goals.options import MAX_CHARACTERS, MAX_LEAD_IN, OPTIONS, SETTINGS, SOUND, Cancel
 
 if TYPE_CHECKING:
@@ -73,9 +75,9 @@ def _say_rule(given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
         named = [spelt(each, given[each.name]) for each in _SAY if each.name in typed - _WITHOUT_SERVER]
         if named:
             return f"--output writes a file, without a server: leave out {', '.join(named)}"
-        ending = next((each for each in _OTHER_FORMATS if output.lower().endswith(each)), "")
-        if ending:
-            return f"--output writes WAV, not {output[-len(ending) :]}: name it .wav, and convert it with ffmpeg or sox"
+        ending = os.path.splitext(output)[1]
+        if ending.lower() in _OTHER_FORMATS:
+            return f"--output writes WAV, not {ending}: name it .wav, and convert it with ffmpeg or sox"
     if given["lines"] and text:
         return "--lines reads standard input: leave out TEXT"
     if given["lines"] and given["id"] is not None:
@@ -183,7 +185,7 @@ def _serve_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
     return None
 
 
-_IDS = Argument("ids", "[ID]...", many=True, offers="goal_ids")
+_IDS = Argument("ids", IDS.metavar, many=True, offers="goal_ids")
 
 #: The commands, in the order in which help lists them: what a newcomer needs first comes first.
 _ROWS = (
@@ -245,6 +247,7 @@ _ROWS = (
         },
         options=_SAY,
         argument=Argument("text", "TEXT...", many=True),
+        no_such_option="To speak a text that starts with '-', write: talk say -- TEXT",
         plain=True,
         rule=_say_rule,
     ),

@@ -13,7 +13,7 @@ import time
 
 from talkcli.client.opening import open_early, stand_back
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.options import Cancel, Say
+from talkcli.goals.options import MAX_CHARACTERS, MAX_KEY, Cancel, Say
 
 if TYPE_CHECKING:
     from typing import Any
@@ -31,8 +31,6 @@ _FIELDS: dict[str, tuple[Option, ...]] = {
 }
 #: What a server may refuse for more than its form: only the library knows the whole id, reads a file, or counts lines.
 _LATE = ("id", "ids", "before", "goal_id", "lines")
-#: Characters of a label and of a text that are surely not too many.
-_LABEL, _TEXT = 64, 10_000
 
 
 def lines(plain: Plain) -> tuple[bytes, bytes] | None:
@@ -59,7 +57,7 @@ def _line(fields: dict[str, Any]) -> bytes | None:
     shown = []
     for name, each in fields.items():
         if isinstance(each, str):
-            fits = 0 < len(each) <= (_TEXT if name == "text" else _LABEL)
+            fits = 0 < len(each) <= (MAX_CHARACTERS if name == "text" else MAX_KEY)
             if not (fits and each.isprintable()) or '"' in each or "\\" in each:
                 return None
             shown.append(f'"{name}": "{each}"')

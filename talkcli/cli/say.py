@@ -17,7 +17,7 @@ from talkcli.cli.outcome import (
     show_if_possible,
     until_ended,
 )
-from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.client.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost
 from talkcli.frozen import TYPE_CHECKING
@@ -65,11 +65,14 @@ def say(
             return _refuse(f"Talk rejected: {error}", error.code, options, feedback=feedback)
         except Interrupted:  # nothing was sent
             return EXIT_SIGPIPE
+        except KeyboardInterrupt:
+            end_line()  # that the terminal has shown ^C on
+            raise
     if output is not None:
         from talkcli.cli.render import render_to
 
         return render_to(output, sentence, chosen, rest(end), options)
-    return _say(options, sentence, chosen, name, timeout, wait=wait, feedback=feedback)
+    return _say(options, sentence, chosen, name, timeout, end, wait=wait, feedback=feedback)
 
 
 def _say(
@@ -78,12 +81,12 @@ def _say(
     chosen: dict[str, Any],
     name: str | None,
     timeout: float | None,
+    end: float | None,
     *,
     wait: bool,
     feedback: bool,
 ) -> int:
-    """Speak one text."""
-    end = None if timeout is None else options.began + timeout
+    """Speak one text; `end`: when the `timeout` is over, by the monotonic clock."""
     if not text.isascii():
         from talkcli.cli.utf8 import readable
 

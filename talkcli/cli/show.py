@@ -162,6 +162,16 @@ def note(words: str) -> None:
             _discard(2)
 
 
+def end_line() -> None:
+    """End a line on standard error that somebody else has begun, a terminal for one."""
+    if sys.stderr is not None:
+        try:
+            sys.stderr.write("\n")
+            sys.stderr.flush()
+        except OSError:
+            _discard(2)  # as in `note`
+
+
 def _folded(text: str) -> str:
     """Return the text in lines that a terminal needs not break."""
     try:

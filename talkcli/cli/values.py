@@ -35,29 +35,24 @@ def read(option: Option, text: str) -> Any:
 
 
 def limits(option: Option) -> str:
-    """Return the limits of a number in words, "" where it has none."""
-    low, high = option.limits
-    if low is None:
-        return ""
-    if high is not None:
-        return f"from {low:g} to {high:g}"
-    return f"above {low:g}" if option.above else f"from {low:g} on"
+    """Return the limits of a number as help has them, "" where it has none."""
+    return f"from {option.range}" if option.limits[1] is not None else option.range
 
 
 def _number(option: Option, text: str) -> float:
     whole = option.kind is INTEGER
-    wanted = f"{'a whole number' if whole else 'a number'} {limits(option)}" if limits(option) else "a valid integer"
+    what = "a whole number" if whole else "a number"
+    wanted = f"{what} {limits(option)}" if option.range else "a valid integer" if whole else what
     try:
         value = int(text) if whole else float(text)
     except ValueError:
         raise ValueError(f"'{text}' is not {wanted}") from None
-    if value != value:  # NaN, which compares with nothing
+    if value != value:  # NaN
         raise ValueError(f"{value!r} is not a number")
-    low, high = option.limits
-    if (low is not None and (value <= low if option.above else value < low)) or (high is not None and value > high):
-        raise ValueError(f"'{text}' is not {wanted}")
     if option.kind is SECONDS and value == float("inf"):
         raise ValueError("no limit is 0")
+    if option.outside(value):
+        raise ValueError(f"'{text}' is not {wanted}")
     return value
 
 

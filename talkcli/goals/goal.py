@@ -2,7 +2,7 @@
 
 Rules for this file: form only. Whether a goal is admitted is the scheduler's business, how a line is cut from a stream
 is the wire's. A field may be added, never renamed or given another meaning. A reader ignores fields that it doesn't
-know; requests, where that would drop what somebody asked for, are in `requests`.
+know; requests, where that would drop what somebody asked for, are in `options` and `protocol.requests`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,8 @@
 """What an option is: one row, of a goal's options or of a command's, from which all that is said of it is made.
 
+Two things may be wrong with a value: its form (`fault`: a request with it is an error, nothing is done), and that there
+is no such value (`refusal`: a goal with it is REJECTED).
+
 It knows no single option; those of goals and servers are in `options`, those of a command beside it. A client imports
 it before it sends anything, so it imports nothing heavy.
 """
@@ -63,7 +66,7 @@ def _bad_data(value: JsonObject) -> str | None:
 FLAG = Kind("boolean", (bool,), "must be true or false")
 TEXT = Kind("string", (str,), "must be a string", "TEXT")
 #: a text that names something: on a command line it is never empty, and it is UTF-8
-WORD = Kind("string", (str,), "must be a string", "WORD")
+WORD = Kind("string", (str,), "must be a string")
 #: a file or a socket by its path, which may be any bytes but not empty
 PATH = Kind("string", (str,), "must be a string", "PATH")
 INTEGER = Kind("integer", (int,), "must be an integer", "N")
@@ -99,7 +102,7 @@ class Option:
 
     name: str
     kind: Kind
-    #: what it means on the wire
+    #: what it means on the wire; this, `form` and `absent` are for documents alone
     meaning: str = ""
     #: what it is where it isn't given; where that is None, a request may have null, too
     default: Any = None
@@ -112,7 +115,7 @@ class Option:
     choices: tuple[str, ...] = ()
     #: what else is wrong with its value, for people, or None
     refuses: Callable[[Any], str | None] | None = None
-    #: of the wire's table: what its value may be besides; what holds where it isn't given
+    #: what its value may be besides; what holds where it isn't given
     form: str = ""
     absent: str = ""
     #: spellings on a command line, "-w, --wait"; the first for yes, the second for no: "--preempt/--queue"
@@ -138,14 +141,31 @@ class Option:
             return kind.wrong
         return kind.fault(value) if kind.fault else None
 
+    def outside(self, value: float) -> bool:
+        """Whether a number is not within the limits."""
+        low, high = self.limits
+        if self.kind is SECONDS and high is None:
+            high = _LARGEST
+        # Written so that NaN, which compares with nothing, is outside.
+        above = low is None or (value > low if self.above else value >= low)
+        return not (above and (high is None or value <= high))
+
     def refusal(self, value: Any) -> str | None:
         """Return why a value of the right form can't be had, for people, or None."""
         if value is None:
             return None
-        low, high = self.limits
-        # Written so that NaN, which compares with nothing, is outside.
-        if self.kind is SECONDS and not 0 <= value <= _LARGEST:
-            return f"the {self.name} {value} is no number of seconds from 0 on"
-        if low is not None and high is not None and not low <= value <= high:
-            return f"the {self.name} {value} is not within {low:g} to {high:g}{self.unit}"
+        if self.limits != (None, None) and self.outside(value):
+            wanted = "no number of seconds" if self.kind is SECONDS else "not"
+            wanted = wanted if self.limits[1] is None else "not within"
+            return f"the {self.name} {value} is {wanted} {self.range}{self.unit}"
         return self.refuses(value) if self.refuses else None
+
+    @property
+    def range(self) -> str:
+        """The limits in words, "" where there are none."""
+        low, high = self.limits
+        if low is None:
+            return ""
+        if high is not None:
+            return f"{low:g} to {high:g}"
+        return f"above {low:g}" if self.above else f"from {low:g} on"

@@ -5,7 +5,7 @@ commands and how they are read, what a server's settings are called, the README'
 them again, for type checkers and readers; tests hold both to the rows. How two options go together is `bad_option`.
 
 Rules for this file: a client imports it before it sends anything, so it imports nothing heavy. A row may be added,
-never renamed or given another meaning.
+never renamed or given another meaning. The first sentence of a request's docstring is its meaning in the wire's table.
 """
 
 from __future__ import annotations
@@ -158,6 +158,7 @@ OPTIONS = (
         INTEGER,
         "higher goes first; first in first out among equals",
         default=0,
+        # As limits, help would show them, and nobody needs to know.
         refuses=_bad_priority,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
         flags="--priority",
@@ -282,8 +283,6 @@ OPTIONS = (
     Option("format", TEXT, "anything else is REJECTED", "text", refuses=_unknown_format, shown=True),
 )
 
-#: What a goal is given on a command line; the others are said by other means than an option.
-GIVEN = tuple(each.name for each in OPTIONS if each.flags and each.name not in {"wait", "feedback"})
 #: What the engine is told of a goal, and what everybody is.
 FOR_ENGINE = tuple(each.name for each in OPTIONS if each.engine)
 #: How it sounds, in a file, too: of these a server has a value of its own.

@@ -3,7 +3,7 @@
 Rules for this file: form only; whether a goal is admitted is the scheduler's business. A request is one class and the
 rows of its fields; what a goal is and a server's settings are is in `goals.options`. A field may be added, never
 renamed or given another meaning. A field that is not in the rows is an error: an option that this server doesn't know
-is refused, never dropped.
+is refused, never dropped. The first sentence of a request's docstring is its meaning in the wire's table.
 """
 
 from __future__ import annotations

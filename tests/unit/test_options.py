@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import math
 import re
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -17,10 +20,10 @@ from talkcli.cli.commands import COMMANDS
 from talkcli.cli.values import read
 from talkcli.engine import protocol
 from talkcli.frozen import fields, replace
+from talkcli.goals.option import INTEGER, NUMBER, Option
 from talkcli.goals.options import (
     DEFAULT_VOICE,
     FOR_ENGINE,
-    GIVEN,
     INITIAL,
     MAX_KEY,
     MAX_PRIORITY,
@@ -176,12 +179,11 @@ def test_what_the_library_takes_is_what_the_rows_say() -> None:
     # `wait` is called `follow` there, and is what one mostly wants; no other format than text can be asked for.
     assert asked.pop("follow") == ("bool", True)
     assert asked.pop("text") == ("str", inspect.Parameter.empty)
-    fields = annotated(Say)
-    rows = {
-        each.name: (fields[each.name], each.default) for each in OPTIONS if each.name not in {"text", "wait", "format"}
-    }
-    assert asked == rows
-    assert [each for each in asked if each in GIVEN] == [*GIVEN]
+    own = annotated(Say)
+    rows = [each for each in OPTIONS if each.name not in {"text", "wait", "format"}]
+    assert asked == {each.name: (own[each.name], each.default) for each in rows}
+    typed = [each.name for each in rows if each.flags and each.name != "feedback"]
+    assert [each for each in asked if each in typed] == typed
     assert list(declared(Client.set).items()) == [(each.name, (annotated(Set)[each.name], None)) for each in SETTINGS]
 
 
@@ -223,3 +225,40 @@ def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
         for name, row in rows.items()
         if not row.setting and name != "print_unit"
     }
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_carries_a_command_out_takes_what_its_row_gives(command: str) -> None:
+    row = COMMANDS[command]
+    module, _, name = row.runs.partition(":")
+    function = getattr(importlib.import_module(f"talkcli.cli.{module}"), name)
+    names = [each.name for each in row.options] + ([row.argument.name] if row.argument else [])
+    bound = inspect.signature(function).bind(None, **dict.fromkeys(names))
+    for each in bound.signature.parameters.values():
+        assert each.default is inspect.Parameter.empty, f"{each.name} is always given"
+
+
+LIMITED = Option("x", NUMBER, limits=(0, 1), above=True), Option("x", INTEGER, limits=(1, None)), Option("x", INTEGER)
+
+
+def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
+    taken: list[list[float]] = [[0.5, 1], [1, 10**400], [-5]]
+    refused: list[list[float]] = [[0, -1, 1.5], [0, -5], []]
+    for option, good, bad in zip(LIMITED, taken, refused, strict=True):
+        for value in good:
+            assert (option.refusal(value), read(option, str(value))) == (None, value)
+        for value in bad:
+            assert f"{value}" in str(option.refusal(value))
+            with pytest.raises(ValueError, match=f"'{value}' is not a"):
+                read(option, str(value))
+    wanted = ["a number from 0 to 1", "a whole number from 1 on", "a valid integer"]
+    for option, words in zip(LIMITED, wanted, strict=True):
+        with pytest.raises(ValueError, match=f"'abc' is not {words}$"):
+            read(option, "abc")
+
+
+def test_a_plain_line_is_read_before_an_option_is_worth_compiling() -> None:
+    """It is read before anything is sent: some hundred rows are made for it."""
+    code = "import talkcli.cli.plain; from talkcli import frozen; from talkcli.goals.option import Option; "
+    code += "print(Option.__init__ is frozen._init_of_few)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "True\n"

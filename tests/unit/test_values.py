@@ -66,29 +66,29 @@ def test_what_does_not_fit_is_refused_as_by_a_dataclass(given: tuple[int, ...], 
             each(*given, **named)  # type: ignore[arg-type]
 
 
+ODD: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
+    *(((), {}), ((), {"y": 1}), ((1, 2, "a", 4), {}), ((1,), {"x": 1}), ((1, 2), {"y": 2})),
+    *(((1,), {"z": 1}), ((), {"z": 1}), ((1, 2, "a"), {"z": 1})),
+]
+
+
 @pytest.mark.parametrize("before", [0, 1, 1_000], ids=["the first", "another", "one of many"])
-def test_the_first_values_of_a_class_are_made_as_all_others_are(before: int) -> None:
+@pytest.mark.parametrize(("given", "named"), ODD)
+def test_the_first_values_of_a_class_are_made_as_all_others_are(
+    before: int, given: tuple[Any, ...], named: dict[str, Any]
+) -> None:
     @frozen
     class Fresh:
         x: int
         y: int = 2
         name: str | None = None
 
-    for number in range(before):
-        Fresh(number)
     make: Any = Fresh
+    for number in range(before):
+        assert make(number) == make(x=number, y=2)
+    with pytest.raises(TypeError, match=r"argument"):
+        make(*given, **named)
     assert fields(make(1, name="a")) == fields(make(x=1, name="a")) == {"x": 1, "y": 2, "name": "a"}
-    for given, named in (
-        ((), {}),
-        ((), {"y": 1}),
-        ((1, 2, "a", 4), {}),
-        ((1,), {"x": 1}),
-        ((1,), {"z": 1}),
-        ((), {"z": 1}),
-    ):
-        with pytest.raises(TypeError, match=r"argument"):
-            make(*given, **named)
-    assert make(3) == make(3, 2)
 
 
 def test_it_keeps_its_class_s_own_and_has_nothing_else() -> None:
