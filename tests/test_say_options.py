@@ -195,6 +195,18 @@ def test_ctrl_c_while_the_text_is_read_ends_the_terminal_s_line(scripted: Talk) 
     assert client.returncode == 130
 
 
+def test_a_lead_in_of_its_own_takes_its_time_and_is_no_part_of_the_goal(make_talk: MakeTalk) -> None:
+    talk = make_talk("--player", "null")
+    for lead_in in (("--lead-in", "300"), ("--lead-in=300",)):
+        goal = json.loads(talk.run("--json", "say", "--wait", *lead_in, "battery low").out.splitlines()[-1])
+        assert goal["state"] == "SUCCEEDED"
+        assert goal["ended_at"] - goal["started_at"] >= goal["duration"] + 0.3
+    refused = talk.run("say", "-o", "x.wav", "--lead-in", "300", "battery low")
+    assert (refused.code, refused.out) == (2, "")
+    assert refused.err.startswith("talk: --output writes a file, without a server: leave out --lead-in\n")
+    assert talk.run("say", "--lead-in", "5001", "x").code == 2
+
+
 def test_speech_that_is_paused_is_noted(scripted: Talk) -> None:
     held = busy(scripted)
     assert scripted.run("pause").code == 0

@@ -118,6 +118,7 @@ class Client:
         volume: float | None = None,
         voice: str | None = None,
         pitch: int | None = None,
+        lead_in: int | None = None,
         data: JsonObject | None = None,
         follow: bool = True,
         feedback: bool = False,
@@ -132,8 +133,10 @@ class Client:
         text, began less than so many seconds ago; `id`: 1 to 64 of A-Z a-z 0-9 . _ : / - of the sender's choice: said
         again with the same id it is not spoken twice, the handle is `attached` to the first.
 
-        `rate`: 80 to 450 words per minute; `volume`: 0 to 1; `voice`: id, name or language; `pitch`: 0 to 100; None
-        is the server's setting when it starts. `data`: an object of at most 1 KiB that travels with the goal.
+        `rate`: 80 to 450 words per minute; `volume`: 0 to 1; `voice`: id, name or language; `pitch`: 0 to 100; None is
+        the server's setting when it starts. `lead_in`: 0 to 5,000 milliseconds of silence before it, also where the
+        output was not idle; None is the server's, where it was. `data`: an object of at most 1 KiB that travels with
+        the goal.
 
         `follow`: have this connection told how it ends; `feedback`: and each word as it is heard, for
         `GoalHandle.feedback` and `events`; `patient`: where the queue is full, wait until there is room, any time.
@@ -158,6 +161,7 @@ class Client:
             volume=volume,
             voice=voice,
             pitch=pitch,
+            lead_in=lead_in,
             data=data,
         )
         check(request)

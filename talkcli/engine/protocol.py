@@ -78,6 +78,7 @@ class Say:
     voice: str | None  # id, name or language
     pitch: int  # 0 to 100, 50 is the voice's own
     followed: bool = False  # whether another goal waits behind it
+    lead_in: int | None = None  # milliseconds of silence before it, whatever the output did; None for `Configure`'s
 
 
 @frozen

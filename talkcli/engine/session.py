@@ -187,7 +187,7 @@ class Session:
         assert self._settings is not None
         self._goal = goal = InHand(say, time.monotonic())
         self.pause.release()
-        self._players.gap.followed = say.followed
+        self._players.begin(say.lead_in, say.followed)
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
         waiting, self._backlog = self._backlog, deque()
@@ -200,6 +200,8 @@ class Session:
         except SettingFailed as error:
             if self._goal is not None:
                 self._end(protocol.FAILED, error.reason, str(error))
+        if self._goal is not None and self._pump is not None and say.lead_in:
+            self._end(protocol.FAILED, "bad_option", "this driver plays by itself: it can't be given a lead-in")
         goal.error = None
         while self._goal is not None and not self._leaving:
             self._go_on(goal)

@@ -274,6 +274,19 @@ OPTIONS = (
         engine=True,
     ),
     Option(
+        "lead_in",
+        INTEGER,
+        "milliseconds of silence before it, also where the output was not idle; 0 for none",
+        limits=(0, MAX_LEAD_IN),
+        unit=" milliseconds",
+        absent="the server's",
+        flags="--lead-in",
+        metavar="MS",
+        help="Milliseconds of silence before it; also where the output was not idle; 0: none. [default: as 'talk "
+        "serve' was told]",
+        engine=True,
+    ),
+    Option(
         "data",
         DATA,
         "travels with the goal, untouched",
@@ -323,6 +336,8 @@ class Say:
     volume: float | None = None  # 0 to 1
     voice: str | None = None  # id, name or language
     pitch: int | None = None  # 0 to 100
+    #: milliseconds of silence before it, whatever the output did; None leaves it to the server, where that was idle
+    lead_in: int | None = None
     data: JsonObject | None = None
     format: str = "text"
 

@@ -99,9 +99,16 @@ class Spawned:
         self._socket.shutdown(socket.SHUT_RDWR)
 
     def say(
-        self, text: str, goal: str = "g1", *, rate: int | None = None, voice: str | None = None, pitch: int = 50
+        self,
+        text: str,
+        goal: str = "g1",
+        *,
+        rate: int | None = None,
+        voice: str | None = None,
+        pitch: int = 50,
+        lead_in: int | None = None,
     ) -> None:
-        self.send(protocol.Say(goal, text, rate or self._rate, 1.0, voice, pitch))
+        self.send(protocol.Say(goal, text, rate or self._rate, 1.0, voice, pitch, lead_in=lead_in))
 
     def pause(self, goal: str = "g1") -> float:
         """Hold the sentence and return the seconds until the process said that it is silent."""
@@ -134,10 +141,16 @@ class Spawned:
         raise AssertionError(f"no {kind.__name__} before the process ended: {self.errors()}")
 
     def spoken(
-        self, text: str, goal: str = "g1", *, rate: int | None = None, voice: str | None = None
+        self,
+        text: str,
+        goal: str = "g1",
+        *,
+        rate: int | None = None,
+        voice: str | None = None,
+        lead_in: int | None = None,
     ) -> protocol.Ended:
         """Say a sentence and return how it ended."""
-        self.say(text, goal, rate=rate, voice=voice)
+        self.say(text, goal, rate=rate, voice=voice, lead_in=lead_in)
         return self.until(protocol.Ended)
 
     def words(self, goal: str = "g1") -> list[protocol.Word]:

@@ -29,8 +29,8 @@ LEAD_IN = 400
 _LEAD = LEAD_IN * RATE // 1000 * 2
 
 
-def _bytes() -> list[bytes]:
-    return [samples.astype("<i2").tobytes() for samples in render(TEXTS, rate=FAST)]
+def _bytes(texts: list[str] = TEXTS) -> list[bytes]:
+    return [samples.astype("<i2").tobytes() for samples in render(texts, rate=FAST)]
 
 
 def test_it_is_heard_before_the_first_sentence_and_not_before_the_next(sink: Sink) -> None:
@@ -119,6 +119,59 @@ def test_a_sentence_that_goes_on_as_soon_as_the_device_was_let_go_of_gets_it_aga
     assert _bytes()[0].endswith(heard[held + _LEAD :])
 
 
+def test_a_sentence_s_own_comes_before_it_wherever_the_output_is(player: Player) -> None:
+    sentences = _bytes([*TEXTS, TEXTS[1]])
+    with Spawned(player.plays()) as engine:
+        engine.until(protocol.Voices)
+        for number, (text, lead_in) in enumerate([(TEXTS[0], LEAD_IN), (TEXTS[1], LEAD_IN), (TEXTS[1], None)]):
+            ended = engine.spoken(text, f"g{number}", lead_in=lead_in)
+            assert ended.outcome == protocol.COMPLETED
+            assert ended.duration == pytest.approx(len(sentences[number]) / RATE / 2, abs=1e-4)
+    assert player.heard.read_bytes() == bytes(_LEAD) + sentences[0] + bytes(_LEAD) + sentences[1] + sentences[2]
+
+
+def test_a_sentence_s_own_stands_for_the_server_s_and_0_is_none(player: Player) -> None:
+    sentences = _bytes([*TEXTS, TEXTS[1]])
+    before = "from talkcli.engine.players import which\nwhich.IDLE_AFTER = 0.0"
+    with Spawned(player.plays(), lead_in=LEAD_IN, before=before) as engine:
+        engine.until(protocol.Voices)
+        assert engine.spoken(TEXTS[0], "g1", lead_in=0).outcome == protocol.COMPLETED
+        assert engine.spoken(TEXTS[1], "g2", lead_in=LEAD_IN // 2).outcome == protocol.COMPLETED
+        assert engine.spoken(TEXTS[1], "g3").outcome == protocol.COMPLETED
+    heard = player.heard.read_bytes()
+    assert heard == sentences[0] + bytes(_LEAD // 2) + sentences[1] + bytes(_LEAD) + sentences[2]
+
+
+@pytest.mark.parametrize(("idle", "again"), [(0.2, _LEAD // 2), (10.0, 0)], ids=["idle", "not idle"])
+def test_a_sentence_s_own_comes_again_after_a_pause_only_where_the_device_was_idle(
+    player: Player, idle: float, again: int
+) -> None:
+    before = f"from talkcli.engine.players import which\nwhich.IDLE_AFTER = {idle}"
+    with Spawned(
+        player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": 0.1}, before=before, alive_every=0.3
+    ) as engine:
+        engine.until(protocol.Voices)
+        engine.say(TEXTS[0], lead_in=LEAD_IN // 2)
+        engine.until(protocol.Word)
+        engine.pause()
+        assert isinstance(engine.event(), protocol.Alive)
+        held = player.heard.stat().st_size
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+    rest = player.heard.read_bytes()[held:]
+    assert rest[:again] == bytes(again)
+    assert _bytes()[0].endswith(rest[again:])
+
+
+def test_a_driver_that_plays_by_itself_can_have_none() -> None:
+    with Spawned(driver="dummy") as engine:
+        engine.until(protocol.Ready)
+        ended = engine.spoken(TEXTS[0], "g1", lead_in=LEAD_IN)
+        assert (ended.outcome, ended.reason) == (protocol.FAILED, "bad_option")
+        assert ended.message == "this driver plays by itself: it can't be given a lead-in"
+        assert engine.spoken(TEXTS[0], "g2", lead_in=0).outcome == protocol.COMPLETED
+
+
 def test_a_short_pause_in_which_the_device_was_let_go_of_gets_none(player: Player) -> None:
     with Spawned(player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": 0.1}) as engine:
         engine.until(protocol.Voices)
@@ -164,7 +217,7 @@ def test_a_file_gets_none(tmp_path: Path) -> None:
     target = tmp_path / "speech.wav"
     with Spawned(f"file:{target}", lead_in=LEAD_IN) as engine:
         engine.until(protocol.Ready)
-        assert engine.spoken(TEXTS[0]).outcome == protocol.COMPLETED
+        assert engine.spoken(TEXTS[0], lead_in=LEAD_IN).outcome == protocol.COMPLETED
     with wave.open(str(target), "rb") as file:
         assert file.readframes(file.getnframes()) == _bytes()[0]
 

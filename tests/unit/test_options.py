@@ -51,6 +51,7 @@ GOOD: list[tuple[str, list[object]]] = [
     ("rate", [80, 200, 450]),
     ("volume", [0, 0.0, 0.5, 1, 1.0]),
     ("pitch", [0, 50, 100]),
+    ("lead_in", [0, 1, 5_000]),
     ("voice", ["en", "default", "French (France)"]),
     ("ttl", [0, 0.0, 0.001, 5, 86_400.0]),
     ("throttle", [0, 0.0, 0.5, 60]),
@@ -61,6 +62,7 @@ BAD: list[tuple[str, list[object]]] = [
     ("rate", [79, 451, 0, -200, 10**400]),
     ("volume", [-0.001, 1.001, 2, -1, math.nan, math.inf, 10**400]),
     ("pitch", [-1, 101, 10**400]),
+    ("lead_in", [-1, 5_001, 10**400]),
     ("voice", [""]),
     ("ttl", NO_SECONDS),
     ("throttle", NO_SECONDS),
@@ -209,9 +211,10 @@ def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_ther
 
 def test_the_engine_is_told_the_goal_s_own_value_else_the_server_s() -> None:
     settings = replace(INITIAL, voice="de", rate=150)
-    assert for_engine(Say("hi"), settings) == {"rate": 150, "volume": 1.0, "voice": "de", "pitch": 50}
-    own = Say("hi", rate=80, volume=0.0, voice=DEFAULT_VOICE, pitch=0)
-    assert for_engine(own, settings) == {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0}
+    general = {"rate": 150, "volume": 1.0, "voice": "de", "pitch": 50, "lead_in": None}
+    assert for_engine(Say("hi"), settings) == general
+    own = Say("hi", rate=80, volume=0.0, voice=DEFAULT_VOICE, pitch=0, lead_in=0)
+    assert for_engine(own, settings) == {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0, "lead_in": 0}
     assert given(Set(preempt=False, ttl=0)) == {"preempt": False, "ttl": 0}
 
 

@@ -190,6 +190,7 @@ WRONG: list[tuple[str, str, list[object]]] = [
     ("say", "volume", ["1", True, [1]]),
     ("say", "voice", [1, True, ["en"]]),
     ("say", "pitch", [50.0, "50", True]),
+    ("say", "lead_in", [50.0, "50", True]),
     ("say", "data", [1, "a", [], True, {"a": "b" * MAX_DATA}]),
     ("say", "format", [None, 1, True, []]),
     ("wait", "feedback", [None, 0, "yes"]),

@@ -55,6 +55,10 @@ class Players:
         self._streaming = False
         #: what lies between two sentences
         self.gap = Gap()
+        #: seconds of silence that the sentence in hand brings along; None for what it was told at the start
+        self._own_lead_in: float | None = None
+        #: whether nothing of the sentence in hand has been heard
+        self._begins = True
         self._worked: str | None = None
         self._used_at: float | None = None
 
@@ -75,6 +79,12 @@ class Players:
         found = commands(self._player, self._device, rate, on_path, self._worked)
         return [partial(ProgramPlayer, command, self._inherited) for command in found]
 
+    def begin(self, lead_in: int | None, followed: bool) -> None:
+        """Take note of a new sentence: milliseconds of a lead-in of its own, and whether a goal waits behind it."""
+        self._own_lead_in = None if lead_in is None else lead_in / 1000
+        self._begins = True
+        self.gap.followed = followed
+
     def worked(self, name: str) -> None:
         """Take note that a sentence was played whole by the player of this name."""
         self._worked = name
@@ -82,11 +92,18 @@ class Players:
     def let_go(self, silent_at: float | None = None) -> None:
         """Take note that a device was closed; `silent_at`: since when it had played nothing but silence."""
         self._used_at = time.monotonic() if silent_at is None else silent_at
+        self._begins = False
 
     def lead_in(self) -> float:
-        """Return the seconds of silence that a player which is started now begins with."""
+        """Return the seconds of silence that a player which is started now begins with.
+
+        A sentence's own are for its beginning; where it was held for long, they wake the device again.
+        """
         idle = self._used_at is None or time.monotonic() - self._used_at >= IDLE_AFTER
-        return self._lead_in if idle else 0.0
+        own = self._own_lead_in
+        if own is not None and self._begins:
+            return own
+        return (self._lead_in if own is None else own) if idle else 0.0
 
     def first(self) -> str | None:
         """Return the name of what is tried first, for people; None if nothing is found."""
