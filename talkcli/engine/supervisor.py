@@ -220,9 +220,12 @@ class Supervisor:
         """Serve until `close`; a bug is reported, so that no goal waits for an engine that is not there."""
         try:
             while not self._closing:
-                self._keep_limits(time.monotonic())
+                # Before it takes what has come: whoever stood still, machine or process, has heard nothing meanwhile.
+                now = time.monotonic()
                 for key in self._inbox.wait(self._next_deadline()):
                     self._handle(key)
+                if not self._closing:
+                    self._keep_limits(now)
             self._inbox.run()  # what came before `close`, which takes no turn
         except Exception as error:
             self._closing = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -47,6 +47,31 @@ def test_a_pause_may_last_longer_than_any_limit(start: Callable[[], Thread], mon
     assert thread.next(1.5) is None
     thread.engine.resume("g1")
     assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+
+
+def test_a_thread_that_stood_still_hears_the_engine_before_it_judges_it(
+    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a machine that was suspended, or a server that was stopped, between two lines of it."""
+    monkeypatch.setattr(supervisor, "HANG_AFTER", 0.5)
+    standing = [0.7]
+
+    class Clock:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(time, name)
+
+        def monotonic(self) -> float:
+            if words and standing and sys._getframe(1).f_code.co_name == "_run":  # the loop, between two rounds
+                time.sleep(standing.pop())
+            return time.monotonic()
+
+    words: list[protocol.Word] = []
+    thread = start()
+    monkeypatch.setattr(supervisor, "time", Clock())
+    thread.say("length=1.1 b c d e f g h i j k")
+    words.append(thread.until(protocol.Word))
+    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert not standing
 
 
 def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(start: Callable[[], Thread]) -> None:
