@@ -1,7 +1,8 @@
 """What ends a client's waiting: signals, a timeout, another thread, a reader of standard output that goes away.
 
 The first three become a descriptor that is readable then, so that they never cut a read or a write in two. The last is
-seen at standard output itself, which is waited for together with that.
+seen at standard output itself, which is waited for together with that. Until there is one of these, a signal for a goal
+that was sent early is held, by `early`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """What lies between two sentences, and how much silence is left out at the end of the first for it.
 
 A sentence ends in a pause of its own. Behind that its player drains and ends, the server is told, and the next one is
-started: 25 to 40 ms by which a queue would be slower than it should sound. So where another goal waits, as much as
-the last changes took is left out of the silence at the end, of samples that nobody can hear. A sentence that nothing
-follows is played to its last sample.
+started: 25 to 40 ms by which a queue would be slower than it should sound. So where another goal waits, as much as the
+last changes took is left out of the silence at the end, of samples that nobody can hear: the playback does so, in
+`_audible_end`. A sentence that nothing follows is played to its last sample.
 
 Pure: the time comes in as an argument (monotonic seconds). Nothing is guessed: until two sentences have followed each
 other by the same player, nothing is left out.

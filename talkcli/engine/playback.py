@@ -211,7 +211,7 @@ class Playback:
         while True:
             if self._pause.asked and not self._stay_silent(stream):
                 return False
-            if self._sent == self._until(stream):
+            if self._sent == self._audible_end(stream):
                 return True
             taken = self._offer(stream)
             self._tick(stream)
@@ -248,12 +248,12 @@ class Playback:
     def _offer(self, stream: Stream) -> int:
         if stream.leading_in:
             return stream.lead_in()
-        with self._samples.part(self._sent, min(self._until(stream), self._sent + stream.piece)) as part:
+        with self._samples.part(self._sent, min(self._audible_end(stream), self._sent + stream.piece)) as part:
             taken = stream.offer(part)
         self._sent += taken
         return taken
 
-    def _until(self, stream: Stream) -> int:
+    def _audible_end(self, stream: Stream) -> int:
         """Return the end of what is to be played: less silence where a goal waits, and for as long as one may come."""
         if not stream.player.real_time or (self._complete and not self._players.gap.followed):
             return self._samples.end
@@ -263,7 +263,7 @@ class Playback:
     def _tick(self, stream: Stream) -> None:
         """Bring the clock up to date, report the words that are heard, forget the samples that were heard."""
         now = time.monotonic()
-        stream.tick(now, last=self._sent == self._until(stream) and not self._pause.asked)
+        stream.tick(now, last=self._sent == self._audible_end(stream) and not self._pause.asked)
         player = stream.player
         if not player.proven:
             return

@@ -1,9 +1,10 @@
 """The engine process's loop: one goal after the other through pyttsx3's engine, with commands in between and during.
 
 One thread. While a goal is spoken by `talk`'s own driver, the driver waits in `Session.wait`; a `Stop` that comes in
-there is carried out at once, by `engine.stop()`, a `Pause` by its playback. Other drivers know no pause: there the
-sentence is stopped, and what is left of it is spoken as another. Nothing may leave a goal without its `Ended`: pyttsx3
-swallows what its callbacks raise, ignores blank text and turns errors into notifications.
+there is carried out at once, by `engine.stop()`, which comes to the driver, its playback and the player; a `Pause` by
+the playback; what ties them together is `start`. Other drivers know no pause: there the sentence is stopped, and what
+is left of it is spoken as another. Nothing may leave a goal without its `Ended`: pyttsx3 swallows what its callbacks
+raise, ignores blank text and turns errors into notifications.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """What a client hears, as frozen values, and their form in JSON: events, results, and the snapshot of a watch.
 
-Rules for this file: form only, no I/O. `to_json` gives what the wire and the commands print, so that a program reads
-both alike. A field may be added, never renamed or given another meaning; a reader ignores what it doesn't know.
+Rules for this file: form only, no I/O. `to_json` gives what the commands print, which is what the wire has; a server
+writes its events by hand, in `server.subscribers`, as it sends thousands of them. A field may be added, never renamed
+or given another meaning; a reader ignores what it doesn't know.
 """
 
 from __future__ import annotations

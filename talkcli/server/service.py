@@ -1,7 +1,8 @@
 """The service: carries out requests, the scheduler's effects and the engine's reports, all in the loop's thread.
 
 What happens is the scheduler's decision, how it is spoken the engine thread's, who hears of it the subscribers'. It
-passes between them and never waits for any of them.
+passes between them and never waits for any of them. It has the one timer: for the scheduler's `deadline`, at which it
+calls `tick`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Where the sound goes: opens a player for each sentence, as `--player` and `--device` say.
 
-It remembers which player worked and when the device was last in use: none is open between two sentences.
+It remembers which player worked and when the device was last in use: none is open between two sentences. That the next
+one is tried where a player fails is the playback's business.
 """
 
 from __future__ import annotations
