@@ -41,6 +41,7 @@ def frozen(cls: type[_T]) -> type[_T]:
         "__match_args__": names,
         "_defaults": defaults,
         "_made": 0,
+        "_names": frozenset(names),
         "__qualname__": cls.__qualname__,
     }
     meta: Any = type(cls)
@@ -62,15 +63,18 @@ def _init_of_few(self: object, *arguments: object, **named: object) -> None:
     """Set the fields of one of the first values of a class, of which there may never be more."""
     cls: Any = type(self)
     names = cls.__match_args__
-    values = {**cls._defaults, **dict(zip(names, arguments, strict=False)), **named}
-    odd = values.keys() != {*names} or len(arguments) > len(names) or named.keys() & names[: len(arguments)]
+    given = dict(zip(names, arguments, strict=False))
+    values = {**cls._defaults, **given, **named}
     cls._made += 1
-    if odd or cls._made > _FEW:
+    # As many as there are fields, none of them twice, and each of a name that a slot has.
+    odd = len(values) != len(names) or len(given) != len(arguments) or not named.keys().isdisjoint(given)
+    if odd or cls._made > _FEW or not values.keys() <= cls._names:
         cls.__init__ = _compiled(cls)
         cls.__init__(self, *arguments, **named)  # which also says what is odd about them
         return
+    put = object.__setattr__
     for name, value in values.items():
-        object.__setattr__(self, name, value)
+        put(self, name, value)
 
 
 def _compiled(cls: Any) -> Any:
