@@ -14,8 +14,6 @@ import sys
 from talkcli.engine import protocol
 from talkcli.engine.channel import Channel
 
-#: Names the descriptor that the player must inherit: the server sees by its end that process and player are gone.
-LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
 #: Linux's: have this process killed when the thread that started it is gone. For what it starts, see `players.child`.
 _PR_SET_PDEATHSIG = 1
 
@@ -95,7 +93,7 @@ def _serve(channel: Channel, configure: protocol.Configure) -> None:
 
 def _inherited() -> list[int]:
     """Return the descriptors that a player must inherit; none when the process was started by hand."""
-    value = os.environ.get(LIVENESS_VARIABLE)
+    value = os.environ.get(protocol.LIVENESS_VARIABLE)
     if value is None:
         return []
     descriptor = int(value)

@@ -67,8 +67,7 @@ class Conversation:
     def __exit__(self, *_: object) -> None:
         """Kill the process and see it gone: it could write to its file once more."""
         self._process.kill()
-        if ready({self._process.liveness: select.POLLIN}, SILENCE_LIMIT):
-            self._process.silent()
+        ready({self._process.liveness: select.POLLIN}, SILENCE_LIMIT)
         self._process.close()
 
     def say(self, say: protocol.Say) -> None:
@@ -89,10 +88,9 @@ class Conversation:
             if process.stderr in found and not process.read_stderr():
                 del watched[process.stderr]
             # Before the limits: who was stopped by Ctrl-Z finds all that was said meanwhile, and the limits long past.
-            heard = process.socket.fileno() in found
-            if heard:
+            if process.socket.fileno() in found:
                 yield from self._received()
-            self._keep_limits(heard)
+            self._keep_limits()
 
     def _received(self) -> Iterator[protocol.Event]:
         for event in self._process.receive():
@@ -108,11 +106,11 @@ class Conversation:
     def _limit(self) -> float:
         return HANG_AFTER if self._process.ready else START_LIMIT
 
-    def _keep_limits(self, heard: bool) -> None:
+    def _keep_limits(self) -> None:
         now = time.monotonic()
         if now >= self._deadline:
             raise TimeoutError
-        if heard or now < self._heard_at + self._limit():
+        if now < self._heard_at + self._limit():
             return
         if not self._process.ready:
             words = f"the engine was not ready after {START_LIMIT:g} s"

@@ -159,7 +159,8 @@ class Playback:
         player = self._candidates.pop(0)()
         self._sent = self._begin
         self._silent_at = None
-        return Stream(player, self._rate, self._clock, self._seconds(self._begin), self._players.lead_in())
+        lead_in = self._players.lead_in(begins=self._begin == 0)
+        return Stream(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _next_player(self, error: AudioFailed) -> None:
         """Give up on this player; raises the first player's error if there is no other, or if sound was taken."""
@@ -212,6 +213,7 @@ class Playback:
             if self._pause.asked and not self._stay_silent(stream):
                 return False
             if self._sent == self._audible_end(stream):
+                self._tick(stream)  # what comes next may be long in coming
                 return True
             taken = self._offer(stream)
             self._tick(stream)
@@ -263,7 +265,8 @@ class Playback:
     def _tick(self, stream: Stream) -> None:
         """Bring the clock up to date, report the words that are heard, forget the samples that were heard."""
         now = time.monotonic()
-        stream.tick(now, last=self._sent == self._audible_end(stream) and not self._pause.asked)
+        last = self._complete and self._sent == self._audible_end(stream)
+        stream.tick(now, last=last and not self._pause.asked)
         player = stream.player
         if not player.proven:
             return

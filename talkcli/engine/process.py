@@ -28,8 +28,6 @@ from talkcli.splitter import LineSplitter
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-#: The variable that tells the engine process which descriptor its player has to inherit.
-LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
 #: Variables of the server's own supervisor, which its children must not answer to.
 _NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
 #: Bytes that may wait to be read by the process: the longest text, escaped, fits several times.
@@ -96,7 +94,7 @@ class EngineProcess:
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,
-                env={**environment, LIVENESS_VARIABLE: str(liveness)},
+                env={**environment, protocol.LIVENESS_VARIABLE: str(liveness)},
                 pass_fds=[liveness] if configure.output is None else [liveness, configure.output],
                 # Ctrl-C in the server's terminal must not reach it, and one kill reaches all of its group.
                 start_new_session=True,

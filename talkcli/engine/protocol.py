@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 #: late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
 ALIVE_EVERY = 0.5
 
+#: Names, in the environment, the descriptor that the player must inherit: by its end the server sees that process and
+#: player are gone.
+LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
+
 # How long an engine process may take for what it has to do, whoever watches it: server, `say -o`, `talk doctor`.
 
 #: Seconds until a process that was started must be ready: a cold start from an SD card takes two or three.

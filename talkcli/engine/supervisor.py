@@ -477,7 +477,7 @@ class Supervisor:
         process.close()
         self._dying.remove(process)
         goal = self._goal
-        if goal and goal.verdict and goal.verdict_on is process and process.gone_by != NEVER:
+        if goal and goal.verdict and goal.verdict_on is process:
             self._finish(goal.verdict)
 
     # -- the end

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import select
 import time
+from array import array
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -17,6 +18,7 @@ from talkcli.engine.players.which import Players
 from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.engine.synthesizers.driver import register
 from tests.engine.test_synthesizer_contract import Scripted
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,6 +32,7 @@ FORM = {
     for topic, keywords in re.findall(r"^\s*([a-z-]+): (\w+=<.*)$", Engine.connect.__doc__ or "", re.MULTILINE)
 }
 _NAME = "talk_scripted"
+_RATE = 16000
 
 
 class Told:
@@ -181,3 +184,37 @@ def test_pyttsx3s_own_loop_speaks_all_that_was_said() -> None:
         {"name": "g1", "completed": True},
         {"name": "g2", "completed": True},
     ]
+
+
+class Halting(Scripted):
+    """Has a little, then nothing for long, then the rest: as what computes may."""
+
+    def speak(self, text: str, sound: Sound, output: Output) -> None:  # noqa: ARG002 - what is said is of no interest
+        output.begin(_RATE)
+        for start, seconds in ((0, 0.1), (2, 0.1)):
+            output.word(start, 1, start / 20)
+            output.write(_tone(seconds))
+        until = time.monotonic() + 0.6
+        while time.monotonic() < until:
+            output.write(b"")
+            time.sleep(0.005)  # it computes
+        output.word(4, 1, 0.2)
+        output.write(_tone(0.3))
+
+
+def _tone(seconds: float) -> bytes:
+    return array("h", [9000 if each % 100 < 50 else -9000 for each in range(int(seconds * _RATE))]).tobytes()
+
+
+@limits()
+def test_words_are_told_as_they_are_heard_while_the_rest_is_computed() -> None:
+    told = Told("null", synthesizer=Halting())
+    told.engine.startLoop(False)
+    began = time.monotonic()
+    at: list[float] = []
+    told.at_word = lambda: at.append(time.monotonic() - began)
+    told.spoken("a b c", "g1")
+    told.engine.endLoop()
+    assert_within(at[1], 0.3, "the word before the gap")
+    assert at[2] >= 0.6, "of what was not there yet"
+    assert time.monotonic() - began >= 0.6 + 0.3 - 0.06, "what was played took its time"

@@ -163,6 +163,38 @@ def test_a_sentence_s_own_comes_again_after_a_pause_only_where_the_device_was_id
     assert _bytes()[0].endswith(rest[again:])
 
 
+#: Holds 0.4 s of what it has read, as a Bluetooth output does, and keeps it.
+SLOW_OUTPUT = """
+import os, time
+began, read = None, 0
+while data := os.read(0, 4096):
+    began = began or time.monotonic()
+    os.write(tape, data)
+    read += len(data)
+    time.sleep(max(0, began + read / 44100 - 0.4 - time.monotonic()))
+time.sleep(max(0, (began or 0) + read / 44100 - time.monotonic()))
+"""
+
+
+def test_a_sentence_that_was_held_in_its_own_begins_with_all_of_it_again(player: Player) -> None:
+    command = player.command(
+        f"import os\ntape = os.open({str(player.heard)!r}, os.O_WRONLY | os.O_CREAT | os.O_APPEND)\n{SLOW_OUTPUT}"
+    )
+    with Spawned(command) as engine:
+        engine.until(protocol.Voices)
+        engine.say(TEXTS[0], lead_in=800)
+        engine.until(protocol.Started)
+        while not (
+            player.heard.exists() and player.heard.stat().st_size > 0.35 * RATE * 2
+        ):  # of which little was heard
+            time.sleep(0.002)  # what another process writes is no event
+        engine.pause()
+        held = player.heard.stat().st_size
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert player.heard.read_bytes()[held:] == bytes(2 * _LEAD) + _bytes()[0]
+
+
 def test_a_driver_that_plays_by_itself_can_have_none() -> None:
     with Spawned(driver="dummy") as engine:
         engine.until(protocol.Ready)

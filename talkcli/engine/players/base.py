@@ -75,7 +75,8 @@ class Player(Protocol):
     def consumed(self) -> int:
         """Return how much of what `offer` took has left for the device; the rest waits, and could still be lost.
 
-        It never shrinks, is never more than was taken, and comes to all of it by the time that `ended` is true. The
+        It never shrinks, is never more than was taken, and comes to all of it by the time that `ended` is true; after
+        `close` it may count what the player has still to take. The
         word clock starts where it begins to grow, and is held back by it.
         """
 

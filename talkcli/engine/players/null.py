@@ -38,6 +38,7 @@ class NullPlayer:
         now = self._clock()
         if self._started is None:
             self._started = now
+        self._started += max(0.0, now - self._heard_at())  # it ran dry, and was silent meanwhile
         if self._taken + len(data) > (now - self._started + AHEAD) * self._bytes_per_second:
             return 0
         self._taken += len(data)

@@ -83,7 +83,6 @@ class ProgramPlayer:
 
     def close(self) -> None:
         """Close the player's input: it drains and ends."""
-        self.consumed()
         self._closed = True
         self._child.close_stdin()
 

@@ -70,11 +70,12 @@ class WavPlayer:
             return
         file, self._file = self._file, None
         try:
-            self._write_header(file)
+            try:
+                self._write_header(file)
+            finally:
+                os.close(file)  # where a quota or a file system of another machine tells that it is full
         except OSError as error:
             raise AudioFailed("audio_lost", f"{self._path}: {error.strerror}") from error
-        finally:
-            os.close(file)
 
     def ended(self) -> bool:
         """Return True once it is closed."""

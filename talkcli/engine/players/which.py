@@ -58,8 +58,6 @@ class Players:
         self.gap = Gap()
         #: seconds of silence that the sentence in hand brings along; None for what it was told at the start
         self._own_lead_in: float | None = None
-        #: whether nothing of the sentence in hand has been heard
-        self._begins = True
         self._worked: str | None = None
         self._used_at: float | None = None
 
@@ -83,7 +81,6 @@ class Players:
     def begin(self, lead_in: int | None, followed: bool) -> None:
         """Take note of a new sentence: milliseconds of a lead-in of its own, and whether a goal waits behind it."""
         self._own_lead_in = None if lead_in is None else lead_in / 1000
-        self._begins = True
         self.gap.followed = followed
 
     def worked(self, name: str) -> None:
@@ -93,18 +90,18 @@ class Players:
     def let_go(self, silent_at: float | None = None) -> None:
         """Take note that a device was closed; `silent_at`: since when it had played nothing but silence."""
         self._used_at = time.monotonic() if silent_at is None else silent_at
-        self._begins = False
 
-    def lead_in(self) -> float:
+    def lead_in(self, begins: bool = True) -> float:
         """Return the seconds of silence that a player which is started now begins with.
 
-        A sentence's own are for its beginning; where it was held for long, they wake the device again.
+        `begins`: whether it begins the sentence, for which a lead-in of its own is; where the sentence was held for
+        long, it wakes the device again.
         """
         idle = self._used_at is None or time.monotonic() - self._used_at >= IDLE_AFTER
         own = self._own_lead_in
-        if own is not None and self._begins:
-            return own
-        return (self._lead_in if own is None else own) if idle else 0.0
+        if own is None:
+            return self._lead_in if idle else 0.0
+        return own if begins or idle else 0.0
 
     def first(self) -> str | None:
         """Return the name of what is tried first, for people; None if nothing is found."""

@@ -50,11 +50,10 @@ class Espeak:
         self._text = ""
         self._output: Output | None = None
         self._raised: BaseException | None = None
-        for self.voice in _DEFAULTS:
-            if espeak.SetVoiceByName(self.voice.encode()) == espeak.EE_OK:
-                break
-        else:
-            raise UnknownVoice(self.voice)
+        found = (each for each in _DEFAULTS if espeak.SetVoiceByName(each.encode()) == espeak.EE_OK)
+        self.voice = next(found, "")
+        if not self.voice:
+            raise UnknownVoice(_DEFAULTS[-1])
         espeak.SetSynthCallback(self._on_audio)
 
     def voices(self) -> tuple[Voice, ...]:
