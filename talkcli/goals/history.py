@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import By
     from talkcli.goals.options import Say
-    from talkcli.goals.queue import Pending
+    from talkcli.goals.queue import Queue
     from talkcli.goals.record import Record
 
 _Name = TypeVar("_Name", str, bytes)
@@ -106,13 +106,13 @@ class Said:
         return last[1] if last is not None and now - last[0] < seconds else None
 
 
-def throttling(say: Say, active: Record | None, pending: Pending, said: Said, now: float) -> tuple[str, str] | None:
+def throttling(say: Say, active: Record | None, queue: Queue, said: Said, now: float) -> tuple[str, str] | None:
     """Return the id of the goal because of which this one is not to be spoken, and what is so with it; or None."""
     if say.throttle is None:
         return None
     if active and (active.text == say.text if say.key is None else active.key == say.key):
         return active.id, "is being said"
-    waiting = pending.with_text(say.text) if say.key is None else None
+    waiting = queue.with_text(say.text) if say.key is None else None
     if waiting:
         return waiting.id, "is waiting already"
     last = said.within(say.throttle, say.key, say.text, now)

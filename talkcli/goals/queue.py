@@ -79,7 +79,7 @@ class _Level:
         record.ahead = record.behind = record.older = record.newer = None
 
 
-class Pending:
+class Queue:
     """The queue."""
 
     def __init__(self) -> None:

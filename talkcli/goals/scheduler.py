@@ -4,7 +4,7 @@ Pure: a request, an engine event or the time goes in, effects come out; no threa
 either does all of its step or raises and has changed nothing. Effects are to be carried out in their order.
 
 What holds after every step: at most one goal is ACTIVE or PREEMPTING, and none starts before that one has ended, while
-speech is paused, or while there is no engine; a goal ends once; the order in which goals wait is `pending`'s.
+speech is paused, or while there is no engine; a goal ends once; the order in which goals wait is the queue's.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from talkcli.goals.effects import Cancelled, Changed, GiveUp, Hold, Resume, Star
 from talkcli.goals.goal import By
 from talkcli.goals.history import EarlyCancels, History, Said, throttling
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option, is_clients_id
-from talkcli.goals.queue import Pending
+from talkcli.goals.queue import Queue
 from talkcli.goals.record import Record
 from talkcli.goals.selection import making_way, select
 from talkcli.goals.states import IllegalTransition, State
@@ -59,7 +59,7 @@ class Scheduler:
         self.paused = False
         #: whether there is an engine to start the next goal; without one they wait
         self.has_engine = True
-        self._pending = Pending()
+        self._queue = Queue()
         self._by_id: dict[str, Record] = {}
         self._said = Said()
         self._early = EarlyCancels()
@@ -70,11 +70,11 @@ class Scheduler:
 
     @property
     def pending_count(self) -> int:
-        return len(self._pending)
+        return len(self._queue)
 
     def pending(self) -> Iterator[Record]:
         """Return the pending goals in the order in which they will be spoken."""
-        return iter(self._pending)
+        return iter(self._queue)
 
     def find(self, goal_id: str) -> Record | None:
         """Return a goal that is active, pending, or still remembered."""
@@ -82,7 +82,7 @@ class Scheduler:
 
     def with_key(self, key: str | None) -> list[Record]:
         """Return the goals with this key that have not ended."""
-        return [each for each in (self.active, self._pending.with_key(key)) if each and each.key == key is not None]
+        return [each for each in (self.active, self._queue.with_key(key)) if each and each.key == key is not None]
 
     def lacks_room(self, say: Say, now: Now, fault: tuple[str, str] | None = None) -> bool:
         """Whether this goal would be REJECTED only because the queue is full; `fault` as in `submit`."""
@@ -96,7 +96,7 @@ class Scheduler:
 
     def unfinished(self) -> list[Record]:
         """Return the active goal and the pending ones."""
-        return ([self.active] if self.active else []) + list(self._pending)
+        return ([self.active] if self.active else []) + list(self._queue)
 
     # -- what clients ask for
 
@@ -117,7 +117,7 @@ class Scheduler:
         refused = self._refuse(say, fault, first) or (None if canceled else self._throttle(say, record, now))
         way = self._way(say)
         if way is None and not (by or refused):
-            refused = "queue_full", f"{len(self._pending)} goals are waiting already (`talk serve --max-queue`)"
+            refused = "queue_full", f"{len(self._queue)} goals are waiting already (`talk serve --max-queue`)"
         if refused:
             record.reason, words = refused
             record.state, record.message, record.ended_at = State.REJECTED, f"Talk rejected: {words}", now.wall
@@ -157,7 +157,7 @@ class Scheduler:
         """End everything, and take no goal any more."""
         self._closing = True
         effects: list[Effect] = []
-        for record in list(self._pending):
+        for record in list(self._queue):
             effects += self._recall(record, "shutdown", "the server was stopped", None, now)
         if self.active:
             effects += self._stop(self.active, "shutdown", None, now)
@@ -201,7 +201,7 @@ class Scheduler:
         if self.active or self.paused or self.has_engine:
             return []
         effects = self._expire(now)
-        record = self._pending.first()
+        record = self._queue.first()
         if record is None:
             return effects
         effects.append(self._activate(record, now))
@@ -241,7 +241,7 @@ class Scheduler:
 
     def deadline(self) -> float | None:
         """Return the monotonic time at which `tick` has something to do."""
-        due = (self._silence_deadline(), self._pending.next_expiry(), self._unbegun_deadline())
+        due = (self._silence_deadline(), self._queue.next_expiry(), self._unbegun_deadline())
         return min((each for each in due if each is not None), default=None)
 
     def tick(self, now: Now) -> list[Effect]:
@@ -280,7 +280,7 @@ class Scheduler:
         return texts.fault(say.text, self.max_text) or fault
 
     def _throttle(self, say: Say, record: Record, now: Now) -> tuple[str, str] | None:
-        found = throttling(say, self.active, self._pending, self._said, now.monotonic)
+        found = throttling(say, self.active, self._queue, self._said, now.monotonic)
         if found is None:
             return None
         record.by = By(goal=found[0])
@@ -288,7 +288,7 @@ class Scheduler:
 
     def _way(self, say: Say) -> list[tuple[Record, str]] | None:
         # There never are more goals in the queue than may be: one that will be recalled makes room enough.
-        return making_way(say, self._pending, self.max_queue, preempts=self._preempts(say))
+        return making_way(say, self._queue, self.max_queue, preempts=self._preempts(say))
 
     def _preempts(self, say: Say) -> bool:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
@@ -300,20 +300,20 @@ class Scheduler:
         queued = False
         for each, reason in ended:
             if reason == "replaced" and each.priority == record.priority and not record.preempt:
-                self._pending.replace(each, record)
+                self._queue.replace(each, record)
                 queued = True
             else:
-                self._pending.remove(each)
+                self._queue.remove(each)
             effects += self._recalled(each, reason, f"{reason} by {record.id}", by, now)
         if record.preempt and self.active and self.active.priority <= record.priority:
             effects += self._stop(self.active, "preempted", by, now)
         if not queued:
-            self._pending.add(record)
+            self._queue.add(record)
         return effects
 
     def _expire(self, now: Now) -> list[Effect]:
         effects: list[Effect] = []
-        for record in self._pending.expired(now.monotonic):
+        for record in self._queue.expired(now.monotonic):
             words = f"its time to live of {record.say.ttl:g} s was over before it was spoken"
             effects += self._recall(record, "expired", words, None, now)
         return effects
@@ -334,20 +334,20 @@ class Scheduler:
         if self.active or self.paused or not self.has_engine:
             return []
         effects = self._expire(now)
-        record = self._pending.first()
+        record = self._queue.first()
         if record is None:
             return effects
         return [*effects, self._activate(record, now), Start(record)]
 
     def _activate(self, record: Record, now: Now) -> Changed:
         record.become(State.ACTIVE)
-        self._pending.remove(record)
+        self._queue.remove(record)
         record.started_at, record.began = now.wall, now.monotonic
         self.active = record
         return Changed(record, State.ACTIVE)
 
     def _recall(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
-        self._pending.remove(record)
+        self._queue.remove(record)
         return self._recalled(record, reason, words, by, now)
 
     def _recalled(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from talkcli.goals.effects import Cancelled
     from talkcli.goals.options import Cancel, Say
-    from talkcli.goals.queue import Pending
+    from talkcli.goals.queue import Queue
     from talkcli.goals.record import Record
 
     class Goals(Protocol):
@@ -63,23 +63,23 @@ def select_waiting(selection: Cancel, waiting: Sequence[Say]) -> list[int]:
     ]
 
 
-def making_way(say: Say, pending: Pending, max_queue: int, *, preempts: bool) -> list[tuple[Record, str]] | None:
+def making_way(say: Say, queue: Queue, max_queue: int, *, preempts: bool) -> list[tuple[Record, str]] | None:
     """Return the pending goals that this one recalls, and the reason; None if it has no room even so."""
-    ended = _outdone(say, pending, preempts=preempts)
-    if ended or len(pending) < max_queue:
+    ended = _outdone(say, queue, preempts=preempts)
+    if ended or len(queue) < max_queue:
         return ended
-    lowest = pending.newest_of_lowest()
+    lowest = queue.newest_of_lowest()
     return [(lowest, "displaced")] if lowest is not None and lowest.priority < say.priority else None
 
 
-def _outdone(say: Say, pending: Pending, *, preempts: bool) -> list[tuple[Record, str]]:
+def _outdone(say: Say, queue: Queue, *, preempts: bool) -> list[tuple[Record, str]]:
     """Return the goals that it recalls whether there is room or not."""
-    replaced = pending.with_key(say.key)
+    replaced = queue.with_key(say.key)
     others: Iterable[Record] = ()
     if say.flush:
-        others = pending.up_to(say.priority)
+        others = queue.up_to(say.priority)
     elif preempts:
-        others = pending.preempting_up_to(say.priority)
+        others = queue.preempting_up_to(say.priority)
     preempted = [(each, "preempted") for each in others if each is not replaced]
     return [(replaced, "replaced"), *preempted] if replaced else preempted
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.goals.options import Say
-from talkcli.goals.queue import Pending
+from talkcli.goals.queue import Queue
 from talkcli.goals.record import Record
 from talkcli.protocol import replies
 from talkcli.protocol.lines import encode
@@ -179,7 +179,7 @@ def test_priorities_that_are_all_different_make_no_search_longer() -> None:
 def test_a_time_to_live_finds_its_place_in_few_comparisons() -> None:
     made = []
     for size in (FEW, MANY // 4):
-        queue = Pending()
+        queue = Queue()
         for number in range(size + 1):
             record = Record(f"4k7f-{number}", number, Say("battery low"), ARM, 1.0)
             # The last one is over first, so that it has the longest way.

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
-from talkcli.goals.queue import Pending
+from talkcli.goals.queue import Queue
 from talkcli.goals.record import Record
 
 steps = st.lists(
@@ -33,7 +33,7 @@ def goal(number: int, priority: int = 0, *, preempt: bool = False, key: str | No
 class Both:
     """The queue, and the same as a list; its user keeps keys apart, as the scheduler does."""
 
-    queue: Pending = field(default_factory=Pending)
+    queue: Queue = field(default_factory=Queue)
     told: list[Record] = field(default_factory=list)
     count: int = 0
 
@@ -101,7 +101,7 @@ def test_whatever_comes_and_goes_the_queue_is_as_the_list(
 
 
 def test_goals_that_left_before_their_time_do_not_pile_up() -> None:
-    queue = Pending()
+    queue = Queue()
     longest = 0
     for number in range(5_000):
         record = goal(number)
