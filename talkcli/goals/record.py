@@ -1,6 +1,6 @@
 """The scheduler's own record of a goal. Outside the scheduler it is read, never written.
 
-Slots and no dictionary: a queue of a hundred thousand goals has to stay small.
+Slots and no dictionary: a queue of ten thousand goals has to stay small.
 """
 
 from __future__ import annotations
@@ -20,9 +20,7 @@ class Record:
     """One goal, from its acceptance to its end."""
 
     __slots__ = (
-        "ahead",
         "began",
-        "behind",
         "by",
         "duration",
         "ended_at",
@@ -30,9 +28,7 @@ class Record:
         "holds",
         "id",
         "message",
-        "newer",
         "number",
-        "older",
         "paused",
         "preempt",
         "queued_at",
@@ -46,7 +42,7 @@ class Record:
         "text",
         "text_bytes",
         "text_hash",
-        "waits",
+        "turn",
     )
 
     def __init__(self, goal_id: str, number: int, say: Say, sender: Sender, queued_at: float) -> None:
@@ -67,12 +63,8 @@ class Record:
         self.preempt = False
         #: the monotonic time by which it must have begun
         self.expires_at: float | None = None
-        #: whether it is in the queue, and its neighbours there, by turn and by acceptance; the queue's business alone
-        self.waits = False
-        self.ahead: Record | None = None
-        self.behind: Record | None = None
-        self.older: Record | None = None
-        self.newer: Record | None = None
+        #: its place among the pending goals of its priority; the queue's business alone
+        self.turn = 0
         self.reason: str | None = None
         self.by: By | None = None
         self.message: str | None = None

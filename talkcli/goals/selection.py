@@ -68,8 +68,8 @@ def making_way(say: Say, queue: Queue, max_queue: int, *, preempts: bool) -> lis
     ended = _outdone(say, queue, preempts=preempts)
     if ended or len(queue) < max_queue:
         return ended
-    lowest = queue.newest_of_lowest()
-    return [(lowest, "displaced")] if lowest is not None and lowest.priority < say.priority else None
+    displaced = queue.giving_way_to(say.priority)
+    return [(displaced, "displaced")] if displaced else None
 
 
 def _outdone(say: Say, queue: Queue, *, preempts: bool) -> list[tuple[Record, str]]:
