@@ -108,8 +108,9 @@ def _to_serve(option: Option) -> Option:
 
 _SERVE = (
     *map(_to_serve, SETTINGS),
-    # At two seconds a sentence, more than three minutes of speech that nobody can still want to hear.
-    Option("max_queue", INTEGER, default=100, limits=(1, None), flags="--max-queue", help="Goals that may wait."),
+    # At two seconds a sentence, more than three minutes of speech that nobody can still want to hear; at most, five
+    # hours, and to look at all that wait still takes no more than a millisecond or so.
+    Option("max_queue", INTEGER, default=100, limits=(1, 10_000), flags="--max-queue", help="Goals that may wait."),
     Option(
         "max_text",
         INTEGER,
