@@ -13,8 +13,8 @@ from tests.bench import crowd, queueing, throughput
 from tests.bench.failure import FailedError
 from tests.bench.groups import GROUPS, measure
 from tests.bench.stage import Options, Stage
+from tests.support.documents import section, tables
 from tests.support.surroundings import needs
-from tests.wire.readme import section, tables
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

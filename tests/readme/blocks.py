@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, TypeVar
 
-from tests.wire.readme import TEXT
+from tests.support.documents import TEXT
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,7 +15,7 @@ from talkcli.cli.commands import COMMANDS
 from talkcli.goals.option import IDS, SECONDS, Option
 from talkcli.goals.options import Set
 from talkcli.protocol.requests import KINDS
-from tests.wire.readme import ROOT
+from tests.support.documents import ROOT
 
 README = ROOT / "README.md"
 

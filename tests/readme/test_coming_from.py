@@ -14,7 +14,7 @@ from pyttsx3 import engine
 
 from talkcli import Client
 from tests.readme.shell import wait_until
-from tests.wire.readme import section, tables, words
+from tests.support.documents import section, tables, words
 
 if TYPE_CHECKING:
     from tests.readme.shell import Shell

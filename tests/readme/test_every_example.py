@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.readme.blocks import BLOCKS, RUN
-from tests.wire.readme import ROOT
+from tests.support.documents import ROOT
 
 #: Examples that tests elsewhere run.
 ELSEWHERE = {

@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from tests.wire.readme import ROOT, TEXT
+from tests.support.documents import ROOT, TEXT
 
 if TYPE_CHECKING:
     from pathlib import Path

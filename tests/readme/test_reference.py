@@ -12,7 +12,7 @@ import pytest
 from talkcli.cli.click_app import talk
 from talkcli.cli.commands import COMMANDS
 from tests.readme import reference
-from tests.wire.readme import ROOT, TEXT, section, tables, words
+from tests.support.documents import ROOT, TEXT, section, tables, words
 
 #: Variables that `talk` makes itself, for processes of its own.
 INTERNAL = {"TALK_LIVENESS_FD"}

@@ -21,9 +21,9 @@ import pytest
 from tests.readme.blocks import block, runs
 from tests.readme.shell import Shell
 from tests.support.compare import assert_heard
+from tests.support.documents import ROOT, TEXT
 from tests.support.reference import Sentence, render
 from tests.support.surroundings import clean_environment, needs, short_directory
-from tests.wire.readme import ROOT, TEXT
 
 if TYPE_CHECKING:
     import pathlib

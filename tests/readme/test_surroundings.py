@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING
 
 from tests.readme.blocks import block, runs
-from tests.wire.readme import ROOT
+from tests.support.documents import ROOT
 
 if TYPE_CHECKING:
     from tests.readme.shell import Shell

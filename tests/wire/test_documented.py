@@ -24,7 +24,7 @@ from talkcli.server import connection, stream
 from talkcli.server.answers import RECENT
 from talkcli.server.later import ALL_WAITING, EACH, MAX_WAITING
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
-from tests.wire.readme import ROOT, examples, first_column, section, tables, words
+from tests.support.documents import ROOT, examples, first_column, section, tables, words
 
 if TYPE_CHECKING:
     from tests.support.processes import Talk

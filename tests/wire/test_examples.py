@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.goals.states import EXIT_CODES
+from tests.support.documents import examples, section
 from tests.support.surroundings import needs
-from tests.wire.readme import examples, section
 
 if TYPE_CHECKING:
     from pathlib import Path

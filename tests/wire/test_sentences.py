@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.conformance.rawsocket import Raw
-from tests.wire.readme import first_column, section, tables
+from tests.support.documents import first_column, section, tables
 
 if TYPE_CHECKING:
     from tests.support.processes import Talk
