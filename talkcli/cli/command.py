@@ -1,4 +1,4 @@
-"""What a command is: one row, from which help, completion, the README's tables and both readers of lines are made.
+"""What a command is: one row, from which help, completion, the documents' tables and both readers of lines are made.
 
 It knows no single command; those are in `commands`. It is imported before anything is sent, and knows no click.
 """

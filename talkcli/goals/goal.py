@@ -77,7 +77,7 @@ class Goal:
     id: str
     state: State
     text: str | None = None
-    #: why it ended, for programs: one of the reasons in the README
+    #: why it ended, for programs: one of the reasons in protocol/README.md
     reason: str | None = None
     by: By | None = None
     #: how it ended, for people

@@ -1,7 +1,7 @@
 """The options of a goal and the settings of a server: each is one row, and everything else is made from the rows.
 
 Made from them: the fields of `say` and `set` on the wire and their checks, what the library refuses, the options of the
-commands and how they are read, what a server's settings are called, the README's tables. `Say` and `Client.say` name
+commands and how they are read, what a server's settings are called, the documents' tables. `Say` and `Client.say` name
 them again, for type checkers and readers; tests hold both to the rows. How two options go together is `bad_option`.
 
 Rules for this file: a client imports it before it sends anything, so it imports nothing heavy. A row may be added,

@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("--as-installed", action="store_true", help="take the talk that --venv has, whatever it is")
     shown = parser.add_mutually_exclusive_group()
     shown.add_argument("--json", action="store_true", help="print one object, with every value that was measured")
-    shown.add_argument("--markdown", action="store_true", help="print the table as the README has it")
+    shown.add_argument("--markdown", action="store_true", help="print the table as README.md beside this has it")
     asked = parser.parse_args()
     if asked.rounds < 1 or asked.idle <= 0:
         parser.error("--rounds and --idle are more than nothing")

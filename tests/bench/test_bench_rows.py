@@ -13,7 +13,7 @@ from tests.bench import crowd, queueing, throughput
 from tests.bench.failure import FailedError
 from tests.bench.groups import GROUPS, measure
 from tests.bench.stage import Options, Stage
-from tests.support.documents import section, tables
+from tests.support.documents import README, SPEED, tables
 from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
@@ -30,8 +30,10 @@ def _form(name: str, goal: str) -> tuple[str, str]:
     return re.sub(r"[0-9][0-9,.]*", "#", name.replace("`", "")), goal
 
 
-#: What was measured, and its goal, of each row of the README's table.
-README = {_form(row[0], row[7]) for row in tables(section("Speed"))[0][1:]}
+#: The table of the last benchmark.
+TABLE = tables(SPEED.text)[0]
+#: What was measured, and its goal, of each of its rows.
+KNOWN = {_form(row[0], row[7]) for row in TABLE[1:]}
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +64,13 @@ def test_a_row_measures_something(stage: Stage, group: str, monkeypatch: pytest.
     for row in rows:
         assert row.values
         assert row.cells()[2].endswith(row.unit)
-        assert _form(row.name, row.goal) in README, "the table in README.md is of an older benchmark"
+        assert _form(row.name, row.goal) in KNOWN, f"the table in {SPEED.name} is of an older benchmark"
+
+
+def test_readme_tells_what_the_table_has() -> None:
+    told = re.findall(r"\d[\d.,]* (?:ms|MB|%)", README.section("Speed"))
+    assert len(told) > 8
+    assert set(told) <= {cell for row in TABLE for cell in row}
 
 
 def test_a_group_that_fails_has_a_reason_in_the_place_of_figures(monkeypatch: pytest.MonkeyPatch) -> None:

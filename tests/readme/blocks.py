@@ -1,7 +1,7 @@
-"""The README's examples by name: each block of code, and which test runs it.
+"""The documents' examples by name: each block of code, and which test runs it.
 
 A name is the heading that the block stands under, with the bold words that begin the paragraph before it, and a number
-from the second one on: "A tour: Speak", "Start 2". So an example that is added has a name that no test has.
+from the second one on: "A tour: Speak", "Start #2". So an example that is added has a name that no test has.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, TypeVar
 
-from tests.support.documents import TEXT
+from tests.support.documents import DOCUMENTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,7 +24,7 @@ _PARTS = re.compile(
 def _blocks() -> dict[str, tuple[str, str]]:
     found: dict[str, tuple[str, str]] = {}
     heading, lead = "", ""
-    for part in _PARTS.finditer(TEXT):
+    for part in (each for document in DOCUMENTS for each in _PARTS.finditer(document.text)):
         if part["heading"]:
             heading, lead = part["heading"].replace("`", ""), ""
         elif part["lead"]:
@@ -44,7 +44,7 @@ RUN: dict[str, str] = {}
 
 def block(name: str) -> str:
     """Return the text of a block."""
-    assert name in BLOCKS, f"the README has no {name!r}; it has: {', '.join(BLOCKS)}"
+    assert name in BLOCKS, f"no document has {name!r}; they have: {', '.join(BLOCKS)}"
     return BLOCKS[name][1]
 
 

@@ -1,6 +1,6 @@
-"""The README's lists of options and requests, made from the rows: `python -m tests.readme.reference` writes them.
+"""The documents' tables of options and requests, made from the rows: `python -m tests.readme.reference` writes them.
 
-A test shows that the README has them as they are now.
+A test shows that the documents have them as they are now.
 """
 
 from __future__ import annotations
@@ -15,24 +15,25 @@ from talkcli.cli.commands import COMMANDS
 from talkcli.goals.option import IDS, SECONDS, Option
 from talkcli.goals.options import Set
 from talkcli.protocol.requests import KINDS
-from tests.support.documents import ROOT
+from tests.support.documents import COMMAND_LINE, WIRE
 
-README = ROOT / "README.md"
+#: Stands in the place of a command's name where the options are everybody's.
+_ALL, _ANYWHERE = "all", "before the command; all but `--version` also after it"
 
 
 def options() -> str:
-    """Return the list: first what every command has, then each command's own."""
+    """Return the table of commands and their options: first what every command has, then each command's own."""
     context = click.Context(talk, info_name="talk")
     shared = {each.name for each in talk.params}
-    parts = ["### Of all commands\n", _table(talk.params, context)]
-    for name in COMMANDS:
+    lines = ["| command | option | meaning |\n| --- | --- | --- |\n", f"| {_ALL} | | {_ANYWHERE} |\n"]
+    lines += _rows(talk.params, context)
+    for name, row in COMMANDS.items():
         command = talk.get_command(context, name)
         assert command
+        lines.append(f"| `{name}` | | {_words(row.summary)} |\n")
         own = [each for each in command.params if each.name not in shared]
-        rows = _table(own, click.Context(command, parent=context, info_name=name))
-        if rows:
-            parts += [f"### {name}\n", rows]
-    return "\n".join(parts)
+        lines += _rows(own, click.Context(command, parent=context, info_name=name))
+    return "".join(lines)
 
 
 def requests() -> str:
@@ -64,24 +65,22 @@ def _values(option: Option) -> str:
     return option.kind.name + (" or null" if option.default is None else "") + (f", {form}" if form else "")
 
 
-#: What is made, by the name that stands around it in the README.
-MADE = {"options": options, "requests": requests}
+#: What is made: by the name that stands around it, the document where that is, and how.
+MADE = {"options": (COMMAND_LINE, options), "requests": (WIRE, requests)}
 
 
-def current(text: str) -> str:
-    """Return the README's text with the lists as they are now."""
-    for name, make in MADE.items():
-        begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->\n"
-        before, rest = text.split(begin)
-        _, after = rest.split(end)
-        text = f"{before}{begin}\n{make()}\n{end}{after}"
-    return text
+def current(name: str) -> str:
+    """Return the text of a document with the list of this name as it is now."""
+    document, make = MADE[name]
+    begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->\n"
+    before, rest = document.text.split(begin)
+    _, after = rest.split(end)
+    return f"{before}{begin}\n{make()}\n{end}{after}"
 
 
-def _table(parameters: list[click.Parameter], context: click.Context) -> str:
-    rows = [each.get_help_record(context) for each in parameters if isinstance(each, click.Option)]
-    lines = [f"| `{_cell(left)}` | {_words(right)} |\n" for left, right in filter(None, rows)]
-    return "".join(["| option | meaning |\n| --- | --- |\n", *lines]) if lines else ""
+def _rows(parameters: list[click.Parameter], context: click.Context) -> list[str]:
+    records = [each.get_help_record(context) for each in parameters if isinstance(each, click.Option)]
+    return [f"| | `{_cell(left)}` | {_words(right)} |\n" for left, right in filter(None, records)]
 
 
 def _words(text: str) -> str:
@@ -97,4 +96,5 @@ def _cell(text: str) -> str:
 
 
 if __name__ == "__main__":
-    README.write_text(current(README.read_text(encoding="utf-8")), encoding="utf-8")
+    for _name, (_document, _) in MADE.items():
+        _document.path.write_text(current(_name), encoding="utf-8")

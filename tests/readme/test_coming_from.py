@@ -14,7 +14,7 @@ from pyttsx3 import engine
 
 from talkcli import Client
 from tests.readme.shell import wait_until
-from tests.support.documents import section, tables, words
+from tests.support.documents import COMMAND_LINE, tables, words
 
 if TYPE_CHECKING:
     from tests.readme.shell import Shell
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def rows() -> list[tuple[str, str, str]]:
     """Return the rows: from where, what was typed, what is typed now."""
     found, where = [], ""
-    for first, before, now in tables(section("Coming from something else"))[0][1:]:
+    for first, before, now in tables(COMMAND_LINE.section("Coming from something else"))[0][1:]:
         where = first or where
         found.append((where, before, now))
     return found

@@ -1,4 +1,4 @@
-"""No example of the README is without a test: an example that is added fails here, by its name, until it has one."""
+"""No example of a document is without a test: an example that is added fails here, by its name, until it has one."""
 
 from __future__ import annotations
 

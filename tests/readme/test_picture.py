@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from tests.support.documents import ROOT, TEXT
+from tests.support.documents import README, ROOT
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,7 +31,7 @@ def shown(picture: Path) -> list[str]:
 
 
 def test_picture_is_at_the_top_of_the_readme() -> None:
-    (path,) = re.findall(r"^!\[[^\]]{20,}\]\((.+)\)$", TEXT.partition("\n## ")[0], re.MULTILINE)
+    (path,) = re.findall(r"^!\[[^\]]{20,}\]\((.+)\)$", README.text.partition("\n## ")[0], re.MULTILINE)
     assert ROOT / path == PLACE / "talk.svg"
 
 

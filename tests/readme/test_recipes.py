@@ -129,12 +129,19 @@ def test_cron(speaking: Talk, shell: Shell) -> None:
 
 @runs("Recipes: ssh")
 def test_ssh(speaking: Talk, shell: Shell) -> None:
+    """One robot, and several; what is said with their server gone."""
     shell.ssh()
     done = shell.run(block("Recipes: ssh"), text=AWKWARD)
     assert (done.returncode, done.stderr) == (0, "")
     assert "not heard" not in done.stdout
-    assert said(speaking) == ["hello from the office", AWKWARD]
-    assert shell.calls("ssh")[0] == ["robot", "talk", "status"]
+    assert said(speaking) == ["hello from the office", AWKWARD, *["the shift is over"] * 3]
+    calls = shell.calls("ssh")
+    assert calls[0] == ["robot", "talk", "status"]
+    assert [each[:2] for each in calls[3:]] == [["-n", each] for each in ("anna", "bert", "carl")]
+    speaking.stop()
+    gone = shell.run(block("Recipes: ssh"), text=AWKWARD).stdout
+    assert "not heard\n" in gone
+    assert "bert: exit code 3\n" in gone
 
 
 @runs("Recipes: The socket, forwarded")
@@ -146,17 +153,6 @@ def test_socket_forwarded(speaking: Talk, shell: Shell) -> None:
         assert said(speaking) == ["hello from the office"]
         _, forward = shell.calls("ssh")
         assert forward[-3:] == ["-L", f"{home}/.robot.sock:{speaking.socket}", "robot"]
-
-
-@runs("Recipes: Several robots")
-def test_several_robots(scripted: Talk, scripted_shell: Shell) -> None:
-    scripted_shell.ssh()
-    done = scripted_shell.run(block("Recipes: Several robots"))
-    assert done.returncode == 0
-    assert said(scripted) == ["the shift is over"] * 3
-    assert [each[1] for each in scripted_shell.calls("ssh")] == ["anna", "bert", "carl"]
-    scripted.stop()
-    assert "bert: exit code 3\n" in scripted_shell.run(block("Recipes: Several robots")).stdout
 
 
 class _Launched:

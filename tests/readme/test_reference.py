@@ -12,7 +12,7 @@ import pytest
 from talkcli.cli.click_app import talk
 from talkcli.cli.commands import COMMANDS
 from tests.readme import reference
-from tests.support.documents import ROOT, TEXT, section, tables, words
+from tests.support.documents import COMMAND_LINE, DOCUMENTS, README, ROOT, tables, words
 
 #: Variables that `talk` makes itself, for processes of its own.
 INTERNAL = {"TALK_LIVENESS_FD"}
@@ -21,13 +21,20 @@ _NAME = re.compile(r"_?[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
 #: Commands that stand in sentences and tables, on one line.
 _BEFORE = r"talk (?:--socket \S+ |--json |-q )*"
 IN_PASSING = sorted(
-    {each for each, name in re.findall(rf"`((?:sudo |ssh robot )?{_BEFORE}([a-z]+)[^`\n]*)`", TEXT) if name in COMMANDS}
+    {
+        each
+        for document in DOCUMENTS
+        for each, name in re.findall(rf"`((?:sudo |ssh robot )?{_BEFORE}([a-z]+)[^`\n]*)`", document.text)
+        if name in COMMANDS
+    }
 )
 
 
-def test_options_are_current() -> None:
+@pytest.mark.parametrize("name", reference.MADE)
+def test_what_is_made_is_current(name: str) -> None:
     """If not: `python -m tests.readme.reference`."""
-    assert reference.current(TEXT) == TEXT
+    document, _ = reference.MADE[name]
+    assert reference.current(name) == document.text
 
 
 def test_options_of_a_command_are_all_there() -> None:
@@ -100,7 +107,7 @@ def test_variables_of_the_sources_are_found() -> None:
 
 
 def test_variables_are_in_the_table() -> None:
-    documented = [each for row in tables(section("Variables"))[0][1:] for each in words(row[0])]
+    documented = [each for row in tables(COMMAND_LINE.section("Variables"))[0][1:] for each in words(row[0])]
     assert sorted(documented) == sorted(variables())
 
 
@@ -115,19 +122,6 @@ def test_commands_in_passing_can_be_read(line: str) -> None:
     command.make_context(name, arguments, parent=click.Context(talk))
 
 
-def test_links_lead_somewhere() -> None:
-    prose = re.sub(r"^```.*?^```$", "", TEXT, flags=re.MULTILINE | re.DOTALL)
-    headings = re.findall(r"^#+ (.+)$", prose, re.MULTILINE)
-    anchors = {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
-    links = re.findall(r"\]\(([^)]+)\)", prose)
-    assert len(links) > 15
-    for link in links:
-        if link.startswith("#"):
-            assert link[1:] in anchors, link
-        elif not link.startswith("https://"):
-            assert (ROOT / link).exists(), link
-
-
 def test_what_doctor_says_of_containers_is_in_the_readme() -> None:
     """It names the README, and the two ways to hand sound in."""
     source = (ROOT / "talkcli" / "doctor" / "sound.py").read_text(encoding="utf-8")
@@ -135,4 +129,4 @@ def test_what_doctor_says_of_containers_is_in_the_readme() -> None:
     assert len(steps) == 2
     for words_of_both in ("--device /dev/snd", "PULSE_SERVER"):
         assert any(words_of_both in each for each in steps)
-        assert words_of_both in section("In a container")
+        assert words_of_both in README.section("In a container")

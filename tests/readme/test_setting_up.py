@@ -21,7 +21,7 @@ import pytest
 from tests.readme.blocks import block, runs
 from tests.readme.shell import Shell
 from tests.support.compare import assert_heard
-from tests.support.documents import ROOT, TEXT
+from tests.support.documents import README, ROOT
 from tests.support.reference import Sentence, render
 from tests.support.surroundings import clean_environment, needs, short_directory
 
@@ -189,7 +189,7 @@ def _packages(text: str) -> set[str]:
 def test_packages_are_debians() -> None:
     """Every package that the README names for apt-get, also within a sentence, is one that apt-get knows."""
     needs("apt-cache")
-    packages = _packages(TEXT)
+    packages = _packages(README.text)
     assert {"pipx", "libespeak-ng1", "alsa-utils", "pulseaudio"} <= packages
     command = ["apt-cache", "show", "--no-all-versions", *sorted(packages)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -212,5 +212,5 @@ def test_ci_runs_the_second_command() -> None:
     assert done.stdout.decode() == block("Start #3")
     steps = [each for each in ci.splitlines() if each and not each.startswith("step ")]
     assert steps[-2:] == ['eval "$test_command"', '"$bin/pytest" -n 3 -m slow']
-    before = TEXT[: TEXT.index(block("Start #3"))].rpartition("passes the tests (")[2]
+    before = README.text[: README.text.index(block("Start #3"))].rpartition("passes the tests (")[2]
     assert "pulseaudio" in _packages(before) <= _packages(ci)

@@ -106,25 +106,16 @@ def test_priority_and_time(speaking: Talk, shell: Shell) -> None:
     speaking.request("cancel")
 
 
-@runs("A tour: Priority and time #2")
-def test_battery_is_not_said_twice(speaking: Talk, shell: Shell) -> None:
-    (line,) = commands("A tour: Priority and time #2")
-    (said,) = shell.run(line).stdout.split()
-    assert speaking.watcher.wait_for_terminal(said) == "SUCCEEDED"
-    again = shell.run(line)
-    assert (again.returncode, again.stdout) == (0, "")
-    refused = speaking.watcher.wait_until(lambda each: each.get("state") == "REJECTED")
-    assert refused["goal"]["reason"] == "throttled"
-
-
-@runs("A tour: Cancel")
-def test_cancel(speaking: Talk, shell: Shell) -> None:
-    """From the last line to the first, which leaves nothing."""
-    speaking.request("pause")
+@runs("A tour: Cancel and pause")
+def test_cancel_and_pause(speaking: Talk, shell: Shell) -> None:
+    """Speech is held, and goals are cancelled from the last line to the first, which leaves nothing."""
+    *cancels, pause, resume = commands("A tour: Cancel and pause")
+    assert shell.run(pause).returncode == 0
+    assert speaking.request("status")["server"]["paused"]
     ids = [speaking.request("say", text=f"number {each}")["goal"]["id"] for each in range(1, 16)]
     ids.append(speaking.request("say", text="four minutes", key="eta")["goal"]["id"])
     ended = {}
-    for line in reversed(commands("A tour: Cancel")):
+    for line in reversed(cancels):
         done = shell.run(line)
         assert done.returncode == 0, line
         ended[line] = done.stdout.split()
@@ -135,13 +126,6 @@ def test_cancel(speaking: Talk, shell: Shell) -> None:
         "talk cancel --current": [],
         "talk cancel": ids[13:15],
     }
-
-
-@runs("A tour: Pause")
-def test_pause(speaking: Talk, shell: Shell) -> None:
-    pause, resume = commands("A tour: Pause")
-    assert shell.run(pause).returncode == 0
-    assert speaking.request("status")["server"]["paused"]
     assert shell.run(resume).returncode == 0
     assert not speaking.request("status")["server"]["paused"]
 

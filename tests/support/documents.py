@@ -1,4 +1,4 @@
-"""The README, taken apart: its sections, its tables and its examples."""
+"""The project's documents, taken apart: their sections, their tables and their examples."""
 
 from __future__ import annotations
 
@@ -6,16 +6,54 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 
 Row = tuple[str, ...]
 
 
-def section(title: str) -> str:
-    """Return what stands under a heading, what is under its own headings included."""
-    found = re.search(rf"^(##+) {re.escape(title)}\n(.*?)(?=^## |^\1 |\Z)", TEXT, re.MULTILINE | re.DOTALL)
-    assert found, f"the README has no section {title!r}"
-    return found[2]
+class Document:
+    """A document in Markdown, by its path from the top of the project."""
+
+    def __init__(self, path: str) -> None:
+        self.name = path
+        self.path = ROOT / path
+        self.text = self.path.read_text(encoding="utf-8")
+
+    def section(self, title: str) -> str:
+        """Return what stands under a heading, what is under its own headings included."""
+        found = re.search(rf"^(##+) {re.escape(title)}\n(.*?)(?=^## |^\1 |\Z)", self.text, re.MULTILINE | re.DOTALL)
+        assert found, f"{self.name} has no section {title!r}"
+        return found[2]
+
+    def examples(self, language: str, title: str | None = None) -> list[str]:
+        """Return the blocks of code in a language: of one section, or all."""
+        text = self.text if title is None else self.section(title)
+        return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+    @property
+    def prose(self) -> str:
+        """The text without its blocks of code."""
+        fenced = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+        return re.sub(r"^    .*$", "", fenced.sub("", self.text), flags=re.MULTILINE)
+
+    @property
+    def anchors(self) -> set[str]:
+        """What a link behind a # may name: the headings, as forges make names of them."""
+        headings = re.findall(r"^#+ (.+)$", self.prose, re.MULTILINE)
+        return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
+
+
+#: What a user reads, and what stands beside what it describes.
+README = Document("README.md")
+COMMAND_LINE = Document("talkcli/cli/README.md")
+WIRE = Document("talkcli/protocol/README.md")
+HOUSE = Document("talkcli/README.md")
+SPEED = Document("tests/bench/README.md")
+CONTRIBUTING = Document(".github/CONTRIBUTING.md")
+#: All of them.
+DOCUMENTS = (
+    *(README, COMMAND_LINE, WIRE, HOUSE, SPEED, CONTRIBUTING),
+    *(Document(each) for each in ("tests/faults/README.md", "tests/fresh/README.md")),
+)
 
 
 def tables(text: str) -> list[list[Row]]:
@@ -37,8 +75,3 @@ def words(cell: str) -> list[str]:
 def first_column(table: list[Row]) -> list[str]:
     """Return the one name that stands as code at the beginning of each row."""
     return [words(row[0])[0] for row in table[1:] if words(row[0])]
-
-
-def examples(language: str, text: str = TEXT) -> list[str]:
-    """Return the blocks of code in a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)

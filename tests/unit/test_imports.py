@@ -155,6 +155,12 @@ def test_every_module_is_of_a_layer() -> None:
     assert {"asyncio", "json"} & set().union(*map(outside, sources()))
 
 
+def test_the_picture_of_the_layers_is_theirs() -> None:
+    """What stands above in the picture for developers is above, and each package is there."""
+    _, _, below = (PACKAGE / "README.md").read_text(encoding="utf-8").partition("## The layers\n")
+    assert re.findall(r"^    (\w+) ", below.partition("\n## ")[0], re.MULTILINE) == LAYERS[::-1]
+
+
 def test_nothing_imports_a_layer_above_it_not_even_for_its_types() -> None:
     for module in sources().keys() - FACE:
         above = {name for name, _ in inside(module) if name not in FACE and layer(name) > layer(module)}

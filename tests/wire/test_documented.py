@@ -1,4 +1,4 @@
-"""What a program can send, be told and end with is in the README's tables, and these have nothing else."""
+"""What a program can send, be told and end with is in the documents' tables, and these have nothing else."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from talkcli.server import connection, stream
 from talkcli.server.answers import RECENT
 from talkcli.server.later import ALL_WAITING, EACH, MAX_WAITING
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
-from tests.support.documents import ROOT, examples, first_column, section, tables, words
+from tests.support.documents import DOCUMENTS, README, ROOT, WIRE, first_column, tables, words
 
 if TYPE_CHECKING:
+    from tests.support.documents import Document
     from tests.support.processes import Talk
 
 #: Which argument of a call is a goal's reason; the place of a keyword doesn't matter.
@@ -43,7 +44,7 @@ def requests_table() -> dict[str, dict[str, tuple[str, ...]]]:
     """Return the rows of each request's fields."""
     found: dict[str, dict[str, tuple[str, ...]]] = {}
     kind = ""
-    for row in tables(section("Requests"))[0][1:]:
+    for row in tables(WIRE.section("Requests"))[0][1:]:
         kind = words(row[0])[0] if row[0] else kind
         fields = found.setdefault(kind, {})
         if row[1]:
@@ -107,7 +108,7 @@ def test_reasons_of_the_sources_are_found() -> None:
 
 
 def test_reasons_are_in_the_table() -> None:
-    table = tables(section("States"))[1]
+    table = tables(WIRE.section("States"))[1]
     assert sorted(first_column(table)) == sorted(reasons())
     for row in table[1:]:
         for state in row[1].split(", "):
@@ -115,7 +116,7 @@ def test_reasons_are_in_the_table() -> None:
 
 
 def test_states_are_in_the_table() -> None:
-    table = tables(section("States"))[0]
+    table = tables(WIRE.section("States"))[0]
     documented = {words(row[0])[0]: (int(row[1]), row[3] == "yes") for row in table[1:]}
     assert documented == {each.name: (int(each), each.terminal) for each in State}
 
@@ -124,7 +125,7 @@ def test_requests_and_their_fields_are_in_the_table() -> None:
     assert {kind: set(fields) for kind, fields in requests_table().items()} == {
         kind: {each.name for each in request.options} for kind, request in KINDS.items()
     }
-    answered = {each for row in tables(section("Requests"))[1][1:] for each in words(row[0])[:1]}
+    answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in words(row[0])[:1]}
     assert answered == set(KINDS)
 
 
@@ -144,11 +145,13 @@ def test_a_value_of_the_documented_type_is_read_and_null_where_it_may_be(kind: s
 def test_what_is_kept_is_what_the_text_says() -> None:
     assert Cancel().everything
     assert RECENT == 10
-    assert f"last {MAX_ENDED:,} goals that ended are kept, and the last {MAX_REJECTED} that were" in section("The goal")
+    assert f"last {MAX_ENDED:,} goals that ended are kept, and the last {MAX_REJECTED} that were" in WIRE.section(
+        "The goal"
+    )
 
 
 def test_limits_are_those_of_the_code() -> None:
-    limits = {row[0]: row[1] for row in tables(section("Errors and limits"))[1][1:]}
+    limits = {row[0]: row[1] for row in tables(WIRE.section("Errors and limits"))[1][1:]}
     assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")
     assert f"within {connection.FIRST_REQUEST:g} s" in limits["the first request"]
     assert f"within {connection.LINE_LIMIT:g} s" in limits["a line"]
@@ -170,7 +173,7 @@ def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("sys.platform", "linux")
-    (paragraph,) = re.findall(r"^\*\*Connecting\..*?\n\n", section("The wire"), re.MULTILINE | re.DOTALL)
+    (paragraph,) = re.findall(r"^\*\*Connecting\..*?\n\n", WIRE.text, re.MULTILINE | re.DOTALL)
     places = [each for each in words(paragraph) if each.endswith(".sock")]
     for name, value in variables.items():
         places = [each.replace(f"${name}/", f"{value}/") for each in places]
@@ -178,11 +181,11 @@ def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_goal_has_the_keys_of_the_table() -> None:
-    assert first_column(tables(section("The goal"))[0]) == list(Goal("", State.PENDING).to_json())
+    assert first_column(tables(WIRE.section("The goal"))[0]) == list(Goal("", State.PENDING).to_json())
 
 
 def test_server_has_the_keys_of_the_text(scripted: Talk) -> None:
-    found = re.search(r"^`server` has (.*?)\.$", section("Requests"), re.MULTILINE | re.DOTALL)
+    found = re.search(r"^`server` has (.*?)\.$", WIRE.section("Requests"), re.MULTILINE | re.DOTALL)
     assert found
     assert words(found[1]) == list(scripted.request("status")["server"])
 
@@ -198,7 +201,7 @@ def test_events_are_in_the_table() -> None:
                     value = node.values[keys.index("event")]
                     assert isinstance(value, ast.Constant), f"{path.name}:{node.lineno}"
                     sent.setdefault(str(value.value), set()).update(str(each) for each in keys if each)
-    table = {words(row[0])[0]: set(words(row[2])) for row in tables(section("Events"))[0][1:]}
+    table = {words(row[0])[0]: set(words(row[2])) for row in tables(WIRE.section("Events"))[0][1:]}
     assert set(sent) == set(table) >= {"state", "word", "paused", "result", "alive"}
     for kind, fields in sent.items():
         assert fields - {"event"} <= table[kind], kind
@@ -213,11 +216,11 @@ def test_error_codes_are_in_the_table() -> None:
     codes = arguments(CODE_AT, "code") | {each.code for each in classes}
     codes |= {"unknown_voice"}  # goes from `voice_fault` into the reply to `set`
     assert codes >= {"bad_json", "unknown_field", "line_too_long", "too_slow", "bad_option", "internal_error"}
-    assert sorted(first_column(tables(section("Errors and limits"))[0])) == sorted(codes)
+    assert sorted(first_column(tables(WIRE.section("Errors and limits"))[0])) == sorted(codes)
 
 
 def test_exit_codes_are_in_the_table() -> None:
-    rows = [row[0] for row in tables(section("Exit codes"))[0][1:]]
+    rows = [row[0] for row in tables(README.section("Exit codes"))[0][1:]]
     assert rows[-1] == f"{errors.EXIT_SIGNAL}+n"
     classes = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.TalkError)]
     used = {each.exit_code for each in classes} | set(states.EXIT_CODES.values())
@@ -238,32 +241,29 @@ def options(name: str) -> set[str]:
     return {form for each in own for form in (*each.opts, *each.secondary_opts)}
 
 
-def test_commands_and_their_options_are_in_the_table() -> None:
-    rows: dict[str, str] = {}
-    for row in tables(section("Commands"))[0][1:]:
-        rows |= {each.split()[0]: row[2] for each in words(row[0])}
-    assert sorted(rows) == sorted(commands.COMMANDS)
-    for name, documented in rows.items():
-        assert {form for each in words(documented) for form in each.split("/")} == options(name), name
+def test_commands_are_in_the_table() -> None:
+    rows = tables(README.section("Commands"))[0][1:]
+    assert sorted(each.split()[0] for row in rows for each in words(row[0])) == sorted(commands.COMMANDS)
 
 
-def test_every_command_in_the_examples_can_be_read() -> None:
-    """Its options are the command's own; what stands around it is the shell's business."""
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda each: each.name)
+def test_every_command_in_the_examples_can_be_read(document: Document) -> None:
+    """Its options are the command's own; what stands around it is the shell's business. The README has all commands."""
     seen = set()
-    for name, rest in re.findall(r"\btalk (?:--json )?([a-z]+)\b([^|#;&\n]*)", "".join(examples("sh"))):
+    for name, rest in re.findall(r"\btalk (?:--json )?([a-z]+)\b([^|#;&\n]*)", "".join(document.examples("sh"))):
         if name not in commands.COMMANDS:
             continue
         seen.add(name)
         shared = {form for each in click_app.talk.params for form in each.opts}
         for option in re.findall(r"(?<!\S)(--?[a-z][a-z-]*)", rest.split(" -- ")[0]):
             assert option in options(name) | shared, f"talk {name}{rest}"
-    assert seen == set(commands.COMMANDS)
+    assert document is not README or seen == set(commands.COMMANDS)
 
 
 def test_readme_has_the_setup_commands_as_they_were() -> None:
     assert (
-        examples("sh", section("Start"))
-        == [each for each in examples("sh") if ".venv" in each]
+        README.examples("sh", "Start")
+        == [each for each in README.examples("sh") if ".venv" in each]
         == [
             "python3 -m venv .venv && . .venv/bin/activate && pip install . && "
             '{ talk serve & sleep 3; talk say "talk is ready" --wait; }\n',

@@ -1,4 +1,4 @@
-"""The README's examples, run as they stand there against a server."""
+"""The examples of the wire and of the library, run as they stand in the documents against a server."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.goals.states import EXIT_CODES
-from tests.support.documents import examples, section
+from tests.support.documents import README, WIRE, Document
 from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
@@ -49,15 +49,15 @@ print(*robot.lips)
 """
 
 
-def only(language: str, title: str, mark: str) -> str:
-    """Return the one example of a section that has a mark in it."""
-    (found,) = [each for each in examples(language, section(title)) if mark in each]
+def only(document: Document, language: str, title: str | None, mark: str) -> str:
+    """Return the one example of a section, or of a whole document, that has a mark in it."""
+    (found,) = [each for each in document.examples(language, title) if mark in each]
     return found
 
 
 def shell_client(directory: Path) -> str:
     path = directory / "say.sh"
-    path.write_text(only("sh", "Two clients", "say.sh"), encoding="utf-8")
+    path.write_text(only(WIRE, "sh", "Two clients", "say.sh"), encoding="utf-8")
     return str(path)
 
 
@@ -69,7 +69,7 @@ def run(talk: Talk, *command: str) -> subprocess.CompletedProcess[str]:
 
 def test_line_of_socat_says_a_sentence(scripted: Talk) -> None:
     needs("socat")
-    done = run(scripted, "sh", "-c", only("sh", "The wire", "battery low"))
+    done = run(scripted, "sh", "-c", only(WIRE, "sh", None, "socat -t 5"))
     greeting, reply = map(json.loads, done.stdout.splitlines())
     assert (greeting["talk"], reply["goal"]["text"]) == (1, "battery low")
     assert scripted.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
@@ -120,7 +120,7 @@ def test_client_in_shell_cancels_on_ctrl_c(scripted: Talk, tmp_path: Path) -> No
 
 
 def test_client_in_plain_python(scripted: Talk) -> None:
-    example = only("python", "Two clients", "socket")
+    example = only(WIRE, "python", "Two clients", "socket")
     assert "talkcli" not in example
     done = run(scripted, sys.executable, "-c", example)
     assert done.returncode == 0, done
@@ -132,25 +132,25 @@ def test_client_in_plain_python(scripted: Talk) -> None:
 
 
 def test_client_in_plain_python_is_told_of_errors(scripted: Talk) -> None:
-    example = only("python", "Two clients", "socket").replace('"feedback": True', '"melody": True')
+    example = only(WIRE, "python", "Two clients", "socket").replace('"feedback": True', '"melody": True')
     done = run(scripted, sys.executable, "-c", example)
     assert (done.returncode, done.stdout) == (1, "")
     assert "melody" in done.stderr
 
 
 def test_first_example_of_the_library(scripted: Talk) -> None:
-    done = run(scripted, sys.executable, "-c", only("python", "A tour", "battery low"))
+    done = run(scripted, sys.executable, "-c", only(README, "python", "A tour", "battery low"))
     assert done.returncode == 0, done
     assert [each.split(": ")[1] for each in done.stdout.splitlines()] == ["follow", "me", "to", "the", "charger"]
 
 
 def test_loop_of_a_robot(scripted: Talk) -> None:
-    done = run(scripted, sys.executable, "-c", ROBOT.format(example=only("python", "A tour", "def patrol")))
+    done = run(scripted, sys.executable, "-c", ROBOT.format(example=only(README, "python", "A tour", "robot.drives")))
     assert (done.returncode, done.stdout, done.stderr) == (0, "please let me pass\n", "")
 
 
 def test_loop_of_a_robot_cancels_what_is_not_true_any_more(scripted: Talk) -> None:
-    example = only("python", "A tour", "def patrol").replace("please let me pass", "never-ends")
+    example = only(README, "python", "A tour", "robot.drives").replace("please let me pass", "never-ends")
     robot = ROBOT.replace("self.lips.append(word)", "self.blocked, self.steps = False, 490").replace(
         "return self.blocked and", "return"
     )
@@ -162,7 +162,7 @@ def test_loop_of_a_robot_cancels_what_is_not_true_any_more(scripted: Talk) -> No
 
 def test_loop_of_a_robot_whose_server_is_killed(scripted: Talk) -> None:
     """The voice is gone, the robot knows and goes on."""
-    example = only("python", "A tour", "def patrol").replace("please let me pass", "never-ends")
+    example = only(README, "python", "A tour", "robot.drives").replace("please let me pass", "never-ends")
     robot = ROBOT.replace("self.lips.append(word)", f"os.kill({scripted.pid}, signal.SIGKILL)").replace(
         'raise SystemExit("nobody heard it")', 'self.lips, self.blocked = ["lights"], False'
     )

@@ -1,4 +1,4 @@
-"""What the README's wire says in sentences: each was asked of a server, and stands there still."""
+"""What the wire's document says in sentences: each was asked of a server, and stands there still."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.conformance.rawsocket import Raw
-from tests.support.documents import first_column, section, tables
+from tests.support.documents import WIRE, first_column, tables
 
 if TYPE_CHECKING:
     from tests.support.processes import Talk
 
-WIRE = " ".join(section("The wire").split())
+SENTENCES = " ".join(WIRE.text.split())
 HELLO = b'{"seq": 6, "request": "hello"}\n'
 
 
@@ -31,7 +31,7 @@ def say(**fields: object) -> dict[str, Any]:
 
 
 def test_what_is_bad_field_in_the_table(scripted: Talk) -> None:
-    (row,) = [row for row in tables(section("Errors and limits"))[0] if row[0] == "`bad_field`"]
+    (row,) = [row for row in tables(WIRE.section("Errors and limits"))[0] if row[0] == "`bad_field`"]
     cases: dict[str, list[dict[str, Any]]] = {
         "a value of the wrong type": [say(rate=200.0), say(ttl=True), say(wait=None), say(text=None)],
         "`text` missing": [{"seq": 7, "request": "say"}],
@@ -58,7 +58,7 @@ def test_what_is_bad_field_in_the_table(scripted: Talk) -> None:
 
 
 def test_data_is_counted_as_ascii(scripted: Talk) -> None:
-    assert "in ASCII (`é` is `\\u00e9`)" in WIRE
+    assert "in ASCII (`é` is `\\u00e9`)" in SENTENCES
     for data, fits in (("b" * 1_015, True), ("b" * 1_016, False), ("é" * 169, True), ("é" * 170, False)):
         (reply,) = asked(scripted, say(data={"a": data}))
         assert reply["ok"] is fits
@@ -66,7 +66,7 @@ def test_data_is_counted_as_ascii(scripted: Talk) -> None:
 
 
 def test_a_rejected_say_that_waits_is_told_its_state_and_result(scripted: Talk) -> None:
-    assert "REJECTED (with `wait`, its `state` and its `result` follow then, too)" in WIRE
+    assert "REJECTED (with `wait`, its `state` and its `result` follow then, too)" in SENTENCES
     for extra in ({"wait": True}, {"feedback": True}):
         reply, state, result = asked(scripted, say(**extra) | {"text": ""})
         assert reply["goal"]["state"] == state["state"] == result["goal"]["state"] == "REJECTED"
@@ -75,7 +75,7 @@ def test_a_rejected_say_that_waits_is_told_its_state_and_result(scripted: Talk) 
 
 
 def test_the_places_of_words_are_code_points(scripted: Talk) -> None:
-    assert "in code points: not bytes, nor UTF-16 units" in WIRE
+    assert "in code points: not bytes, nor UTF-16 units" in SENTENCES
     text = "length=0.05 🤖🤖 e\u0301 end"
     words = [each for each in asked(scripted, say(text=text, feedback=True)) if each.get("event") == "word"]
     assert [(each["start"], each["end"]) for each in words] == [(0, 11), (12, 14), (15, 17), (18, 21)]
@@ -83,7 +83,7 @@ def test_the_places_of_words_are_code_points(scripted: Talk) -> None:
 
 
 def test_an_integer_has_no_fraction(scripted: Talk) -> None:
-    assert "`200.0` is none" in WIRE
+    assert "`200.0` is none" in SENTENCES
     for request in (say(rate=200.0), say(priority=1.0), {"seq": 7, "request": "set", "pitch": 50.0}):
         assert asked(scripted, request)[0]["error"]["code"] == "bad_field"
     assert asked(scripted, say(ttl=5, volume=1))[0]["goal"]["state"] == "PENDING"  # but a number may be without one
@@ -101,8 +101,8 @@ def test_an_integer_has_no_fraction(scripted: Talk) -> None:
     ],
 )
 def test_a_line_in_which_no_seq_can_be_read_is_answered_without(scripted: Talk, line: bytes, code: str) -> None:
-    assert f"`{code}`" in WIRE.partition("A line in which no `seq` can be read is answered without one:")[2][:200]
-    assert code in first_column(tables(section("Errors and limits"))[0])
+    assert f"`{code}`" in SENTENCES.partition("A line in which no `seq` can be read is answered without one:")[2][:200]
+    assert code in first_column(tables(WIRE.section("Errors and limits"))[0])
     hello, error = asked(scripted, HELLO, line)
     assert hello == {"seq": 6, "ok": True}
     assert error.keys() == {"ok", "error"}
@@ -111,6 +111,6 @@ def test_a_line_in_which_no_seq_can_be_read_is_answered_without(scripted: Talk, 
 
 
 def test_a_last_line_without_its_end_is_not_taken(scripted: Talk) -> None:
-    assert "what has no `\\n` when you close is not taken" in WIRE
+    assert "what has no `\\n` when you close is not taken" in SENTENCES
     assert asked(scripted, HELLO, json.dumps(say()).encode()) == [{"seq": 6, "ok": True}]
     assert scripted.watcher.goals() == []
