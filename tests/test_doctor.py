@@ -15,7 +15,7 @@ import pytest
 
 from talkcli import Client
 from talkcli.client import dial
-from talkcli.doctor import look, reach, sentence
+from talkcli.doctor import machine, sentence, server
 from talkcli.goals.states import State
 from tests.faults.broken import write
 from tests.support.compare import assert_silent, extent
@@ -67,7 +67,7 @@ def examined(
         done, found = doctor(talk, "--silent")
         assert done.code == 4
         return found
-    monkeypatch.setattr(reach, "Client", partial(Client, patience=patience))
+    monkeypatch.setattr(server, "Client", partial(Client, patience=patience))
     return within({**talk.env, "TALK_PLAYER": f"file:{directory}/said.wav"}, monkeypatch, silent=True)
 
 
@@ -151,7 +151,7 @@ def test_silent_beside_another_user_s_server_says_as_whom_to_play(
 ) -> None:
     needs("aplay")
     talk = make_talk(watched=False)
-    monkeypatch.setattr(look, "_environment", lambda _: None)  # it is not to be read
+    monkeypatch.setattr(machine, "_environment", lambda _: None)  # it is not to be read
     found = within({**talk.env, "ALSA_CONFIG_PATH": "/dev/null"}, monkeypatch, silent=True)
     assert found["sentence"]["next"].endswith(f": sudo -u '#{os.getuid()}' talk doctor --silent")
 
@@ -230,7 +230,7 @@ def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk, behind: st
         for number in range(3):
             client.say(f"number {number} never-ends")
         began = time.monotonic()
-        played = reach.speak(client, sentence.TEXT, 0.3)
+        played = server.speak(client, sentence.TEXT, 0.3)
         assert time.monotonic() - began < 8
         assert (played.state, played.reason) == (State.RECALLED, "late")
         assert played.words == "it still waited behind 4 goals after 0.3 s, and was taken back"
@@ -241,7 +241,7 @@ def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk, behind: st
 
 def test_a_sentence_that_was_begun_and_is_not_over_in_time_is_cancelled(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
-        played = reach.speak(client, "sentence never-ends", 0.5)
+        played = server.speak(client, "sentence never-ends", 0.5)
         assert (played.state, played.reason) == (State.PREEMPTED, "late")
         assert "begun and not over after 0.5 s" in str(played.words)
         assert client.status().active is None
@@ -251,7 +251,7 @@ def test_a_sentence_preempts_nothing(make_talk: MakeTalk) -> None:
     talk = make_talk("--preempt", scripted=True)
     with Client(talk.socket) as client:
         first = client.say("sentence length=0.5")
-        assert reach.speak(client, sentence.TEXT, 10).state is State.SUCCEEDED
+        assert server.speak(client, sentence.TEXT, 10).state is State.SUCCEEDED
         assert first.wait(10).state is State.SUCCEEDED
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.doctor import ask, look, programs
+from talkcli.doctor import ask, machine, programs
 from talkcli.doctor.session import Session
 from talkcli.doctor.sound import Cards, SoundServer
 from tests.faults.broken import write
@@ -141,15 +141,15 @@ def test_cards_and_who_may_open_them(tmp_path: Path) -> None:
     write(kernel / "cards", text)
     for name, mode in (("pcmC0D0p", 0o660), ("pcmC0D0c", 0o660), ("pcmC1D0p", 0o666)):
         write(nodes / name, "", mode)
-    found = look.cards(STRANGER, str(kernel), str(nodes))
+    found = machine.cards(STRANGER, str(kernel), str(nodes))
     assert found.names == ("USB Audio Device",)
     assert found.nodes == (f"{nodes}/pcmC0D0p", f"{nodes}/pcmC1D0p")
     assert found.forbidden == (f"{nodes}/pcmC0D0p",), "others may open the second one, by its mode"
     group = os.stat(nodes / "pcmC0D0p").st_gid
     member = Session(4141, "member", gids=(group,))
-    assert look.cards(member, str(kernel), str(nodes)).forbidden == ()
-    assert look.cards(Session(0, "root"), str(kernel), str(nodes)).forbidden == ()
-    assert look.cards(STRANGER, str(tmp_path / "gone"), str(tmp_path / "gone")) == Cards(kernel=False, group="audio")
+    assert machine.cards(member, str(kernel), str(nodes)).forbidden == ()
+    assert machine.cards(Session(0, "root"), str(kernel), str(nodes)).forbidden == ()
+    assert machine.cards(STRANGER, str(tmp_path / "gone"), str(tmp_path / "gone")) == Cards(kernel=False, group="audio")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
@@ -158,9 +158,9 @@ def test_a_server_of_the_same_user_is_looked_at_in_its_own_surroundings(tmp_path
     with subprocess.Popen(["sleep", "98"], env=env) as process:
         try:
             end = time.monotonic() + 5
-            while look._environment(process.pid) != env:  # it is another program's until it has begun
+            while machine._environment(process.pid) != env:  # it is another program's until it has begun
                 assert time.monotonic() < end
-            found, seen = look.surroundings(process.pid)
+            found, seen = machine.surroundings(process.pid)
             assert seen == env
             assert (found.server, found.uid, found.runtime) == (process.pid, os.getuid(), str(tmp_path))
             assert found.runtime_owner == os.getuid()
@@ -168,5 +168,5 @@ def test_a_server_of_the_same_user_is_looked_at_in_its_own_surroundings(tmp_path
             assert set(found.gids) == {os.getegid(), *os.getgroups()}
         finally:
             process.kill()
-    found, seen = look.surroundings(None)
+    found, seen = machine.surroundings(None)
     assert (found.server, seen) == (None, dict(os.environ))

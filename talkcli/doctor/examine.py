@@ -11,7 +11,20 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.doctor import ask, findings, level, look, places, probe, reach, sentence, serving, session, sound, voice
+from talkcli.doctor import (
+    ask,
+    findings,
+    level,
+    machine,
+    places,
+    probe,
+    sentence,
+    server,
+    serving,
+    session,
+    sound,
+    voice,
+)
 from talkcli.doctor.probe import Setting
 from talkcli.doctor.sentence import Played
 from talkcli.errors import TalkError
@@ -58,7 +71,7 @@ class Examination:
 
     def findings(self) -> Iterator[Finding]:
         """Give each finding as soon as it is known; Interrupted."""
-        client, found = reach.connect(self._option, self._interrupt)
+        client, found = server.connect(self._option, self._interrupt)
         with contextlib.ExitStack() as stack:
             if client is not None:
                 stack.enter_context(client)
@@ -84,11 +97,11 @@ class Examination:
     def _all(self, client: Client | None, found: Places) -> Iterator[Finding]:
         named = None if client else os.environ.get("TALK_VOICE") or None
         engine = probe.look(Setting(voice=named, interrupt=self._interrupt))
-        yield from voice.judge(look.python(), engine, server=client is not None)
-        process = self._process = reach.process_here(client) if client else None
-        here, env = look.surroundings(process)
+        yield from voice.judge(machine.python(), engine, server=client is not None)
+        process = self._process = server.process_here(client) if client else None
+        here, env = machine.surroundings(process)
         if process is not None and here.server is None:
-            self._owner = look.owner(process)
+            self._owner = machine.owner(process)
         if client is not None and process is None:
             yield session.elsewhere()
             yield from sound.judge_setting(*self._player())
@@ -118,7 +131,7 @@ class Examination:
         players = ask.players(env, wanted, by)
         used = wanted or next(iter(players.found), None)
         devices = ask.devices(env, used, None if device is None else str(device))
-        cards, server = look.cards(here), ask.sound_server(env, here)
+        cards, server = machine.cards(here), ask.sound_server(env, here)
         self._hangs = server.hangs
         yield from sound.judge(players, devices, cards, server, here, running=running)
         if not sound.is_silent(wanted):
@@ -132,10 +145,10 @@ class Examination:
             if self._process is None:
                 return sentence.elsewhere()
             setting = self._setting_of_server(self._process, env)
-            played, speaking = reach.beside(client, lambda: probe.speak(sentence.SHORT, setting, 0.0, LIMIT))
+            played, speaking = server.beside(client, lambda: probe.speak(sentence.SHORT, setting, 0.0, LIMIT))
         elif client is not None:
-            played = reach.speak(client, sentence.TEXT, LIMIT)
-            played = reach.with_player(played, self._server.get("player"))
+            played = server.speak(client, sentence.TEXT, LIMIT)
+            played = server.with_player(played, self._server.get("player"))
         elif engine.reason is not None:
             played = Played(State.ABORTED, engine.reason, engine.words)
         else:
@@ -165,6 +178,6 @@ class Examination:
         player = told.get("player")
         if sound.is_silent(player):
             player = sound.SILENT  # a file would get a sentence more, perhaps in the middle of one of the server's
-        elif player in sound.NAMED and not look.names_a_player(process, env):
+        elif player in sound.NAMED and not machine.names_a_player(process, env):
             player = None  # that one is the first that the server tries, and not the only one
         return Setting(player, told.get("device"), told.get("voice"), self._interrupt, told.get("driver"), env)

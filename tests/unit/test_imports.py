@@ -308,5 +308,5 @@ def test_contributing_names_every_file_that_an_option_goes_through() -> None:
     having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
     assert named - having == {"engine.protocol"}  # which is not told
     # Examples and help of commands; and a sentence that the doctor says, as any client does.
-    assert having - named == {"cli.commands", "doctor.reach"}
+    assert having - named == {"cli.commands", "doctor.server"}
     assert len(having) <= 7
