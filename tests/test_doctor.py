@@ -230,7 +230,7 @@ def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk, behind: st
         for number in range(3):
             client.say(f"number {number} never-ends")
         began = time.monotonic()
-        played = server.speak(client, sentence.TEXT, 0.3)
+        played = sentence.by_server(client, sentence.TEXT, 0.3)
         assert time.monotonic() - began < 8
         assert (played.state, played.reason) == (State.RECALLED, "late")
         assert played.words == "it still waited behind 4 goals after 0.3 s, and was taken back"
@@ -241,7 +241,7 @@ def test_a_sentence_that_waits_too_long_is_taken_back(scripted: Talk, behind: st
 
 def test_a_sentence_that_was_begun_and_is_not_over_in_time_is_cancelled(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
-        played = server.speak(client, "sentence never-ends", 0.5)
+        played = sentence.by_server(client, "sentence never-ends", 0.5)
         assert (played.state, played.reason) == (State.PREEMPTED, "late")
         assert "begun and not over after 0.5 s" in str(played.words)
         assert client.status().active is None
@@ -251,7 +251,7 @@ def test_a_sentence_preempts_nothing(make_talk: MakeTalk) -> None:
     talk = make_talk("--preempt", scripted=True)
     with Client(talk.socket) as client:
         first = client.say("sentence length=0.5")
-        assert server.speak(client, sentence.TEXT, 10).state is State.SUCCEEDED
+        assert sentence.by_server(client, sentence.TEXT, 10).state is State.SUCCEEDED
         assert first.wait(10).state is State.SUCCEEDED
 
 

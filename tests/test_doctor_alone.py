@@ -18,7 +18,7 @@ import pytest
 
 import talkcli
 from talkcli.doctor import examine, programs
-from talkcli.doctor.findings import heard
+from talkcli.doctor.report import heard
 from tests.conformance.bareserve import TALK, environment, serving
 from tests.faults.broken import python_path, write
 from tests.faults.test_users import NOBODY, as_user, impostor

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.doctor import ask, machine, programs
-from talkcli.doctor.session import Session
-from talkcli.doctor.sound import Cards, SoundServer
+from talkcli.doctor import machine, programs, sound
+from talkcli.doctor.machine import Cards, Session
+from talkcli.doctor.sound import SoundServer
 from tests.faults.broken import write
 from tests.support.surroundings import clean_environment
 
@@ -85,34 +85,34 @@ def test_devices_are_named_as_their_player_names_them(tmp_path: Path) -> None:
     aplay = "printf 'null\\n    Discard\\ndefault\\n    Default\\nplughw:CARD=Device,DEV=0\\n    USB\\n'"
     pactl = "printf '0\\tusb\\tm.c\\ts16le 2ch 44100Hz\\tSUSPENDED\\n1\\thdmi\\tm.c\\ts16le 2ch 44100Hz\\tIDLE\\n'"
     env = env_with(tmp_path, aplay=aplay, pactl=pactl, pw_cli=f"/bin/cat <<'X'{PW_NODES}X")
-    found = {each: ask.devices(env, each, None) for each in ("aplay", "pacat", "pw-cat")}
+    found = {each: sound.devices(env, each, None) for each in ("aplay", "pacat", "pw-cat")}
     assert {player: each and each.names for player, each in found.items()} == {
         "aplay": ("default", "plughw:CARD=Device,DEV=0"),
         "pacat": ("usb", "hdmi"),
         "pw-cat": ("alsa_output.usb",),
     }
-    assert ask.devices(env, "my-player", None) is None
-    assert ask.suspended(env) == ("usb",)
+    assert sound.devices(env, "my-player", None) is None
+    assert sound.suspended(env) == ("usb",)
 
 
 def test_devices_that_cannot_be_listed_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(programs, "LIMIT", 0.3)
     env = env_with(tmp_path, aplay="exec /bin/sleep 98", pactl="echo Connection refused >&2; exit 1")
-    troubles = [each.trouble for player in ("aplay", "pacat", "pw-cat") if (each := ask.devices(env, player, None))]
+    troubles = [each.trouble for player in ("aplay", "pacat", "pw-cat") if (each := sound.devices(env, player, None))]
     assert troubles == ["no answer within 0.3 s", "Connection refused", "pw-cli is not there"]
 
 
 def test_a_sound_server_is_found_by_its_own_program_or_by_its_socket(tmp_path: Path) -> None:
     info = "printf 'Server Name: pulseaudio\\nDefault Sink: usb\\n'"
     (tmp_path / "one").mkdir()
-    found = ask.sound_server(env_with(tmp_path / "one", pactl=info), STRANGER)
+    found = sound.sound_server(env_with(tmp_path / "one", pactl=info), STRANGER)
     assert (found.name, found.sink) == ("pulseaudio", "usb")
     (tmp_path / "two").mkdir()
     env = env_with(tmp_path / "two", pactl="echo Connection refused >&2; exit 1", pw_cli="exit 0")
-    assert "PipeWire" in str(ask.sound_server(env, STRANGER).name)
+    assert "PipeWire" in str(sound.sound_server(env, STRANGER).name)
     (tmp_path / "run" / "pulse").mkdir(parents=True)
     (tmp_path / "run" / "pulse" / "native").touch()
-    found = ask.sound_server({"PATH": "/nowhere", "XDG_RUNTIME_DIR": str(tmp_path / "run")}, STRANGER)
+    found = sound.sound_server({"PATH": "/nowhere", "XDG_RUNTIME_DIR": str(tmp_path / "run")}, STRANGER)
     assert (found.name, found.askable, found.sockets) == (None, False, (f"{tmp_path}/run/pulse/native",))
 
 
@@ -120,17 +120,17 @@ def test_how_loud_it_is_comes_from_the_mixer_that_is_in_charge(tmp_path: Path) -
     server, cards = SoundServer(name="PipeWire"), Cards(kernel=True, names=("USB",))
     controls = "case $1 in scontrols) echo \"Simple mixer control 'Master',0\";; *) echo 'Mono: 0 [0%] [off]';; esac"
     env = env_with(tmp_path, amixer=controls, wpctl="echo 'Volume: 0.40 [MUTED]'")
-    (alsa,) = ask.levels(env, SoundServer(), cards)
+    (alsa,) = sound.levels(env, SoundServer(), cards)
     assert (alsa.name, alsa.muted) == ("Master", True)
-    (wire,) = ask.levels(env, server, cards)
+    (wire,) = sound.levels(env, server, cards)
     assert (wire.muted, wire.percent) == (True, 40)
     env = env_with(
         tmp_path, pactl="case $1 in get-sink-mute) echo Mute: no;; *) echo 'Volume: mono: 9 / 30% / x';; esac"
     )
-    (pulse,) = ask.levels(env, server, cards)
+    (pulse,) = sound.levels(env, server, cards)
     assert (pulse.muted, pulse.percent) == (False, 30)
-    assert ask.levels(env, SoundServer(), Cards(kernel=False)) == ()
-    assert ask.levels(env, SoundServer(hangs=True), cards) == ()
+    assert sound.levels(env, SoundServer(), Cards(kernel=False)) == ()
+    assert sound.levels(env, SoundServer(hangs=True), cards) == ()
 
 
 def test_cards_and_who_may_open_them(tmp_path: Path) -> None:

@@ -19,8 +19,7 @@ _NOT_HEARD = EXIT_CODES[State.ABORTED]
 def doctor(options: Common, silent: bool) -> int:
     """Show each finding and, at last, the one thing to do next; return the exit code."""
     from talkcli.doctor.examine import Examination
-    from talkcli.doctor.findings import heard
-    from talkcli.doctor.report import lines, verdict
+    from talkcli.doctor.report import heard, lines, verdict
 
     found = []
     with Interrupts() as interrupts:

@@ -1,5 +1,6 @@
 """What `talk doctor` knows: everything between a sentence and a loudspeaker, looked at in order.
 
-Some modules gather facts, the others judge them and are pure. It may import all but the cli, and the engine only where
-it needs one. A new check is a fact, what it means, and its place in `examine`.
+`machine`, `voice`, `sound`, `server` and `sentence` each have one subject: its facts as frozen values, who gathers
+them, and what they mean. A judgement is pure: facts go in, findings come out. A new check is a fact and what it means,
+in the module of its subject, and its place in `examine`. It may import all but `talkcli.server` and the cli.
 """

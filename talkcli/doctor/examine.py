@@ -11,22 +11,10 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.doctor import (
-    ask,
-    findings,
-    level,
-    machine,
-    places,
-    probe,
-    sentence,
-    server,
-    serving,
-    session,
-    sound,
-    voice,
-)
-from talkcli.doctor.probe import Setting
+from talkcli.doctor import machine, sentence, server, sound, voice
 from talkcli.doctor.sentence import Played
+from talkcli.doctor.voice import Setting
+from talkcli.engine.players.programs import PACKAGES
 from talkcli.errors import TalkError
 from talkcli.goals.states import State
 
@@ -34,8 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from talkcli.client.client import Client
-    from talkcli.doctor.findings import Finding
-    from talkcli.doctor.places import Places
+    from talkcli.doctor.machine import Session
+    from talkcli.doctor.report import Finding
+    from talkcli.doctor.server import Places
     from talkcli.doctor.voice import Engine
     from talkcli.goals.goal import Goal, JsonObject
 
@@ -96,23 +85,23 @@ class Examination:
 
     def _all(self, client: Client | None, found: Places) -> Iterator[Finding]:
         named = None if client else os.environ.get("TALK_VOICE") or None
-        engine = probe.look(Setting(voice=named, interrupt=self._interrupt))
-        yield from voice.judge(machine.python(), engine, server=client is not None)
+        engine = voice.look(Setting(voice=named, interrupt=self._interrupt))
+        yield from voice.judge(voice.python(), engine, server=client is not None)
         process = self._process = server.process_here(client) if client else None
         here, env = machine.surroundings(process)
         if process is not None and here.server is None:
             self._owner = machine.owner(process)
         if client is not None and process is None:
-            yield session.elsewhere()
+            yield machine.elsewhere()
             yield from sound.judge_setting(*self._player())
         elif sys.platform.startswith("linux"):
-            yield from session.judge(here)
+            yield from machine.judge_session(here)
             yield from self._sound(here, env, running=client is not None)
-        yield places.judge(found)
+        yield server.judge_places(found)
         if self._gone is not None:
-            yield serving.gone(self._gone)
+            yield server.gone(self._gone)
         if client is not None:
-            yield from serving.judge(self._server, self._log, time.time())
+            yield from server.judge(self._server, self._log, time.time())
         yield self._sentence(client, engine, env)
 
     def _player(self) -> tuple[str | None, str | None]:
@@ -123,20 +112,20 @@ class Examination:
         player = os.environ.get("TALK_PLAYER") or None
         return (player, "TALK_PLAYER") if player else (None, None)
 
-    def _sound(self, here: session.Session, env: Mapping[str, str], *, running: bool) -> Iterator[Finding]:
+    def _sound(self, here: Session, env: Mapping[str, str], *, running: bool) -> Iterator[Finding]:
         if self._server.get("driver") not in {None, _OWN_DRIVER}:
             return
         wanted, by = self._player()
         device = self._server.get("device")
-        players = ask.players(env, wanted, by)
+        players = sound.players(env, wanted, by)
         used = wanted or next(iter(players.found), None)
-        devices = ask.devices(env, used, None if device is None else str(device))
-        cards, server = machine.cards(here), ask.sound_server(env, here)
-        self._hangs = server.hangs
-        yield from sound.judge(players, devices, cards, server, here, running=running)
+        devices = sound.devices(env, used, None if device is None else str(device))
+        cards, found = machine.cards(here), sound.sound_server(env, here)
+        self._hangs = found.hangs
+        yield from sound.judge(players, devices, cards, found, here, running=running)
         if not sound.is_silent(wanted):
             default = device is None and used in players.packages
-            yield from level.judge(ask.levels(env, server, cards), default=default)
+            yield from sound.judge_levels(sound.levels(env, found, cards), default=default)
 
     def _sentence(self, client: Client | None, engine: Engine, env: Mapping[str, str]) -> Finding:
         wanted, _ = self._player()
@@ -145,17 +134,17 @@ class Examination:
             if self._process is None:
                 return sentence.elsewhere()
             setting = self._setting_of_server(self._process, env)
-            played, speaking = server.beside(client, lambda: probe.speak(sentence.SHORT, setting, 0.0, LIMIT))
+            played, speaking = sentence.beside(client, lambda: sentence.by_engine(sentence.SHORT, setting, 0.0, LIMIT))
         elif client is not None:
-            played = server.speak(client, sentence.TEXT, LIMIT)
-            played = server.with_player(played, self._server.get("player"))
+            played = sentence.by_server(client, sentence.TEXT, LIMIT)
+            played = sentence.with_player(played, self._server.get("player"))
         elif engine.reason is not None:
             played = Played(State.ABORTED, engine.reason, engine.words)
         else:
             setting = Setting(wanted, None, os.environ.get("TALK_VOICE") or None, self._interrupt)
-            played = probe.speak(sentence.TEXT, setting, 0.0 if self._silent else 1.0, LIMIT)
+            played = sentence.by_engine(sentence.TEXT, setting, 0.0 if self._silent else 1.0, LIMIT)
         custom = sound.is_custom(wanted)
-        behind = findings.behind(self._found, custom=custom)
+        behind = sentence.behind(self._found, custom=custom)
         if self._silent and self._owner is not None:
             behind = sentence.as_owner(self._owner)
         stalled = played.reason == "audio_stalled" and not (self._hangs or custom)
@@ -163,7 +152,7 @@ class Examination:
             played,
             silent=self._silent or sound.is_silent(wanted),
             server=by_server,
-            suspended=ask.suspended(env) if stalled else (),
+            suspended=sound.suspended(env) if stalled else (),
             behind=behind,
             hangs=self._hangs,
             speaking=speaking,
@@ -178,6 +167,6 @@ class Examination:
         player = told.get("player")
         if sound.is_silent(player):
             player = sound.SILENT  # a file would get a sentence more, perhaps in the middle of one of the server's
-        elif player in sound.NAMED and not machine.names_a_player(process, env):
+        elif player in PACKAGES and not machine.names_a_player(process, env):
             player = None  # that one is the first that the server tries, and not the only one
         return Setting(player, told.get("device"), told.get("voice"), self._interrupt, told.get("driver"), env)

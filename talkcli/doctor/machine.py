@@ -1,6 +1,6 @@
-"""Facts that files tell: who runs this process or the server's, in what surroundings, and the kernel's sound cards.
+"""The machine: who runs this process or the server's, in what surroundings, and the sound cards that it may open.
 
-It judges nothing, starts nothing and opens no device: that would wake it.
+Files tell it all. Nothing is started and no device is opened: that would wake it.
 """
 
 from __future__ import annotations
@@ -8,18 +8,16 @@ from __future__ import annotations
 import contextlib
 import grp
 import os
-import platform
 import pwd
 import re
 import stat
 import struct
-import sys
 from typing import TYPE_CHECKING
 
 from talkcli import peers
-from talkcli.doctor.session import Session
-from talkcli.doctor.sound import Cards
-from talkcli.doctor.voice import Python
+from talkcli.doctor.report import Finding, done, some, warning
+from talkcli.engine import devices
+from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -36,14 +34,44 @@ _SSH = frozenset({"ssh", "sshd"})
 _ACL_USER, _ACL_GROUP, _READ_WRITE = 2, 8, 6
 
 
-def python() -> Python:
-    """Return what interpreter this is; pyttsx3 is not imported, as it may be broken."""
-    from importlib.metadata import PackageNotFoundError, version
+@frozen
+class Session:
+    """Facts about a process: this one, or the server's."""
 
-    found: str | None = None
-    with contextlib.suppress(PackageNotFoundError):
-        found = version("pyttsx3")
-    return Python(platform.python_version(), sys.executable, found)
+    uid: int
+    user: str
+    #: the process whose surroundings were looked at, where it is the server's
+    server: int | None = None
+    #: names and numbers of its groups
+    groups: tuple[str, ...] = ()
+    gids: tuple[int, ...] = ()
+    #: uid of the user who called sudo, as root
+    sudo_uid: int | None = None
+    #: what started it, for people: "a system service", "cron", "ssh", "a container"; the first says most
+    kinds: tuple[str, ...] = ()
+    #: XDG_RUNTIME_DIR; None where it is not set
+    runtime: str | None = None
+    #: uid of who owns that directory; None where it is not there
+    runtime_owner: int | None = None
+    #: the directory that it would be, where that is there
+    usual_runtime: str | None = None
+
+
+@frozen
+class Cards:
+    """The sound cards of the kernel."""
+
+    #: whether the kernel tells of any: a container, or a machine without a driver, does not
+    kernel: bool
+    names: tuple[str, ...] = ()
+    #: what plays: /dev/snd/pcmC0D0p
+    nodes: tuple[str, ...] = ()
+    #: those of them that may not be opened
+    forbidden: tuple[str, ...] = ()
+    #: the group that they belong to
+    group: str | None = None
+    #: whether this user is to be in that group from the next login on
+    from_next_login: bool = False
 
 
 def surroundings(server: int | None) -> tuple[Session, Mapping[str, str]]:
@@ -158,8 +186,6 @@ def _parents(pid: int) -> Iterable[str]:
 
 def cards(session: Session, kernel: str = "/proc/asound", nodes: str = "/dev/snd") -> Cards:
     """Return the kernel's sound cards, and which of them this user may open."""
-    from talkcli.engine import devices
-
     # " 0 [Device         ]: USB-Audio - USB Audio Device", and a second line with its place
     names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _text(f"{kernel}/cards"), re.MULTILINE)
     playing = devices.playing(nodes)
@@ -219,3 +245,95 @@ def _text(path: str) -> str:
             return file.read()
     except OSError:
         return ""
+
+
+def elsewhere() -> Finding:
+    """Return what is to be said where the server's surroundings can't be seen."""
+    return done(
+        "session", "the server runs on another machine or in a container: run talk doctor there to look at its sound"
+    )
+
+
+def seen_from(session: Session) -> str:
+    """Return for people from where the sound was looked at."""
+    return "from here" if session.server is None else f"from the server (process {session.server})"
+
+
+def judge_session(session: Session) -> list[Finding]:
+    """Judge where this runs."""
+    who = f"user {session.user} (uid {session.uid})"
+    if session.sudo_uid is not None:
+        who += f" by sudo from uid {session.sudo_uid}"
+    if session.kinds:
+        who += f", in {' and '.join(session.kinds)}"
+    if session.server is not None:
+        who = f"the server's: {who}"
+    if session.runtime is None:
+        if session.usual_runtime is None:
+            # As on a robot without logind: nothing is missing that there could be.
+            return [done("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")]
+        return [
+            warning(
+                "session",
+                f"{who}; XDG_RUNTIME_DIR is not set, as under cron, sudo, su and in system services: players find no "
+                "PipeWire or PulseAudio of this user",
+                f"export XDG_RUNTIME_DIR={session.usual_runtime}{_again(session)}",
+            )
+        ]
+    if session.runtime_owner is None:
+        return [
+            warning(
+                "session",
+                f"{who}; XDG_RUNTIME_DIR is {session.runtime}, which is not there",
+                "log in as this user (not by su or sudo), or unset XDG_RUNTIME_DIR",
+            )
+        ]
+    if session.runtime_owner != session.uid:
+        return [
+            warning(
+                "session",
+                f"{who}; XDG_RUNTIME_DIR is {session.runtime}, which is uid {session.runtime_owner}'s: its sound "
+                "server takes nobody else",
+                f"run this as the user who owns it: sudo -u '#{session.runtime_owner}' talk doctor",
+            )
+        ]
+    return [done("session", f"{who}; XDG_RUNTIME_DIR is {session.runtime}")]
+
+
+def _again(session: Session) -> str:
+    return "" if session.server is None else " where the server is started, and start it again"
+
+
+def judge_cards(cards: Cards, session: Session, *, served: bool) -> list[Finding]:
+    """Judge the cards, and who may open them; `served`: whether a sound server answers, which opens them itself."""
+    return [_cards(cards, session, served), _access(cards, session, served)]
+
+
+def _cards(cards: Cards, session: Session, served: bool) -> Finding:
+    if cards.names:
+        return done("cards", some(cards.names))
+    if served:
+        return done("cards", "none of this machine's own; the sound server has what is needed")
+    if "a container" in session.kinds:
+        step = "start the container with --device /dev/snd, or with the sound server's socket: see the README"
+        return warning("cards", "none in this container", step)
+    words = "the kernel knows none" if cards.kernel else "the kernel has no sound (no /proc/asound)"
+    return warning("cards", words, "plug in a loudspeaker or sound card, and look with: aplay -l")
+
+
+def _access(cards: Cards, session: Session, served: bool) -> Finding:
+    group = cards.group or "audio"
+    if not cards.nodes:
+        return done("group", f"nothing in /dev/snd to open, so the group {group} is not needed")
+    if not cards.forbidden:
+        member = (
+            f"in the group {group}" if group in session.groups else f"not in the group {group}, and needs not to be"
+        )
+        return done("group", f"user {session.user} may open the cards ({member})")
+    words = f"user {session.user} may not open {some(cards.forbidden)}: not in the group {group}"
+    if served:
+        return done("group", f"{words}; the sound server opens them")
+    if cards.from_next_login:
+        step = "log out and in again" if session.server is None else "start the server again, from a new login"
+        return warning("group", f"{words} yet, though it is to be from the next login on", step)
+    return warning("group", words, f"sudo usermod -aG {group} {session.user}, and log in again")

@@ -1,17 +1,27 @@
-"""Findings as lines for people. Pure: the screen comes from the caller."""
+"""What was found: one finding a check, what all of them mean together, and how both are shown to people.
+
+Pure: the screen comes from the caller.
+"""
 
 from __future__ import annotations
 
 import textwrap
 
-from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding, heard, next_step
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
-from talkcli.terminal.text import GAP, Screen, pad
+from talkcli.terminal.text import GAP, Screen, pad, printable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from talkcli.goals.goal import JsonObject
+
+#: The states of a finding. A warning may be why a sentence is not heard; with a failure it is certain.
+DONE, WARNING, FAILED = "done", "warning", "failed"
+#: The check that sends a sentence all the way.
+SENTENCE = "sentence"
+#: Names that are shown of a long list.
+_SHOWN = 4
 #: Columns of the state, and of the check's name: of the longest of each.
 _STATE, _CHECK = 7, 12
 _INDENT = " " * (_STATE + _CHECK + 2 * len(GAP))
@@ -20,6 +30,52 @@ _ARROW = "-> "
 _STEP = "  "
 #: Which state of a goal has a finding's colour.
 _COLOURS = {DONE: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILED: State.ABORTED}
+
+
+@frozen
+class Finding:
+    """What one check has found."""
+
+    check: str
+    state: str
+    #: for people; text of others in it is escaped already
+    message: str
+    #: the one thing to do, in plain words; None where nothing is to be done
+    next: str | None = None
+
+    def to_json(self) -> JsonObject:
+        return {"check": self.check, "state": self.state, "message": self.message, "next": self.next}
+
+
+def done(check: str, message: str) -> Finding:
+    """Return a finding that all is well."""
+    return Finding(check, DONE, printable(message))
+
+
+def warning(check: str, message: str, step: str) -> Finding:
+    """Return a finding of what may be why nothing is heard."""
+    return Finding(check, WARNING, printable(message), printable(step))
+
+
+def failed(check: str, message: str, step: str) -> Finding:
+    """Return a finding of what lets nothing be heard."""
+    return Finding(check, FAILED, printable(message), printable(step))
+
+
+def some(names: tuple[str, ...]) -> str:
+    """Return names for people, not all of many."""
+    rest = len(names) - _SHOWN
+    return ", ".join(names) if rest <= 1 else f"{', '.join(names[:_SHOWN])} and {rest} more"
+
+
+def heard(findings: Sequence[Finding]) -> bool:
+    """Tell whether a sentence would be heard: one was played, and nothing failed."""
+    return any(each.check == SENTENCE for each in findings) and all(each.state != FAILED for each in findings)
+
+
+def next_step(findings: Sequence[Finding]) -> str | None:
+    """Return the one thing to do: for the first that failed."""
+    return next((each.next for each in findings if each.state == FAILED), None)
 
 
 def lines(finding: Finding, screen: Screen) -> list[str]:

@@ -1,19 +1,38 @@
-"""The proof: a sentence that was sent all the way, and what its end means. Pure."""
+"""The proof: a sentence that is sent all the way, through the server or by an engine process, and what its end means.
+
+As any client's goal it waits its turn and can be cancelled.
+"""
 
 from __future__ import annotations
 
-from talkcli.doctor.findings import SENTENCE, Finding, done, failed
+from typing import TYPE_CHECKING
+
+from talkcli.client.dial import Interrupted
+from talkcli.doctor.report import SENTENCE, Finding, done, failed
 from talkcli.doctor.sound import is_custom
-from talkcli.doctor.voice import INSTALL_LIBRARY
-from talkcli.frozen import frozen
+from talkcli.doctor.voice import INSTALL_LIBRARY, conversation, fault
+from talkcli.engine import protocol
+from talkcli.engine.once import EngineFailed
+from talkcli.errors import TalkError
+from talkcli.frozen import frozen, replace
 from talkcli.goals.states import State
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from talkcli.client.client import Client
+    from talkcli.client.goal import GoalHandle
+    from talkcli.doctor.voice import Setting
+    from talkcli.goals.goal import Goal
 
 #: What is said; short, and worth hearing.
 TEXT = "If you hear this, talk works."
 #: What is played beside a server where nobody hears it: short, as a device that takes one player has no place for the
 #: server's meanwhile, and long enough to see that a player doesn't just swallow it.
 SHORT = "talk works well"
-
+_ID = "doctor"
+#: Words per minute, of what is heard and of what nobody hears: that holds the device no longer than it must.
+_RATE, _SILENT_RATE = 200, 450
 #: What to do about a reason. What isn't here is told by `reason` and message alone.
 REMEDIES = {
     "no_player": "sudo apt-get install -y alsa-utils",
@@ -37,6 +56,8 @@ _OF_PLAYER = frozenset({"audio_device", "audio_lost", "audio_stalled"})
 _OF_SOUND = _OF_PLAYER | {"no_player"}
 _OF_START = frozenset({"engine_failed", "engine_hung"})
 _AGAIN = "somebody else ended it: run talk doctor again"
+#: Checks of what lies behind the engine, the nearest cause of a sentence's end first.
+_BEHIND = ("player", "device", "sound server", "group", "cards", "session")
 
 
 @frozen
@@ -52,6 +73,86 @@ class Played:
     player: str | None = None
 
 
+def by_server(client: Client, text: str, limit: float) -> Played:
+    """Send a sentence that waits its turn, and return how it ended; after `limit` seconds it is taken back."""
+    try:
+        goal = client.say(text, preempt=False, ttl=0)
+    except TalkError as error:
+        return Played(State.LOST, "lost", error.message)
+    try:
+        if goal.speech_paused:
+            goal.cancel()
+            return Played(goal.state, "paused", "speech is paused")
+        return _played(goal.wait(limit))
+    except TimeoutError:
+        return _taken_back(client, goal, limit)
+    except TalkError as error:
+        return Played(State.LOST, "lost", error.message)
+    except Interrupted:
+        goal.request_cancel()
+        raise
+
+
+def _taken_back(client: Client, goal: GoalHandle, limit: float) -> Played:
+    """Cancel a goal that has not ended in time, and say what was in its way."""
+    try:
+        before = client.status()
+        ended = goal.cancel()
+    except TalkError as error:
+        return Played(State.LOST, "lost", error.message)
+    if ended.state in {State.SUCCEEDED, State.ABORTED}:  # in this moment
+        return _played(ended)
+    ahead = next((number for number, each in enumerate(before.pending) if each.id == goal.id), None)
+    if before.server.get("paused") is True:
+        return Played(ended.state, "paused", "speech is paused")
+    if ahead is None:
+        return Played(ended.state, "late", f"it was begun and not over after {limit:g} s, and was cancelled")
+    goals = "1 goal" if ahead + bool(before.active) == 1 else f"{ahead + bool(before.active)} goals"
+    return Played(ended.state, "late", f"it still waited behind {goals} after {limit:g} s, and was taken back")
+
+
+def _played(goal: Goal) -> Played:
+    return Played(goal.state, goal.reason, goal.message, goal.duration)
+
+
+def with_player(played: Played, player: object) -> Played:
+    """Return how a sentence ended, with the name of the server's player."""
+    return replace(played, player=str(player)) if player else played
+
+
+def beside(client: Client, play: Callable[[], Played]) -> tuple[Played, bool]:
+    """Play without the server, and return how that went, and whether the server spoke meanwhile."""
+    try:
+        before = client.status()
+        played = play()
+        after = client.status()
+    except TalkError as error:
+        return Played(State.LOST, "lost", error.message), False
+    spoken = {each.id for each in after.recent if each.state in {State.SUCCEEDED, State.PREEMPTED}}
+    return played, bool(before.active or after.active or spoken - {each.id for each in before.recent})
+
+
+def by_engine(text: str, setting: Setting, volume: float, limit: float) -> Played:
+    """Play a sentence by an engine process, in at most `limit` seconds, and return how that went."""
+    try:
+        with conversation(setting, limit) as engine:
+            player = setting.player
+            for event in engine.events():
+                if isinstance(event, protocol.Ready):
+                    player = event.player
+                    rate = _RATE if volume else _SILENT_RATE
+                    engine.say(protocol.Say(_ID, text, rate, volume, setting.voice, 50))
+                elif isinstance(event, protocol.Ended):
+                    if event.outcome == protocol.COMPLETED:
+                        return Played(State.SUCCEEDED, duration=event.duration, player=player)
+                    return Played(State.ABORTED, event.reason, event.message or event.outcome, player=player)
+    except EngineFailed as error:
+        return Played(State.ABORTED, *fault(error))
+    except TimeoutError:
+        pass
+    return Played(State.ABORTED, "engine_hung", f"it was not over after {limit:g} s")
+
+
 def elsewhere() -> Finding:
     """Return what is to be said where a server's player is out of reach for a process of this command's own."""
     words = "not played: the server runs on another machine or in a container, and so does its player"
@@ -61,6 +162,15 @@ def elsewhere() -> Finding:
 def as_owner(uid: int) -> str:
     """Return what to do where a server's player failed by another user than the server's."""
     return f"play as the server's own user, who may have another sound: sudo -u '#{uid}' talk doctor --silent"
+
+
+def behind(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
+    """Return the next step for what lies behind the engine, where something there is not as it should be.
+
+    `custom`: whether the player is a command of the user's own, of which nobody here knows what it needs.
+    """
+    steps = {each.check: each.next for each in findings}
+    return next((steps[check] for check in _BEHIND[: 1 if custom else None] if steps.get(check) is not None), None)
 
 
 def _is_busy(reason: str | None, words: str | None) -> bool:

@@ -1,23 +1,40 @@
-"""What makes a sound of samples: players, devices, cards, who may use them, sound servers. Pure.
+"""What makes a sound of samples: players, devices, sound servers, and how loud the output is.
 
-Only a sentence proves that there is sound: what may be in its way is a warning here. Without a player it is certain.
+Programs of others tell it; asking wakes no device. Only a sentence proves that there is sound: what may be in its way
+is a warning here. Without a player it is certain.
 """
 
 from __future__ import annotations
 
+import re
 import shlex
+from typing import TYPE_CHECKING
 
-from talkcli.doctor.findings import Finding, done, failed, warning
-from talkcli.doctor.session import Session, seen_from
+from talkcli.doctor import programs
+from talkcli.doctor.machine import judge_cards, seen_from
+from talkcli.doctor.report import Finding, done, failed, some, warning
+from talkcli.engine.devices import sound_servers
+from talkcli.engine.players.programs import PACKAGES
 from talkcli.frozen import frozen
 
-#: Players that are programs known here, as `engine.players` has them; nothing of the engine is imported to judge.
-NAMED = frozenset({"aplay", "pacat", "pw-cat"})
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from talkcli.doctor.machine import Cards, Session
+
 #: Players that need no device.
 SILENT = "null"
 FILE = "file:"
-#: Names that are shown of a long list.
-_SHOWN = 4
+#: What ALSA lists besides devices: converters, and ways that nobody takes by default.
+_NO_DEVICES = frozenset(
+    {"null", "lavrate", "samplerate", "speexrate", "jack", "oss", "speex", "upmix", "vdownmix", "usbstream"}
+)
+#: The name of the check of levels.
+_LOUDNESS = "loudness"
+#: Per cent below which nobody may hear it across a room.
+_FAINT = 20
+#: ALSA's controls that a loudspeaker hangs on, as `amixer scontrols` names them.
+_CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
 
 
 @frozen
@@ -50,23 +67,6 @@ class Devices:
 
 
 @frozen
-class Cards:
-    """The sound cards of the kernel."""
-
-    #: whether the kernel tells of any: a container, or a machine without a driver, does not
-    kernel: bool
-    names: tuple[str, ...] = ()
-    #: what plays: /dev/snd/pcmC0D0p
-    nodes: tuple[str, ...] = ()
-    #: those of them that may not be opened
-    forbidden: tuple[str, ...] = ()
-    #: the group that they belong to
-    group: str | None = None
-    #: whether this user is to be in that group from the next login on
-    from_next_login: bool = False
-
-
-@frozen
 class SoundServer:
     """PulseAudio or PipeWire, as a client of it finds it."""
 
@@ -86,6 +86,20 @@ class SoundServer:
     named: str | None = None
 
 
+@frozen
+class Level:
+    """A mixer's setting of one output."""
+
+    #: the sink or the control
+    name: str
+    muted: bool
+    #: None where the mixer doesn't say
+    percent: int | None
+    #: the command that undoes a mute, and the one that makes it louder
+    unmute: str
+    louder: str
+
+
 def is_silent(player: str | None) -> bool:
     """Tell whether a player makes no sound by its nature."""
     return player is not None and (player == SILENT or player.startswith(FILE))
@@ -94,7 +108,7 @@ def is_silent(player: str | None) -> bool:
 def is_custom(player: str | None) -> bool:
     """Tell whether a player is a command of the user's own: what another program needs, only its user knows."""
     program = program_of(player) if player and not is_silent(player) else None
-    return program is not None and program.rpartition("/")[2] not in NAMED
+    return program is not None and program.rpartition("/")[2] not in PACKAGES
 
 
 def program_of(command: str) -> str | None:
@@ -103,6 +117,135 @@ def program_of(command: str) -> str | None:
         return next(iter(shlex.split(command)), None)
     except ValueError:
         return None
+
+
+def players(env: Mapping[str, str], wanted: str | None, by: str | None) -> Players:
+    """Return which players there are; `wanted`: the setting, `by` whom it is."""
+    found = tuple(each for each in PACKAGES if programs.path_of(each, env))
+    runs = True
+    if wanted is not None and not is_silent(wanted):
+        program = program_of(wanted)
+        runs = bool(program and programs.path_of(program, env))
+    return Players(dict(PACKAGES), found, wanted, by, runs)
+
+
+def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> Devices | None:
+    """Return where a player can play to; None for one that nobody can ask."""
+    if player == "aplay":
+        said = programs.said("aplay", "-L", env=env)
+        names = [each for each in said.out.splitlines() if each and not each[0].isspace() and each not in _NO_DEVICES]
+        return _devices("aplay -L", said, names, wanted)
+    if player == "pacat":
+        said = programs.said("pactl", "list", "short", "sinks", env=env)
+        return _devices("pactl list short sinks", said, [name for name, _ in _sinks(said)], wanted)
+    if player == "pw-cat":
+        said = programs.said("pw-cli", "ls", "Node", env=env)
+        blocks = re.split(r"^\s*id \d+,", said.out, flags=re.MULTILINE)
+        found = [re.search(r'node\.name = "([^"]*)"', each) for each in blocks if '"Audio/Sink"' in each]
+        return _devices("pw-cli ls Node", said, [each[1] for each in found if each], wanted)
+    return None
+
+
+def _devices(command: str, said: programs.Said, names: list[str], wanted: str | None) -> Devices:
+    return Devices(command, tuple(names), None if said.well else _trouble(command.partition(" ")[0], said), wanted)
+
+
+def _trouble(program: str, said: programs.Said) -> str:
+    if said.late:
+        return f"no answer within {programs.LIMIT:g} s"
+    return f"{program} is not there" if said.code is None and not said.err else said.complaint
+
+
+def suspended(env: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the sinks that take no data; while nothing plays, those that are asleep, too."""
+    return tuple(name for name, state in _sinks(programs.said("pactl", "list", "short", "sinks", env=env))
+                 if state == "SUSPENDED")  # fmt: skip
+
+
+def _sinks(said: programs.Said) -> list[tuple[str, str]]:
+    """Return names and states of the sinks: number, name, module, format, state, with tabs between them."""
+    lines = [each.split("\t") for each in said.out.splitlines()]
+    return [(each[1], each[-1].strip()) for each in lines if said.well and len(each) > 2]
+
+
+def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
+    """Return the sound server that a player of this session finds."""
+    named = env.get("PULSE_SERVER") or None
+    sockets = tuple(sound_servers(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else [])))
+    pulse = programs.said("pactl", "info", env=env)
+    if pulse.well:
+        name = _field(pulse.out, "Server Name") or "PulseAudio"
+        return SoundServer(name=name, sink=_field(pulse.out, "Default Sink"), sockets=sockets, named=named)
+    wire = programs.Said(None) if pulse.late else programs.said("pw-cli", "info", "0", env=env)
+    if wire.well:
+        return SoundServer(name="PipeWire, without its PulseAudio part", sockets=sockets, named=named)
+    askable = any(programs.path_of(each, env) for each in ("pactl", "pw-cli"))
+    trouble = _trouble("pactl", pulse) if programs.path_of("pactl", env) else _trouble("pw-cli", wire)
+    return SoundServer(
+        sockets=sockets, trouble=trouble, hangs=pulse.late or wire.late, askable=askable, named=named
+    )  # fmt: skip
+
+
+def _field(text: str, name: str) -> str | None:
+    found = re.search(rf"^\s*{name}: (.+)$", text, re.MULTILINE)
+    return found[1].strip() if found else None
+
+
+def levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> tuple[Level, ...]:
+    """Return how loud the default output is, by the first mixer that tells."""
+    if server.hangs:
+        return ()
+    if server.name is not None:
+        mute = programs.said("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
+        if mute.well:
+            volume = programs.said("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
+            return (level_of_pactl(mute.out, volume.out),)
+        whole = programs.said("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
+        return (level_of_wpctl(whole.out),) if whole.well else ()
+    if not cards.names:
+        return ()
+    controls = programs.said("amixer", "scontrols", env=env)
+    names = re.findall(r"control '([^']*)'", controls.out)
+    asked = [(each, programs.said("amixer", "sget", each, env=env)) for each in _CONTROLS if each in names]
+    return tuple(level_of_amixer(name, said.out) for name, said in asked if said.well)
+
+
+def level_of_pactl(mute: str, volume: str) -> Level:
+    """Return what `pactl get-sink-mute` and `get-sink-volume` say of the default sink."""
+    return Level(
+        "the default sink",
+        "yes" in mute.lower(),
+        _percent(volume),
+        "pactl set-sink-mute @DEFAULT_SINK@ 0",
+        "pactl set-sink-volume @DEFAULT_SINK@ 70%",
+    )
+
+
+def level_of_wpctl(text: str) -> Level:
+    """Return what `wpctl get-volume @DEFAULT_AUDIO_SINK@` says: "Volume: 0.40 [MUTED]"."""
+    found = re.search(r"Volume: (\d+(?:\.\d+)?)", text)
+    percent = round(float(found[1]) * 100) if found else None
+    return Level(
+        "the default sink",
+        "[MUTED]" in text,
+        percent,
+        "wpctl set-mute @DEFAULT_AUDIO_SINK@ 0",
+        "wpctl set-volume @DEFAULT_AUDIO_SINK@ 0.7",
+    )
+
+
+def level_of_amixer(control: str, text: str) -> Level:
+    """Return what `amixer sget CONTROL` says; on some channels of several is on."""
+    switches = re.findall(r"\[(on|off)\]", text)
+    muted = bool(switches) and "on" not in switches
+    words = f"amixer sset {control}"
+    return Level(control, muted, _percent(text), f"{words} unmute", f"{words} 70%")
+
+
+def _percent(text: str) -> int | None:
+    """Return the loudest of the channels."""
+    found = [int(each) for each in re.findall(r"(\d+)%", text)]
+    return max(found, default=None)
 
 
 def judge_setting(wanted: str | None, by: str | None) -> list[Finding]:
@@ -121,8 +264,7 @@ def judge(
         found.append(_device(devices))
     return [
         *found,
-        _cards(cards, server, session),
-        _group(cards, server, session),
+        *judge_cards(cards, session, served=server.name is not None),
         _sound_server(server, cards, session),
     ]
 
@@ -159,44 +301,14 @@ def _device(devices: Devices) -> Finding:
             "device", f"{devices.listed_by} lists none", "plug in a loudspeaker; in a container, hand the device in"
         )
     if wanted is None:
-        return done("device", f"the default; {devices.listed_by} lists {_some(names)}")
+        return done("device", f"the default; {devices.listed_by} lists {some(names)}")
     if wanted in names or ":" in wanted:  # ALSA makes plughw:1,0 of any card; whether it can, the sentence shows
-        return done("device", f"{wanted}; {devices.listed_by} lists {_some(names)}")
+        return done("device", f"{wanted}; {devices.listed_by} lists {some(names)}")
     return warning(
         "device",
-        f"{wanted} is not among those that {devices.listed_by} lists: {_some(names)}",
+        f"{wanted} is not among those that {devices.listed_by} lists: {some(names)}",
         "start the server with --device and one of these names",
     )
-
-
-def _cards(cards: Cards, server: SoundServer, session: Session) -> Finding:
-    if cards.names:
-        return done("cards", _some(cards.names))
-    if server.name is not None:
-        return done("cards", "none of this machine's own; the sound server has what is needed")
-    if "a container" in session.kinds:
-        step = "start the container with --device /dev/snd, or with the sound server's socket: see the README"
-        return warning("cards", "none in this container", step)
-    words = "the kernel knows none" if cards.kernel else "the kernel has no sound (no /proc/asound)"
-    return warning("cards", words, "plug in a loudspeaker or sound card, and look with: aplay -l")
-
-
-def _group(cards: Cards, server: SoundServer, session: Session) -> Finding:
-    group = cards.group or "audio"
-    if not cards.nodes:
-        return done("group", f"nothing in /dev/snd to open, so the group {group} is not needed")
-    if not cards.forbidden:
-        member = (
-            f"in the group {group}" if group in session.groups else f"not in the group {group}, and needs not to be"
-        )
-        return done("group", f"user {session.user} may open the cards ({member})")
-    words = f"user {session.user} may not open {_some(cards.forbidden)}: not in the group {group}"
-    if server.name is not None:
-        return done("group", f"{words}; the sound server opens them")
-    if cards.from_next_login:
-        step = "log out and in again" if session.server is None else "start the server again, from a new login"
-        return warning("group", f"{words} yet, though it is to be from the next login on", step)
-    return warning("group", words, f"sudo usermod -aG {group} {session.user}, and log in again")
 
 
 def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Finding:
@@ -213,7 +325,7 @@ def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Findin
         if session.kinds and not cards.names:
             return _out_of_reach(server, session, f"none can be reached {where}")
         return done(check, f"no PulseAudio or PipeWire runs for user {session.user}{alone}")
-    at = f"at {server.named} (PULSE_SERVER)" if server.named else f"at {_some(server.sockets)}"
+    at = f"at {server.named} (PULSE_SERVER)" if server.named else f"at {some(server.sockets)}"
     if not server.askable:
         step = "sudo apt-get install -y pulseaudio-utils"
         return warning(check, f"there is one {at}, but no program to ask it: pactl, pw-cli", step)
@@ -238,7 +350,18 @@ def _out_of_reach(server: SoundServer, session: Session, words: str) -> Finding:
     return warning(check, words, "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)")
 
 
-def _some(names: tuple[str, ...]) -> str:
-    """Return names for people, not all of many."""
-    rest = len(names) - _SHOWN
-    return ", ".join(names) if rest <= 1 else f"{', '.join(names[:_SHOWN])} and {rest} more"
+def judge_levels(levels: tuple[Level, ...], *, default: bool) -> list[Finding]:
+    """Judge how loud it is; `default`: whether it is this output that is played to, as far as can be known."""
+    if not levels:
+        return []
+    broken = failed if default else warning
+    for level in levels:
+        if level.muted:
+            return [broken(_LOUDNESS, f"{level.name} is muted", level.unmute)]
+        if level.percent == 0:
+            return [broken(_LOUDNESS, f"{level.name} is at 0%", level.louder)]
+    for level in levels:
+        if level.percent is not None and level.percent < _FAINT:
+            return [warning(_LOUDNESS, f"{level.name} is at {level.percent}%: few will hear it", level.louder)]
+    shown = [f"{each.name} at {each.percent}%" if each.percent is not None else f"{each.name} on" for each in levels]
+    return [done(_LOUDNESS, ", ".join(shown))]

@@ -1,9 +1,27 @@
-"""What makes sound of a text: Python, pyttsx3, libespeak-ng with its data and voices. Pure."""
+"""What makes sound of a text: Python, pyttsx3, libespeak-ng with its data and voices.
+
+An engine process of the doctor's own shows it. What libespeak-ng or a player does to it ends that process and is a fact
+here; this one never loads the library.
+"""
 
 from __future__ import annotations
 
-from talkcli.doctor.findings import Finding, done, failed, warning
+import contextlib
+import os
+import platform
+import select
+import sys
+import time
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
+
+from talkcli.doctor.report import Finding, done, failed, warning
+from talkcli.engine import protocol
+from talkcli.engine.once import Conversation, EngineFailed, EngineSilent
 from talkcli.frozen import frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 #: What to do where there is no library.
 INSTALL_LIBRARY = "sudo apt-get install -y libespeak-ng1, or: pip install espeakng-loader"
@@ -31,6 +49,62 @@ class Engine:
     #: why it didn't start, for programs and in its own words; None where it did
     reason: str | None = None
     words: str = ""
+
+
+@frozen
+class Setting:
+    """What the engine process is to speak with."""
+
+    player: str | None = None
+    device: str | None = None
+    voice: str | None = None
+    #: a descriptor that ends any waiting with Interrupted
+    interrupt: int | None = None
+    driver: str | None = None
+    #: the environment in which it is to run; None for this process's
+    env: Mapping[str, str] | None = None
+
+
+def python() -> Python:
+    """Return what interpreter this is; pyttsx3 is not imported, as it may be broken."""
+    found: str | None = None
+    with contextlib.suppress(PackageNotFoundError):
+        found = version("pyttsx3")
+    return Python(platform.python_version(), sys.executable, found)
+
+
+def look(setting: Setting) -> Engine:
+    """Start an engine process, and return what it says of itself."""
+    found = Engine()
+    try:
+        with conversation(setting) as engine:
+            for event in engine.events():
+                if isinstance(event, protocol.Ready):
+                    found = Engine(event.driver, event.version)
+                elif isinstance(event, protocol.Voices):
+                    return Engine(found.driver, found.synthesizer, len(event.voices))
+    except EngineFailed as error:
+        if found.driver is None or error.reason == "engine_crashed":
+            reason, words = fault(error)
+            return Engine(reason=reason, words=words)
+    return found  # it is ready; that it lists no voices is for who judges
+
+
+def conversation(setting: Setting, limit: float | None = None) -> Conversation:
+    """Return what talks to an engine process of these settings, for at most `limit` seconds."""
+    configure = protocol.Configure(
+        os.getpid(), setting.driver, setting.player, setting.device, setting.voice, list_voices=True
+    )
+    interrupt = None if setting.interrupt is None else {setting.interrupt: select.POLLIN}
+    deadline = None if limit is None else time.monotonic() + limit
+    return Conversation(configure, env=setting.env, deadline=deadline, interrupt=interrupt)
+
+
+def fault(error: EngineFailed) -> tuple[str, str]:
+    """Return why an engine process failed, for programs and in words; whether it was ready yet makes no difference."""
+    if isinstance(error, EngineSilent):
+        return "engine_hung", f"the engine process said nothing for {error.seconds:g} s"
+    return error.reason, str(error)
 
 
 def judge(python: Python, engine: Engine, *, server: bool) -> list[Finding]:

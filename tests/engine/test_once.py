@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.doctor import probe
-from talkcli.doctor.probe import Setting
+from talkcli.doctor import sentence, voice
 from talkcli.doctor.sentence import Played
-from talkcli.doctor.voice import Engine
+from talkcli.doctor.voice import Engine, Setting
 from talkcli.engine import once, protocol
 from talkcli.engine.once import Conversation, EngineFailed
 from talkcli.goals.states import State
@@ -91,18 +90,18 @@ def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None
 def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(once, "HANG_AFTER", 0.4)
     hung = Played(State.ABORTED, "engine_hung", "the engine process said nothing for 0.4 s")
-    assert probe.speak("hang", Setting(), 1.0, 20.0) == hung
+    assert sentence.by_engine("hang", Setting(), 1.0, 20.0) == hung
     behaviour = tmp_path / "start"
     behaviour.write_text("hang")
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
     monkeypatch.setattr(once, "START_LIMIT", 0.3)
     words = "the engine process said nothing for 0.3 s"
-    assert probe.look(Setting()) == Engine(reason="engine_hung", words=words)
+    assert voice.look(Setting()) == Engine(reason="engine_hung", words=words)
 
 
 @pytest.mark.usefixtures("scripted")
 def test_doctor_tells_how_an_engine_process_died_and_what_takes_too_long() -> None:
     died = Played(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
-    assert probe.speak("silent-start crash", Setting(), 1.0, 20.0) == died
+    assert sentence.by_engine("silent-start crash", Setting(), 1.0, 20.0) == died
     late = Played(State.ABORTED, "engine_hung", "it was not over after 0.5 s")
-    assert probe.speak("never-ends", Setting(), 1.0, 0.5) == late
+    assert sentence.by_engine("never-ends", Setting(), 1.0, 0.5) == late

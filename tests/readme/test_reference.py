@@ -124,8 +124,8 @@ def test_commands_in_passing_can_be_read(line: str) -> None:
 
 def test_what_doctor_says_of_containers_is_in_the_readme() -> None:
     """It names the README, and the two ways to hand sound in."""
-    source = (ROOT / "talkcli" / "doctor" / "sound.py").read_text(encoding="utf-8")
-    steps = re.findall(r'"(start the container [^"]*README)"', source)
+    sources = [each.read_text(encoding="utf-8") for each in (ROOT / "talkcli" / "doctor").glob("*.py")]
+    steps = [step for each in sources for step in re.findall(r'"(start the container [^"]*README)"', each)]
     assert len(steps) == 2
     for words_of_both in ("--device /dev/snd", "PULSE_SERVER"):
         assert any(words_of_both in each for each in steps)

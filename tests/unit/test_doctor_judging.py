@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from talkcli import __version__
-from talkcli.doctor import places, report, sentence, serving, voice
-from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding, behind, done, failed, heard, next_step, warning
-from talkcli.doctor.places import Place, Places
-from talkcli.doctor.sentence import Played
+from talkcli.doctor import report, sentence, server, voice
+from talkcli.doctor.report import DONE, FAILED, WARNING, Finding, done, failed, heard, next_step, warning
+from talkcli.doctor.sentence import Played, behind
+from talkcli.doctor.server import Place, Places
 from talkcli.doctor.voice import Engine, Python
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
@@ -138,28 +138,28 @@ PATH = "/run/user/1000/talk/talk.sock"
         (Places((Place(PATH, ABSENT),)), "not there", "talk serve"),
         (Places((Place(PATH, STALE, 1000),)), "left over", "talk serve (it takes the place"),
         (Places((Place(PATH, FORBIDDEN, 7),)), "no permission (uid 7)", "have uid 7 let you in"),
-        (Places((Place(PATH, places.FOREIGN, 7),)), "another user's server (uid 7)", f"talk --socket {PATH} doctor"),
+        (Places((Place(PATH, server.FOREIGN, 7),)), "another user's server (uid 7)", f"talk --socket {PATH} doctor"),
         (Places((Place(PATH, ABSENT),), "TALK_SOCKET"), "named by TALK_SOCKET", "unset TALK_SOCKET, or"),
         (Places((Place(PATH, ABSENT),), "--socket"), "named by --socket", "leave --socket out, or"),
         (Places((Place("/x", ABSENT),), "TALK_SOCKET", elsewhere=PATH), "/x", f"a server is on {PATH}"),
-        (Places((Place(PATH, places.MUTE),), None, None, "it does not answer"), "it does not answer", "restart"),
-        (Places((Place(PATH, places.MUTE),), None, None, "busy", "busy"), "busy", "--max-clients"),
-        (Places((Place(PATH, places.STOPPED, 0, 7),), None, None, "it does not answer"), "is stopped", "kill -CONT 7"),
+        (Places((Place(PATH, server.MUTE),), None, None, "it does not answer"), "it does not answer", "restart"),
+        (Places((Place(PATH, server.MUTE),), None, None, "busy", "busy"), "busy", "--max-clients"),
+        (Places((Place(PATH, server.STOPPED, 0, 7),), None, None, "it does not answer"), "is stopped", "kill -CONT 7"),
         (Places((Place(PATH, ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
     ],
 )
 def test_where_no_server_is_each_place_is_named_with_what_is_there(found: Places, words: str, step: str) -> None:
-    judgement = places.judge(found)
+    judgement = server.judge_places(found)
     assert judgement.state == FAILED
     assert words in judgement.message
     assert step in str(judgement.next)
 
 
 def test_where_a_server_is_what_lies_before_it_is_a_warning() -> None:
-    served = Place(PATH, places.SERVER)
-    found = places.judge(Places((Place("/a", ABSENT), served), pid=4711))
+    served = Place(PATH, server.SERVER)
+    found = server.judge_places(Places((Place("/a", ABSENT), served), pid=4711))
     assert (found.state, found.message) == (DONE, f"the server is on {PATH} (process 4711)")
-    found = places.judge(Places((Place("/a", places.FOREIGN, 7), served), pid=4711))
+    found = server.judge_places(Places((Place("/a", server.FOREIGN, 7), served), pid=4711))
     assert found.state == WARNING
     assert "/a: another user's server (uid 7)" in found.message
 
@@ -179,7 +179,7 @@ def test_where_a_server_is_what_lies_before_it_is_a_warning() -> None:
 def test_a_server_is_judged_by_what_it_says_of_itself(
     change: dict[str, object], check: str, state: str, step: str | None
 ) -> None:
-    found = of(serving.judge({**SERVER, **change}, [], 0.0), check)
+    found = of(server.judge({**SERVER, **change}, [], 0.0), check)
     assert found.state == state
     assert (step in str(found.next)) if step else found.next is None
 
@@ -188,14 +188,14 @@ def test_the_last_failures_are_counted_and_the_last_one_told() -> None:
     aborted = Goal(
         "4k7f-2", State.ABORTED, reason="audio_device", ended_at=0.0, message="Talk aborted: aplay: device is busy"
     )
-    found = of(serving.judge(SERVER, [SPOKEN, aborted], 600.0), "failures")
+    found = of(server.judge(SERVER, [SPOKEN, aborted], 600.0), "failures")
     assert found.state == WARNING
     assert "1 of the last 2 goals ABORTED, last 4k7f-2, 10 min ago" in found.message
     assert "audio_device: aplay: device is busy" in found.message
     assert "another program holds the device" in str(found.next)
-    found = of(serving.judge(SERVER, [aborted, SPOKEN], 600.0), "failures")
+    found = of(server.judge(SERVER, [aborted, SPOKEN], 600.0), "failures")
     assert (found.state, "1 succeeded since" in found.message) == (DONE, True)
-    assert of(serving.judge(SERVER, [SPOKEN], 0.0), "failures").message == "none in the last goal"
+    assert of(server.judge(SERVER, [SPOKEN], 0.0), "failures").message == "none in the last goal"
 
 
 def test_the_sentence_says_how_it_ended_and_what_to_do() -> None:

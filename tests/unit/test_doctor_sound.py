@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.doctor import level, session, sound
-from talkcli.doctor.findings import DONE, FAILED, WARNING, Finding
-from talkcli.doctor.session import Session
-from talkcli.doctor.sound import Cards, Devices, Players, SoundServer
-from talkcli.engine.players import programs as players
+from talkcli.doctor import machine, sound
+from talkcli.doctor.machine import Cards, Session
+from talkcli.doctor.report import DONE, FAILED, WARNING, Finding
+from talkcli.doctor.sound import Devices, Players, SoundServer
 from talkcli.frozen import replace
 
 PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)
@@ -123,35 +122,36 @@ def test_a_sound_server_that_hangs_or_is_named_wrongly_or_cannot_be_asked() -> N
 
 
 def test_without_a_runtime_directory_the_session_says_what_to_set() -> None:
-    found = session.judge(replace(PI, runtime=None, runtime_owner=None, usual_runtime="/run/user/1000"))[0]
+    found = machine.judge_session(replace(PI, runtime=None, runtime_owner=None, usual_runtime="/run/user/1000"))[0]
     assert (found.state, found.next) == (WARNING, "export XDG_RUNTIME_DIR=/run/user/1000")
     assert "cron, sudo" in found.message
-    served = session.judge(replace(PI, runtime=None, usual_runtime="/run/user/1000", server=7))[0]
+    served = machine.judge_session(replace(PI, runtime=None, usual_runtime="/run/user/1000", server=7))[0]
     assert "where the server is started" in str(served.next)
-    assert session.judge(replace(PI, runtime=None))[0].state == DONE
-    assert "not there" in session.judge(replace(PI, runtime_owner=None))[0].message
-    assert "uid 33's" in session.judge(replace(PI, runtime_owner=33))[0].message
+    assert machine.judge_session(replace(PI, runtime=None))[0].state == DONE
+    assert "not there" in machine.judge_session(replace(PI, runtime_owner=None))[0].message
+    assert "uid 33's" in machine.judge_session(replace(PI, runtime_owner=33))[0].message
 
 
 def test_what_is_muted_is_not_heard() -> None:
-    pulse = level.of_pactl("Mute: yes\n", "Volume: mono: 65536 / 100% / 0.00 dB\n")
+    pulse = sound.level_of_pactl("Mute: yes\n", "Volume: mono: 65536 / 100% / 0.00 dB\n")
     assert (pulse.muted, pulse.percent) == (True, 100)
-    wire = level.of_wpctl("Volume: 0.05\n")
+    wire = sound.level_of_wpctl("Volume: 0.05\n")
     assert (wire.muted, wire.percent) == (False, 5)
-    assert level.of_wpctl("Volume: 0.40 [MUTED]\n").muted
-    alsa = level.of_amixer("Master", "  Front Left: Playback 0 [0%] [-65.25dB] [off]\n  Front Right: 9 [40%] [on]\n")
+    assert sound.level_of_wpctl("Volume: 0.40 [MUTED]\n").muted
+    alsa = sound.level_of_amixer(
+        "Master", "  Front Left: Playback 0 [0%] [-65.25dB] [off]\n  Front Right: 9 [40%] [on]\n"
+    )
     assert (alsa.muted, alsa.percent) == (False, 40)
-    off = level.of_amixer("Master", "  Mono: Playback 0 [0%] [-65.25dB] [off]\n")
-    assert level.judge((alsa, off), default=True)[0].next == "amixer sset Master unmute"
-    assert level.judge((pulse,), default=True)[0].state == FAILED
-    assert level.judge((pulse,), default=False)[0].state == WARNING, "another device is played to"
-    assert level.judge((wire,), default=True)[0].state == WARNING
-    assert level.judge((replace(wire, percent=0),), default=True)[0].state == FAILED
-    assert level.judge((alsa,), default=True)[0].state == DONE
-    assert level.judge((), default=True) == []
+    off = sound.level_of_amixer("Master", "  Mono: Playback 0 [0%] [-65.25dB] [off]\n")
+    assert sound.judge_levels((alsa, off), default=True)[0].next == "amixer sset Master unmute"
+    assert sound.judge_levels((pulse,), default=True)[0].state == FAILED
+    assert sound.judge_levels((pulse,), default=False)[0].state == WARNING, "another device is played to"
+    assert sound.judge_levels((wire,), default=True)[0].state == WARNING
+    assert sound.judge_levels((replace(wire, percent=0),), default=True)[0].state == FAILED
+    assert sound.judge_levels((alsa,), default=True)[0].state == DONE
+    assert sound.judge_levels((), default=True) == []
 
 
 def test_a_player_is_a_user_s_own_where_its_program_is_another() -> None:
-    assert players.PACKAGES.keys() == sound.NAMED
     assert all(map(sound.is_custom, ("sleep 100", "/opt/bin/play -x", "false")))
     assert not any(map(sound.is_custom, ("/usr/bin/aplay -q", "pacat", "null", "file:a.wav", "'", "", None)))

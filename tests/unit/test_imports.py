@@ -275,26 +275,64 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, [], "")
 
 
-#: The doctor's modules that judge facts; they read a clock's format at most, and gather nothing.
-JUDGING = ["findings", "session", "voice", "sound", "level", "places", "sentence", "serving", "report"]
-#: What those may import of the package besides each other.
-FOR_JUDGING = {"", "goals.goal", "goals.options", "goals.states", "terminal.text", "unreachable", "frozen"}
+#: The doctor's modules that judge; each gathers what it judges, too, but for the last.
+JUDGING = ["machine", "voice", "sound", "server", "sentence", "report"]
+#: What the doctor's judgements may call besides each other; a clock's format is all that they read.
+FOR_JUDGING = {"talkcli.goals.options", "talkcli.goals.states", "talkcli.terminal.text", "talkcli.frozen"}
+
+
+@cache
+def sources_of_names(module: str) -> dict[str, str]:
+    """Return the names that a module imports at its top, and where each is from: one of the package, or a library."""
+    found: dict[str, str] = {}
+    for node in sources()[module].body:
+        if isinstance(node, ast.Import):
+            found |= {each.asname or each.name: each.name for each in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {each.asname or each.name: absolute(module, node) for each in node.names}
+    return found
+
+
+def not_its_own(function: ast.FunctionDef) -> set[str]:
+    """Return the names in a function that are neither its arguments nor its variables."""
+    names = [node for node in ast.walk(function) if isinstance(node, ast.Name)]
+    own = {node.arg for node in ast.walk(function) if isinstance(node, ast.arg)}
+    own |= {node.id for node in names if isinstance(node.ctx, ast.Store)}
+    return {node.id for node in names} - own
 
 
 def test_the_doctor_judges_without_looking() -> None:
-    judging = {f"doctor.{each}" for each in JUDGING}
-    assert judging <= sources().keys()
-    for module in judging:
-        assert not outside(module) & (IMPURE - {"time"}), module
-        assert {name for name, each in inside(module) if not each.typing} <= judging | FOR_JUDGING, module
+    """Facts are gathered beside it, so this follows each judgement through all that it calls."""
+    functions = {
+        (module, node.name): node
+        for module, tree in sources().items()
+        if part(module) == "doctor"
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef)
+    }
+    new = {each for each in functions if each[1].startswith("judge") or each[0] == "doctor.report"}
+    assert {module for module, _ in new} == {f"doctor.{each}" for each in JUDGING}
+    judging: set[tuple[str, str]] = set()
+    while new:
+        judging |= new
+        called = set()
+        for module, name in new:
+            function = functions[module, name]
+            assert not any(isinstance(node, ast.Import | ast.ImportFrom) for node in ast.walk(function)), name
+            for each in not_its_own(function):
+                source = sources_of_names(module).get(each, f"talkcli.{module}")
+                owner = (source.removeprefix("talkcli."), each)
+                if owner in functions:
+                    called.add(owner)
+                elif source != f"talkcli.{module}" and part(owner[0]) != "doctor" and not each.lstrip("_").isupper():
+                    pure = source in FOR_JUDGING or source.partition(".")[0] not in (IMPURE | {"talkcli"}) - {"time"}
+                    assert pure or each == "__version__", f"talkcli.{module}: {name} has {each} of {source}"
+        new = called - judging
 
 
-def test_the_doctor_is_imported_by_its_command_alone_and_the_engine_where_it_needs_one() -> None:
+def test_the_doctor_is_imported_by_its_command_alone() -> None:
     for module in sources():
         for name, each in inside(module):
-            if part(module) == "doctor" and not each.typing:
-                assert part(name) not in {"cli", "server"}, f"talkcli.{module} imports {name}"
-                assert part(name) != "engine" or each.function, f"talkcli.{module}:{each.line}"
             if part(name) == "doctor" and part(module) != "doctor":
                 assert module == "cli.doctor", f"talkcli.{module} imports {name}"
                 assert each.function, "the other commands don't pay for it"
@@ -308,5 +346,5 @@ def test_contributing_names_every_file_that_an_option_goes_through() -> None:
     having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
     assert named - having == {"engine.protocol"}  # which is not told
     # Examples and help of commands; and a sentence that the doctor says, as any client does.
-    assert having - named == {"cli.commands", "doctor.server"}
+    assert having - named == {"cli.commands", "doctor.sentence"}
     assert len(having) <= 7
