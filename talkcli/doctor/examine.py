@@ -16,6 +16,7 @@ from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Setting
 from talkcli.engine.players.programs import PACKAGES
 from talkcli.errors import TalkError
+from talkcli.frozen import replace
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
@@ -30,10 +31,6 @@ if TYPE_CHECKING:
 
 #: Seconds that the sentence may take, its time in the queue included: long enough for one that is being spoken.
 LIMIT = 20.0
-#: Goals of the log that are looked at for failures.
-_LOG = 100
-#: Seconds in which an engine should be ready, and between two looks whether it is.
-_STARTING, _PAUSE = 1.0, 0.05
 #: The driver that plays through programs; any other has a way of its own.
 _OWN_DRIVER = "espeak"
 
@@ -46,85 +43,76 @@ class Examination:
         self._option = socket
         self._silent = silent
         self._interrupt = interrupt
+        #: what the server says of itself; empty without one
         self._server: JsonObject = {}
-        self._log: list[Goal] = []
         self._found: list[Finding] = []
         #: the server's process, where it runs here
         self._process: int | None = None
         #: its user, where that is another, from whose surroundings nothing can be played
         self._owner: int | None = None
-        #: why a server that was there said nothing of itself
-        self._gone: str | None = None
         #: whether the sound server hangs: whoever asks it again waits again
         self._hangs = False
 
     def findings(self) -> Iterator[Finding]:
         """Give each finding as soon as it is known; Interrupted."""
         client, found = server.connect(self._option, self._interrupt)
-        with contextlib.ExitStack() as stack:
-            if client is not None:
-                stack.enter_context(client)
-                client = self._asked(client)
+        with client or contextlib.nullcontext():
             for each in self._all(client, found):
                 self._found.append(each)
                 yield each
 
-    def _asked(self, client: Client) -> Client | None:
-        """Return the client once the server has described itself; None where it went away."""
-        try:
-            end = time.monotonic() + _STARTING
-            self._server, self._log = client.status().server, client.log(_LOG)
-            # A server that has just been started doesn't know its player yet, and tells nobody when it does.
-            while self._server.get("engine") == "starting" and time.monotonic() < end:
-                time.sleep(_PAUSE)
-                self._server = client.status().server
-        except TalkError as error:
-            self._gone = error.message
-            return None
-        return client
-
     def _all(self, client: Client | None, found: Places) -> Iterator[Finding]:
+        log: list[Goal] = []
+        gone = None
+        if client is not None:
+            try:
+                self._server, log = server.described(client)
+            except TalkError as error:
+                client, gone = None, error.message
         named = None if client else os.environ.get("TALK_VOICE") or None
         engine = voice.look(Setting(voice=named, interrupt=self._interrupt))
         yield from voice.judge(voice.python(), engine, server=client is not None)
         process = self._process = server.process_here(client) if client else None
         here, env = machine.surroundings(process)
         if process is not None and here.server is None:
-            self._owner = machine.owner(process)
+            self._owner = machine.owner(f"/proc/{process}")
         if client is not None and process is None:
             yield machine.elsewhere()
-            yield from sound.judge_setting(*self._player())
+            yield from sound.judge_silent(*self._player(), running=True)
         elif sys.platform.startswith("linux"):
-            yield from machine.judge_session(here)
+            yield machine.judge_session(here)
             yield from self._sound(here, env, running=client is not None)
         yield server.judge_places(found)
-        if self._gone is not None:
-            yield server.gone(self._gone)
+        if gone is not None:
+            yield server.gone(gone)
         if client is not None:
-            yield from server.judge(self._server, self._log, time.time())
+            yield from server.judge(self._server, log, time.time())
         yield self._sentence(client, engine, env)
 
-    def _player(self) -> tuple[str | None, str | None]:
-        """Return the player that is set, and by whom."""
+    def _player(self) -> tuple[str | None, str]:
+        """Return the player that is set, and by whom it would be."""
         if self._server:
-            player = self._server.get("player")
-            return (str(player), "the server's") if player else (None, None)
-        player = os.environ.get("TALK_PLAYER") or None
-        return (player, "TALK_PLAYER") if player else (None, None)
+            return self._told("player"), "the server's"
+        return os.environ.get("TALK_PLAYER") or None, "TALK_PLAYER"
+
+    def _told(self, setting: str) -> str | None:
+        """Return a setting of the server's; None where it has none, or there is no server."""
+        value = self._server.get(setting)
+        return str(value) if value else None
 
     def _sound(self, here: Session, env: Mapping[str, str], *, running: bool) -> Iterator[Finding]:
         if self._server.get("driver") not in {None, _OWN_DRIVER}:
             return
         wanted, by = self._player()
-        device = self._server.get("device")
+        device = self._told("device")
         players = sound.players(env, wanted, by)
         used = wanted or next(iter(players.found), None)
-        devices = sound.devices(env, used, None if device is None else str(device))
+        devices = sound.devices(env, used, device)
         cards, found = machine.cards(here), sound.sound_server(env, here)
         self._hangs = found.hangs
         yield from sound.judge(players, devices, cards, found, here, running=running)
         if not sound.is_silent(wanted):
-            default = device is None and used in players.packages
+            default = device is None and used in PACKAGES
             yield from sound.judge_levels(sound.levels(env, found, cards), default=default)
 
     def _sentence(self, client: Client | None, engine: Engine, env: Mapping[str, str]) -> Finding:
@@ -136,8 +124,7 @@ class Examination:
             setting = self._setting_of_server(self._process, env)
             played, speaking = sentence.beside(client, lambda: sentence.by_engine(sentence.SHORT, setting, 0.0, LIMIT))
         elif client is not None:
-            played = sentence.by_server(client, sentence.TEXT, LIMIT)
-            played = sentence.with_player(played, self._server.get("player"))
+            played = replace(sentence.by_server(client, sentence.TEXT, LIMIT), player=wanted)
         elif engine.reason is not None:
             played = Played(State.ABORTED, engine.reason, engine.words)
         else:
@@ -156,17 +143,14 @@ class Examination:
             behind=behind,
             hangs=self._hangs,
             speaking=speaking,
-            device=self._server.get("device"),
+            device=self._told("device"),
         )
 
     def _setting_of_server(self, process: int, env: Mapping[str, str]) -> Setting:
         """Return what the server speaks with, for a process that does as it does, without a sound."""
-        told = {
-            name: str(self._server[name]) for name in ("player", "device", "voice", "driver") if self._server.get(name)
-        }
-        player = told.get("player")
+        player = self._told("player")
         if sound.is_silent(player):
             player = sound.SILENT  # a file would get a sentence more, perhaps in the middle of one of the server's
         elif player in PACKAGES and not machine.names_a_player(process, env):
             player = None  # that one is the first that the server tries, and not the only one
-        return Setting(player, told.get("device"), told.get("voice"), self._interrupt, told.get("driver"), env)
+        return Setting(player, self._told("device"), self._told("voice"), self._interrupt, self._told("driver"), env)

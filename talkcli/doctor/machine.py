@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 #: The group that Debian's cards belong to.
-_AUDIO = "audio"
+AUDIO = "audio"
 #: Files that container runtimes leave in theirs.
 _CONTAINER = ("/.dockerenv", "/run/.containerenv", "/run/systemd/container")
 #: Parents that are looked at: a shell in a script in cron is three below it.
@@ -69,7 +69,7 @@ class Cards:
     #: those of them that may not be opened
     forbidden: tuple[str, ...] = ()
     #: the group that they belong to
-    group: str | None = None
+    group: str = AUDIO
     #: whether this user is to be in that group from the next login on
     from_next_login: bool = False
 
@@ -93,10 +93,10 @@ def names_a_player(server: int, env: Mapping[str, str]) -> bool:
     return named or bool(env.get("TALK_PLAYER"))
 
 
-def owner(pid: int) -> int | None:
-    """Return the user of a process; None where it is gone."""
+def owner(path: str) -> int | None:
+    """Return the user who owns a file, a process by its directory in /proc; None where it is not there."""
     with contextlib.suppress(OSError):
-        return os.stat(f"/proc/{pid}").st_uid
+        return os.stat(path).st_uid
     return None
 
 
@@ -105,9 +105,9 @@ def _environment(pid: int) -> dict[str, str] | None:
     try:
         with open(f"/proc/{pid}/environ", "rb") as file:
             data = file.read()
-        if os.stat(f"/proc/{pid}").st_uid != os.getuid():
-            return None
     except OSError:
+        return None
+    if owner(f"/proc/{pid}") != os.getuid():
         return None
     pairs = (each.partition("=") for each in os.fsdecode(data).split("\0") if "=" in each)
     return {name: value for name, _, value in pairs}
@@ -119,10 +119,6 @@ def _session(environment: Mapping[str, str], server: int | None) -> Session:
     caller = environment.get("SUDO_UID", "")
     runtime = environment.get("XDG_RUNTIME_DIR") or None
     usual = f"/run/user/{uid}"
-    owner = None
-    if runtime is not None:
-        with contextlib.suppress(OSError):
-            owner = os.stat(runtime).st_uid
     return Session(
         uid=uid,
         user=_user(uid),
@@ -132,7 +128,7 @@ def _session(environment: Mapping[str, str], server: int | None) -> Session:
         sudo_uid=int(caller) if uid == 0 and caller.isdecimal() else None,
         kinds=tuple(_kinds(environment, server)),
         runtime=runtime,
-        runtime_owner=owner,
+        runtime_owner=None if runtime is None else owner(runtime),
         usual_runtime=usual if os.path.isdir(usual) else None,
     )
 
@@ -153,8 +149,9 @@ def _group(gid: int) -> str:
 
 def _groups(pid: int | None) -> tuple[int, ...]:
     if pid is not None:
-        found = re.search(r"^Groups:(.*)$", _text(f"/proc/{pid}/status"), re.MULTILINE)
-        mine = re.search(r"^Gid:\s+\d+\s+(\d+)", _text(f"/proc/{pid}/status"), re.MULTILINE)
+        status = _text(f"/proc/{pid}/status")
+        found = re.search(r"^Groups:(.*)$", status, re.MULTILINE)
+        mine = re.search(r"^Gid:\s+\d+\s+(\d+)", status, re.MULTILINE)
         if found and mine:
             return tuple(sorted({int(mine[1]), *map(int, found[1].split())}))
     return tuple(sorted({os.getegid(), *os.getgroups()}))
@@ -177,8 +174,8 @@ def _kinds(environment: Mapping[str, str], server: int | None) -> Iterable[str]:
 
 def _parents(pid: int) -> Iterable[str]:
     for _ in range(_GENERATIONS):
-        found = re.search(r"^PPid:\s+(\d+)", _text(f"/proc/{pid}/status"), re.MULTILINE)
-        pid = int(found[1]) if found else 0
+        parent = peers.stat_of(pid)[1:2]
+        pid = int(parent[0]) if parent else 0
         if pid == 0:
             return
         yield peers.command_of(pid) or ""
@@ -189,7 +186,7 @@ def cards(session: Session, kernel: str = "/proc/asound", nodes: str = "/dev/snd
     # " 0 [Device         ]: USB-Audio - USB Audio Device", and a second line with its place
     names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _text(f"{kernel}/cards"), re.MULTILINE)
     playing = devices.playing(nodes)
-    group = _AUDIO
+    group = AUDIO
     forbidden = []
     for each in playing:
         with contextlib.suppress(OSError):
@@ -259,7 +256,7 @@ def seen_from(session: Session) -> str:
     return "from here" if session.server is None else f"from the server (process {session.server})"
 
 
-def judge_session(session: Session) -> list[Finding]:
+def judge_session(session: Session) -> Finding:
     """Judge where this runs."""
     who = f"user {session.user} (uid {session.uid})"
     if session.sudo_uid is not None:
@@ -271,33 +268,24 @@ def judge_session(session: Session) -> list[Finding]:
     if session.runtime is None:
         if session.usual_runtime is None:
             # As on a robot without logind: nothing is missing that there could be.
-            return [done("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")]
-        return [
-            warning(
-                "session",
-                f"{who}; XDG_RUNTIME_DIR is not set, as under cron, sudo, su and in system services: players find no "
-                "PipeWire or PulseAudio of this user",
-                f"export XDG_RUNTIME_DIR={session.usual_runtime}{_again(session)}",
-            )
-        ]
+            return done("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")
+        return warning(
+            "session",
+            f"{who}; XDG_RUNTIME_DIR is not set, as under cron, sudo, su and in system services: players find no "
+            "PipeWire or PulseAudio of this user",
+            f"export XDG_RUNTIME_DIR={session.usual_runtime}{_again(session)}",
+        )
+    words = f"{who}; XDG_RUNTIME_DIR is {session.runtime}"
     if session.runtime_owner is None:
-        return [
-            warning(
-                "session",
-                f"{who}; XDG_RUNTIME_DIR is {session.runtime}, which is not there",
-                "log in as this user (not by su or sudo), or unset XDG_RUNTIME_DIR",
-            )
-        ]
+        step = "log in as this user (not by su or sudo), or unset XDG_RUNTIME_DIR"
+        return warning("session", f"{words}, which is not there", step)
     if session.runtime_owner != session.uid:
-        return [
-            warning(
-                "session",
-                f"{who}; XDG_RUNTIME_DIR is {session.runtime}, which is uid {session.runtime_owner}'s: its sound "
-                "server takes nobody else",
-                f"run this as the user who owns it: sudo -u '#{session.runtime_owner}' talk doctor",
-            )
-        ]
-    return [done("session", f"{who}; XDG_RUNTIME_DIR is {session.runtime}")]
+        return warning(
+            "session",
+            f"{words}, which is uid {session.runtime_owner}'s: its sound server takes nobody else",
+            f"run this as the user who owns it: sudo -u '#{session.runtime_owner}' talk doctor",
+        )
+    return done("session", words)
 
 
 def _again(session: Session) -> str:
@@ -322,7 +310,7 @@ def _cards(cards: Cards, session: Session, served: bool) -> Finding:
 
 
 def _access(cards: Cards, session: Session, served: bool) -> Finding:
-    group = cards.group or "audio"
+    group = cards.group
     if not cards.nodes:
         return done("group", f"nothing in /dev/snd to open, so the group {group} is not needed")
     if not cards.forbidden:

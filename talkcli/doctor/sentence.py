@@ -14,7 +14,7 @@ from talkcli.doctor.voice import INSTALL_LIBRARY, conversation, fault
 from talkcli.engine import protocol
 from talkcli.engine.once import EngineFailed
 from talkcli.errors import TalkError
-from talkcli.frozen import frozen, replace
+from talkcli.frozen import frozen
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
@@ -77,29 +77,24 @@ def by_server(client: Client, text: str, limit: float) -> Played:
     """Send a sentence that waits its turn, and return how it ended; after `limit` seconds it is taken back."""
     try:
         goal = client.say(text, preempt=False, ttl=0)
+        try:
+            if goal.speech_paused:
+                goal.cancel()
+                return Played(goal.state, "paused", "speech is paused")
+            return _played(goal.wait(limit))
+        except TimeoutError:
+            return _taken_back(client, goal, limit)
+        except Interrupted:
+            goal.request_cancel()
+            raise
     except TalkError as error:
         return Played(State.LOST, "lost", error.message)
-    try:
-        if goal.speech_paused:
-            goal.cancel()
-            return Played(goal.state, "paused", "speech is paused")
-        return _played(goal.wait(limit))
-    except TimeoutError:
-        return _taken_back(client, goal, limit)
-    except TalkError as error:
-        return Played(State.LOST, "lost", error.message)
-    except Interrupted:
-        goal.request_cancel()
-        raise
 
 
 def _taken_back(client: Client, goal: GoalHandle, limit: float) -> Played:
     """Cancel a goal that has not ended in time, and say what was in its way."""
-    try:
-        before = client.status()
-        ended = goal.cancel()
-    except TalkError as error:
-        return Played(State.LOST, "lost", error.message)
+    before = client.status()
+    ended = goal.cancel()
     if ended.state in {State.SUCCEEDED, State.ABORTED}:  # in this moment
         return _played(ended)
     ahead = next((number for number, each in enumerate(before.pending) if each.id == goal.id), None)
@@ -113,11 +108,6 @@ def _taken_back(client: Client, goal: GoalHandle, limit: float) -> Played:
 
 def _played(goal: Goal) -> Played:
     return Played(goal.state, goal.reason, goal.message, goal.duration)
-
-
-def with_player(played: Played, player: object) -> Played:
-    """Return how a sentence ended, with the name of the server's player."""
-    return replace(played, player=str(player)) if player else played
 
 
 def beside(client: Client, play: Callable[[], Played]) -> tuple[Played, bool]:

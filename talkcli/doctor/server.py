@@ -12,6 +12,7 @@ import time
 
 from talkcli import __version__, paths, peers
 from talkcli.client.client import Client
+from talkcli.doctor.machine import owner
 from talkcli.doctor.report import Finding, done, failed, warning
 from talkcli.doctor.sentence import remedy
 from talkcli.errors import TalkError
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
 _NAME = "talk doctor"
 #: How an error begins that names every place: `Places` says that better.
 _NO_SERVER = "no server"
+#: Goals of the log that are looked at for failures.
+_LOG = 100
+#: Seconds in which an engine should be ready, and between two looks whether it is.
+_STARTING, _PAUSE = 1.0, 0.05
 #: What is found at a place, beside what `found_at` finds where nobody can be reached.
 FOREIGN = "another user's server"
 #: A connection proves no more: the kernel takes it, whatever the process does.
@@ -131,12 +136,8 @@ def _is_stopped(pid: int | None) -> bool:
 
 def _owner(path: str) -> int | None:
     """Return who owns a socket's file, or else its directory."""
-    for each in (path, os.path.dirname(path)):
-        try:
-            return os.stat(each).st_uid
-        except OSError:
-            continue
-    return None
+    found = owner(path)
+    return owner(os.path.dirname(path)) if found is None else found
 
 
 def _server_among(places: list[str]) -> str | None:
@@ -146,6 +147,19 @@ def _server_among(places: list[str]) -> str | None:
 def _others(tried: list[str]) -> tuple[str, ...]:
     """Return the sockets of other users that can be seen: all of them for root, none for most."""
     return tuple(each for each in sorted(glob.glob(f"/run/user/*/talk/{paths.SOCKET}")) if each not in tried)
+
+
+def described(client: Client) -> tuple[JsonObject, list[Goal]]:
+    """Return how a server describes itself, and the goals that ended last, oldest first; TalkError where it goes away.
+
+    A server that has just been started doesn't know its player yet, and tells nobody when it does.
+    """
+    end = time.monotonic() + _STARTING
+    server, log = client.status().server, client.log(_LOG)
+    while server.get("engine") == "starting" and time.monotonic() < end:
+        time.sleep(_PAUSE)
+        server = client.status().server
+    return server, log
 
 
 def process_here(client: Client) -> int | None:

@@ -18,7 +18,7 @@ from talkcli.engine.players.programs import PACKAGES
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from talkcli.doctor.machine import Cards, Session
 
@@ -41,13 +41,11 @@ _CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
 class Players:
     """Which programs can play."""
 
-    #: those that `talk` knows, with the package each comes in
-    packages: dict[str, str]
-    #: … and those that are there, best first
+    #: those of the programs that `talk` knows that are there, best first
     found: tuple[str, ...]
     #: what is to play, by the server's setting or by TALK_PLAYER; None for the first that is there
     wanted: str | None
-    #: by whom that was said, for people: "the server", "TALK_PLAYER"
+    #: by whom that was said, for people: "the server's", "TALK_PLAYER"
     by: str | None = None
     #: whether a wanted program can be run
     runs: bool = True
@@ -126,28 +124,46 @@ def players(env: Mapping[str, str], wanted: str | None, by: str | None) -> Playe
     if wanted is not None and not is_silent(wanted):
         program = program_of(wanted)
         runs = bool(program and programs.path_of(program, env))
-    return Players(dict(PACKAGES), found, wanted, by, runs)
+    return Players(found, wanted, by, runs)
 
 
 def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> Devices | None:
     """Return where a player can play to; None for one that nobody can ask."""
-    if player == "aplay":
-        said = programs.said("aplay", "-L", env=env)
-        names = [each for each in said.out.splitlines() if each and not each[0].isspace() and each not in _NO_DEVICES]
-        return _devices("aplay -L", said, names, wanted)
-    if player == "pacat":
-        said = programs.said("pactl", "list", "short", "sinks", env=env)
-        return _devices("pactl list short sinks", said, [name for name, _ in _sinks(said)], wanted)
-    if player == "pw-cat":
-        said = programs.said("pw-cli", "ls", "Node", env=env)
-        blocks = re.split(r"^\s*id \d+,", said.out, flags=re.MULTILINE)
-        found = [re.search(r'node\.name = "([^"]*)"', each) for each in blocks if '"Audio/Sink"' in each]
-        return _devices("pw-cli ls Node", said, [each[1] for each in found if each], wanted)
-    return None
+    if player not in _LISTING:
+        return None
+    command, names = _LISTING[player]
+    program, *words = command.split()
+    said = programs.said(program, *words, env=env)
+    return Devices(command, tuple(names(said)), None if said.well else _trouble(program, said), wanted)
 
 
-def _devices(command: str, said: programs.Said, names: list[str], wanted: str | None) -> Devices:
-    return Devices(command, tuple(names), None if said.well else _trouble(command.partition(" ")[0], said), wanted)
+def _alsa_names(said: programs.Said) -> list[str]:
+    return [each for each in said.out.splitlines() if each and not each[0].isspace() and each not in _NO_DEVICES]
+
+
+def _sinks(said: programs.Said) -> list[tuple[str, str]]:
+    """Return names and states of the sinks: number, name, module, format, state, with tabs between them."""
+    lines = [each.split("\t") for each in said.out.splitlines()]
+    return [(each[1], each[-1].strip()) for each in lines if said.well and len(each) > 2]
+
+
+def _sink_names(said: programs.Said) -> list[str]:
+    return [name for name, _ in _sinks(said)]
+
+
+def _node_names(said: programs.Said) -> list[str]:
+    nodes = re.split(r"^\s*id \d+,", said.out, flags=re.MULTILINE)
+    found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
+    return [each[1] for each in found if each]
+
+
+_SINKS = "pactl list short sinks"
+#: How the devices of a player are listed, and read from what that says.
+_LISTING: dict[str | None, tuple[str, Callable[[programs.Said], list[str]]]] = {
+    "aplay": ("aplay -L", _alsa_names),
+    "pacat": (_SINKS, _sink_names),
+    "pw-cat": ("pw-cli ls Node", _node_names),
+}
 
 
 def _trouble(program: str, said: programs.Said) -> str:
@@ -158,14 +174,8 @@ def _trouble(program: str, said: programs.Said) -> str:
 
 def suspended(env: Mapping[str, str]) -> tuple[str, ...]:
     """Return the sinks that take no data; while nothing plays, those that are asleep, too."""
-    return tuple(name for name, state in _sinks(programs.said("pactl", "list", "short", "sinks", env=env))
-                 if state == "SUSPENDED")  # fmt: skip
-
-
-def _sinks(said: programs.Said) -> list[tuple[str, str]]:
-    """Return names and states of the sinks: number, name, module, format, state, with tabs between them."""
-    lines = [each.split("\t") for each in said.out.splitlines()]
-    return [(each[1], each[-1].strip()) for each in lines if said.well and len(each) > 2]
+    said = programs.said(*_SINKS.split(), env=env)
+    return tuple(name for name, state in _sinks(said) if state == "SUSPENDED")
 
 
 def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
@@ -181,9 +191,7 @@ def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
         return SoundServer(name="PipeWire, without its PulseAudio part", sockets=sockets, named=named)
     askable = any(programs.path_of(each, env) for each in ("pactl", "pw-cli"))
     trouble = _trouble("pactl", pulse) if programs.path_of("pactl", env) else _trouble("pw-cli", wire)
-    return SoundServer(
-        sockets=sockets, trouble=trouble, hangs=pulse.late or wire.late, askable=askable, named=named
-    )  # fmt: skip
+    return SoundServer(sockets=sockets, trouble=trouble, hangs=pulse.late or wire.late, askable=askable, named=named)
 
 
 def _field(text: str, name: str) -> str | None:
@@ -248,22 +256,21 @@ def _percent(text: str) -> int | None:
     return max(found, default=None)
 
 
-def judge_setting(wanted: str | None, by: str | None) -> list[Finding]:
-    """Judge a server's player where nothing else can be seen: it may be one that makes no sound."""
-    return [_player(Players({}, (), wanted, by), running=True)] if is_silent(wanted) else []
+def judge_silent(player: str | None, by: str | None, *, running: bool) -> list[Finding]:
+    """Judge a player by its name alone: it may be one that makes no sound; `by`, `running`: as of `judge`."""
+    if not is_silent(player):
+        return []
+    step = "start the server without --player" if running else "unset TALK_PLAYER"
+    return [failed("player", f"{player} ({by}): it keeps the time and makes no sound", step)]
 
 
 def judge(
     players: Players, devices: Devices | None, cards: Cards, server: SoundServer, session: Session, *, running: bool
 ) -> list[Finding]:
     """Judge what plays; `running`: whether a talk server runs, which has a player of its own."""
-    found = [_player(players, running=running)]
-    if is_silent(players.wanted):
-        return found
-    if devices is not None:
-        found.append(_device(devices))
-    return [
-        *found,
+    return judge_silent(players.wanted, players.by, running=running) or [
+        _player(players, running=running),
+        *([] if devices is None else [_device(devices)]),
         *judge_cards(cards, session, served=server.name is not None),
         _sound_server(server, cards, session),
     ]
@@ -271,22 +278,18 @@ def judge(
 
 def _player(players: Players, *, running: bool) -> Finding:
     wanted = players.wanted
-    if is_silent(wanted):
-        step = "start the server without --player" if running else "unset TALK_PLAYER"
-        return failed("player", f"{wanted} ({players.by}): it keeps the time and makes no sound", step)
     broken = warning if running else failed
     others = [each for each in players.found if each != wanted]
     if wanted is not None:
         if players.runs:
             also = f"; there {'is' if len(others) == 1 else 'are'} also {', '.join(others)}" if others else ""
             return done("player", f"{wanted} ({players.by}){also}")
-        package = players.packages.get(wanted)
+        package = PACKAGES.get(wanted)
         step = f"sudo apt-get install -y {package}" if package else "name a program that is there, with --player"
         return broken("player", f"{wanted} ({players.by}) is not there", step)
     if not players.found:
-        first = next(iter(players.packages.values()))
-        names = ", ".join(players.packages)
-        return broken("player", f"none is on the PATH: {names}", f"sudo apt-get install -y {first}")
+        first = next(iter(PACKAGES.values()))
+        return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {first}")
     after = f"; then {', '.join(others[1:])}" if len(others) > 1 else ""
     return done("player", f"{others[0]} is used{after}")
 

@@ -11,8 +11,7 @@ from talkcli.doctor.sound import Devices, Players, SoundServer
 from talkcli.frozen import replace
 
 PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)
-PACKAGES = {"aplay": "alsa-utils", "pacat": "pulseaudio-utils", "pw-cat": "pipewire-bin"}
-PLAYERS = Players(PACKAGES, ("aplay", "pacat"), None)
+PLAYERS = Players(("aplay", "pacat"), None)
 DEVICES = Devices("aplay -L", ("default", "plughw:CARD=Device,DEV=0"))
 CARDS = Cards(kernel=True, names=("USB Audio Device",), nodes=("/dev/snd/pcmC0D0p",), group="audio")
 NO_CARDS = Cards(kernel=True)
@@ -42,25 +41,25 @@ def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
 
 
 def test_no_player_names_the_package() -> None:
-    found = judged("player", Players(PACKAGES, (), None))
+    found = judged("player", Players((), None))
     assert (found.state, found.next) == (FAILED, "sudo apt-get install -y alsa-utils")
-    assert judged("player", Players(PACKAGES, (), None), running=True).state == WARNING
+    assert judged("player", Players((), None), running=True).state == WARNING
 
 
 def test_a_player_that_is_set_and_not_there_is_named() -> None:
-    found = judged("player", Players(PACKAGES, ("aplay",), "pw-cat", "TALK_PLAYER", runs=False))
+    found = judged("player", Players(("aplay",), "pw-cat", "TALK_PLAYER", runs=False))
     assert (found.state, found.next) == (FAILED, "sudo apt-get install -y pipewire-bin")
-    found = judged("player", Players(PACKAGES, ("aplay",), "/opt/play", "TALK_PLAYER", runs=False))
+    found = judged("player", Players(("aplay",), "/opt/play", "TALK_PLAYER", runs=False))
     assert found.state == FAILED
     assert "/opt/play (TALK_PLAYER)" in found.message
 
 
 @pytest.mark.parametrize("player", ["null", "file:/tmp/x.wav"])
 def test_a_player_without_sound_is_not_heard(player: str) -> None:
-    found = sound.judge(Players(PACKAGES, (), player, "the server's"), None, CARDS, PULSE, PI, running=True)
+    found = sound.judge(Players((), player, "the server's"), None, CARDS, PULSE, PI, running=True)
     assert [each.state for each in found] == [FAILED]
-    assert found == sound.judge_setting(player, "the server's")
-    assert sound.judge_setting("aplay", "the server's") == []
+    assert found == sound.judge_silent(player, "the server's", running=True)
+    assert sound.judge_silent("aplay", "the server's", running=True) == []
 
 
 def test_a_device_is_looked_for_among_those_that_the_player_lists() -> None:
@@ -122,14 +121,14 @@ def test_a_sound_server_that_hangs_or_is_named_wrongly_or_cannot_be_asked() -> N
 
 
 def test_without_a_runtime_directory_the_session_says_what_to_set() -> None:
-    found = machine.judge_session(replace(PI, runtime=None, runtime_owner=None, usual_runtime="/run/user/1000"))[0]
+    found = machine.judge_session(replace(PI, runtime=None, runtime_owner=None, usual_runtime="/run/user/1000"))
     assert (found.state, found.next) == (WARNING, "export XDG_RUNTIME_DIR=/run/user/1000")
     assert "cron, sudo" in found.message
-    served = machine.judge_session(replace(PI, runtime=None, usual_runtime="/run/user/1000", server=7))[0]
+    served = machine.judge_session(replace(PI, runtime=None, usual_runtime="/run/user/1000", server=7))
     assert "where the server is started" in str(served.next)
-    assert machine.judge_session(replace(PI, runtime=None))[0].state == DONE
-    assert "not there" in machine.judge_session(replace(PI, runtime_owner=None))[0].message
-    assert "uid 33's" in machine.judge_session(replace(PI, runtime_owner=33))[0].message
+    assert machine.judge_session(replace(PI, runtime=None)).state == DONE
+    assert "not there" in machine.judge_session(replace(PI, runtime_owner=None)).message
+    assert "uid 33's" in machine.judge_session(replace(PI, runtime_owner=33)).message
 
 
 def test_what_is_muted_is_not_heard() -> None:
