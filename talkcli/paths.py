@@ -12,13 +12,18 @@ import os
 import stat
 import sys
 
-from talkcli.unreachable import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
-
 #: The name of the socket in its directory.
 SOCKET = "talk.sock"
 #: The directory of a server for the whole machine: what systemd makes for `RuntimeDirectory=talk`.
 SYSTEM_DIRECTORY = "/run/talk"
 SYSTEM_SOCKET = f"{SYSTEM_DIRECTORY}/{SOCKET}"
+
+#: What there may be at a place where a client reaches nobody.
+ABSENT = "not there"
+FILE = "a file, and no socket"
+DIRECTORY = "a directory, and no socket"
+STALE = "nobody answers: left over from a server that ended"
+FORBIDDEN = "no permission"
 
 
 def named_socket(option: str | None) -> str | None:
@@ -36,7 +41,7 @@ def client_sockets(named: str | None) -> list[str]:
 
 
 def found_at(path: str, error: OSError) -> str:
-    """Return what is at a place where a connection failed: a constant of `unreachable`, else the system's words."""
+    """Return what is at a place where a connection failed: one of the words above, else the system's words."""
     try:
         mode = os.stat(path).st_mode
     except OSError:  # `error` tells why; or it was removed just now

@@ -14,11 +14,11 @@ import time
 from talkcli import paths, peers
 from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
 from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.paths import DIRECTORY, FILE, FORBIDDEN
 from talkcli.protocol import replies
 from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import Hello, write_request
 from talkcli.splitter import LineSplitter
-from talkcli.unreachable import DIRECTORY, FILE, FORBIDDEN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

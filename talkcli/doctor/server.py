@@ -19,7 +19,7 @@ from talkcli.errors import TalkError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.options import told
 from talkcli.goals.states import State
-from talkcli.unreachable import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
+from talkcli.paths import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,8 +12,8 @@ from talkcli.doctor.server import Place, Places
 from talkcli.doctor.voice import Engine, Python
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
+from talkcli.paths import ABSENT, FORBIDDEN, STALE
 from talkcli.terminal.text import Screen, width
-from talkcli.unreachable import ABSENT, FORBIDDEN, STALE
 
 PYTHON = Python("3.11.2", "/usr/bin/python3", "2.99")
 ENGINE = Engine("espeak", "eSpeak NG 1.51 (system)", 141)
