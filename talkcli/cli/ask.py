@@ -43,16 +43,16 @@ def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | N
 def status(options: Common, goal_id: str | None) -> int:
     """Show how the server stands, or one goal, and return the exit code."""
     from talkcli.goals.goal import Goal
-    from talkcli.terminal import output
+    from talkcli.terminal.goals import goal_lines, status_lines
 
     with options.connect(urgent=True) as client:
         found = client.status() if goal_id is None else client.goal(goal_id)
     if options.json:
         show_json(found.to_json())
     elif isinstance(found, Goal):
-        _show_lines(output.goal_lines(found, screen()))
+        _show_lines(goal_lines(found, screen()))
     else:
-        _show_lines(output.status_lines(found, screen()))
+        _show_lines(status_lines(found, screen()))
     return EXIT_OK
 
 
@@ -72,7 +72,7 @@ def log(options: Common, count: int) -> int:
 
 def voices(options: Common, language: str | None) -> int:
     """Show the engine's voices, or those of a language with its variants, and return the exit code."""
-    from talkcli.terminal import output
+    from talkcli.terminal.goals import voice_lines
 
     with options.connect() as client:
         found = every = client.voices()
@@ -85,13 +85,13 @@ def voices(options: Common, language: str | None) -> int:
         for voice in found:
             show_json(voice)
     else:
-        _show_lines(output.voice_lines(found))
+        _show_lines(voice_lines(found))
     return EXIT_OK
 
 
 def change(options: Common, **settings: Any) -> int:
     """Change those settings of the server that aren't None, or show them all, and return the exit code."""
-    from talkcli.terminal import output
+    from talkcli.terminal.goals import setting_lines
 
     asked = {name: value for name, value in settings.items() if value is not None}
     with options.connect() as client:
@@ -99,7 +99,7 @@ def change(options: Common, **settings: Any) -> int:
     if options.json:
         show_json(found)
     elif not asked:
-        _show_lines(output.setting_lines(found))
+        _show_lines(setting_lines(found))
     return EXIT_OK
 
 

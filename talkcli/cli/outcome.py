@@ -107,10 +107,10 @@ def report(goal: Goal, options: Common, shown: Feedback | None = None) -> int:
     if options.json and shown is None:
         show_if_possible(show_json, goal.to_json())
     if goal.state is not State.SUCCEEDED and goal.state.terminal and not options.quiet:
-        from talkcli.terminal import output
+        from talkcli.terminal.goals import ending
 
         tell = shown.aside if shown else note
-        words = output.ending(goal)
+        words = ending(goal)
         if goal.state is State.ABORTED and goal.reason != "nothing_to_say":
             words += "; see 'talk doctor'"
         tell(words)

@@ -30,7 +30,7 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_BYTES
 from talkcli.goals.states import State
 from talkcli.protocol.replies import Canceled
-from talkcli.terminal import output
+from talkcli.terminal.goals import ending
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -150,7 +150,7 @@ class _Lines:
         if self._options.json:
             self._print(lambda: self._show(goal) if self._shown else show_json(goal.to_json()))
         if not self._options.quiet:
-            self._tell(f"line {line.number}: {output.ending(goal)}")
+            self._tell(f"line {line.number}: {ending(goal)}")
         code = exit_code(goal)
         self._refused = self._refused or code
         if self._tally:

@@ -11,7 +11,7 @@ import time
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
-from talkcli.terminal.senders import who_forms, why_forms
+from talkcli.terminal.goals import who_forms, why_forms
 from talkcli.terminal.text import (
     GAP,
     LONGEST_ID,

@@ -14,8 +14,7 @@ from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, PausedChanged, Snapshot, StateChanged, WordHeard
 from talkcli.protocol.replies import ServerStatus
-from talkcli.terminal import output
-from talkcli.terminal.senders import who_forms, why_forms
+from talkcli.terminal.goals import setting_lines, status_lines, who_forms, why_forms
 from talkcli.terminal.text import Screen, cut, share, width
 from talkcli.terminal.transcript import Transcript, log_lines
 
@@ -120,7 +119,7 @@ def test_a_transcript_fits(goal: Goal, room: int, full: bool) -> None:
 def test_a_status_fits(goals: list[Goal], active: Goal, room: int) -> None:
     now = replace(active, state=State.ACTIVE, started_at=NOON, paused=True, key="k" * 64, priority=10**6)
     waiting = tuple(replace(each, state=State.PENDING, ttl=5.0, queued_at=NOON) for each in goals)
-    lines = output.status_lines(ServerStatus(SERVER, now, waiting, tuple(goals)), Screen(room), NOON)
+    lines = status_lines(ServerStatus(SERVER, now, waiting, tuple(goals)), Screen(room), NOON)
     assert all(width(each) <= room and plain(each) for each in lines), lines
 
 
@@ -211,5 +210,5 @@ def test_why_a_goal_ended() -> None:
 
 
 def test_settings_are_shown_as_their_options_take_them() -> None:
-    lines = output.setting_lines({"rate": 200, "volume": 0.5, "voice": None, "preempt": True, "ttl": None, "new": None})
+    lines = setting_lines({"rate": 200, "volume": 0.5, "voice": None, "preempt": True, "ttl": None, "new": None})
     assert lines == ["rate     200", "volume   0.5", "voice    default", "preempt  yes", "ttl      0", "new      -"]
