@@ -11,6 +11,7 @@ import time
 
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
+from talkcli.protocol.lines import encode
 from talkcli.terminal.text import GAP, LONGEST_ID, Screen, cut, fitted, folded, id_room, pad, printable, width, wrapped
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ class _Table:
             return [f"{label:<{_LABEL}}{without}"]
         heads = [f"{'' if number else label:<{_LABEL}}{self._head(goal)}" for number, goal in enumerate(goals)]
         tails = [self._tails(goal) for goal in goals]
-        texts = [_text(goal) for goal in goals]
+        texts = [quoted(goal, MAX_TEXT) for goal in goals]
         room = self._screen.room(max(map(width, heads)))
         if room is None:
             return [GAP.join([head + text, *tail[:1]]) for head, text, tail in zip(heads, texts, tails, strict=True)]
@@ -144,7 +145,7 @@ class _Table:
         goal_id = pad(cut(printable(goal.id), id_room(self._screen)), self._id_columns)
         state = self._screen.painted(pad(goal.state.name, 9), goal.state)
         head = f"{goal_id}{GAP}{state}{GAP}"
-        return f"{_clock(goal.ended_at)}{GAP}{head}" if goal.state.terminal else head
+        return f"{clock(goal.ended_at)}{GAP}{head}" if goal.state.terminal else head
 
     def _tails(self, goal: Goal) -> list[str]:
         """Return what stands after a goal's text, the longest form first."""
@@ -155,8 +156,9 @@ class _Table:
         return [", ".join([f"from {each}", *notes]) for each in who_forms(goal.client)]
 
 
-def _text(goal: Goal) -> str:
-    return "(text no longer kept)" if goal.text is None else f'"{printable(goal.text, MAX_TEXT)}"'
+def quoted(goal: Goal, limit: int | None = None) -> str:
+    """Return the text of a goal, cut after `limit` characters."""
+    return "(text no longer kept)" if goal.text is None else f'"{printable(goal.text, limit)}"'
 
 
 def _notes(goal: Goal, now: float) -> list[str]:
@@ -298,12 +300,11 @@ def _value(value: object) -> str:
 
 
 def _json(data: JsonObject) -> str:
-    from talkcli.protocol.lines import encode
-
     return encode(data).decode().rstrip("\n")
 
 
-def _clock(seconds: float | None) -> str:
+def clock(seconds: float | None) -> str:
+    """Return a moment of today, in the local time zone."""
     return "--:--:--" if seconds is None else time.strftime("%H:%M:%S", time.localtime(seconds))
 
 

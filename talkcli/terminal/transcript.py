@@ -11,7 +11,7 @@ import time
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
-from talkcli.terminal.goals import who_forms, why_forms
+from talkcli.terminal.goals import clock, quoted, who_forms, why_forms
 from talkcli.terminal.text import (
     GAP,
     LONGEST_ID,
@@ -40,7 +40,6 @@ _LEAST_TEXT = 16
 _USUAL_ID = 8
 #: Where a line begins that goes on from the one before it: under the state.
 _INDENT = 10
-_CLOCK = "%H:%M:%S"
 _DATE = "%b %d %H:%M:%S"
 
 
@@ -85,8 +84,9 @@ class Transcript:
         place = f"server {printable(str(status.server.get('pid')))} on {printable(str(status.server.get('socket')))}"
         waiting = f", {len(status.pending)} waiting" if status.pending else ""
         at_work = "paused" if self._paused else "speaking" if status.active else "silent"
-        lines = [_fitted(f"{_clock(now)}{GAP}{pad('watching', 10)}{GAP}{at_work}{waiting}; {place}", screen)]
-        return lines + [line for goal in known for line in self._goal(goal, goal.state, _since(goal, now), screen)]
+        head = f"{clock(now)}{GAP}{pad('watching', 10)}{GAP}{at_work}{waiting}; {place}"
+        goals = [line for goal in known for line in self._goal(goal, goal.state, _since(goal, now), screen)]
+        return [cut(head, screen.room(0)), *goals]
 
     def _changed(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
         if event.goal is not None:
@@ -123,7 +123,7 @@ class Transcript:
             forms = [f"{forms[0]}, from {each}" for each in who_forms(goal.client)] + forms
         room = screen.room(width(head))
         if room is None:
-            return [(head + pad(_text(goal), _TEXT_COLUMNS) + GAP + forms[0]).rstrip()]
+            return [(head + pad(quoted(goal), _TEXT_COLUMNS) + GAP + forms[0]).rstrip()]
         tail_room = room // 3
         # Who ended it must not give way to its column; who sent it was told when it began.
         whole = forms[:-1] if ended and goal.by is not None and len(forms) > 1 else forms
@@ -132,11 +132,11 @@ class Transcript:
             return self._ending(head, goal, whole, screen)
         tail = cut(forms[-1], tail_room) if tail is None else tail
         text_room = room - tail_room - len(GAP)
-        return [(head + pad(shortened(_text(goal), text_room), text_room) + GAP + tail).rstrip()]
+        return [(head + pad(shortened(quoted(goal), text_room), text_room) + GAP + tail).rstrip()]
 
     def _ending(self, head: str, goal: Goal, forms: list[str], screen: Screen) -> list[str]:
         """Return the end of a goal whose reason is too long for its column: beside the text, or else under it."""
-        text = _text(goal)
+        text = quoted(goal)
         room = screen.room(width(head)) or 0
         beside = room - len(GAP) - min(width(text), _LEAST_TEXT)
         tail = next((each for each in forms if width(each) <= beside), None)
@@ -147,7 +147,7 @@ class Transcript:
 
     def _head(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
         shown = self._make_room(goal_id, screen)
-        return GAP.join((_clock(at), screen.painted(pad(word, 10), state), pad(shown, self._id_columns), ""))
+        return GAP.join((clock(at), screen.painted(pad(word, 10), state), pad(shown, self._id_columns), ""))
 
     def _make_room(self, goal_id: str, screen: Screen) -> str:
         """Widen the column of the ids for this one, and return it as it is shown."""
@@ -161,7 +161,7 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float | None = None) -
     today = time.localtime(time.time() if now is None else now)[:3]
     heads = [(_when(goal.ended_at, today), goal.state.name, cut(printable(goal.id), id_room(screen))) for goal in goals]
     widths = [max((width(head[place]) for head in heads), default=0) for place in range(3)]
-    texts = [_text(goal) for goal in goals]
+    texts = [quoted(goal) for goal in goals]
     who = [who_forms(goal.client) for goal in goals]
     why = [why_forms(goal) for goal in goals]
     room = screen.room(sum(widths) + 3 * len(GAP))
@@ -181,24 +181,11 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float | None = None) -
     ]
 
 
-def _text(goal: Goal) -> str:
-    return "(text no longer kept)" if goal.text is None else f'"{printable(goal.text)}"'
-
-
-def _fitted(line: str, screen: Screen) -> str:
-    return cut(line, screen.room(0))
-
-
 def _since(goal: Goal, now: float) -> float:
     return (goal.queued_at if goal.started_at is None else goal.started_at) or now
 
 
-def _clock(seconds: float) -> str:
-    return time.strftime(_CLOCK, time.localtime(seconds))
-
-
 def _when(seconds: float | None, today: tuple[int, ...]) -> str:
-    if seconds is None:
-        return "--:--:--"
-    local = time.localtime(seconds)
-    return time.strftime(_CLOCK if local[:3] == today else _DATE, local)
+    if seconds is None or time.localtime(seconds)[:3] == today:
+        return clock(seconds)
+    return time.strftime(_DATE, time.localtime(seconds))
