@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 
 from talkcli.cli.show import note, screen, show, show_json
+from talkcli.cli.values import nearest
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
 
@@ -140,7 +141,6 @@ def _show_canceled(done: Canceled, options: Common) -> None:
 
 def _suggest_key(key: str, client: Client) -> None:
     """Where nothing has this key, but something a similar one, tell whoever typed it."""
-    from talkcli.cli.nearest import nearest
     from talkcli.terminal.text import printable
 
     try:
@@ -155,7 +155,6 @@ def _suggest_key(key: str, client: Client) -> None:
 
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     """Return what is said where no voice speaks a language, which may have been given by its name."""
-    from talkcli.cli.nearest import nearest
     from talkcli.terminal.text import printable
 
     codes = {_language(each): _language(each) for each in voices}

@@ -11,8 +11,7 @@ import click
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import regardless, show_if_possible
 from talkcli.cli.show import note, show_json
-from talkcli.cli.utf8 import readable
-from talkcli.cli.values import read
+from talkcli.cli.values import read, readable
 from talkcli.client.dial import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, UsageError
 from talkcli.goals.options import SOUND

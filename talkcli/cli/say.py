@@ -18,6 +18,7 @@ from talkcli.cli.outcome import (
     until_ended,
 )
 from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.cli.values import readable
 from talkcli.client.dial import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost
 from talkcli.frozen import TYPE_CHECKING
@@ -88,8 +89,6 @@ def _say(
 ) -> int:
     """Speak one text; `end`: when the `timeout` is over, by the monotonic clock."""
     if not text.isascii():
-        from talkcli.cli.utf8 import readable
-
         text, unreadable = readable(text)
         if unreadable and not options.quiet:
             note(unreadable)

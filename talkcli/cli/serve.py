@@ -10,6 +10,7 @@ from talkcli.cli import units
 from talkcli.cli.command import MODE, spelt
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import note, show
+from talkcli.cli.values import nearest
 
 if TYPE_CHECKING:
     from talkcli.cli.show import Common
@@ -64,7 +65,6 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
 def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
-    from talkcli.cli.nearest import nearest
     from talkcli.engine.players.base import AudioFailed
     from talkcli.engine.players.programs import PLAYERS, commands, on_path
     from talkcli.terminal.text import printable

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from talkcli.cli.nearest import nearest
+from talkcli.cli.values import nearest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

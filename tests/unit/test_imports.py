@@ -263,7 +263,7 @@ COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", 
         ("from talkcli import Client", [*HEAVY, *COSTLY]),
         ("import talkcli.cli, talkcli.cli.plain, talkcli.cli.early", [*HEAVY, *COSTLY, "json", "re", "enum", "signal"]),
         ("import talkcli.cli.ask, talkcli.cli.say, talkcli.cli.wait", [*HEAVY, *COSTLY]),
-        ("import talkcli.terminal.goals, talkcli.terminal.transcript, talkcli.cli.show, talkcli.cli.nearest", HEAVY),
+        ("import talkcli.terminal.goals, talkcli.terminal.transcript, talkcli.cli.show, talkcli.cli.values", HEAVY),
     ],
 )
 def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> None:
