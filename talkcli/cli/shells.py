@@ -2,7 +2,8 @@
 
 click's scripts give a shell the words as it cuts them: bash cuts at `:` and `=`, which ids may hold, and a value with a
 blank, a comma, a quote or a `*` doesn't survive the way back. Here the shell sends the line up to the cursor, as it was
-typed; what goes back is quoted, and begins where the shell puts it.
+typed; what goes back is quoted, and begins where the shell puts it. `talk completion` prints the scripts; the files in
+completions/ are the same.
 """
 
 from __future__ import annotations
@@ -11,10 +12,15 @@ import os
 import re
 from typing import TYPE_CHECKING
 
+import click
 from click.shell_completion import ShellComplete, add_completion_class, split_arg_string
+
+from talkcli.cli.show import show
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
+
+    from talkcli.cli.show import Common
 
 _BASH = """\
 %(complete_func)s() {
@@ -148,6 +154,12 @@ class Fish(_Line):
 
 #: Each of them by its shell's name.
 SHELLS: dict[str, type[ShellComplete]] = {"bash": Bash, "zsh": Zsh, "fish": Fish}
+
+
+def completion(_: Common, shell: str) -> None:
+    """Print the script of a shell."""
+    talk = click.get_current_context().find_root().command
+    show(SHELLS[shell](talk, {}, "talk", "_TALK_COMPLETE").source().rstrip("\n"))
 
 
 def register() -> None:
