@@ -16,8 +16,7 @@ from talkcli import __version__
 from talkcli.cli import complete, values
 from talkcli.cli.command import ALL_EXIT_CODES, COMMON, FILE, spelt
 from talkcli.cli.commands import COMMANDS
-from talkcli.cli.ends import OutputClosed, ended
-from talkcli.cli.show import Common, note, show_error
+from talkcli.cli.show import Common, OutputClosed, ended, note, show_error
 from talkcli.cli.usage import (
     told,
     unknown_command,

@@ -84,8 +84,7 @@ def carry_out(plain: Plain) -> int:
             opened = stand_back(opened, plain.given["timeout"])
     except KeyboardInterrupt:
         return 128 + int(_signal.SIGINT)  # nothing was sent
-    from talkcli.cli.ends import ended
-    from talkcli.cli.show import Common
+    from talkcli.cli.show import Common, ended
 
     options = Common(began=began, opened=opened, held=held, typed=plain.typed, **plain.common)
     return ended(lambda: plain.command.carry_out(options, plain.given), options)

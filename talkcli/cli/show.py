@@ -1,4 +1,7 @@
-"""What all commands share in showing: the options that say how, lines on standard output, notes on standard error."""
+"""What all commands share: the options that say how, lines on standard output, notes on standard error, and their end.
+
+Whatever a command raises becomes words on standard error and an exit code. What a goal's end means is not known here.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,17 @@ import stat
 import sys
 import time
 
+from talkcli import __version__
+from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, TalkError
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from collections.abc import Set as AbstractSet
     from typing import Any, TextIO
 
     from talkcli.client.client import Client
     from talkcli.client.opening import Opened
-    from talkcli.errors import TalkError
     from talkcli.goals.goal import JsonObject
     from talkcli.terminal.text import Screen
 
@@ -25,7 +29,7 @@ if TYPE_CHECKING:
 OUTPUT = 1
 #: What writing says where there is no room, or the disk is broken.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-#: Whether there was no room for what was to be shown.
+#: Whether there was no room for what was to be shown: a command that went on without ends as one that failed.
 _failed = False
 #: Columns of a terminal that doesn't say how many it has.
 _USUAL_WIDTH = 80
@@ -70,6 +74,44 @@ class Common:
         return Client(self.socket, opened=self.opened, **options)
 
 
+class OutputClosed(Exception):
+    """Standard output is closed. Under its own name, because click ends the process with 1 for a broken pipe."""
+
+
+def ended(command: Callable[[], object], options: Common) -> int:
+    """Run a command, and return its exit code: what it returns, if that is a number, else 0; or that of its error."""
+    try:
+        code = command()
+        if sys.stdout:
+            sys.stdout.flush()
+    except TalkError as error:
+        show_error(error, json=options.json)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return EXIT_SIGINT
+    except MemoryError:
+        note(_without_memory())
+        return EXIT_ERROR
+    except Exception as error:
+        if isinstance(error, OutputClosed) or reader_is_gone(error) or never_readable(error):
+            give_up_output()
+            return EXIT_SIGPIPE
+        if no_room(error):
+            output_failed(error)
+            return EXIT_ERROR
+        if os.environ.get("TALK_DEBUG"):
+            raise
+        note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
+        return EXIT_ERROR
+    return (code if isinstance(code, int) else 0) or (EXIT_ERROR if _failed else 0)
+
+
+def _without_memory() -> str:
+    from talkcli import resources
+
+    return f"there is not enough memory for talk: {resources.limits()}"
+
+
 def give_up_output() -> None:
     """Write nothing more to standard output, which takes nothing; not even at the interpreter's end."""
     _discard(OUTPUT)
@@ -105,16 +147,11 @@ def no_room(error: Exception) -> bool:
 
 
 def output_failed(error: Exception) -> None:
-    """Tell why standard output can't be written, and write nothing more to it. See `has_failed`."""
+    """Tell why standard output can't be written, and write nothing more to it. The command ends as one that failed."""
     global _failed  # noqa: PLW0603 - as standard output is the process's
     _failed = True
     give_up_output()
     note(f"standard output can't be written: {error.strerror if isinstance(error, OSError) else error}")
-
-
-def has_failed() -> bool:
-    """Whether there was no room for what was to be shown: a command that went on without ends as one that failed."""
-    return _failed
 
 
 def show(line: str) -> None:
