@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, screen, show, show_json
 from talkcli.client.dial import Interrupted
+from talkcli.doctor.examine import Examination
+from talkcli.doctor.report import heard, lines, verdict
 from talkcli.goals.states import EXIT_CODES, State
 
 if TYPE_CHECKING:
@@ -18,9 +20,6 @@ _NOT_HEARD = EXIT_CODES[State.ABORTED]
 
 def doctor(options: Common, silent: bool) -> int:
     """Show each finding and, at last, the one thing to do next; return the exit code."""
-    from talkcli.doctor.examine import Examination
-    from talkcli.doctor.report import heard, lines, verdict
-
     found = []
     with Interrupts() as interrupts:
         try:

@@ -331,10 +331,10 @@ def test_the_doctor_judges_without_looking() -> None:
 
 def test_the_doctor_is_imported_by_its_command_alone() -> None:
     for module in sources():
-        for name, each in inside(module):
+        for name, _ in inside(module):
             if part(name) == "doctor" and part(module) != "doctor":
                 assert module == "cli.doctor", f"talkcli.{module} imports {name}"
-                assert each.function, "the other commands don't pay for it"
+            assert name != "cli.doctor", "a row names it, so that the other commands don't pay for it"
 
 
 def test_contributing_names_every_file_that_an_option_goes_through() -> None:
