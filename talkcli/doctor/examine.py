@@ -15,6 +15,7 @@ from talkcli.doctor import machine, sentence, server, sound, voice
 from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Setting
 from talkcli.engine.players.programs import PACKAGES
+from talkcli.engine.start import is_own
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
 from talkcli.goals.states import State
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 
 #: Seconds that the sentence may take, its time in the queue included: long enough for one that is being spoken.
 LIMIT = 20.0
-#: The driver that plays through programs; any other has a way of its own.
-_OWN_DRIVER = "espeak"
 
 
 class Examination:
@@ -101,8 +100,8 @@ class Examination:
         return str(value) if value else None
 
     def _sound(self, here: Session, env: Mapping[str, str], *, running: bool) -> Iterator[Finding]:
-        if self._server.get("driver") not in {None, _OWN_DRIVER}:
-            return
+        if not is_own(self._told("driver")):
+            return  # it plays by itself
         wanted, by = self._player()
         device = self._told("device")
         players = sound.players(env, wanted, by)
