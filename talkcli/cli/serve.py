@@ -1,20 +1,16 @@
-"""`talk serve`: it runs the server, or prints a unit. No other module imports the server."""
+"""`talk serve`: it runs the server, or has a unit printed. No other module imports the server."""
 
 from __future__ import annotations
 
 import os
-import sys
 from typing import TYPE_CHECKING, Any
 
 from talkcli.cli import units
-from talkcli.cli.command import MODE, spelt
-from talkcli.cli.commands import COMMANDS
-from talkcli.cli.show import note, show
+from talkcli.cli.show import note
 from talkcli.cli.values import nearest
 
 if TYPE_CHECKING:
     from talkcli.cli.show import Common
-    from talkcli.goals.option import Option
 
 #: What is said at the start where nothing could sound.
 NO_DEVICE = (
@@ -27,7 +23,7 @@ NO_DEVICE = (
 def serve(options: Common, print_unit: str | None, **given: Any) -> int:
     """Run the server, or print a unit that would; return the exit code. `given`: the other options, by their names."""
     if print_unit:
-        _print_unit(options, print_unit, given)
+        units.print_unit(options, print_unit, given)
         return 0
     if not options.quiet:
         _warn_of_sound(given["player"] or "", given["driver"])
@@ -75,27 +71,3 @@ def _warn_of_player(player: str) -> None:
         near = nearest(player, PLAYERS.keys() - {player})
         hint = f"did you mean '{near}'? " if near else ""
         note(f"{printable(str(error))}: {hint}nothing can be heard until it is there")
-
-
-def _print_unit(options: Common, name: str, given: dict[str, Any]) -> None:
-    from talkcli.terminal.text import printable
-
-    typed = [each for each in COMMANDS["serve"].options if each.name in options.typed and each.name in given]
-    mode = given["socket_mode"] if "socket_mode" in options.typed else None
-    wanted = units.wanted(sys.argv[0], [_written(each, given[each.name]) for each in typed], options.socket, mode)
-    show(units.UNITS[name](wanted).rstrip("\n"))
-    hidden = units.hidden_from_others(wanted.files) if name == "system" else None
-    if hidden:
-        file, directory = hidden
-        note(
-            f"this talk needs {printable(file)}, and the service's own user can't pass {printable(directory)}: install "
-            "it for all, as with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in a "
-            "checkout, then print the unit"
-        )
-
-
-def _written(option: Option, value: object) -> str:
-    """Return an option as it is written on a command line."""
-    if value is True:
-        return spelt(option)
-    return f"{spelt(option)}={value:04o}" if option.kind is MODE else f"{spelt(option)}={value}"

@@ -1,4 +1,4 @@
-"""The units that `talk serve --print-unit` prints: how systemd runs the server. Text alone; nothing is installed here.
+"""The units that `talk serve --print-unit` prints: how systemd runs the server. Nothing is installed here.
 
 A unit works as it stands, so whatever it says is shown by a test that starts a server with it. The system's unit keeps
 the server away from everything but sockets, the sound devices and what it needs to say who sent a goal.
@@ -14,12 +14,19 @@ import sys
 from typing import TYPE_CHECKING
 
 from talkcli import paths
+from talkcli.cli.command import MODE, spelt
+from talkcli.cli.commands import COMMANDS
+from talkcli.cli.show import note, show
 from talkcli.errors import UsageError
 from talkcli.frozen import frozen, replace
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
+    from typing import Any
+
+    from talkcli.cli.show import Common
+    from talkcli.goals.option import Option
 
 #: Who may talk to the system's server: this group's members, who may use the sound card already.
 GROUP = "audio"
@@ -212,17 +219,40 @@ UNITS: dict[str, Callable[[Wanted], str]] = {
 }
 
 
-def wanted(started_as: str, options: Sequence[str], socket: str | None, mode: int | None) -> Wanted:
-    """Return what a unit is made from, for the `talk` that runs now: the installed script, else its module."""
+def print_unit(options: Common, name: str, given: Mapping[str, Any]) -> None:
+    """Print the unit of this name; `given`: the options of `serve`. Tell where the system's own user can't run it."""
+    typed = [each for each in COMMANDS["serve"].options if each.name in options.typed and each.name in given]
+    mode = given["socket_mode"] if "socket_mode" in options.typed else None
+    path = os.path.abspath(options.socket) if options.socket else None
+    program = _program(sys.argv[0])
+    files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
+    words = [*([f"--socket={path}"] if path else []), *(_written(each, given[each.name]) for each in typed)]
+    show(UNITS[name](Wanted(program, files, tuple(words), path, mode)).rstrip("\n"))
+    hidden = _hidden_from_others(files) if name == "system" else None
+    if hidden:
+        file, directory = hidden
+        note(
+            f"this talk needs {printable(file)}, and the service's own user can't pass {printable(directory)}: install "
+            "it for all, as with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in a "
+            "checkout, then print the unit"
+        )
+
+
+def _program(started_as: str) -> tuple[str, ...]:
+    """Return the command of the `talk` that runs now: the installed script, else its module."""
     beside = os.path.join(os.path.dirname(sys.executable), "talk")
     found = shutil.which(started_as if os.path.basename(started_as) == "talk" else beside)
-    program = (os.path.abspath(found),) if found else (sys.executable, "-m", "talkcli")
-    files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
-    path = os.path.abspath(socket) if socket else None
-    return Wanted(program, files, (*([f"--socket={path}"] if path else []), *options), path, mode)
+    return (os.path.abspath(found),) if found else (sys.executable, "-m", "talkcli")
 
 
-def hidden_from_others(files: Sequence[str]) -> tuple[str, str] | None:
+def _written(option: Option, value: object) -> str:
+    """Return an option as it is written on a command line."""
+    if value is True:
+        return spelt(option)
+    return f"{spelt(option)}={value:04o}" if option.kind is MODE else f"{spelt(option)}={value}"
+
+
+def _hidden_from_others(files: Sequence[str]) -> tuple[str, str] | None:
     """Return the first of these files that other users can't get to, and the directory that they can't pass."""
     for path in files:
         steps = path.split(os.sep)
