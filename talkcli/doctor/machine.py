@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 #: The group that Debian's cards belong to.
-AUDIO = "audio"
+_AUDIO = "audio"
 #: Files that container runtimes leave in theirs.
 _CONTAINER = ("/.dockerenv", "/run/.containerenv", "/run/systemd/container")
 #: Parents that are looked at: a shell in a script in cron is three below it.
@@ -69,7 +69,7 @@ class Cards:
     #: those of them that may not be opened
     forbidden: tuple[str, ...] = ()
     #: the group that they belong to
-    group: str = AUDIO
+    group: str = _AUDIO
     #: whether this user is to be in that group from the next login on
     from_next_login: bool = False
 
@@ -186,7 +186,7 @@ def cards(session: Session, kernel: str = "/proc/asound", nodes: str = "/dev/snd
     # " 0 [Device         ]: USB-Audio - USB Audio Device", and a second line with its place
     names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _text(f"{kernel}/cards"), re.MULTILINE)
     playing = devices.playing(nodes)
-    group = AUDIO
+    group = _AUDIO
     forbidden = []
     for each in playing:
         with contextlib.suppress(OSError):
