@@ -6,6 +6,7 @@ What carries a command out is imported when it is run, so that no command pays f
 from __future__ import annotations
 
 import os
+import re
 from inspect import cleandoc
 from typing import TYPE_CHECKING, Any
 
@@ -17,22 +18,14 @@ from talkcli.cli import complete, values
 from talkcli.cli.command import ALL_EXIT_CODES, COMMON, FILE, spelt
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import Common, OutputClosed, ended, note, show_error
-from talkcli.cli.usage import (
-    told,
-    unknown_command,
-    with_short_help,
-    write_examples,
-    write_exit_codes,
-    write_lines,
-    write_options,
-)
+from talkcli.cli.values import nearest
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, UsageError
 from talkcli.goals.option import FLAG, INTEGER, NUMBER, SECONDS
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
-    from talkcli.cli.command import Argument, Command
+    from talkcli.cli.command import Argument, Codes, Command
     from talkcli.goals.option import Option
 
 _EXAMPLES = """
@@ -41,6 +34,18 @@ _EXAMPLES = """
     talk cancel                       silence, now
     talk doctor                       silent? what to do next
 """
+#: What a command is called elsewhere, where that isn't near to its name here.
+_ELSEWHERE = {
+    "check": "doctor",
+    "follow": "watch",
+    "history": "log",
+    "kill": "cancel",
+    "queue": "status",
+    "speak": "say",
+    "start": "serve",
+    "stop": "cancel",
+    "unpause": "resume",
+}
 
 
 class _Value(click.ParamType):  # type: ignore[type-arg,unused-ignore]
@@ -151,7 +156,7 @@ class ClickCommand(click.Command):
         except click.UsageError as error:
             error.ctx = error.ctx or ctx  # the help to look at is this command's
             if isinstance(error, click.NoSuchOption) and self.row.no_such_option:
-                words = told(error)
+                words = _what_is_wrong(error)
                 stop = "" if words.endswith("?") else "."
                 raise click.UsageError(f"{words}{stop} {self.row.no_such_option}", ctx) from error
             raise
@@ -162,17 +167,17 @@ class ClickCommand(click.Command):
         return rest
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        return with_short_help(super().shell_complete(ctx, incomplete))
+        return _with_short_help(super().shell_complete(ctx, incomplete))
 
     def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         super().format_help_text(ctx, formatter)
-        write_examples(self.row.examples, formatter)
+        _write_examples(self.row.examples, formatter)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        write_options(self, ctx, formatter, "Options of every command")
+        _write_options(self, ctx, formatter, "Options of every command")
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        write_exit_codes(self.row.exit_codes, formatter)
+        _write_exit_codes(self.row.exit_codes, formatter)
 
 
 class _Commands(click.Group):
@@ -201,7 +206,7 @@ class _Commands(click.Group):
 
         rows = [each for each in COMMANDS.values() if each.name.startswith(incomplete)]
         named = [CompletionItem(each.name, help=each.summary) for each in rows]
-        return named + with_short_help(click.Command.shell_complete(self, ctx, incomplete))
+        return named + _with_short_help(click.Command.shell_complete(self, ctx, incomplete))
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -210,23 +215,23 @@ class _Commands(click.Group):
         if ctx.resilient_parsing:  # a shell asks for completion: nothing may be said
             return super().resolve_command(ctx, args)
         if name and not name.startswith("-") and name not in COMMANDS:
-            raise click.UsageError(unknown_command(args, COMMANDS), ctx)
+            raise click.UsageError(_unknown_command(args), ctx)
         return super().resolve_command(ctx, args)
 
     def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         super().format_help_text(ctx, formatter)
-        write_examples(_EXAMPLES, formatter)
+        _write_examples(_EXAMPLES, formatter)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         self.format_commands(ctx, formatter)
-        write_options(self, ctx, formatter, "Options, before or after the command")
+        _write_options(self, ctx, formatter, "Options, before or after the command")
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         with formatter.section("Commands"):
             formatter.write_dl([(each.name, each.summary) for each in COMMANDS.values()])
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        write_exit_codes(ALL_EXIT_CODES, formatter)
+        _write_exit_codes(ALL_EXIT_CODES, formatter)
 
 
 @click.group(
@@ -250,7 +255,7 @@ def _first_screen(context: click.Context) -> str:
     formatter = context.make_formatter()
     formatter.write(f"{talk.help}\n\n")
     with formatter.indentation():
-        write_lines(_EXAMPLES, formatter)
+        _write_lines(_EXAMPLES, formatter)
     talk.format_commands(context, formatter)
     formatter.write("\n'talk COMMAND --help' says more of each, 'talk --help' has the exit codes.")
     return formatter.getvalue()
@@ -289,7 +294,7 @@ def _show_click_error(error: click.ClickException, *, json: bool) -> None:
     """Show a usage error. What was typed may be text of somebody else's, so its controls are escaped."""
     from talkcli.terminal.text import printable
 
-    words = printable(told(error))
+    words = printable(_what_is_wrong(error))
     if json:
         show_error(UsageError(words), json=True)
         return
@@ -297,3 +302,77 @@ def _show_click_error(error: click.ClickException, *, json: bool) -> None:
     if "--help" not in words:
         context = getattr(error, "ctx", None)
         note(f"see '{context.command_path if context else 'talk'} --help'")
+
+
+def _with_short_help(options: list[CompletionItem]) -> list[CompletionItem]:
+    """Have a shell show of an option's help what it has room for beside it: what stands before its first stop."""
+    for each in options:
+        each.help = re.split(r"[.;](?:\s|$)", each.help or "", maxsplit=1)[0] + "."
+    return options
+
+
+def _write_examples(examples: str, formatter: click.HelpFormatter) -> None:
+    """Write a section of command lines, as they are."""
+    with formatter.section("Examples"):
+        _write_lines(examples, formatter)
+
+
+def _write_lines(text: str, formatter: click.HelpFormatter) -> None:
+    """Write lines as they are, indented as the formatter is at this moment."""
+    for line in text.strip().splitlines():
+        formatter.write(f"{'':{formatter.current_indent}}{line.strip()}\n")
+
+
+def _write_options(command: click.Command, ctx: click.Context, formatter: click.HelpFormatter, shared: str) -> None:
+    """Write the command's own options, and then, under the heading `shared`, those that all have."""
+    own: list[tuple[str, str]] = []
+    common: list[tuple[str, str]] = []
+    for parameter in command.get_params(ctx):
+        record = parameter.get_help_record(ctx)
+        if record and isinstance(parameter, click.Option):
+            (own if parameter.expose_value else common).append(record)
+    for heading, records in (("Options", own), (shared, common)):
+        if records:
+            with formatter.section(heading):
+                formatter.write_dl(records)
+
+
+def _write_exit_codes(exit_codes: Codes, formatter: click.HelpFormatter) -> None:
+    """Write a section of exit codes, in their order."""
+    rows = sorted(exit_codes.items(), key=lambda row: row[0] if isinstance(row[0], int) else 128)
+    with formatter.section("Exit codes"):
+        formatter.write_dl([(str(code), words) for code, words in rows])
+
+
+def _unknown_command(words: list[str]) -> str:
+    """Return what is said of a command that there isn't: which was meant, or how to speak these words."""
+    name = words[0]
+    if name.lower() == "help":
+        meant = next((each for each in words[1:] if each in COMMANDS), None)
+        return f"no such command '{name}': write 'talk{f' {meant}' if meant else ''} --help'"
+    near = _ELSEWHERE.get(name.lower()) or nearest(name, COMMANDS)
+    return f"no such command '{name}': " + (
+        f"did you mean '{near}'?" if near else f"to speak it, write: talk say {_quoted(' '.join(words))}"
+    )
+
+
+def _quoted(text: str) -> str:
+    """Return a text as a shell takes it, in the quotes that people write where these do."""
+    import shlex
+
+    return shlex.quote(text) if any(each in text for each in '"$`\\!') else f'"{text}"'
+
+
+def _what_is_wrong(error: click.ClickException) -> str:
+    """Return what is wrong with a command line, without the next step."""
+    if isinstance(error, click.NoSuchOption):
+        # Without the dashes, which make any two of them alike.
+        near = nearest(error.option_name.lstrip("-"), [each.lstrip("-") for each in error.possibilities or ()])
+        return f"no such option '{error.option_name}'" + (f": did you mean '--{near}'?" if near else "")
+    if isinstance(error, click.MissingParameter) and error.param and isinstance(error.param.type, click.Choice):
+        return f"{error.param.metavar} is missing: one of {', '.join(error.param.type.choices)}"
+    words = error.format_message().rstrip(".")
+    if isinstance(error, click.BadParameter):
+        option, colon, wrong = words.removeprefix("Invalid value for ").partition(": ")
+        return option.replace("'", "") + colon + wrong
+    return words if words[:2].isupper() else words[:1].lower() + words[1:]
