@@ -8,8 +8,8 @@ import json
 import socket
 from typing import TYPE_CHECKING, Any
 
-from talkcli.server.answers import Answers
 from talkcli.server.connection import Connection
+from talkcli.server.requests import Answers
 from talkcli.server.service import Service
 from talkcli.server.settings import Settings
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from talkcli.engine import protocol
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
-from talkcli.server.answers import Answers
 from talkcli.server.mailbox import AT_ONCE, Mailbox
+from talkcli.server.requests import Answers
 from talkcli.server.service import Service
 from talkcli.server.settings import Settings
 

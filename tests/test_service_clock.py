@@ -16,7 +16,7 @@ from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, Say
 from talkcli.goals.states import State
 from talkcli.server import clock, service
-from talkcli.server.answers import Answers
+from talkcli.server.requests import Answers
 from talkcli.server.service import Service
 from talkcli.server.settings import Settings
 

@@ -20,9 +20,9 @@ from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
 from talkcli.server import log
 from talkcli.server.accept import Acceptor, make_room
-from talkcli.server.answers import Answers
 from talkcli.server.connection import Connection
 from talkcli.server.listener import InheritedListener, Listener, listen
+from talkcli.server.requests import Answers
 from talkcli.server.service import DOOR, Service
 from talkcli.server.systemd import Systemd
 from talkcli.server.upkeep import Upkeep

@@ -21,8 +21,8 @@ from talkcli.goals.states import State
 from talkcli.protocol.lines import MAX_LINE
 from talkcli.protocol.requests import KINDS, read_request
 from talkcli.server import connection, stream
-from talkcli.server.answers import RECENT
 from talkcli.server.later import ALL_WAITING, EACH, MAX_WAITING
+from talkcli.server.requests import RECENT
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
 from tests.support.documents import DOCUMENTS, README, ROOT, WIRE, first_column, tables, words
 
