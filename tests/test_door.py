@@ -9,7 +9,6 @@ import socket
 from typing import TYPE_CHECKING, Any
 
 from talkcli.server.connection import Connection
-from talkcli.server.requests import Answers
 from talkcli.server.service import Service
 from talkcli.server.settings import Settings
 
@@ -46,7 +45,6 @@ def _word(line: dict[str, Any]) -> str:
 def server_for(clients: int) -> Iterator[Callable[[bytes], Client]]:
     """Give what connects a client, which has said something already, to a server with so many places."""
     served = Service("4k7f", Settings(max_clients=clients), "unused", 0o600)
-    served.requests = Answers(served)
     made: list[Client] = []
 
     def connect(says: bytes = b"") -> Client:

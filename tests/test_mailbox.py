@@ -10,9 +10,8 @@ from talkcli.engine import protocol
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
 from talkcli.server.mailbox import AT_ONCE, Mailbox
-from talkcli.server.requests import Answers
-from talkcli.server.service import Service
 from talkcli.server.settings import Settings
+from talkcli.server.speech import Speech
 
 if TYPE_CHECKING:
     from talkcli.goals.record import Record
@@ -89,8 +88,7 @@ def test_report_that_meets_a_bug_takes_no_other_with_it() -> None:
 def test_the_engine_gets_to_work_before_clients_are_told() -> None:
     async def play() -> None:
         written: list[str] = []
-        served = Service("4k7f", Settings(), "unused", 0o600)
-        served.requests = Answers(served)
+        served = Speech("4k7f", Settings())
         served.engine = _Written(written)  # type: ignore[assignment]
         served.scheduler.engine_ready(served.now())
 

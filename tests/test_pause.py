@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.server import pauses
+from talkcli.server import requests
 from tests.conformance.bareserve import TALK, environment, run
 from tests.support.surroundings import short_directory
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 LIMITED = """
 import sys
 sys.path.insert(0, {root!r})
-from talkcli.server import pauses
+from talkcli.server import requests
 from tests.support import scripted_serve
-pauses.PAUSE_LIMIT = {limit}
+requests.PAUSE_LIMIT = {limit}
 scripted_serve.main()
 """
 
@@ -125,7 +125,7 @@ def test_silence_of_an_earlier_pause_answers_no_later_one(scripted: Talk) -> Non
     scripted.run("cancel")
 
 
-@pytest.mark.parametrize("limit", [0.5, pytest.param(pauses.PAUSE_LIMIT, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("limit", [0.5, pytest.param(requests.PAUSE_LIMIT, marks=pytest.mark.slow)])
 def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(
     make_talk: MakeTalk, tmp_path: Path, limit: float
 ) -> None:

@@ -15,10 +15,9 @@ from talkcli.frozen import replace
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, Say
 from talkcli.goals.states import State
-from talkcli.server import clock, service
-from talkcli.server.requests import Answers
-from talkcli.server.service import Service
+from talkcli.server import clock, speech
 from talkcli.server.settings import Settings
+from talkcli.server.speech import Speech
 
 if TYPE_CHECKING:
     from talkcli.engine import protocol
@@ -45,9 +44,8 @@ class _Clock:
         return time.monotonic() + self.ahead
 
 
-async def _queued_behind_another(ttl: float) -> Service:
-    served = Service("4k7f", Settings(goals=replace(INITIAL, ttl=ttl)), "unused", 0o600)
-    served.requests = Answers(served)
+async def _queued_behind_another(ttl: float) -> Speech:
+    served = Speech("4k7f", Settings(goals=replace(INITIAL, ttl=ttl)))
     served.engine = _BusyEngine()  # type: ignore[assignment]
     served.scheduler.engine_ready(served.now())
     for text in ("a long sentence", "the door is open"):
@@ -55,7 +53,7 @@ async def _queued_behind_another(ttl: float) -> Service:
     return served
 
 
-async def _until(served: Service, goal_id: str, state: State, limit: float) -> float:
+async def _until(served: Speech, goal_id: str, state: State, limit: float) -> float:
     """Return the seconds until the goal is in this state."""
     began = time.monotonic()
     record = served.scheduler.find(goal_id)
@@ -70,7 +68,7 @@ def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine_wakes
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     slept = _Clock()
-    monkeypatch.setattr(service, "elapsed", slept)
+    monkeypatch.setattr(speech, "elapsed", slept)
 
     async def scenario() -> None:
         served = await _queued_behind_another(ttl=600)
@@ -83,7 +81,7 @@ def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine_wakes
 
 def test_no_request_after_a_suspend_finds_a_goal_whose_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
     slept = _Clock()
-    monkeypatch.setattr(service, "elapsed", slept)
+    monkeypatch.setattr(speech, "elapsed", slept)
 
     async def scenario() -> None:
         served = await _queued_behind_another(ttl=600)

@@ -1,6 +1,6 @@
 """The server: asyncio around the scheduler, and the engine thread beside it.
 
 It does I/O only: what happens is decided by `goals`. It may import all but doctor and cli, and only `cli.serve`
-imports it. What a request is answered goes to `answers`, who hears of what to `subscribers`, what one client may to
-`connection`.
+imports it. What a request does and is answered goes to `requests`, what is spoken to `speech`, who hears of what to
+`subscribers`, what one client may to `connection`.
 """

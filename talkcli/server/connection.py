@@ -64,8 +64,8 @@ class Handler(Protocol):
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
         """Carry out a request, and answer it now or later."""
 
-    def failed(self, what: str, error: Exception) -> None:
-        """Note a request whose handling failed for a reason of the server's own."""
+    def owes(self, connection: Connection) -> bool:
+        """Whether a client waits for something: then its connection stays open though it sends nothing more."""
 
 
 class Connection:
@@ -76,8 +76,6 @@ class Connection:
         #: set by the handler when the client joins
         self.sender: Sender
         self.admitted = False
-        #: answers that are still to come for requests taken: the connection stays open for them
-        self.owed = 0
         self._handler = handler
         self._loop = loop
         self._stream = Stream(loop, handler.streams, connected, self, SOFT_OUTPUT)
@@ -177,13 +175,6 @@ class Connection:
         self._stream.flush()
         return not self._open
 
-    def settle(self) -> None:
-        """Note that an answer that was owed has been given."""
-        self.owed -= 1
-        if self._half_closed:
-            # Not at once: whoever gives the answer may be in the middle of other things, and another request must wait.
-            self._ask_for_a_turn()
-
     def refuse(self, code: str, words: str) -> None:
         """Say why, and close."""
         self._write(replies.failure(None, code, words))
@@ -206,6 +197,8 @@ class Connection:
 
     def _send(self, message: JsonObject | bytes) -> None:
         """Send a message after the lists that are on their way."""
+        if self._half_closed:  # it may be the last that is owed. Not at once: another request must wait meanwhile
+            self._ask_for_a_turn()
         if not self._outbox:
             self._write(message)
         elif len(self._outbox) < MAX_HELD:
@@ -260,8 +253,8 @@ class Connection:
         else:
             self._ask_for_a_turn()
             return
-        idle = not (self._outbox or self._lines or self.owed or self._congested)
-        if self._half_closed and idle:
+        idle = not (self._outbox or self._lines or self._congested)
+        if self._half_closed and idle and not self._handler.owes(self):
             self.close()
 
     def _ask_for_a_turn(self) -> None:
@@ -312,11 +305,11 @@ class Connection:
             self._first_limit = None
         if not self.admitted and not self._let_in(request):
             return
-        try:
-            self._carry_out(seq, request)
-        except Exception as error:  # noqa: BLE001 - one client's request must not take the voice from the others
-            self._handler.failed(request.kind, error)
-            self.reply(replies.failure(seq, "internal_error", f"{request.kind} failed: a bug of talk's, see its log"))
+        if isinstance(request, Hello):
+            self.sender = replace(self.sender, name=request.name)
+            self.reply(replies.ok(seq))
+        else:
+            self._handler.handle(self, seq, request)
 
     def _let_in(self, request: Request) -> bool:
         """Let a client in whose business is urgent; send the others away from a full server."""
@@ -326,10 +319,3 @@ class Connection:
         self._write(replies.busy_greeting())
         self.close()
         return False
-
-    def _carry_out(self, seq: int | None, request: Request) -> None:
-        if isinstance(request, Hello):
-            self.sender = replace(self.sender, name=request.name)
-            self.reply(replies.ok(seq))
-        else:
-            self._handler.handle(self, seq, request)

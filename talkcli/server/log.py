@@ -9,6 +9,7 @@ import os
 import select
 import sys
 import time
+import traceback
 from typing import TYPE_CHECKING
 
 from talkcli.engine.players.programs import NO_PLAYER
@@ -63,6 +64,13 @@ def seldom(kind: str, words: str) -> None:
     more = _seldom.setdefault(kind, Quota(1, _SELDOM)).take(time.monotonic())
     if more is not None:
         line(f"{words} ({more} more of these were not logged)" if more else words)
+
+
+def bug(what: str, error: Exception) -> None:
+    """Write a line of a bug, with the place where it is."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" at {os.path.basename(frames[-1].filename)}:{frames[-1].lineno}" if frames else ""
+    line(f"a bug in {what}{place}: {shown(f'{type(error).__name__}: {error}')}")
 
 
 def ended(record: Record, seconds: float | None) -> None:

@@ -1,47 +1,72 @@
-"""The answer to each request, now or as soon as what it asks for is so."""
+"""A coroutine a request: carries it out, and answers it now or as soon as what it asks for is so.
+
+Each is driven on the spot, and waits by `call.wait`; what it waits for is brought about by what is spoken
+(`speech.py`), or here: room in the queue, and a cancel that ends goals which wait themselves. While a request waits it
+keeps its connection open, and it is forgotten with it.
+"""
 
 from __future__ import annotations
 
-import os
-import time
-from itertools import chain
+import asyncio
+import sys
 from typing import TYPE_CHECKING
 
-from talkcli import __version__
 from talkcli.errors import UnknownGoal
-from talkcli.frozen import replace
+from talkcli.frozen import fields, replace
 from talkcli.goals.goal import By
 from talkcli.goals.options import Cancel, Say, Set, as_shown, bad_option, given
+from talkcli.goals.selection import select_waiting
 from talkcli.goals.states import State
-from talkcli.protocol import replies
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
 from talkcli.server import log
-from talkcli.server.pauses import Pauses
+from talkcli.server.call import Call, go_on
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Coroutine, Iterator
+    from typing import Any
 
-    from talkcli.goals.effects import Cancelled, Submitted
+    from talkcli.goals.effects import Cancelled
     from talkcli.goals.goal import JsonObject, Sender
     from talkcli.goals.record import Record
+    from talkcli.server.call import Place
     from talkcli.server.connection import Connection
-    from talkcli.server.service import Service
+    from talkcli.server.speech import Speech
 
 #: Ended goals that `status` lists.
 RECENT = 10
+#: Seconds for which the voices are awaited; a client gives up after five.
+VOICES_LIMIT = 4.0
+#: Seconds after which a pause is answered though nobody knows that it is silent.
+PAUSE_LIMIT = 2.0
+#: Requests that wait for one client; the wire names it. Each is kept with its text, and a client is read from all the
+#: while, because a cancel may come behind them.
+MAX_WAITING = 1_000
+#: Bytes of all the requests that wait, as of the output that waits.
+ALL_WAITING = 64 * 1024 * 1024
+#: Bytes that each is counted with besides what it carries. It takes a tenth of that; but so no more than 8,000 wait,
+#: and a cancel of so many is answered within 2 s, too.
+EACH = 8 * 1024
 
 
-class Answers:
-    """Answers the requests of a service's clients."""
+class Requests:
+    """Carries out the requests of a server's clients."""
 
-    def __init__(self, service: Service) -> None:
-        self._service = service
-        self._scheduler = service.scheduler
-        #: cancels that are answered when the goal they stopped is silent
-        self._cancels: list[tuple[Connection, int | None, Cancelled]] = []
-        self._pauses = Pauses(service)
-        self._by_kind: dict[type[Request], Callable[..., None]] = {
+    def __init__(self, speech: Speech, describe: Callable[[], JsonObject]) -> None:
+        """`describe` returns what `status` says of the server itself."""
+        self._speech = speech
+        self._scheduler = speech.scheduler
+        self._describe = describe
+        #: goals that wait for room in the queue, and those that were cancelled meanwhile and are to be told so
+        self._for_room: Place = {}
+        self._canceled: Place = {}
+        #: those that wait, by connection, in their order
+        self._calls: dict[Connection, Place] = {}
+        #: bytes of all that are kept while they wait
+        self._size = 0
+        self._turn: asyncio.Handle | None = None
+        speech.queue_changed = self._look
+        self._by_kind: dict[type[Request], Callable[[Call, Any], Coroutine[Place, bool | None, None]]] = {
             Say: self._say,
             Wait: self._wait,
             Cancel: self._cancel,
@@ -50,96 +75,168 @@ class Answers:
             Watch: self._watch,
             Log: self._log,
             Set: self._set,
-            Pause: self._pauses.pause,
-            Resume: self._pauses.resume,
+            Pause: self._pause,
+            Resume: self._resume,
         }
 
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
         """Carry out a request, and answer it now or later."""
-        later = self._service.later
-        if isinstance(request, Cancel | Pause):
-            later.hurry(connection)  # silence waits for nothing; what was asked for before it comes before it
-        elif later.holds(connection) or self._awaits_voices(request):
-            fault = later.too_many(connection, request)
-            if fault is None:
-                later.until_voices(connection, request, lambda by: self._go(connection, seq, request, by))
-                return
-            if isinstance(request, Say):
-                self._submit(connection, seq, request, connection.sender, fault)
-                return
-            later.hurry(connection)
-        self._carry_out(connection, seq, request)
+        call = Call(connection, seq, request)
+        call.begin(self._carry_out(call))
+        if call.place is not None:
+            self._calls.setdefault(connection, {})[call] = None
 
-    def silent(self, goal_id: str, pause: int) -> None:
-        """Answer those who wait for the active goal to be silent in this pause of it."""
-        self._pauses.silent(goal_id, pause)
+    def owes(self, connection: Connection) -> bool:
+        """Whether a request of this connection waits."""
+        return connection in self._calls
 
     def left(self, connection: Connection) -> None:
-        """Owe a connection that is gone nothing more."""
-        self._cancels = [each for each in self._cancels if each[0] is not connection]
-        self._pauses.left(connection)
+        """Forget the requests of a client that is gone."""
+        for each in self._waiting(connection):
+            each.drop()
 
-    def ended(self, record: Record) -> None:
-        """Answer those who wait for this goal to be silent."""
-        due = [each for each in self._cancels if each[2].stopping is record]
-        if due:
-            self._cancels = [each for each in self._cancels if each[2].stopping is not record]
-        for connection, seq, done in due:
-            self._report_cancel(connection, seq, done)
-            connection.settle()
-        self._pauses.ended(record)
+    def shut_down(self) -> None:
+        """End all goals, those that wait, too."""
+        ends = self._end_waiting(self._select(Cancel()), None)
+        self._speech.shut_down()
+        go_on(self._speech.for_voices)
+        self._speech.news.tell([*ends, self._speech.look_finished])
+
+    async def _carry_out(self, call: Call) -> None:
+        request, fault = call.request, None
+        try:
+            if isinstance(request, Cancel | Pause):
+                self._hurry(call.connection)  # silence waits for nothing; what was asked for before comes before it
+            elif self._must_wait(call):
+                fault = self._keep(call)
+                if fault is None:
+                    await call.wait(self._speech.for_voices, VOICES_LIMIT)
+                elif not isinstance(request, Say):
+                    self._hurry(call.connection)
+            if fault and isinstance(request, Say):
+                self._submit(call, request, call.connection.sender, fault)
+            else:
+                await self._by_kind[type(request)](call, request)
+        except UnknownGoal as error:
+            call.answer(call.refused(error.code, str(error)))
+        except Exception as error:  # noqa: BLE001 - one client's request must not take the voice from the others
+            log.bug(request.kind, error)
+            words = f"{request.kind} failed: a bug of talk's, see its log"
+            call.answer(call.refused("internal_error", words))
+        finally:
+            self._size -= call.size
+            if call.connection in self._calls:
+                self._forget(call)
+
+    # -- who waits
+
+    def _waiting(self, connection: Connection) -> list[Call]:
+        """Return the requests of this connection that wait, in their order."""
+        return list(self._calls.get(connection, ()))
+
+    def _forget(self, call: Call) -> None:
+        mine = self._calls[call.connection]
+        mine.pop(call, None)
+        if not mine:
+            del self._calls[call.connection]
+
+    def _must_wait(self, call: Call) -> bool:
+        """Whether it can't be carried out yet: the voices are needed, or what came before it needs them."""
+        request, waiting = call.request, self._speech.for_voices
+        if waiting and (isinstance(request, Say) or self._holds(call.connection)):
+            return True
+        if not self._speech.awaits_voices:
+            return False
+        if isinstance(request, Set):
+            return request.voice is not None and not bad_option(request)
+        return isinstance(request, Voices) or (isinstance(request, Say) and request.voice is not None)
+
+    def _holds(self, connection: Connection) -> bool:
+        """Whether a request of this connection waits for the voices: what comes after it must not overtake it."""
+        return any(each.place is self._speech.for_voices for each in self._waiting(connection))
+
+    def _keep(self, call: Call) -> tuple[str, str] | None:
+        """Count a request that is to wait; return reason and words why it can't, or None."""
+        if call.size:
+            return None  # it has waited for something else already
+        size = EACH + sum(map(_bytes_of, fields(call.request).values()))
+        if len(self._waiting(call.connection)) >= MAX_WAITING:
+            return "queue_full", f"{MAX_WAITING:,} requests of this connection are waiting already"
+        if self._size + size > ALL_WAITING:
+            return "queue_full", f"{ALL_WAITING >> 20} MiB of requests are waiting already"
+        call.size = size
+        self._size += size
+        return None
+
+    def _hurry(self, connection: Connection) -> None:
+        """Have go on what of this connection waits for the voices; the others' know nothing of what hurries."""
+        for each in self._waiting(connection):
+            if each.place is self._speech.for_voices:
+                each.resume()
+
+    def _look(self) -> None:
+        """Let go, soon, what may go now that a goal has come to the queue, or left it."""
+        if self._for_room and self._turn is None:
+            # Soon, not at once: whoever changed something may be in the middle of other changes.
+            self._turn = asyncio.get_running_loop().call_soon(self._let_go)
+
+    def _let_go(self) -> None:
+        self._turn = None
+        full: set[object] = set()
+        went = False
+        for each in list(self._for_room):
+            say = each.request
+            assert isinstance(say, Say)
+            # All that room depends on, but for an id: where a thousand lack it, one is asked for.
+            kind = (say.priority, say.key, say.flush, say.preempt) if say.id is None else None
+            if kind in full:
+                continue
+            if not self._scheduler.has_room(say):
+                if kind:
+                    full.add(kind)
+            elif not each.connection.has_hung_up():
+                each.resume()
+                went = True
+        if went:
+            self._look()  # they may have made room for others, those before them first
+
+    def _select(self, selection: Cancel) -> list[Call]:
+        """Return the selected goals of those that wait."""
+        waiting = (*self._canceled, *self._for_room, *self._speech.for_voices)
+        goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
+        selected = select_waiting(selection, [say for _, say in goals])
+        # Who has hung up has taken its request back, and is about to be forgotten.
+        return [goals[place][0] for place in selected if not goals[place][0].connection.has_hung_up()]
+
+    def _end_waiting(self, calls: list[Call], by: By | None) -> list[Callable[[], None]]:
+        """Have these goals wait for nothing more; return what submits them as cancelled, to be told in its turn."""
+        new = [each for each in calls if each.place is not self._canceled]
+        for each in new:
+            each.by = by
+            each.move(self._canceled)
+        return [each.resume for each in new]
 
     # -- one method a request
 
-    def _go(self, connection: Connection, seq: int | None, request: Request, by: By | None) -> Submitted | None:
-        """Carry out a request that has waited for the voices; with `by`, it is a goal that was cancelled meanwhile."""
-        if by and isinstance(request, Say):
-            return self._submit(connection, seq, request, connection.sender, canceled=by)
-        self._carry_out(connection, seq, request)
-        return None
+    async def _say(self, call: Call, say: Say) -> None:
+        sender, fault = call.connection.sender, None
+        if call.by is None:
+            now = self._speech.now()
+            if self._turn:  # a goal that comes now must not take the room of one that waits
+                self._turn.cancel()
+                self._let_go()
+            fault = self._speech.voice_fault(say.voice)
+            if say.patient and self._scheduler.lacks_room(say, now, fault):
+                fault = self._keep(call)
+                if fault is None:
+                    with self._speech.subscribers.kept_waiting(call.connection):
+                        await call.wait(self._for_room)
+        self._submit(call, say, sender, fault)
 
-    def _carry_out(self, connection: Connection, seq: int | None, request: Request) -> None:
-        try:
-            self._by_kind[type(request)](connection, seq, request)
-        except UnknownGoal as error:
-            connection.reply(replies.failure(seq, error.code, str(error)))
-
-    def _awaits_voices(self, request: Request) -> bool:
-        """Whether it can't be carried out yet: the voices are needed, or a goal that came before it needs them."""
-        if isinstance(request, Voices):
-            return self._voices_awaited()
-        if isinstance(request, Set):
-            return request.voice is not None and self._voices_awaited() and not bad_option(request)
-        if isinstance(request, Say):
-            return self._service.later.awaits_voices or (request.voice is not None and self._voices_awaited())
-        return False
-
-    def _say(self, connection: Connection, seq: int | None, request: Say) -> None:
-        later, sender = self._service.later, connection.sender
-        now = self._service.now()
-        later.look_now()
-        fault = self._service.voice_fault(request.voice)
-        if request.patient and self._scheduler.lacks_room(request, now, fault):
-            fault = later.too_many(connection, request)
-            if fault is None:
-                later.until_room(
-                    connection, request, lambda by: self._submit(connection, seq, request, sender, canceled=by)
-                )
-                return
-        self._submit(connection, seq, request, sender, fault)
-
-    def _submit(
-        self,
-        connection: Connection,
-        seq: int | None,
-        request: Say,
-        sender: Sender,
-        fault: tuple[str, str] | None = None,
-        canceled: By | None = None,
-    ) -> Submitted:
-        now = self._service.now()
-        fault = fault or self._service.voice_fault(request.voice)
-        submitted = self._scheduler.submit(request, sender, now, fault, canceled)
+    def _submit(self, call: Call, say: Say, sender: Sender, fault: tuple[str, str] | None) -> None:
+        connection, now = call.connection, self._speech.now()
+        fault = fault or self._speech.voice_fault(say.voice)
+        submitted = self._scheduler.submit(say, sender, now, fault, call.by)
         record = submitted.record
         extra: JsonObject = {"paused": True} if self._scheduler.paused else {}
         if submitted.attached:
@@ -148,24 +245,26 @@ class Answers:
         else:
             # As it was accepted: it may have started in the same step, but that is told by its events.
             state = record.state if record.state is State.REJECTED else State.PENDING
+            if call.by and record.by is call.by:
+                call.ended = record
         goal = record.snapshot(state).to_json()
         ended = submitted.attached and state.terminal
-        if (request.wait or request.feedback) and not ended:
-            self._service.subscribers.await_result(record.id, connection, feedback=request.feedback)
-        connection.reply(replies.ok(seq, goal=goal, **extra))
-        if ended and (request.wait or request.feedback):
+        if (say.wait or say.feedback) and not ended:
+            self._speech.subscribers.await_result(record.id, connection, feedback=say.feedback)
+        call.answer(call.ok(goal=goal, **extra))
+        if ended and (say.wait or say.feedback):
             connection.publish(encode({"event": "result", "goal": goal}))
-        self._service.apply(submitted.effects)
-        return submitted
+        self._speech.apply(submitted.effects)
 
-    def _wait(self, connection: Connection, seq: int | None, request: Wait) -> None:
+    async def _wait(self, call: Call, request: Wait) -> None:
+        await self._speech.news.until_told(call)  # the result of a goal that has ended is the last of it
         if request.ids is None:
             records = self._scheduler.unfinished()
         else:
             records = [self._find(each) for each in dict.fromkeys(request.ids)]
         for record in records:
             if not record.state.terminal:
-                self._service.subscribers.await_result(record.id, connection, feedback=request.feedback)
+                self._speech.subscribers.await_result(record.id, call.connection, feedback=request.feedback)
         # As they are now: what becomes of them meanwhile is told by the events that come after the list. Of a thousand
         # that have ended, each is looked at when its turn comes to be sent.
         active = self._scheduler.active
@@ -175,75 +274,124 @@ class Answers:
         def goals() -> Iterator[JsonObject]:
             for record, state in zip(records, states, strict=True):
                 goal = spoken if spoken and record is active else record.snapshot(state)
-                yield replies.item(seq, goal=goal.to_json())
+                yield {"goal": goal.to_json()}
 
         def results() -> Iterator[JsonObject]:
             for record, state in zip(records, states, strict=True):
                 if state.terminal:  # the subscribers are told of the others
                     yield {"event": "result", "goal": record.snapshot().to_json()}
 
-        connection.stream(goals(), replies.ok(seq, count=len(records)), results())
+        call.answer(call.ok(count=len(records)), goals(), results())
 
-    def _cancel(self, connection: Connection, seq: int | None, request: Cancel) -> None:
-        later, now = self._service.later, self._service.now()
-        waiting = later.choose(request, By(client=connection.sender))
+    async def _cancel(self, call: Call, selection: Cancel) -> None:
+        speech, by = self._speech, By(client=call.connection.sender)
+        now = speech.now()
+        waiting = self._select(selection)
+        ends = self._end_waiting(waiting, by)
         ids = {each.request.id for each in waiting if isinstance(each.request, Say)}
-        # The engine is told before thousands of clients may be.
-        done = self._scheduler.cancel(request, connection.sender, now, ids)
-        self._service.apply(done.effects)
-        connection.owed += 1
-
-        def answer() -> None:
-            done.recalled += [each.ended for each in waiting if each.ended]
-            if done.stopping is None or done.stopping.state.terminal:
-                self._report_cancel(connection, seq, done)
-                connection.settle()
-            else:
-                self._cancels.append((connection, seq, done))
-
-        later.end(answer)
-
-    def _status(self, connection: Connection, seq: int | None, request: Status) -> None:
-        if request.id is None:
-            self._send_overview(connection, seq)
+        done = self._scheduler.cancel(selection, call.connection.sender, now, ids)
+        speech.apply(done.effects)  # the engine is told before thousands of clients may be
+        speech.news.tell(ends)
+        if done.stopping:  # its end will be told after all that
+            while not done.stopping.state.terminal:
+                await call.wait(speech.for_silence(done.stopping))
         else:
-            connection.reply(replies.ok(seq, goal=self._find(request.id).snapshot().to_json()))
+            await speech.news.until_told(call)
+        done.recalled += [each.ended for each in waiting if each.ended]
+        self._report_cancel(call, done)
 
-    def _watch(self, connection: Connection, seq: int | None, _: Watch) -> None:
-        self._send_overview(connection, seq)
-        self._service.subscribers.watch(connection)
+    def _report_cancel(self, call: Call, done: Cancelled) -> None:
+        ended = list(done.recalled)
+        if done.stopping and done.stopping.state is not State.SUCCEEDED:
+            ended.append(done.stopping)
 
-    def _voices(self, connection: Connection, seq: int | None, _: Voices) -> None:
-        self._send_voices(connection, seq)
+        def goals() -> Iterator[JsonObject]:
+            for record in ended:
+                yield {"canceled": record.snapshot().to_json()}
+            for record in done.ended:
+                yield {"ended": record.snapshot().to_json()}
 
-    def _voices_awaited(self) -> bool:
-        return self._service.voices is None and self._service.engine_words in {"starting", "ready"}
+        if done.unknown:
+            words = ", ".join(repr(each) for each in done.unknown)
+            reply = call.refused(UnknownGoal.code, f"no goal {words} is known: see `talk status`")
+        else:
+            reply = call.ok(count=len(ended))
+        call.answer(reply, goals())
 
-    def _log(self, connection: Connection, seq: int | None, request: Log) -> None:
+    async def _pause(self, call: Call, _: Pause) -> None:
+        speech = self._speech
+        speech.now()
+        speech.pause(By(client=call.connection.sender))
+        active = self._scheduler.active
+        if active and not speech.is_silent(active) and not await call.wait(speech.for_silence(active), PAUSE_LIMIT):
+            words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_LIMIT:g} s"
+            call.answer(call.refused("not_silent", words))
+        else:
+            self._report_pause(call, active)
+
+    async def _resume(self, call: Call, _: Resume) -> None:
+        self._report_pause(call, self._speech.resume(By(client=call.connection.sender)))
+
+    def _report_pause(self, call: Call, goal: Record | None) -> None:
+        told = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
+        call.answer(call.ok(paused=self._scheduler.paused, goal=told))
+
+    async def _status(self, call: Call, request: Status) -> None:
+        if request.id is None:
+            self._send_overview(call)
+        else:
+            call.answer(call.ok(goal=self._find(request.id).snapshot().to_json()))
+
+    async def _watch(self, call: Call, _: Watch) -> None:
+        await self._speech.news.until_told(call)  # what comes after the overview has happened after it
+        self._send_overview(call)
+        self._speech.subscribers.watch(call.connection)
+
+    def _send_overview(self, call: Call) -> None:
+        pending = list(self._scheduler.pending())
+        recent = list(self._scheduler.history.latest(RECENT))
+
+        def goals() -> Iterator[JsonObject]:
+            for record in pending:
+                yield {"pending": record.snapshot().to_json()}
+            for record in reversed(recent):
+                yield {"recent": record.snapshot().to_json()}
+
+        active = self._scheduler.active
+        now = active.snapshot().to_json() if active else None
+        call.answer(call.ok(server=self._describe(), active=now), goals())
+
+    async def _voices(self, call: Call, _: Voices) -> None:
+        voices = self._speech.voices
+        if voices is None:
+            words = f"the engine can't list its voices now: it is {self._speech.engine_words}"
+            if self._scheduler.active:
+                words += ", and busy with its first sentence: ask again after that"
+            call.answer(call.refused("engine_failed", words))
+            return
+        told: list[JsonObject] = [{"id": each.id, "language": each.language, "name": each.name} for each in voices]
+        call.answer(call.ok(count=len(voices)), ({"voice": each} for each in told))
+
+    async def _log(self, call: Call, request: Log) -> None:
         records = list(self._scheduler.history.log(request.count))
-        items = (replies.item(seq, goal=each.snapshot().to_json()) for each in reversed(records))
-        connection.stream(items, replies.ok(seq, count=len(records)))
+        call.answer(call.ok(count=len(records)), ({"goal": each.snapshot().to_json()} for each in reversed(records)))
 
-    def _set(self, connection: Connection, seq: int | None, request: Set) -> None:
+    async def _set(self, call: Call, request: Set) -> None:
         words = bad_option(request)
         if words:
-            connection.reply(replies.failure(seq, "bad_option", words))
-        else:
-            self._change_settings(connection, seq, request)
-
-    def _change_settings(self, connection: Connection, seq: int | None, request: Set) -> None:
-        service, scheduler = self._service, self._scheduler
-        fault = service.voice_fault(request.voice)
+            call.answer(call.refused("bad_option", words))
+            return
+        fault = self._speech.voice_fault(request.voice)
         if fault:
-            connection.reply(replies.failure(seq, *fault))
+            call.answer(call.refused(*fault))
             return
         changed = given(request)
-        scheduler.settings = replace(scheduler.settings, **changed)
-        service.later.look()  # what preempts may have room
+        self._scheduler.settings = replace(self._scheduler.settings, **changed)
+        self._look()  # what preempts may have room
         if changed:
             values = ", ".join(f"{name} {value}" for name, value in changed.items())
-            log.line(f"set to {log.shown(values)} by {log.who(connection.sender)}")
-        connection.reply(replies.ok(seq, settings=as_shown(scheduler.settings)))
+            log.line(f"set to {log.shown(values)} by {log.who(call.connection.sender)}")
+        call.answer(call.ok(settings=as_shown(self._scheduler.settings)))
 
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)
@@ -251,68 +399,8 @@ class Answers:
             raise UnknownGoal(f"no goal {goal_id!r} is known: see `talk status`")
         return record
 
-    # -- what is sent
 
-    def _send_overview(self, connection: Connection, seq: int | None) -> None:
-        pending = list(self._scheduler.pending())
-        recent = list(self._scheduler.history.latest(RECENT))
-
-        def items() -> Iterator[JsonObject]:
-            for record in pending:
-                yield replies.item(seq, pending=record.snapshot().to_json())
-            for record in reversed(recent):
-                yield replies.item(seq, recent=record.snapshot().to_json())
-
-        active = self._scheduler.active
-        now = active.snapshot().to_json() if active else None
-        connection.stream(items(), replies.ok(seq, server=self._describe(), active=now))
-
-    def _describe(self) -> JsonObject:
-        service, settings = self._service, self._service.settings
-        ready = service.ready
-        return {
-            "pid": os.getpid(),
-            "version": __version__,
-            "boot": service.boot,
-            "socket": service.path,
-            "started_at": service.began.wall,
-            "uptime": time.monotonic() - service.began.monotonic,
-            "engine": service.engine_words,
-            "driver": ready.driver if ready else settings.driver,
-            "synthesizer": ready.version if ready else None,
-            "player": ready.player if ready else settings.player,
-            "device": settings.device,
-            "lead_in": settings.lead_in,
-            **as_shown(self._scheduler.settings),
-            "paused": self._scheduler.paused,
-            "pending": self._scheduler.pending_count,
-            "max_queue": settings.max_queue,
-            "clients": len(service.connections),
-            "max_clients": settings.max_clients,
-        }
-
-    def _send_voices(self, connection: Connection, seq: int | None) -> None:
-        voices = self._service.voices
-        if voices is None:
-            words = f"the engine can't list its voices now: it is {self._service.engine_words}"
-            if self._scheduler.active:
-                words += ", and busy with its first sentence: ask again after that"
-            connection.reply(replies.failure(seq, "engine_failed", words))
-            return
-        items = (
-            replies.item(seq, voice={"id": each.id, "language": each.language, "name": each.name}) for each in voices
-        )
-        connection.stream(items, replies.ok(seq, count=len(voices)))
-
-    def _report_cancel(self, connection: Connection, seq: int | None, done: Cancelled) -> None:
-        ended = list(done.recalled)
-        if done.stopping and done.stopping.state is not State.SUCCEEDED:
-            ended.append(done.stopping)
-        canceled = (replies.item(seq, canceled=each.snapshot().to_json()) for each in ended)
-        before = (replies.item(seq, ended=each.snapshot().to_json()) for each in done.ended)
-        if done.unknown:
-            words = ", ".join(repr(each) for each in done.unknown)
-            reply = replies.failure(seq, UnknownGoal.code, f"no goal {words} is known: see `talk status`")
-        else:
-            reply = replies.ok(seq, count=len(ended))
-        connection.stream(chain(canceled, before), reply)
+def _bytes_of(value: object) -> int:
+    """Return the bytes that a value from a request takes in memory: small lists take many times their JSON."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
+    return sys.getsizeof(value) + sum(map(_bytes_of, inside))

@@ -22,7 +22,6 @@ from talkcli.server import log
 from talkcli.server.accept import Acceptor, make_room
 from talkcli.server.connection import Connection
 from talkcli.server.listener import InheritedListener, Listener, listen
-from talkcli.server.requests import Answers
 from talkcli.server.service import DOOR, Service
 from talkcli.server.systemd import Systemd
 from talkcli.server.upkeep import Upkeep
@@ -75,43 +74,43 @@ class _Server:
         settings = self._settings
         make_room(settings.max_clients + DOOR)
         service = self._service = Service(_boot(), settings, self._listener.path, self._listener.mode)
-        service.requests = Answers(service)
-        systemd = self._systemd = Systemd(loop, os.environ, service.words)
-        service.changed = systemd.changed
-        acceptor = self._acceptor = Acceptor(loop, lambda each: Connection(service, loop, each).begin(), service.failed)
+        speech = service.speech
+        systemd = self._systemd = Systemd(loop, os.environ, speech.words)
+        speech.changed = systemd.changed
+        acceptor = self._acceptor = Acceptor(loop, lambda each: Connection(service, loop, each).begin(), log.bug)
         upkeep = Upkeep(loop, self._listener, self._moved, self._lost)
         loop.set_exception_handler(self._on_bug)
         for number in self._ended_by:
             loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the voice along
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # whoever started this may have had some of them blocked
-        service.engine = Supervisor(
+        speech.engine = Supervisor(
             protocol.Configure(
                 os.getpid(), settings.driver, settings.player, settings.device, settings.goals.voice, settings.lead_in
             ),
-            service.report,
+            speech.report,
         )
-        self._start(service.engine)
+        self._start(speech.engine)
         try:
             acceptor.open(self._listener.socket)
             upkeep.begin()
             if settings.goals.voice or settings.driver:
                 # Who asked for what can't be had is told so, and nothing else.
                 with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(service.engine_known.wait(), START_LIMIT)
-            if not service.closing:
+                    await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT)
+            if not speech.closing:
                 systemd.ready()
                 log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
-                service.apply(service.scheduler.submit(Say(settings.greeting), _self(), service.now()).effects)
-            await service.finished.wait()
+                speech.apply(speech.scheduler.submit(Say(settings.greeting), _self(), speech.now()).effects)
+            await speech.finished.wait()
             systemd.stopping()
             upkeep.end()
             acceptor.close()
             await self._say_goodbye()
         finally:
-            service.engine.close()
-            service.engine.join(_ENGINE_GOODBYE)
+            speech.engine.close()
+            speech.engine.join(_ENGINE_GOODBYE)
             systemd.close()
         if service.fatal:
             raise service.fatal
@@ -133,9 +132,8 @@ class _Server:
     def _lost(self, error: AddressInUse) -> None:
         """End: clients find another server, or none; a supervisor that starts this one again will hear why."""
         log.line(log.shown(f"ending: {error}"))
-        self._service.fatal = error
         self._systemd.stopping()
-        self._service.shut_down()
+        self._service.end(error)
 
     async def _say_goodbye(self) -> None:
         """Let every client take what was written for it, but wait for none that doesn't read."""
@@ -152,7 +150,7 @@ class _Server:
             # Not by the loop, which may have a long turn to finish: whoever asks twice wants no goodbye.
             signal.signal(each, self._on_second_signal)
         self._systemd.stopping()
-        self._service.shut_down()
+        self._service.end()
 
     def _on_second_signal(self, number: int, _: object) -> None:
         """End at once; the engine process dies with this one."""
@@ -163,7 +161,7 @@ class _Server:
     def _on_bug(self, _: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
         error = context.get("exception")
         if isinstance(error, Exception):
-            self._service.failed(str(context.get("message")), error)
+            log.bug(str(context.get("message")), error)
         else:
             log.line(log.shown(str(context.get("message"))))
 

@@ -5,6 +5,8 @@ It knows connections and goals, nothing of requests or the engine.
 
 from __future__ import annotations
 
+from collections import Counter
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from talkcli.goals.states import State
@@ -12,7 +14,7 @@ from talkcli.protocol.lines import encode
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from talkcli.goals.goal import By, JsonObject
     from talkcli.goals.record import Record
@@ -34,7 +36,7 @@ class Subscribers:
         self._awaited: dict[Connection, set[str]] = {}
         self._watchers: dict[Connection, None] = {}
         #: those whose request waits, and how many of them
-        self._kept: dict[Connection, int] = {}
+        self._kept: Counter[Connection] = Counter()
         self._alive: asyncio.TimerHandle | None = None
 
     def await_result(self, goal_id: str, connection: Connection, *, feedback: bool = False) -> None:
@@ -42,32 +44,34 @@ class Subscribers:
         waiting = self._waiters.setdefault(goal_id, {})
         if connection not in waiting:
             self._awaited.setdefault(connection, set()).add(goal_id)
-            connection.owed += 1
             self._keep_alive()
         waiting[connection] = waiting.get(connection, False) or feedback
 
-    def keep_waiting(self, connection: Connection) -> None:
+    @contextmanager
+    def kept_waiting(self, connection: Connection) -> Iterator[None]:
         """Tell this connection that the server is alive while its request waits."""
-        self._kept[connection] = self._kept.get(connection, 0) + 1
+        self._kept[connection] += 1
         self._keep_alive()
+        try:
+            yield
+        finally:
+            self._kept[connection] -= 1
+            if not self._kept[connection]:
+                del self._kept[connection]
 
-    def answered(self, connection: Connection) -> None:
-        """Note that a request that waited is being answered."""
-        self._kept[connection] -= 1
-        if not self._kept[connection]:
-            del self._kept[connection]
+    def has(self, connection: Connection) -> bool:
+        """Whether this connection is to be told of a goal, or of everything."""
+        return connection in self._awaited or connection in self._watchers
 
     def watch(self, connection: Connection) -> None:
         """Tell this connection of everything."""
         if connection not in self._watchers:
             self._watchers[connection] = None
-            connection.owed += 1
             self._keep_alive()
 
     def left(self, connection: Connection) -> None:
         """Forget a connection that is gone."""
         self._watchers.pop(connection, None)
-        self._kept.pop(connection, None)
         for goal_id in self._awaited.pop(connection, ()):
             waiting = self._waiters[goal_id]
             del waiting[connection]
@@ -121,7 +125,6 @@ class Subscribers:
             awaited.discard(record.id)
             if not awaited:
                 del self._awaited[connection]
-            connection.settle()
 
     def _keep_alive(self) -> None:
         if self._alive is None:

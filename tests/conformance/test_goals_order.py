@@ -254,13 +254,13 @@ def test_all_hear_of_the_server_s_end_where_it_is_more_than_may_wait_for_them(ma
 COUNTING = """
 import sys
 sys.path.insert(0, {root!r})
-from talkcli.server import later, log
+from talkcli.server import log, requests
 from tests.support import scripted_serve
-let_go = later.Later._let_go
+let_go = requests.Requests._let_go
 def counted(self):
     log.line("looks for room")
     let_go(self)
-later.Later._let_go = counted
+requests.Requests._let_go = counted
 scripted_serve.main()
 """
 

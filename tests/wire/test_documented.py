@@ -21,8 +21,7 @@ from talkcli.goals.states import State
 from talkcli.protocol.lines import MAX_LINE
 from talkcli.protocol.requests import KINDS, read_request
 from talkcli.server import connection, stream
-from talkcli.server.later import ALL_WAITING, EACH, MAX_WAITING
-from talkcli.server.requests import RECENT
+from talkcli.server.requests import ALL_WAITING, EACH, MAX_WAITING, RECENT
 from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
 from tests.support.documents import DOCUMENTS, README, ROOT, WIRE, first_column, tables, words
 
@@ -36,7 +35,7 @@ REASON_AT = {
     "_end": 2, "_close": 2, "failed": 1,
 }  # fmt: skip
 #: … and which is the code of an error on the wire.
-CODE_AT = {"BadRequest": 1, "failure": 1, "call_later": 2}
+CODE_AT = {"BadRequest": 1, "failure": 1, "refused": 0, "call_later": 2}
 CODE = re.compile(r"[a-z]+(_[a-z]+)*")
 
 

@@ -1,0 +1,353 @@
+"""What is spoken: carries out the scheduler's decisions and takes the engine's reports, all in the loop's thread.
+
+What happens is the scheduler's decision, how it is spoken the engine thread's, who hears of it the subscribers'. It
+passes between them and never waits for any of them. It knows no requests but as those who wait, and are to go on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from functools import partial
+from typing import TYPE_CHECKING
+
+from talkcli.engine import protocol
+from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
+from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
+from talkcli.errors import TalkError, UsageError
+from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
+from talkcli.goals.options import DEFAULT_VOICE, for_engine
+from talkcli.goals.scheduler import Scheduler
+from talkcli.goals.states import State
+from talkcli.server import log
+from talkcli.server.call import go_on
+from talkcli.server.clock import LOOK_EVERY, elapsed
+from talkcli.server.mailbox import Mailbox
+from talkcli.server.news import News
+from talkcli.server.stream import Streams
+from talkcli.server.subscribers import Subscribers
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
+    from talkcli.engine.supervisor import Supervisor
+    from talkcli.goals.goal import By, JsonObject
+    from talkcli.goals.record import Record
+    from talkcli.server.call import Place
+    from talkcli.server.settings import Settings
+
+
+class Speech:
+    """The goals of one server and the engine that speaks them, for as long as it runs."""
+
+    def __init__(self, boot: str, settings: Settings) -> None:
+        self.settings = settings
+        #: set before the first client is there
+        self.engine: Supervisor
+        #: called, in the loop's thread, when `words` may have changed
+        self.changed: Callable[[], None] = lambda: None
+        #: called when a goal has come to the queue, or left it
+        self.queue_changed: Callable[[], None] = lambda: None
+        #: called when nothing can be spoken any more, and why
+        self.lost: Callable[[TalkError], None] = lambda _: None
+        self.scheduler = Scheduler(
+            boot,
+            max_queue=settings.max_queue,
+            max_text=settings.max_text,
+            settings=settings.goals,
+        )
+        self.scheduler.engine_lost()  # none is ready yet
+        #: set once everything has ended after `shut_down`
+        self.finished = asyncio.Event()
+        self.ready: protocol.Ready | None = None
+        self.voices: tuple[protocol.Voice, ...] | None = None
+        #: requests that wait until the voices are known, or it is known that they won't be
+        self.for_voices: Place = {}
+        #: how the engine is, in a few words
+        self.engine_words = "starting"
+        #: set once an engine process is ready, or it is known that none will be; and at the server's end
+        self.engine_known = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        self.subscribers = Subscribers(self._loop)
+        self.streams = Streams(self._loop)
+        self.news = News(self._loop, self.streams)
+        #: whether it was told to end, and takes no goal any more
+        self.closing = False
+        self._timer: asyncio.TimerHandle | None = None
+        #: when the goals that were handed to the engine began, until their end is told: one, or for a moment two
+        self._started: dict[str, float] = {}
+        #: requests that wait for a goal to be silent, until its end is told
+        self._for_silence: dict[Record, Place] = {}
+        #: the goal that is known to be held and silent
+        self._silent: Record | None = None
+        self._mailbox = Mailbox(self._loop, self._note, log.bug)
+        self._takes: dict[type[Report], Callable[[Any], None]] = {
+            protocol.Ready: self._ready,
+            protocol.StartFailed: self._start_failed,
+            protocol.Voices: self._voices_known,
+            protocol.Word: self._word,
+            protocol.Paused: self._paused,
+            protocol.Ended: self._ended,
+            EngineSaid: lambda said: log.line(f"engine: {log.shown(said.words)}"),
+            EngineDied: self._died,
+            EngineMissing: self._missing,
+            ThreadDied: self._thread_died,
+        }
+        #: whether the engine was told that a goal waits behind the one it has in hand
+        self._followed = False
+
+    def words(self) -> str:
+        """Return what is done and how the engine is, for people; no goal's text: any user may read it."""
+        scheduler, ready = self.scheduler, self.ready
+        if self.engine_words != "ready":
+            doing = f"engine: {self.engine_words}"
+        elif scheduler.paused:
+            doing = "paused"
+        else:
+            doing = f"speaking {scheduler.active.id}" if scheduler.active else "idle"
+        waiting = f", {scheduler.pending_count} waiting" if scheduler.pending_count else ""
+        voice = f"; {ready.version or ready.driver}, {log.sound_of(ready)}" if ready else ""
+        return log.shown(doing + waiting + voice)
+
+    # -- what is waited for
+
+    @property
+    def awaits_voices(self) -> bool:
+        """Whether the voices will be known."""
+        return self.voices is None and self.engine_words in {"starting", "ready"}
+
+    def voice_fault(self, voice: str | None) -> tuple[str, str] | None:
+        """Return reason and words why a voice can't be had; None also where the voices aren't known."""
+        if voice is None or voice == DEFAULT_VOICE or not self.voices or find_voice(voice, self.voices):
+            return None
+        return "unknown_voice", unknown_voice(voice, self.voices)
+
+    def is_silent(self, record: Record) -> bool:
+        """Whether the active goal is known to be held and silent."""
+        return record is self._silent
+
+    def for_silence(self, record: Record) -> Place:
+        """Return where to wait until the active goal is silent, goes on after a pause, or its end has been told."""
+        return self._for_silence.setdefault(record, {})
+
+    # -- pauses
+
+    def pause(self, by: By) -> None:
+        """Hold what is being spoken, and start nothing."""
+        newly, effects, active = not self.scheduler.paused, self.scheduler.pause(), self.scheduler.active
+        if newly:
+            self._tell_paused(active if active and active.paused else None, by)
+        self.apply(effects)
+
+    def resume(self, by: By) -> Record | None:
+        """Go on with what is held, or start what waits; return what was held, or is spoken anyway."""
+        now = self.now()
+        newly, active = self.scheduler.paused, self.scheduler.active
+        if active and active.state is not State.ACTIVE:
+            active = None  # it is being stopped
+        self._silent = None
+        effects = self.scheduler.resume(now)
+        if newly:
+            self._tell_paused(active, by)
+        self.apply(effects)
+        if active:
+            go_on(self.for_silence(active))  # they will not see it silent any more
+        return active
+
+    def _tell_paused(self, held: Record | None, by: By) -> None:
+        """Publish and log that speech is paused, or not any more."""
+        paused, held_id = self.scheduler.paused, held.id if held else None
+        self.news.tell([partial(self.subscribers.paused, held_id, paused=paused, by=by, at=time.time())])
+        assert by.client
+        log.line(f"{'paused' if paused else 'resumed'} by {log.who(by.client)}")
+
+    # -- the scheduler's effects
+
+    def now(self) -> Now:
+        """Return the time, after whatever was due by then is done."""
+        now = self._now()
+        deadline = self.scheduler.deadline()
+        if deadline is not None and deadline <= now.monotonic:
+            self.apply(self.scheduler.tick(now))
+        return now
+
+    @staticmethod
+    def _now() -> Now:
+        return Now(elapsed(), time.time())
+
+    def apply(self, effects: list[Effect]) -> None:
+        """Carry out what the scheduler decided, in its order, but what is for the engine before what clients are told.
+
+        So it works, or stops, while they are. What it says to that is taken in another turn of the loop: they hear of
+        everything in the scheduler's order.
+        """
+        told = []
+        for effect in effects:
+            if isinstance(effect, Changed):
+                told.append(partial(self._tell_changed, effect, time.time()))
+                continue
+            try:
+                self._carry_out(effect)
+            except Exception as error:  # noqa: BLE001 - the effects after it must not be lost: the engine would wait
+                log.bug(type(effect).__name__, error)
+        if any(isinstance(each, Changed) and each.state is not State.REJECTED for each in effects):
+            self.queue_changed()
+        self.news.tell(told)
+        self._tell_followed()
+        self._set_timer()
+        self.changed()
+        self.look_finished()
+
+    def _carry_out(self, effect: Effect) -> None:
+        if isinstance(effect, Start):
+            self._start(effect.record)
+        elif isinstance(effect, GiveUp):
+            self.engine.give_up(effect.record.id)
+        elif isinstance(effect, Hold):
+            self.engine.pause(effect.record.id, effect.record.holds)
+        elif isinstance(effect, Resume):
+            self.engine.resume(effect.record.id)
+        else:
+            self.engine.stop(effect.record.id)
+
+    def _tell_changed(self, change: Changed, at: float) -> None:
+        record = change.record
+        self.subscribers.changed(record, change.state, at)
+        if change.state.terminal:
+            began = self._started.pop(record.id, None)
+            log.ended(record, None if began is None else time.monotonic() - began)
+            if record is self._silent:
+                self._silent = None
+            go_on(self._for_silence.pop(record, {}))
+            self.look_finished()
+
+    def _start(self, record: Record) -> None:
+        self._started[record.id] = time.monotonic()
+        self._followed = self.scheduler.pending_count > 0
+        chosen = for_engine(record.say, self.scheduler.settings)
+        self.engine.say(protocol.Say(record.id, record.text or "", followed=self._followed, **chosen))
+
+    def _tell_followed(self) -> None:
+        """Have the engine know that a goal waits behind the one it speaks: it makes good what the change will take."""
+        active, followed = self.scheduler.active, self.scheduler.pending_count > 0
+        if active and followed is not self._followed:
+            self._followed = followed
+            self.engine.follow(active.id, followed)
+
+    def _set_timer(self) -> None:
+        if self._timer:
+            self._timer.cancel()
+        deadline = self.scheduler.deadline()
+        self._timer = None
+        if deadline is not None:
+            rest = max(0.0, deadline - elapsed())
+            self._timer = self._loop.call_later(min(rest, LOOK_EVERY), self._tick)
+
+    def _tick(self) -> None:
+        self.apply(self.scheduler.tick(self._now()))
+
+    # -- the engine's reports
+
+    def report(self, report: Report) -> None:
+        """Take what the engine thread says; called in any thread."""
+        self._mailbox.post(report)
+
+    def _note(self, report: Report) -> None:
+        take = self._takes.get(type(report))
+        if take:  # what else the process says is for the engine thread alone
+            take(report)
+
+    def _voices_known(self, voices: protocol.Voices) -> None:
+        self.voices = voices.voices
+        go_on(self.for_voices)
+
+    def _died(self, died: EngineDied) -> None:
+        self.scheduler.engine_lost()
+        self._set_timer()
+        self._engine_fails(died.words)
+
+    def _missing(self, missing: EngineMissing) -> None:
+        self.apply(self.scheduler.engine_missing(missing.words, self.now()))
+
+    def _ready(self, ready: protocol.Ready) -> None:
+        if self.ready != ready:
+            log.ready(ready, self.settings.for_player)
+        self.ready, self.engine_words = ready, "ready"
+        self.engine_known.set()
+        self.apply(self.scheduler.engine_ready(self.now()))
+
+    def _start_failed(self, failed: protocol.StartFailed) -> None:
+        if failed.usage and self.ready is None:
+            self.lost(UsageError(failed.message))
+            return
+        self._engine_fails(failed.message)
+        if failed.lasting:
+            self.engine_known.set()
+            # None will come: goals need not wait to be told.
+            self.apply(self.scheduler.engine_ready(self.now()))
+
+    def _engine_fails(self, words: str) -> None:
+        if words != self.engine_words:
+            log.line(log.shown(words))
+        self.engine_words = words
+        go_on(self.for_voices)
+        self.changed()
+
+    def _thread_died(self, died: ThreadDied) -> None:
+        """End: there is nothing left that could speak, and a supervisor will start another server."""
+        words = died.words
+        self._engine_fails(words)
+        self.lost(TalkError(words))
+        if self.scheduler.active:
+            self.apply(self.scheduler.failed(self.scheduler.active.id, "engine_failed", words, None, self._now()))
+
+    def _ended(self, ended: protocol.Ended) -> None:
+        active = self.scheduler.active
+        if active is None or active.id != ended.id:
+            return  # it was given up before the engine came to its end
+        now = self.now()
+        if self.scheduler.active is not active:
+            return  # it was due just now
+        if ended.outcome == protocol.COMPLETED:
+            effects = self.scheduler.completed(ended.id, ended.duration, now)
+        elif ended.outcome == protocol.STOPPED and active.stop_since is not None:
+            effects = self.scheduler.stopped(ended.id, now)
+        else:
+            reason, words = ended.reason or "engine_failed", ended.message or "the engine stopped by itself"
+            effects = self.scheduler.failed(ended.id, reason, words, ended.duration, now)
+        self.apply(effects)
+
+    def _word(self, word: protocol.Word) -> None:
+        active = self.scheduler.active
+        if active is None or active.id != word.id:
+            return
+        record = self.scheduler.heard(word.id, word.end)
+        text = (record.text or "")[word.start : word.end]
+        event: JsonObject = {
+            "word": text,
+            "start": word.start,
+            "end": word.end,
+            "number": word.number,
+            "time": word.time,
+        }
+        self.news.tell([partial(self.subscribers.heard, word.id, event, time.time())])
+
+    def _paused(self, paused: protocol.Paused) -> None:
+        active = self.scheduler.active
+        if active is not None and active.id == paused.id and active.paused and active.holds == paused.number:
+            self._silent = active
+            go_on(self.for_silence(active))
+
+    # -- the end
+
+    def shut_down(self) -> None:
+        """End every goal, and take no other."""
+        self.closing = True
+        self.engine_known.set()
+        self.apply(self.scheduler.shutdown(self._now()))
+
+    def look_finished(self) -> None:
+        """Set `finished`, where everything has ended and that is told."""
+        if self.closing and self.scheduler.active is None and self.news.told:
+            self.finished.set()
