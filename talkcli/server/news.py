@@ -70,10 +70,10 @@ class News:
         """Tell a portion; `before`: bytes that waited for clients before what this one has to be read with."""
         self._turn = None
         self._telling = True
-        for _ in range(_PORTION):
-            if not self._line or self._streams.waiting > before + _PORTION_OUTPUT:
-                break
+        for _ in range(min(_PORTION, len(self._line))):
             self._do(self._line.popleft())
+            if self._streams.waiting > before + _PORTION_OUTPUT:
+                break
         self._telling = False
         if not self._line:
             self._patience = _PATIENCE

@@ -57,8 +57,7 @@ class Requests:
         self._speech = speech
         self._scheduler = speech.scheduler
         self._describe = describe
-        #: goals that wait for room in the queue, and those that were cancelled meanwhile and are to be told so
-        self._for_room: Place = {}
+        #: goals that were cancelled while they waited, and are to be told so
         self._canceled: Place = {}
         #: those that wait, by connection, in their order
         self._calls: dict[Connection, Place] = {}
@@ -143,7 +142,7 @@ class Requests:
     def _must_wait(self, call: Call) -> bool:
         """Whether it can't be carried out yet: the voices are needed, or what came before it needs them."""
         request, waiting = call.request, self._speech.for_voices
-        if waiting and (isinstance(request, Say) or self._holds(call.connection)):
+        if waiting and (isinstance(request, Say) or self._held(call.connection)):
             return True
         if not self._speech.awaits_voices:
             return False
@@ -151,9 +150,9 @@ class Requests:
             return request.voice is not None and not bad_option(request)
         return isinstance(request, Voices) or (isinstance(request, Say) and request.voice is not None)
 
-    def _holds(self, connection: Connection) -> bool:
-        """Whether a request of this connection waits for the voices: what comes after it must not overtake it."""
-        return any(each.place is self._speech.for_voices for each in self._waiting(connection))
+    def _held(self, connection: Connection) -> list[Call]:
+        """Return the requests of this connection that wait for the voices: what comes after them must not overtake."""
+        return [each for each in self._waiting(connection) if each.place is self._speech.for_voices]
 
     def _keep(self, call: Call) -> tuple[str, str] | None:
         """Count a request that is to wait; return reason and words why it can't, or None."""
@@ -170,13 +169,12 @@ class Requests:
 
     def _hurry(self, connection: Connection) -> None:
         """Have go on what of this connection waits for the voices; the others' know nothing of what hurries."""
-        for each in self._waiting(connection):
-            if each.place is self._speech.for_voices:
-                each.resume()
+        for each in self._held(connection):
+            each.resume()
 
     def _look(self) -> None:
         """Let go, soon, what may go now that a goal has come to the queue, or left it."""
-        if self._for_room and self._turn is None:
+        if self._speech.for_room and self._turn is None:
             # Soon, not at once: whoever changed something may be in the middle of other changes.
             self._turn = asyncio.get_running_loop().call_soon(self._let_go)
 
@@ -184,7 +182,7 @@ class Requests:
         self._turn = None
         full: set[object] = set()
         went = False
-        for each in list(self._for_room):
+        for each in list(self._speech.for_room):
             say = each.request
             assert isinstance(say, Say)
             # All that room depends on, but for an id: where a thousand lack it, one is asked for.
@@ -202,7 +200,7 @@ class Requests:
 
     def _select(self, selection: Cancel) -> list[Call]:
         """Return the selected goals of those that wait."""
-        waiting = (*self._canceled, *self._for_room, *self._speech.for_voices)
+        waiting = (*self._canceled, *self._speech.for_room, *self._speech.for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
         selected = select_waiting(selection, [say for _, say in goals])
         # Who has hung up has taken its request back, and is about to be forgotten.
@@ -229,8 +227,8 @@ class Requests:
             if say.patient and self._scheduler.lacks_room(say, now, fault):
                 fault = self._keep(call)
                 if fault is None:
-                    with self._speech.subscribers.kept_waiting(call.connection):
-                        await call.wait(self._for_room)
+                    self._speech.subscribers.keep_alive()
+                    await call.wait(self._speech.for_room)
         self._submit(call, say, sender, fault)
 
     def _submit(self, call: Call, say: Say, sender: Sender, fault: tuple[str, str] | None) -> None:
@@ -323,7 +321,7 @@ class Requests:
         speech.now()
         speech.pause(By(client=call.connection.sender))
         active = self._scheduler.active
-        if active and not speech.is_silent(active) and not await call.wait(speech.for_silence(active), PAUSE_LIMIT):
+        if active and active is not speech.silent and not await call.wait(speech.for_silence(active), PAUSE_LIMIT):
             words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_LIMIT:g} s"
             call.answer(call.refused("not_silent", words))
         else:

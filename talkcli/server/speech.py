@@ -64,12 +64,14 @@ class Speech:
         self.voices: tuple[protocol.Voice, ...] | None = None
         #: requests that wait until the voices are known, or it is known that they won't be
         self.for_voices: Place = {}
+        #: goals that wait for room in the queue; whoever hears of `queue_changed` lets them go
+        self.for_room: Place = {}
         #: how the engine is, in a few words
         self.engine_words = "starting"
         #: set once an engine process is ready, or it is known that none will be; and at the server's end
         self.engine_known = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self.subscribers = Subscribers(self._loop)
+        self.subscribers = Subscribers(self._loop, lambda: (each.connection for each in self.for_room))
         self.streams = Streams(self._loop)
         self.news = News(self._loop, self.streams)
         #: whether it was told to end, and takes no goal any more
@@ -80,7 +82,7 @@ class Speech:
         #: requests that wait for a goal to be silent, until its end is told
         self._for_silence: dict[Record, Place] = {}
         #: the goal that is known to be held and silent
-        self._silent: Record | None = None
+        self.silent: Record | None = None
         self._mailbox = Mailbox(self._loop, self._note, log.bug)
         self._takes: dict[type[Report], Callable[[Any], None]] = {
             protocol.Ready: self._ready,
@@ -123,10 +125,6 @@ class Speech:
             return None
         return "unknown_voice", unknown_voice(voice, self.voices)
 
-    def is_silent(self, record: Record) -> bool:
-        """Whether the active goal is known to be held and silent."""
-        return record is self._silent
-
     def for_silence(self, record: Record) -> Place:
         """Return where to wait until the active goal is silent, goes on after a pause, or its end has been told."""
         return self._for_silence.setdefault(record, {})
@@ -146,7 +144,7 @@ class Speech:
         newly, active = self.scheduler.paused, self.scheduler.active
         if active and active.state is not State.ACTIVE:
             active = None  # it is being stopped
-        self._silent = None
+        self.silent = None
         effects = self.scheduler.resume(now)
         if newly:
             self._tell_paused(active, by)
@@ -182,16 +180,17 @@ class Speech:
         So it works, or stops, while they are. What it says to that is taken in another turn of the loop: they hear of
         everything in the scheduler's order.
         """
-        told = []
+        told, moved, at = [], False, time.time()
         for effect in effects:
             if isinstance(effect, Changed):
-                told.append(partial(self._tell_changed, effect, time.time()))
+                told.append(partial(self._tell_changed, effect.record, effect.state, at))
+                moved = moved or effect.state is not State.REJECTED
                 continue
             try:
                 self._carry_out(effect)
             except Exception as error:  # noqa: BLE001 - the effects after it must not be lost: the engine would wait
                 log.bug(type(effect).__name__, error)
-        if any(isinstance(each, Changed) and each.state is not State.REJECTED for each in effects):
+        if moved:
             self.queue_changed()
         self.news.tell(told)
         self._tell_followed()
@@ -211,14 +210,13 @@ class Speech:
         else:
             self.engine.stop(effect.record.id)
 
-    def _tell_changed(self, change: Changed, at: float) -> None:
-        record = change.record
-        self.subscribers.changed(record, change.state, at)
-        if change.state.terminal:
+    def _tell_changed(self, record: Record, state: State, at: float) -> None:
+        self.subscribers.changed(record, state, at)
+        if state.terminal:
             began = self._started.pop(record.id, None)
             log.ended(record, None if began is None else time.monotonic() - began)
-            if record is self._silent:
-                self._silent = None
+            if record is self.silent:
+                self.silent = None
             go_on(self._for_silence.pop(record, {}))
             self.look_finished()
 
@@ -336,7 +334,7 @@ class Speech:
     def _paused(self, paused: protocol.Paused) -> None:
         active = self.scheduler.active
         if active is not None and active.id == paused.id and active.paused and active.holds == paused.number:
-            self._silent = active
+            self.silent = active
             go_on(self.for_silence(active))
 
     # -- the end

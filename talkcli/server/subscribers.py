@@ -5,8 +5,6 @@ It knows connections and goals, nothing of requests or the engine.
 
 from __future__ import annotations
 
-from collections import Counter
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from talkcli.goals.states import State
@@ -14,7 +12,7 @@ from talkcli.protocol.lines import encode
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable
 
     from talkcli.goals.goal import By, JsonObject
     from talkcli.goals.record import Record
@@ -27,16 +25,16 @@ ALIVE_EVERY = 5.0
 class Subscribers:
     """The connections that have asked to be told."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, others: Callable[[], Iterable[Connection]]) -> None:
+        """`others`: who else is told that the server is alive, because a request waits."""
         self._loop = loop
+        self._others = others
         #: events published so far: a watcher sees by a gap that feedback was dropped
         self._count = 0
         #: by goal: those who wait for its end, and whether they want its feedback
         self._waiters: dict[str, dict[Connection, bool]] = {}
         self._awaited: dict[Connection, set[str]] = {}
         self._watchers: dict[Connection, None] = {}
-        #: those whose request waits, and how many of them
-        self._kept: Counter[Connection] = Counter()
         self._alive: asyncio.TimerHandle | None = None
 
     def await_result(self, goal_id: str, connection: Connection, *, feedback: bool = False) -> None:
@@ -44,20 +42,8 @@ class Subscribers:
         waiting = self._waiters.setdefault(goal_id, {})
         if connection not in waiting:
             self._awaited.setdefault(connection, set()).add(goal_id)
-            self._keep_alive()
+            self.keep_alive()
         waiting[connection] = waiting.get(connection, False) or feedback
-
-    @contextmanager
-    def kept_waiting(self, connection: Connection) -> Iterator[None]:
-        """Tell this connection that the server is alive while its request waits."""
-        self._kept[connection] += 1
-        self._keep_alive()
-        try:
-            yield
-        finally:
-            self._kept[connection] -= 1
-            if not self._kept[connection]:
-                del self._kept[connection]
 
     def has(self, connection: Connection) -> bool:
         """Whether this connection is to be told of a goal, or of everything."""
@@ -67,7 +53,7 @@ class Subscribers:
         """Tell this connection of everything."""
         if connection not in self._watchers:
             self._watchers[connection] = None
-            self._keep_alive()
+            self.keep_alive()
 
     def left(self, connection: Connection) -> None:
         """Forget a connection that is gone."""
@@ -109,6 +95,11 @@ class Subscribers:
         event: JsonObject = {"event": "paused", "paused": paused, "id": held, "by": by.to_json()}
         _publish({**event, "n": self._count, "at": at}, listening)
 
+    def keep_alive(self) -> None:
+        """Tell those who wait for anything, from now on, that the server is alive."""
+        if self._alive is None:
+            self._alive = self._loop.call_later(ALIVE_EVERY, self._say_alive)
+
     def _tell_watchers(self, record: Record, state: State, event: JsonObject) -> None:
         if not self._watchers:
             return
@@ -126,16 +117,12 @@ class Subscribers:
             if not awaited:
                 del self._awaited[connection]
 
-    def _keep_alive(self) -> None:
-        if self._alive is None:
-            self._alive = self._loop.call_later(ALIVE_EVERY, self._say_alive)
-
     def _say_alive(self) -> None:
         self._alive = None
-        listening = dict.fromkeys([*self._awaited, *self._watchers, *self._kept])
+        listening = dict.fromkeys([*self._awaited, *self._watchers, *self._others()])
         _publish({"event": "alive"}, listening)
         if listening:
-            self._keep_alive()
+            self.keep_alive()
 
 
 def _publish(event: JsonObject, connections: Iterable[Connection], *, feedback: bool = False) -> None:
