@@ -1,7 +1,8 @@
 """What is spoken: carries out the scheduler's decisions and takes the engine's reports, all in the loop's thread.
 
 What happens is the scheduler's decision, how it is spoken the engine thread's, who hears of it the subscribers'. It
-passes between them and never waits for any of them. It knows no requests but as those who wait, and are to go on.
+passes between them and never waits for any of them. It has the one timer: for the scheduler's `deadline`, at which it
+calls `tick`. It knows no requests but as those who wait, and are to go on.
 """
 
 from __future__ import annotations
