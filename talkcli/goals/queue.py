@@ -4,14 +4,15 @@ Pure, and no rule of admission: it keeps what it is given. Higher priority goes 
 but for what is put at the front of its priority or in the place of another.
 
 Ten thousand wait at most (`--max-queue`): a place among them is found in fourteen comparisons, and what stands behind
-it moves up in a microsecond. What is asked at each goal looks at no other; what looks at all of them says so.
+it moves up in a microsecond. What is asked at each goal looks at no other; what looks at all of them says so: thousands
+of goals that wait for room ask, too, each time that something leaves.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, insort
 from math import inf
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -29,6 +30,10 @@ class Queue:
     def __init__(self) -> None:
         #: in their order: priority, negated, and turn; no two are equal
         self._goals: list[tuple[int, int, Record]] = []
+        #: those that were sent to preempt, in the same order
+        self._preempting: list[tuple[int, int, Record]] = []
+        #: in the order in which they give way, the last first: priority, negated, and number
+        self._newest: list[tuple[int, int, Record]] = []
         #: those with a time to live: its end, and their number
         self._expiries: list[tuple[float, int, Record]] = []
         self._by_key: dict[str, Record] = {}
@@ -56,16 +61,13 @@ class Queue:
         return list(map(_goal, self._goals[bisect_left(self._goals, (-priority,)) :]))
 
     def preempting_up_to(self, priority: int) -> list[Record]:
-        """Return the goals of this priority and lower ones that were sent to preempt. Looks at all of these."""
-        return [each for each in self.up_to(priority) if each.preempt]
+        """Return the goals of this priority and lower ones that were sent to preempt."""
+        return list(map(_goal, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
     def giving_way_to(self, priority: int) -> Record | None:
-        """Return the goal that gives way to one of this priority: of the lowest, the one accepted last, if it is lower.
-
-        Looks at all of the lowest priority, if it is lower.
-        """
-        lowest = -self._goals[-1][0] if self._goals else priority
-        return max(self.up_to(lowest), key=attrgetter("number")) if lowest < priority else None
+        """Return the goal that gives way to one of this priority: of a lower and the lowest, the one accepted last."""
+        last = self._newest[-1][2] if self._newest else None
+        return last if last and last.priority < priority else None
 
     def add(self, record: Record) -> None:
         """Put a goal at the end of its priority, or at the front where it preempts."""
@@ -81,6 +83,9 @@ class Queue:
     def remove(self, record: Record) -> None:
         """Take a goal out."""
         del self._goals[bisect_left(self._goals, (-record.priority, record.turn))]
+        del self._newest[bisect_left(self._newest, (-record.priority, record.number))]
+        if record.preempt:
+            del self._preempting[bisect_left(self._preempting, (-record.priority, record.turn))]
         if record.expires_at is not None:
             del self._expiries[bisect_left(self._expiries, (record.expires_at, record.number))]
         if record.key is not None:
@@ -96,6 +101,9 @@ class Queue:
 
     def _enter(self, record: Record) -> None:
         insort(self._goals, (-record.priority, record.turn, record))
+        insort(self._newest, (-record.priority, record.number, record))
+        if record.preempt:
+            insort(self._preempting, (-record.priority, record.turn, record))
         if record.expires_at is not None:
             insort(self._expiries, (record.expires_at, record.number, record))
         if record.key is not None:

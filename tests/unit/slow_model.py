@@ -1,4 +1,4 @@
-"""A slow model of the scheduler: the README's rules for goals, order and cancel, told again with plain lists.
+"""A slow model of the scheduler: the documents' rules for goals, order and cancel, told again with plain lists.
 
 Rules for this file: it imports nothing of `talkcli` and is written from the rules, never from the scheduler's code: two
 tellings that agree are worth something, two copies are not. Speed is no aim. A new option is a field of `Wish` and of
