@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import Client
-from talkcli.client.dial import Interrupted
+from talkcli.client.connect import Interrupted
 from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, PausedChanged, Result, Snapshot, StateChanged, WordHeard

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import Client
-from talkcli.client import dial
+from talkcli.client import connect
 from talkcli.doctor import machine, sentence, server
 from talkcli.goals.states import State
 from tests.faults.broken import write
@@ -63,7 +63,7 @@ def examined(
 
     By the command where these are its own; else in this process, with a file for the sentence, which takes no time.
     """
-    if patience == dial.ANSWER_LIMIT:
+    if patience == connect.ANSWER_LIMIT:
         done, found = doctor(talk, "--silent")
         assert done.code == 4
         return found
@@ -346,7 +346,7 @@ def test_a_sound_server_that_hangs_is_named_and_it_ends_all_the_same(
     assert found["sentence"]["next"] == found["sound server"]["next"]
 
 
-@pytest.mark.parametrize("limit", [0.5, pytest.param(dial.ANSWER_LIMIT, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("limit", [0.5, pytest.param(connect.ANSWER_LIMIT, marks=pytest.mark.slow)])
 def test_a_server_that_hangs_is_named(
     make_talk: MakeTalk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: float
 ) -> None:
@@ -360,7 +360,7 @@ def test_a_server_that_hangs_is_named(
     assert "server" not in found
 
 
-@pytest.mark.parametrize("limit", [0.5, pytest.param(dial.BUSY_LIMIT, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("limit", [0.5, pytest.param(connect.BUSY_LIMIT, marks=pytest.mark.slow)])
 def test_a_full_server_is_named(
     make_talk: MakeTalk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: float
 ) -> None:

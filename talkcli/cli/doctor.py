@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, screen, show, show_json
-from talkcli.client.dial import Interrupted
+from talkcli.client.connect import Interrupted
 from talkcli.doctor.examine import Examination
 from talkcli.doctor.report import heard, lines, verdict
 from talkcli.goals.states import EXIT_CODES, State

@@ -14,7 +14,7 @@ import threading
 from typing import Protocol
 
 from talkcli.cli.show import colourful, note, show, show_json
-from talkcli.client.dial import ready
+from talkcli.client.connect import ready
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard

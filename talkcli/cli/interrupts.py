@@ -38,7 +38,7 @@ def has_reader() -> bool:
 
 
 def watched_output() -> dict[int, int]:
-    """Return what to wait for, as `dial.ready` takes it, so that a reader of standard output that goes away ends it."""
+    """Return what to wait for, as `connect.ready` takes it, so that a reader of standard output that goes ends it."""
     return {} if _condition() & select.POLLNVAL else {OUTPUT: 0}  # that would end it at once
 
 
@@ -53,7 +53,8 @@ class Interrupts:
     """Catches SIGINT, SIGTERM and SIGHUP: `number` is the signal then. A second one ends the process at once, but for
     SIGHUP: of a terminal that is closed the shell tells its commands, and then the system.
 
-    `descriptor` becomes readable. `watched` has all that there is to wait for, as `dial.ready` takes it; it may change.
+    `descriptor` becomes readable. `watched` has all that there is to wait for, as `connect.ready` takes it; it
+    may change.
     """
 
     def __init__(self, timeout: float | None = None, held: Iterable[int] = ()) -> None:

@@ -16,7 +16,7 @@ from talkcli.cli.show import (
     reader_is_gone,
     show_json,
 )
-from talkcli.client.dial import Interrupted
+from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import EXIT_CODES, State

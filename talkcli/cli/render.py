@@ -12,7 +12,7 @@ from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import regardless, show_if_possible
 from talkcli.cli.show import note, show_json
 from talkcli.cli.values import read, readable
-from talkcli.client.dial import Interrupted
+from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, UsageError
 from talkcli.goals.options import SOUND
 

@@ -19,7 +19,7 @@ from talkcli.cli.outcome import (
 )
 from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.values import readable
-from talkcli.client.dial import ANSWER_LIMIT, Interrupted
+from talkcli.client.connect import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State

@@ -24,7 +24,7 @@ from talkcli.cli.outcome import (
 from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.stdin import LineReader
 from talkcli.cli.values import readable
-from talkcli.client.dial import ANSWER_LIMIT, Interrupted
+from talkcli.client.connect import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_BYTES

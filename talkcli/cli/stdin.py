@@ -7,7 +7,7 @@ import select
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.client.dial import ready
+from talkcli.client.connect import ready
 from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.frozen import frozen
 from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
@@ -53,7 +53,7 @@ def read_text(end: float | None, interrupt: Mapping[int, int], *, whole: bool = 
     """Return standard input as one text; InputTooLong for more than the longest one, which is not read to its end.
 
     `end`: the monotonic time by which it must have been read, else InputLate; `interrupt`: what ends the reading with
-    Interrupted, as in `dial.ready`; `whole`: read all of it, for no goal.
+    Interrupted, as in `connect.ready`; `whole`: read all of it, for no goal.
     """
     data = bytearray()
     while whole or len(data) <= _MOST:
@@ -73,7 +73,7 @@ class LineReader:
     """Cuts standard input into lines. A line that is too long is read to its end, counted and not kept."""
 
     def __init__(self, interrupt: Mapping[int, int]) -> None:
-        """`interrupt`: what ends the reading with Interrupted, as in `dial.ready`."""
+        """`interrupt`: what ends the reading with Interrupted, as in `connect.ready`."""
         self._interrupt = interrupt
         # One byte above the longest text: the CR of a line that ends in CRLF.
         self._splitter = LineSplitter(MAX_BYTES + 1)

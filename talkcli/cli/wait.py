@@ -5,7 +5,7 @@ from __future__ import annotations
 from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.outcome import regardless, report, rest, show_if_possible
 from talkcli.cli.show import note
-from talkcli.client.dial import ANSWER_LIMIT, Interrupted
+from talkcli.client.connect import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.cli.interrupts import Interrupts, has_reader
 from talkcli.cli.show import Common, screen, show, show_json
-from talkcli.client.dial import Interrupted
+from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_SIGPIPE
 from talkcli.terminal.transcript import Transcript
 

@@ -16,8 +16,8 @@ import os
 import select
 
 from talkcli import __version__
+from talkcli.client.connect import ANSWER_LIMIT
 from talkcli.client.connection import SILENCE_LIMIT, Connection
-from talkcli.client.dial import ANSWER_LIMIT
 from talkcli.client.event_buffer import MAX_STATES, EventBuffer
 from talkcli.client.goal import Followed, GoalHandle
 from talkcli.client.outgoing import batches, check, check_key, full_id, too_long
@@ -59,7 +59,7 @@ class Client:
 
         `socket`: path of the server's socket, default TALK_SOCKET, then the usual places; `name`: what this sender
         calls itself in `talk status` and the log, default TALK_NAME; `interrupt`: a descriptor that ends any waiting
-        with `dial.Interrupted` as soon as it is readable, or several, each with the events of poll that do so
+        with `connect.Interrupted` as soon as it is readable, or several, each with the events of poll that do so
         (broken and hung up always do); `patience`: seconds in which the server must greet; `urgent`: for status and
         cancel alone, for which a full server keeps some places; `opened`: a connection that `client.opening` has begun,
         with the first request that this client will send.

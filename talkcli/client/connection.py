@@ -16,7 +16,7 @@ from _socket import SHUT_RDWR, SHUT_WR  # see `peers`
 from collections import deque
 from collections.abc import Callable
 
-from talkcli.client.dial import ANSWER_LIMIT, dial, ready
+from talkcli.client.connect import ANSWER_LIMIT, dial, ready
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import Say

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from talkcli.client.dial import Interrupted
+from talkcli.client.connect import Interrupted
 from talkcli.doctor.report import SENTENCE, Finding, done, failed
 from talkcli.doctor.sound import is_custom
 from talkcli.doctor.voice import INSTALL_LIBRARY, conversation, fault

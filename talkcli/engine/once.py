@@ -11,7 +11,7 @@ import select
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.client.dial import ready
+from talkcli.client.connect import ready
 from talkcli.engine import protocol
 from talkcli.engine.process import EngineProcess
 from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
@@ -49,7 +49,7 @@ class Conversation:
     ) -> None:
         """`env`: the process's environment, if not this one's; `deadline`: the monotonic time by which all is over.
 
-        `interrupt`: what ends any waiting with Interrupted, as in `dial.ready`.
+        `interrupt`: what ends any waiting with Interrupted, as in `connect.ready`.
         """
         self._configure = configure
         self._env = env

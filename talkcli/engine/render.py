@@ -17,7 +17,7 @@ import stat
 import time
 from typing import TYPE_CHECKING
 
-from talkcli.client.dial import ready
+from talkcli.client.connect import ready
 from talkcli.engine import protocol
 from talkcli.engine.once import Conversation, EngineFailed
 from talkcli.engine.players.wav_stream import WavStreamPlayer

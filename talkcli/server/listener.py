@@ -12,7 +12,7 @@ import stat
 import sys
 
 from talkcli import __version__, paths, peers
-from talkcli.client import dial
+from talkcli.client import connect
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
 from talkcli.protocol.requests import Hello
 from talkcli.server.lock import Lock, identity, serves_already
@@ -147,7 +147,7 @@ def listen(named: str | None, mode: int) -> Listener | InheritedListener:
 def _refuse_second_server(named: str | None) -> None:
     """Refuse where clients would find another server before or instead of this one."""
     try:
-        found = dial.dial(named, Hello(urgent=True), __version__)
+        found = connect.dial(named, Hello(urgent=True), __version__)
     except (ServerUnavailable, AccessDenied):
         return  # nobody there who would answer our clients
     except TalkError as error:

@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.client.dial import Interrupted
+from talkcli.client.connect import Interrupted
 from talkcli.engine import once
 from talkcli.engine.process import engine_command
 from talkcli.engine.render import CannotWrite, RenderFailed, pieces, render
