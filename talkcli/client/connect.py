@@ -16,8 +16,8 @@ from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, Ta
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.paths import DIRECTORY, FILE, FORBIDDEN
 from talkcli.protocol import replies
-from talkcli.protocol.lines import decode, encode
-from talkcli.protocol.requests import Hello, write_request
+from talkcli.protocol.lines import decode
+from talkcli.protocol.requests import Hello, request_line
 from talkcli.splitter import LineSplitter
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ def _greet(
     try:
         try:
             if hello:
-                connected.send(encode(write_request(hello)))
+                connected.send(request_line(hello))
         except BrokenPipeError:
             pass  # it has hung up already, but it may have said why
         end = time.monotonic() + patience

@@ -20,8 +20,8 @@ from talkcli.client.connect import ANSWER_LIMIT, dial, ready
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import Say
-from talkcli.protocol.lines import decode, encode
-from talkcli.protocol.requests import write_request
+from talkcli.protocol.lines import decode
+from talkcli.protocol.requests import request_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -125,7 +125,7 @@ class Connection:
         # waits for room isn't accepted yet: who hangs up takes it back.
         interruptible = slow or not isinstance(request, Say)
         try:
-            self._send(encode({"seq": number, **write_request(request)}))
+            self._send(request_line(request, number))
             self.wait_until(
                 lambda: exchange.reply is not None,
                 lambda: None if slow else exchange.touched + self._patience,
@@ -142,7 +142,7 @@ class Connection:
 
     def post(self, request: Request) -> None:
         """Send a request whose reply nobody waits for."""
-        self._send(encode({"seq": next(self._numbers), **write_request(request)}))
+        self._send(request_line(request, next(self._numbers)))
 
     def _no_reply(self, request: Request) -> TalkError:
         why = self.ended or f"it did not reply within {self._patience:g} s"

@@ -11,8 +11,8 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.option import MAX_ID, MAX_IDS
 from talkcli.goals.options import Say, bad_key, bad_option
 from talkcli.goals.states import State
-from talkcli.protocol.lines import MAX_LINE, encode
-from talkcli.protocol.requests import write_request
+from talkcli.protocol.lines import MAX_LINE
+from talkcli.protocol.requests import request_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -80,7 +80,7 @@ def check(request: Say | Set) -> None:
 def too_long(request: Say) -> Goal | None:
     """Return the goal that the server would have made of a text that doesn't fit into a request, None if it fits."""
     try:
-        line = encode({"seq": _LONGEST_NUMBER, **write_request(request)})
+        line = request_line(request, _LONGEST_NUMBER)
     except ValueError as error:  # NaN in `data`
         raise UsageError(f"'data' is no JSON: {error}") from None
     if len(line) <= MAX_LINE:
