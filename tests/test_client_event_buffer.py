@@ -80,7 +80,7 @@ def test_watch_ends_with_its_iterator() -> None:
             break
         client.events()  # not even begun
         client.status()
-        watches = client._followed._watches
+        watches = client._connection.followed._watches
         assert watches is not None
         assert len(watches) == 0
 

@@ -242,7 +242,7 @@ def test_goal_is_lost_with_its_server(client: Client, scripted: Talk) -> None:
 
 def test_late_feedback_of_an_unknown_goal_is_an_error(client: Client) -> None:
     with pytest.raises(UnknownGoal):
-        GoalHandle(client, Goal("none-1", State.ACTIVE)).feedback(1)
+        GoalHandle(client._connection, Goal("none-1", State.ACTIVE)).feedback(1)
 
 
 # Polled

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import Client
+from talkcli.client.connection import SocketConnection
 from talkcli.errors import AccessDenied, Busy, Lost, ServerUnavailable, UnknownGoal, UsageError
 from talkcli.goals.states import State
 from tests.conformance.rawsocket import GREETING, FakeServer
@@ -279,10 +280,10 @@ def test_full_server_turns_goals_away_but_answers_status_and_cancel(
         turned_away = [talk.start(*each) for each in commands]
         assert talk.run("status", goal_id).code == 0
         assert talk.run("cancel").id == goal_id
-        with Client(talk.socket, urgent=True) as urgent:
+        with Client.over(SocketConnection(talk.socket, urgent=True)) as urgent:
             assert [each.id for each in urgent.status().recent] == [goal_id]
         with pytest.raises(Busy, match="--max-clients"):
-            Client(talk.socket, patience=0.5)
+            SocketConnection(talk.socket, patience=0.5)
         assert 0.5 <= time.monotonic() - began < 2.5
         for each in turned_away:
             done = talk.finish(each)

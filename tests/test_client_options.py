@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import Client, PausedChanged, State, StateChanged
-from talkcli.client.outgoing import batches
+from talkcli.client.client import batches
 from talkcli.errors import BadOption, RequestRefused, UnknownGoal, UsageError
 from talkcli.protocol.lines import MAX_LINE, encode
 from talkcli.server import subscribers

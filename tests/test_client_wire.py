@@ -13,6 +13,7 @@ import pytest
 
 from talkcli import Client
 from talkcli.client.connect import Interrupted
+from talkcli.client.connection import SocketConnection
 from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, PausedChanged, Result, Snapshot, StateChanged, WordHeard
@@ -40,7 +41,7 @@ def test_answer_to_a_patient_say_may_take_long_as_long_as_the_server_is_alive() 
         peer.reply("status", **OVERVIEW)
         peer.send(result())
 
-    with serving(play) as path, Client(path, patience=0.2) as client:
+    with serving(play) as path, Client.over(SocketConnection(path, patience=0.2)) as client:
         handle = client.say("a", patient=True)
         assert (handle.state, handle.speech_paused, handle.attached) == (State.PENDING, True, False)
         client.status()
@@ -54,7 +55,7 @@ def test_answer_to_pause_may_take_long() -> None:
         peer.send({"seq": seq, "ok": True, "paused": True, "goal": goal("ACTIVE")})
         peer.reply("resume", paused=False, goal=None)
 
-    with serving(play) as path, Client(path, patience=0.2) as client:
+    with serving(play) as path, Client.over(SocketConnection(path, patience=0.2)) as client:
         held = client.pause()
         assert held
         assert held.state is State.ACTIVE
@@ -62,7 +63,7 @@ def test_answer_to_pause_may_take_long() -> None:
 
 
 def test_answer_to_any_other_say_must_come_in_time() -> None:
-    with serving(unanswered) as path, Client(path, patience=0.2) as client:
+    with serving(unanswered) as path, Client.over(SocketConnection(path, patience=0.2)) as client:
         began = time.monotonic()
         with pytest.raises(Lost, match="may still be spoken"):
             client.say("a")
@@ -71,7 +72,7 @@ def test_answer_to_any_other_say_must_come_in_time() -> None:
 
 def test_server_that_says_nothing_at_all_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("talkcli.client.connection.SILENCE_LIMIT", 0.3)
-    with serving(unanswered) as path, Client(path, patience=5) as client:
+    with serving(unanswered) as path, Client.over(SocketConnection(path, patience=5)) as client:
         began = time.monotonic()
         with pytest.raises(Lost, match=r"nothing for 0\.3 s"):
             client.say("a", patient=True)
@@ -230,7 +231,7 @@ def test_interrupt_ends_the_wait_for_a_goal_and_loses_nothing(interrupt: tuple[i
         peer.reply("status", **OVERVIEW)
         peer.send(peer.word(), result())
 
-    with serving(play) as path, Client(path, interrupt=interrupt[0]) as client:
+    with serving(play) as path, Client.over(SocketConnection(path, interrupt=interrupt[0])) as client:
         handle = client.say("a", feedback=True)
         waiting: dict[str, Callable[[], object]] = {
             "events": lambda: list(handle.events(5)),
@@ -252,7 +253,7 @@ def test_interrupt_ends_what_may_take_long(interrupt: tuple[int, int], how: str)
             peer.send({"seq": request["seq"], "ok": True, **OVERVIEW})
         os.write(interrupt[1], b"x")
 
-    with serving(play) as path, Client(path, interrupt=interrupt[0]) as client:
+    with serving(play) as path, Client.over(SocketConnection(path, interrupt=interrupt[0])) as client:
         doing: dict[str, Callable[[], object]] = {
             "watch": lambda: list(client.events()),
             "say": lambda: client.say("a", patient=True),

@@ -15,6 +15,7 @@ import pytest
 
 from talkcli import Client
 from talkcli.client import connect
+from talkcli.client.connection import SocketConnection
 from talkcli.doctor import machine, sentence, server
 from talkcli.goals.states import State
 from tests.faults.broken import write
@@ -67,7 +68,7 @@ def examined(
         done, found = doctor(talk, "--silent")
         assert done.code == 4
         return found
-    monkeypatch.setattr(server, "Client", partial(Client, patience=patience))
+    monkeypatch.setattr(server, "SocketConnection", partial(SocketConnection, patience=patience))
     return within({**talk.env, "TALK_PLAYER": f"file:{directory}/said.wav"}, monkeypatch, silent=True)
 
 

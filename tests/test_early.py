@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.client.opening import Opened, open_early, stand_back
+from talkcli.client.connect import Begun, reach, stand_back
+from talkcli.frozen import replace
 from talkcli.paths import client_sockets
 from tests.conformance.bareserve import TALK, run
 from tests.support.connection import PATIENCE
@@ -87,15 +88,15 @@ def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
     """What it costs whoever waits for the first word: none of what follows is there when the request is out."""
     code = (
         "import sys\n"
-        "from talkcli.client import opening\n"
-        "opened = opening.open_early\n"
+        "from talkcli.client import connect\n"
+        "ask = connect.ask\n"
         "def spy(*arguments):\n"
-        "    found = opened(*arguments)\n"
+        "    found = ask(*arguments)\n"
         "    assert found and found.sent\n"
         "    heavy = {{'click', 'json', 're', 'enum', 'socket', 'typing', 'talkcli.client.client'}}\n"
         "    print(sorted(heavy & {{*sys.modules}}))\n"
         "    return found\n"
-        "opening.open_early = spy\n"
+        "connect.ask = spy\n"
         "from talkcli.cli import run\n"
         "assert run({}) == 0\n"
         "print('click' in sys.modules)\n"
@@ -109,13 +110,13 @@ def test_who_waits_for_a_goal_imports_nothing_until_the_server_has_had_its_time(
     """They would run beside the engine and the player until the first sound."""
     code = (
         "import sys\n"
-        "from talkcli.client import opening\n"
-        "stand_back = opening.stand_back\n"
-        "def spy(*opened):\n"
-        "    found = stand_back(*opened)\n"
+        "from talkcli.client import connect\n"
+        "stand_back = connect.stand_back\n"
+        "def spy(*begun):\n"
+        "    found = stand_back(*begun)\n"
         "    print('stood back', {{'json', 'talkcli.client.client'}} & {{*sys.modules}})\n"
         "    return found\n"
-        "opening.stand_back = spy\n"
+        "connect.stand_back = spy\n"
         "from talkcli.cli import run\n"
         "assert run({}) == 0\n"
     )
@@ -131,26 +132,26 @@ def test_who_waits_for_a_goal_imports_nothing_until_the_server_has_had_its_time(
 
 def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
-    begun = Opened(ours.detach(), "s", b"greeting\n", b"request\n")
-    with theirs:
+    begun = Begun(ours, "s", greeted=True, received=b"greeting\n", sent=b"request\n")
+    with ours, theirs:
         theirs.sendall(b"reply\n")
-        monkeypatch.setattr("talkcli.client.opening.time.process_time", lambda: 0.1)
+        monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: 0.1)
         began = time.monotonic()
         found = stand_back(begun, None)
         assert time.monotonic() - began >= 0.1
-        assert found == Opened(begun.descriptor, "s", b"greeting\nreply\n", b"request\n")
-        monkeypatch.setattr("talkcli.client.opening.time.process_time", lambda: PATIENCE)
-        monkeypatch.setattr("talkcli.client.opening._BACK", PATIENCE)
+        assert found == replace(begun, received=b"greeting\nreply\n")
+        monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: PATIENCE)
+        monkeypatch.setattr("talkcli.client.connect._BACK", PATIENCE)
         began = time.monotonic()
         assert stand_back(found, 0.05) == found  # its own limit comes first
         for refused in (b'{"seq": 1, "ok": false}\n', b'{"goal": {"state": "REJECTED"}}\n'):
             theirs.sendall(refused)
             assert stand_back(found, None).received.endswith(refused)  # there is nothing to wait for
         theirs.sendall(b"event\n")
-    assert stand_back(found, None).received.endswith(b"reply\nevent\n")  # nor is there when the server is gone
-    assert time.monotonic() - began < PATIENCE
-    with socket.socket(fileno=found.descriptor) as kept:
-        assert (os.get_blocking(kept.fileno()), kept.recv(1)) == (False, b"")
+        theirs.close()
+        assert stand_back(found, None).received.endswith(b"reply\nevent\n")  # nor is there when the server is gone
+        assert time.monotonic() - began < PATIENCE
+        assert (os.get_blocking(ours.fileno()), ours.recv(1)) == (False, b"")
 
 
 def test_commands_that_send_one_request_need_no_click(scripted: Talk) -> None:
@@ -199,7 +200,8 @@ def test_a_server_whose_backlog_is_full_is_not_passed_over_for_the_next_place() 
             patch.setenv("TMPDIR", directory)
             assert first in client_sockets(None)
             assert second in client_sockets(None)
-            assert open_early(None, b"hello\n", b"request\n", lambda: None) is None
+            found = reach(None)
+            assert (found.socket, found.full, found.failures[-1][0]) == (None, True, first)
         listening.setblocking(False)
         with pytest.raises(BlockingIOError):  # nobody came to the second
             listening.accept()

@@ -16,12 +16,13 @@ from talkcli.cli.click_app import talk
 from talkcli.cli.command import COMMON
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import Common
-from talkcli.client.opening import GREETING
+from talkcli.client.client import check, too_long
+from talkcli.client.connect import GREETING
 from talkcli.goals.option import FLAG
 from talkcli.goals.options import Cancel, Say
 from talkcli.protocol import replies
 from talkcli.protocol.lines import encode
-from talkcli.protocol.requests import Hello, Pause, Resume, Status, write_request
+from talkcli.protocol.requests import Hello, Pause, Resume, Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -181,6 +182,11 @@ def test_anything_else_is_click_s(line: list[str]) -> None:
     assert plain.read(line, {}) is None
 
 
+def sent_early(found: plain.Plain) -> tuple[Hello, Request] | None:
+    """Return what is said early for a command, None where nothing is."""
+    return early.first(found) if early.asks_at_once(found) else None
+
+
 def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
     """Return what the client library says for a command, with no way of its own around `requests`."""
     name, command = found.given.get("name") or os.environ.get("TALK_NAME") or None, found.command.name
@@ -190,8 +196,9 @@ def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
         feedback = found.given["feedback"]
         return hello, Say(text, wait=found.given["wait"] or feedback, feedback=feedback, **options)
     if command == "cancel":
-        return hello, Cancel(None, found.given["current"], found.given["before"], found.given["key"])
-    others: dict[str, Request] = {"status": Status(), "pause": Pause(), "resume": Resume()}
+        given = found.given
+        return hello, Cancel(given["ids"] or None, given["current"], given["before"], given["key"])
+    others: dict[str, Request] = {"status": Status(found.given.get("goal_id")), "pause": Pause(), "resume": Resume()}
     return hello, others[command]
 
 
@@ -201,11 +208,13 @@ def assert_sent_as_by_the_library(arguments: list[str], environment: Mapping[str
         for name, value in environment.items():
             patch.setenv(name, value)
         found = plain.read(arguments, os.environ)
-        sent = found and early.lines(found)
+        sent = found and sent_early(found)
         if not found or not sent:
             return
-        hello, request = library_sends(found)
-    assert sent == (encode(write_request(hello)), encode({"seq": 1, **write_request(request)}))
+        assert sent == library_sends(found)
+    if isinstance(sent[1], Say):
+        check(sent[1])
+        assert too_long(sent[1]) is None
 
 
 @settings(max_examples=200, deadline=None)
@@ -224,30 +233,37 @@ def test_thousands_that_are_sent_early_are_what_the_library_sends(
 
 
 @given(st.text(max_size=40))
-def test_a_text_goes_early_as_it_is_or_not_at_all(text: str) -> None:
+def test_any_text_goes_early_as_it_is(text: str) -> None:
     found = plain.read(["say", "--", text], {})
-    sent = found and early.lines(found)
-    if sent:
-        assert sent[1] == encode({"seq": 1, "request": "say", "text": text})
+    assert not found or text == "-" or sent_early(found) == (Hello(), Say(text))
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        *(["say", "x" * 10_001], ["say", "x", "--id", "a"], ["say", "x", "--as", "n" * 65], ["say", "-"]),
-        *(
-            ["say", "--lines"],
-            ["say", 'a "quoted" word'],
-            ["cancel", "12"],
-            ["cancel", "--before", "x"],
-        ),
-        *(["status", "12"], ["wait"], ["cancel", "--key", "k" * 65]),
+        *(["say", 'a "quoted" word'], ["say", "two\nlines"], ["say", "x", "--id", "a"], ["say", "x" * 10_000]),
+        *(["cancel", "4k7f-12"], ["cancel", "--before", "x"], ["cancel", "--key", "k"], ["status", "4k7f-12"]),
     ],
 )
-def test_what_may_be_refused_is_not_sent_early(line: list[str]) -> None:
+def test_what_the_server_alone_judges_goes_early(line: list[str]) -> None:
     found = plain.read(line, {})
     assert found
-    assert early.lines(found) is None
+    assert sent_early(found) == library_sends(found)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(["say", "x" * 10_001], ["say", "x", "--voice", "v" * 10_000], ["say", "x", "--as", "n" * 65]),
+        *(["say", "-"], ["say", "--lines"], ["say", "Gr\udcc3\udcbc"], ["wait"], ["log"]),
+        *(["cancel", "12"], ["cancel", "a", "a"], ["cancel", "i" * 65], ["cancel", ""], ["cancel", "--before", "12"]),
+        *(["status", "12"], ["status", "i" * 65], ["cancel", "--key", "k" * 65]),
+    ],
+)
+def test_what_the_library_may_change_or_refuse_is_not_sent_early(line: list[str]) -> None:
+    found = plain.read(line, {})
+    assert found
+    assert sent_early(found) is None
 
 
 def test_the_greeting_that_is_looked_for_is_the_server_s() -> None:

@@ -1,8 +1,8 @@
 """Begins a plain command before the program that carries it out is imported, and carries it out.
 
-A request is sent early only where nothing can be wrong with it, so that no error is found after it was sent. Its line
-must be, byte for byte, the one that the client library sends for the same command: the library takes it for its own,
-see `Connection`. A test shows that it is.
+A request is sent early only where nothing can be wrong with it, so that no error is found after it was sent. It is the
+one that the client library sends for the same command: the library takes it for its own, see `SocketConnection`. A test
+shows that it is.
 """
 
 from __future__ import annotations
@@ -11,80 +11,106 @@ import _signal
 import os
 import time
 
-from talkcli.client.opening import open_early, stand_back
+from talkcli.client.connect import ask, reach, sender, stand_back
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.options import MAX_CHARACTERS, MAX_KEY, Cancel, Say
+from talkcli.goals.option import MAX_ID
+from talkcli.goals.options import MAX_CHARACTERS, Cancel, Say, bad_key
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import Any
 
     from talkcli.cli.plain import Plain
-    from talkcli.goals.option import Option
+    from talkcli.client.connect import Begun
+    from talkcli.protocol.requests import Hello, Request
 
-#: The requests that are sent early, by their commands: the rows of their fields.
-_FIELDS: dict[str, tuple[Option, ...]] = {
-    "say": Say.options,
-    "cancel": Cancel.options,
-    "status": (),
-    "pause": (),
-    "resume": (),
-}
-#: What a server may refuse for more than its form: only the library knows the whole id, reads a file, or counts lines.
-_LATE = ("id", "ids", "before", "goal_id", "lines")
-
-
-def lines(plain: Plain) -> tuple[bytes, bytes] | None:
-    """Return the lines of `hello` and of the request; None where something about them is not plain."""
-    command, given = plain.command.name, dict(plain.given)
-    if command not in _FIELDS or any(given.pop(each, None) for each in _LATE):
-        return None
-    if command == "say":
-        given["wait"] = given["wait"] or given["feedback"]
-        given["text"] = "" if given["text"] == ("-",) else " ".join(given["text"])
-        if not given["text"]:
-            return None
-    name = given.get("name") or os.environ.get("TALK_NAME") or None
-    urgent = {"urgent": True} if command in ("cancel", "status") else {}
-    hello = _line({"request": "hello", "name": name, **urgent})
-    fields = {each.name: given.get(each.name, each.default) for each in _FIELDS[command]}
-    asked = {each.name: fields[each.name] for each in _FIELDS[command] if fields[each.name] != each.default}
-    request = _line({"seq": 1, "request": command, **asked})
-    return (hello, request) if hello and request else None
-
-
-def _line(fields: dict[str, Any]) -> bytes | None:
-    """Return an object as a line of JSON; None where a text in it is long, or has what JSON escapes."""
-    shown = []
-    for name, each in fields.items():
-        if isinstance(each, str):
-            fits = 0 < len(each) <= (MAX_CHARACTERS if name == "text" else MAX_KEY)
-            if not (fits and each.isprintable()) or '"' in each or "\\" in each:
-                return None
-            shown.append(f'"{name}": "{each}"')
-        elif each is not None:
-            shown.append(f'"{name}": {str(each).lower() if isinstance(each, bool) else repr(each)}')
-    return f"{{{', '.join(shown)}}}\n".encode()
+#: The commands whose request may be sent early.
+_EARLY = ("say", "cancel", "status", "pause", "resume")
+#: Those that find a place where a server is full.
+_URGENT = ("cancel", "status")
 
 
 def carry_out(plain: Plain) -> int:
     """Carry out a plain command line, and return its exit code."""
     began = time.monotonic()
-    said = lines(plain)
+    command, given = plain.command.name, plain.given
     held: set[int] = set()
 
     def hold() -> None:
         # A goal that is on its way is this command's to cancel: a signal waits until there is somebody to do so.
-        asked = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if plain.command.name == "say" else set()
+        asked = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if command == "say" else set()
         held.update(asked - _signal.pthread_sigmask(_signal.SIG_BLOCK, asked))
 
-    named = plain.common.get("socket") or os.environ.get("TALK_SOCKET") or None
     try:
-        opened = open_early(named, *said, hold) if said else None
-        if opened and opened.sent and plain.given.get("wait") and not plain.given.get("feedback"):
-            opened = stand_back(opened, plain.given["timeout"])
+        begun = _begin(plain, hold) if asks_at_once(plain) else None
+        if begun and begun.sent and given.get("wait") and not given.get("feedback"):
+            begun = stand_back(begun, given["timeout"])
     except KeyboardInterrupt:
         return 128 + int(_signal.SIGINT)  # nothing was sent
     from talkcli.cli.show import Common, ended
 
-    options = Common(began=began, opened=opened, held=held, typed=plain.typed, **plain.common)
-    return ended(lambda: plain.command.carry_out(options, plain.given), options)
+    options = Common(began=began, begun=begun, held=held, typed=plain.typed, **plain.common)
+    return ended(lambda: plain.command.carry_out(options, given), options)
+
+
+def asks_at_once(plain: Plain) -> bool:
+    """Whether a command begins with a request, and doesn't read standard input before, which may take any time."""
+    return plain.command.name in _EARLY and not plain.given.get("lines") and plain.given.get("text") != ("-",)
+
+
+def _begin(plain: Plain, before: Callable[[], None]) -> Begun:
+    """Return the command's connection, as far as it comes in no time; `before`: called before its request is sent."""
+    begun = reach(plain.common.get("socket") or os.environ.get("TALK_SOCKET") or None)
+    if begun.socket is None:
+        return begun
+    # After it has connected: the server greets meanwhile.
+    said = first(plain)
+    return ask(begun, *said, before) if said else begun
+
+
+def first(plain: Plain) -> tuple[Hello, Request] | None:
+    """Return what a command says first, and its request; None where that may be refused, or only the library knows."""
+    from talkcli.errors import UsageError
+
+    request = _request(plain)
+    if request is None:
+        return None
+    try:
+        return sender(plain.given.get("name"), urgent=plain.command.name in _URGENT), request
+    except UsageError:
+        return None
+
+
+def _request(plain: Plain) -> Request | None:
+    from talkcli.protocol.requests import Pause, Resume, Status
+
+    command, given = plain.command.name, plain.given
+    if command == "say":
+        return _say(given)
+    if command == "cancel":
+        ids, before, key = given["ids"], given["before"], given["key"]
+        # More ids may be too many for a request, or the same.
+        if len(ids) > 1 or not all(map(_whole, [*ids, before or "-"])) or (key and bad_key(key)):
+            return None
+        return Cancel(ids or None, given["current"], before, key)
+    if command == "status":
+        goal_id = given["goal_id"]
+        return Status(goal_id) if goal_id is None or _whole(goal_id) else None
+    return Pause() if command == "pause" else Resume()
+
+
+def _whole(goal_id: str) -> bool:
+    """Whether an id is one as it stands; numbers stand for goals of a server that the library knows once it greets."""
+    return 0 < len(goal_id) <= MAX_ID and not goal_id.isdecimal()
+
+
+def _say(given: dict[str, Any]) -> Say | None:
+    """Return a goal; None where its text isn't sent as it is, or may not fit into a request."""
+    options = {each.name: given[each.name] for each in Say.options if each.name in given}
+    say = Say(**{**options, "text": " ".join(given["text"]), "wait": given["wait"] or given["feedback"]})
+    try:
+        say.text.encode()
+    except UnicodeEncodeError:
+        return None
+    # With as much escaped as can be, these and all that is shorter fit.
+    return None if len(say.text) + len(say.voice or "") > MAX_CHARACTERS else say

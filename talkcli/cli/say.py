@@ -98,7 +98,7 @@ def _say(
         try:
             patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
             with options.connect(name=name, interrupt=interrupts.watched, patience=patience) as client:
-                if interrupts.number is not None and not (options.opened and options.opened.sent):
+                if interrupts.number is not None and not (options.begun and options.begun.sent):
                     raise Interrupted  # what has been sent is cancelled, once its id is known
                 goal = client.say(text, follow=wait, feedback=feedback, **chosen)
                 shown = _feedback(options) if feedback else None

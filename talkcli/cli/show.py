@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from typing import Any, TextIO
 
     from talkcli.client.client import Client
-    from talkcli.client.opening import Opened
+    from talkcli.client.connect import Begun
     from talkcli.goals.goal import JsonObject
     from talkcli.terminal.text import Screen
 
@@ -42,7 +42,7 @@ _NO_BREAK = "\0"
 class Common:
     """What every command is given: the options that all have, and what was done before it is carried out."""
 
-    __slots__ = ("began", "held", "json", "opened", "quiet", "socket", "typed")
+    __slots__ = ("began", "begun", "held", "json", "quiet", "socket", "typed")
 
     def __init__(
         self,
@@ -51,27 +51,28 @@ class Common:
         json: bool = False,
         quiet: bool = False,
         began: float | None = None,
-        opened: Opened | None = None,
+        begun: Begun | None = None,
         held: Iterable[int] = (),
         typed: AbstractSet[str] = frozenset(),
     ) -> None:
-        """`typed`: the options that stand on the command line; for `began`, `opened` and `held` see `early`."""
+        """`typed`: the options that stand on the command line; for `began`, `begun` and `held` see `early`."""
         self.socket = socket
         self.json = json
         self.quiet = quiet
         #: when the command began, by the monotonic clock
         self.began = time.monotonic() if began is None else began
-        #: a connection on which its request was sent already
-        self.opened = opened
+        #: how far its connection has come already, maybe with its request sent
+        self.begun = begun
         #: signals that wait for somebody to take them
         self.held = held
         self.typed = typed
 
     def connect(self, **options: Any) -> Client:
-        """Return a client connected to the server; see `Client` for the options."""
+        """Return a client connected to the server; see `SocketConnection` for the options."""
         from talkcli.client.client import Client
+        from talkcli.client.connection import SocketConnection
 
-        return Client(self.socket, opened=self.opened, **options)
+        return Client.over(SocketConnection(self.socket, begun=self.begun, **options))
 
 
 class OutputClosed(Exception):

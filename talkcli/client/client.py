@@ -12,84 +12,67 @@ It imports neither click nor asyncio nor pyttsx3, starts no thread, and may be u
 
 from __future__ import annotations
 
-import os
-import select
-
-from talkcli import __version__
-from talkcli.client.connect import ANSWER_LIMIT
-from talkcli.client.connection import SILENCE_LIMIT, Connection
+from talkcli.client.connection import SILENCE_LIMIT, SocketConnection
 from talkcli.client.event_buffer import MAX_STATES, EventBuffer
-from talkcli.client.goal import Followed, GoalHandle
-from talkcli.client.outgoing import batches, check, check_key, full_id, too_long
+from talkcli.client.goal import GoalHandle
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
-from talkcli.goals.option import MAX_LOG
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.option import MAX_ID, MAX_IDS, MAX_LOG
+from talkcli.goals.options import Cancel, Say, Set, bad_key, bad_option
 from talkcli.goals.states import State
 from talkcli.protocol.events import Snapshot
+from talkcli.protocol.lines import MAX_LINE
 from talkcli.protocol.replies import Canceled, ServerStatus, goal_in, goals
-from talkcli.protocol.requests import MAX_NAME, Hello, Log, Pause, Resume, Status, Voices, Wait, Watch
+from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch, request_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
     from types import TracebackType
 
-    from talkcli.client.opening import Opened
+    from talkcli.client.connection import Connection
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
 
 __all__ = ["Canceled", "Client", "GoalHandle", "ServerStatus"]
 
+#: Bytes of a request's line that are left for what isn't its list of ids: another id, a key, the names of the fields.
+_REST_OF_LINE = 4096
+#: Bytes of JSON that one character may take: a quote with its backslash, two halves of a surrogate pair, escaped.
+_LONGEST_ASCII, _LONGEST_CHARACTER = 2, 12
+#: The number of a request has no more digits than this.
+_LONGEST_NUMBER = 10**15
+
 
 class Client:
     """A connection to a talk server; the socket is found as the command `talk` finds it."""
 
-    def __init__(
-        self,
-        socket: str | None = None,
-        *,
-        name: str | None = None,
-        interrupt: int | Mapping[int, int] | None = None,
-        patience: float = ANSWER_LIMIT,
-        urgent: bool = False,
-        opened: Opened | None = None,
-    ) -> None:
+    def __init__(self, socket: str | None = None, *, name: str | None = None) -> None:
         """Connect.
 
         `socket`: path of the server's socket, default TALK_SOCKET, then the usual places; `name`: what this sender
-        calls itself in `talk status` and the log, default TALK_NAME; `interrupt`: a descriptor that ends any waiting
-        with `connect.Interrupted` as soon as it is readable, or several, each with the events of poll that do so
-        (broken and hung up always do); `patience`: seconds in which the server must greet; `urgent`: for status and
-        cancel alone, for which a full server keeps some places; `opened`: a connection that `client.opening` has begun,
-        with the first request that this client will send.
+        calls itself in `talk status` and the log, default TALK_NAME.
 
         UsageError for a name that is too long; ServerUnavailable, AccessDenied, Busy or ProtocolMismatch where there is
         no server to be had: nothing was sent then.
         """
-        from talkcli import paths
+        self._connection: Connection = SocketConnection(socket, name=name)
 
-        self._followed = Followed()
-        # Bytes in a variable that are no UTF-8 keep nobody from cancelling.
-        called = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
-        name = name or called or None
-        if name and len(name) > MAX_NAME:
-            raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
-        if isinstance(interrupt, int):
-            interrupt = {interrupt: select.POLLIN}
-        hello = Hello(name, urgent)
-        self._connection = Connection(
-            paths.named_socket(socket), hello, __version__, self._followed.hear, interrupt, patience, opened
-        )
+    @classmethod
+    def over(cls, connection: Connection) -> Client:
+        """Return a client on a connection that there is already. Internal: for `talk`'s own commands, no promise."""
+        client = cls.__new__(cls)
+        client._connection = connection
+        return client
 
     @property
     def path(self) -> str:
         """The socket of the server."""
-        return self._connection.line.path
+        return self._connection.path
 
     @property
     def server_pid(self) -> int | None:
-        return self._connection.line.pid
+        return self._connection.pid
 
     def close(self) -> None:
         """Close the connection. What was sent is spoken all the same."""
@@ -167,15 +150,15 @@ class Client:
         check(request)
         rejected = too_long(request)
         if rejected is not None:
-            return GoalHandle(self, rejected)
-        handle = GoalHandle(self, Goal("", State.PENDING))
+            return GoalHandle(self._connection, rejected)
+        handle = GoalHandle(self._connection, Goal("", State.PENDING))
 
         def accepted(reply: JsonObject, _: list[JsonObject]) -> None:
             handle.goal = Goal.from_json(reply.get("goal"))
             handle.attached = reply.get("attached") is True
             handle.speech_paused = reply.get("paused") is True
             if request.wait:
-                self._followed.add(handle, feedback=feedback)
+                handle._listen(feedback=feedback)
 
         self._connection.request(request, accepted, slow=patient)
         return handle
@@ -190,8 +173,8 @@ class Client:
 
         def accepted(_: JsonObject, items: list[JsonObject]) -> None:
             for goal in goals(items, "goal"):
-                handles[goal.id] = GoalHandle(self, goal)
-                self._followed.add(handles[goal.id], feedback=feedback)
+                handles[goal.id] = GoalHandle(self._connection, goal)
+                handles[goal.id]._listen(feedback=feedback)
 
         for some in [None] if wanted is None else batches(wanted):
             self._connection.request(Wait(some, feedback), accepted)
@@ -215,7 +198,9 @@ class Client:
         first, *others = [None] if wanted is None else batches(wanted) or [()]
         last = None if before is None else self._full_id(before)
         requests = [Cancel(first, current, last, key), *map(Cancel, others)]
-        check_key(key)
+        fault = None if key is None else bad_key(key)
+        if fault:
+            raise UsageError(fault)
         items: list[JsonObject] = []
         unknown: list[str] = []
         for request in requests:
@@ -302,7 +287,7 @@ class Client:
 
         def accepted(reply: JsonObject, items: list[JsonObject]) -> None:
             buffer.add(Snapshot(ServerStatus.from_reply(reply, items)))
-            self._followed.watch(buffer)
+            self._connection.followed.watch(buffer)
 
         self._connection.request(Watch(), accepted)
         return self._take_all(buffer)
@@ -310,7 +295,17 @@ class Client:
     # -- inside
 
     def _full_id(self, goal_id: str) -> str:
-        return full_id(goal_id, self._connection.line.boot)
+        """Return the whole id for a number alone, which means a goal of this server.
+
+        UsageError for an empty id, UnknownGoal for one that no goal can have.
+        """
+        if not goal_id:
+            raise UsageError("an id is empty: is the variable set that it comes from?")
+        if goal_id.isascii() and goal_id.isdecimal():
+            goal_id = f"{self._connection.boot}-{goal_id}"
+        if len(goal_id) > MAX_ID:
+            raise UnknownGoal(f"no goal {goal_id[:MAX_ID]!a}… is known: an id has at most {MAX_ID} characters")
+        return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
         event: Event | None = None
@@ -328,9 +323,43 @@ class Client:
             yield event
         raise Lost(f"nothing more is heard of the server at {self.path}: {self._connection.ended}")
 
-    def _follow_late(self, handle: GoalHandle, *, feedback: bool) -> None:
-        def accepted(_: JsonObject, items: list[JsonObject]) -> None:
-            handle._settle(next(goals(items, "goal")))
-            self._followed.add(handle, feedback=feedback)
 
-        self._connection.request(Wait((handle.id,), feedback), accepted)
+def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
+    """Return the ids in their order, each once, in parts that each fit into a request's line."""
+    parts: list[list[str]] = []
+    room = 0
+    for each in dict.fromkeys(ids):
+        plain = each.isascii() and each.isprintable()
+        size = (_LONGEST_ASCII if plain else _LONGEST_CHARACTER) * len(each) + len('"", ')
+        if not parts or size > room or len(parts[-1]) == MAX_IDS:
+            parts.append([])
+            room = MAX_LINE - _REST_OF_LINE
+        room -= size
+        parts[-1].append(each)
+    return [tuple(each) for each in parts]
+
+
+def check(request: Say | Set) -> None:
+    """Raise UsageError for options of the wrong kind, or out of their range: as the server would, without asking it."""
+    for option in request.options:
+        try:
+            fault = option.fault(getattr(request, option.name))
+        except (TypeError, ValueError) as error:  # something in `data`
+            fault = f"is no JSON: {error}"
+        if fault:
+            raise UsageError(f"{option.name!r} {fault}")
+    words = bad_option(request)
+    if words:
+        raise UsageError(words)
+
+
+def too_long(request: Say) -> Goal | None:
+    """Return the goal that the server would have made of a text that doesn't fit into a request, None if it fits."""
+    try:
+        line = request_line(request, _LONGEST_NUMBER)
+    except ValueError as error:  # NaN in `data`
+        raise UsageError(f"'data' is no JSON: {error}") from None
+    if len(line) <= MAX_LINE:
+        return None
+    message = f"Talk rejected: the text has {len(request.text):,} characters, more than a request can hold"
+    return Goal("", State.REJECTED, request.text, reason="text_too_long", message=message)

@@ -1,30 +1,40 @@
-"""How a client gets from nothing to a server that has greeted it: every place tried, and why each failed.
+"""From nothing to a server that has greeted: every place tried, why each failed, and the first request sent at once.
 
-It sends nothing but `hello`, so whatever fails here is safe to try again.
+In two stages. Of the first a connection is made by `reach`, and whoever knows already what to ask sends it by `ask`,
+before the rest of the client is imported: the server works meanwhile. It imports next to nothing itself, not even
+`socket` and `json`, which together take as long as the interpreter's start, and knows only the plain case, a server of
+this protocol that answers at once. The second, `connect`, takes over from wherever that ended: it waits, tries the
+other places, and says what is wrong. Nothing is sent twice that could have an effect.
 """
 
 from __future__ import annotations
 
 import _socket  # see `peers`
-import math
 import os
-import select
 import time
 
-from talkcli import paths, peers
-from talkcli.errors import AccessDenied, BadRequest, Busy, ServerUnavailable, TalkError
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli import paths
+from talkcli.frozen import TYPE_CHECKING, frozen, replace
 from talkcli.paths import DIRECTORY, FILE, FORBIDDEN
-from talkcli.protocol import replies
-from talkcli.protocol.lines import decode
-from talkcli.protocol.requests import Hello, request_line
-from talkcli.splitter import LineSplitter
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
-    from talkcli.client.opening import Opened
+    from talkcli.errors import AccessDenied, TalkError
+    from talkcli.goals.goal import JsonObject
+    from talkcli.protocol.requests import Hello, Request
+    from talkcli.splitter import LineSplitter
 
+#: How a server of this protocol begins its greeting, as `protocol.lines` writes it; a test compares the two.
+GREETING = b'{"talk": 1, "version": '
+#: The number of the first request on a connection.
+FIRST = 1
+#: Seconds in which a server greets that is up and has time; whoever waits longer wants to be able to interrupt it.
+AT_ONCE = 0.2
+#: Seconds for which a client stands back at most.
+_BACK = 0.2
+#: What is in the answer to a request after which there is nothing to wait for.
+_REFUSED = (b'"ok": false', b'"state": "REJECTED"')
 #: Seconds in which a server greets, and answers each request.
 ANSWER_LIMIT = 5.0
 #: Seconds for which a client tries again where the server is full or its backlog is; with jitter, so that many clients
@@ -37,6 +47,33 @@ _LET_IN = "have its owner let you in, with `talk serve --socket-mode 0660` and t
 _OWN = "or start your own with: talk serve"
 
 
+class Interrupted(Exception):
+    """One of the caller's own descriptors became ready while something was awaited."""
+
+
+@frozen
+class Begun:
+    """A connection as the first stage leaves it, or that there is none."""
+
+    #: not blocking; None where no place has anybody who could be asked
+    socket: _socket.socket | None
+    #: the place that it leads to
+    path: str = ""
+    #: the places before it, each with what is wrong there: the system's error, or that it belongs to somebody else
+    failures: tuple[tuple[str, Exception], ...] = ()
+    #: whether `hello` was said
+    greeted: bool = False
+    #: what the server has said: less than its greeting, or more
+    received: bytes = b""
+    #: what was sent of the first request
+    sent: bytes = b""
+
+    @property
+    def full(self) -> bool:
+        """Whether the last place has a server that takes up no connection at this moment."""
+        return self.socket is None and bool(self.failures) and isinstance(self.failures[-1][1], BlockingIOError)
+
+
 @frozen
 class Line:
     """A connection to a server that has greeted, and what was read of it beyond the greeting."""
@@ -45,56 +82,152 @@ class Line:
     path: str
     #: the server's boot id: the first half of its goals' ids
     boot: str
-    #: the server's process id and version
+    #: the server's process id
     pid: int | None
-    version: str | None
     splitter: LineSplitter
     #: lines that came with the greeting
     lines: list[bytes]
+    #: what was sent of the first request already
+    sent: bytes
 
 
-class Interrupted(Exception):
-    """One of the caller's own descriptors became ready while something was awaited."""
+def reach(named: str | None, failures: tuple[tuple[str, Exception], ...] = ()) -> Begun:
+    """Return a connection to the first place that takes one, on which nothing has been said.
+
+    `named`: the only socket to try, or None for the list; `failures`: what is wrong with the first places of that,
+    which are not tried again.
+    """
+    for path in paths.client_sockets(named)[len(failures) :]:
+        connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
+        # Not blocking: a server that is stopped and whose backlog is full would hold the client for ever.
+        connected.setblocking(False)
+        wrong: Exception | None = None
+        try:
+            connected.connect(path)
+        except OSError as error:
+            wrong = error
+        else:
+            wrong = None if named or path == paths.SYSTEM_SOCKET else _foreign(connected)
+            if wrong is None:
+                return Begun(connected, path, failures)
+        connected.close()
+        failures = (*failures, (path, wrong))
+        if isinstance(wrong, BlockingIOError):  # a server that is there is the one, not the next
+            break
+    return Begun(None, failures=failures)
 
 
-class _BacklogFull(ServerUnavailable):
-    """More clients connect than the server takes at this moment."""
+def _foreign(connected: _socket.socket) -> AccessDenied | None:
+    """Return what is wrong with a server that somebody else has put where ours belongs: it would hear all."""
+    from talkcli import peers
+
+    _, uid = peers.credentials(connected)
+    if uid in {os.getuid(), 0}:
+        return None
+    from talkcli.errors import AccessDenied
+
+    return AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
 
 
-def dial(
+def ask(begun: Begun, hello: Hello, request: Request, before: Callable[[], None]) -> Begun:
+    """Say hello, and send the first request as soon as the server has greeted; return how far that has come.
+
+    `before`: called before the request is sent, which is not done where the server greets otherwise, or not at once.
+    """
+    from talkcli.protocol.requests import request_line
+
+    connected, line = begun.socket, request_line(request, FIRST)
+    assert connected
+    received = sent = b""
+    connected.settimeout(AT_ONCE)
+    try:
+        connected.sendall(request_line(hello))
+        received = connected.recv(65536)
+        if received.startswith(GREETING) and b"\n" in received:
+            before()
+            sent = line[: connected.send(line)]
+    except OSError:  # it may have more to do than to greet, or has hung up: whoever reads on will find out
+        pass
+    connected.setblocking(False)
+    return replace(begun, greeted=True, received=received, sent=sent)
+
+
+def stand_back(begun: Begun, timeout: float | None) -> Begun:
+    """Leave the processor to the server for a while, and return the connection with what the server says meanwhile.
+
+    For who waits for a goal to end and has nothing to do before. Until the first sound, server, engine, player and
+    sound server take about the processor time that this process has had so far, whatever the machine; the rest of the
+    client, imported in that time, made it 1.4 times as long where both cores of two had other work as well.
+
+    `timeout`: the seconds that the whole command may take, or None.
+    """
+    end = time.monotonic() + min(time.process_time(), _BACK, _BACK if timeout is None else timeout)
+    connected, received = begun.socket, begun.received
+    assert connected
+    try:
+        while (left := end - time.monotonic()) > 0:
+            connected.settimeout(left)
+            said = connected.recv(65536)
+            if not said:
+                break
+            received += said
+            if any(each in said for each in _REFUSED):
+                break
+    except OSError:  # the time is up; or the connection has broken, which whoever reads on will find
+        pass
+    connected.setblocking(False)
+    return replace(begun, received=received)
+
+
+def sender(name: str | None, *, urgent: bool = False) -> Hello:
+    """Return what is said first by whoever has this name, or else that of TALK_NAME; UsageError for one too long."""
+    from talkcli.errors import UsageError
+    from talkcli.protocol.requests import MAX_NAME, Hello
+
+    # Bytes in a variable that are no UTF-8 keep nobody from cancelling.
+    called = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
+    name = name or called or None
+    if name and len(name) > MAX_NAME:
+        raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
+    return Hello(name, urgent)
+
+
+def connect(
     named: str | None,
     hello: Hello,
-    version: str,
     patience: float = ANSWER_LIMIT,
     interrupt: Mapping[int, int] | None = None,
-    opened: Opened | None = None,
+    begun: Begun | None = None,
 ) -> Line:
     """Return a connection to the first server that answers.
 
-    `named`: the only socket to try, or None for the list; `hello`: what is said to it; `version`: the client's own;
-    `patience`: seconds in which the server must greet; `interrupt`: what ends it with Interrupted, as in `ready`;
-    `opened`: a connection on which `hello` was sent already.
+    `named`: the only socket to try, or None for the list; `hello`: what is said to it; `patience`: seconds in which the
+    server must greet; `interrupt`: what ends it with Interrupted, as in `ready`; `begun`: how far it has come already.
 
     ServerUnavailable, AccessDenied, ProtocolMismatch or Busy where there is none.
     """
+    from talkcli.errors import AccessDenied, Busy, ServerUnavailable
+
     end = time.monotonic() + min(BUSY_LIMIT, patience)
-    if opened:
-        connected = _socket.socket(fileno=opened.descriptor)
-        try:
-            return _greet(connected, opened.path, None, version, patience, interrupt, opened.received)
-        except BaseException as error:
-            connected.close()
-            if opened.sent or not isinstance(error, Busy | AccessDenied):
-                raise
+    begun = begun or reach(named)
     while True:
         try:
-            return _try_all(named, hello, version, patience, interrupt)
-        except (Busy, _BacklogFull):
-            if time.monotonic() >= end:
+            if begun.socket is None:
+                raise _nobody(begun, named)
+            return _greet(begun, begun.socket, hello, patience, interrupt)
+        except AccessDenied as error:
+            if begun.socket is None or begun.sent:
+                raise
+            failures = (*begun.failures, (begun.path, error))
+        except (Busy, ServerUnavailable) as error:
+            again = begun.full or isinstance(error, Busy)
+            if not again or begun.sent or time.monotonic() >= end:
                 raise
             import random
 
             ready({}, random.uniform(*_BUSY_PAUSE), interrupt)
+            failures = ()
+        begun = reach(named, failures)
 
 
 def ready(watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None) -> set[int]:
@@ -103,6 +236,9 @@ def ready(watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[
     Each comes with poll's events; that it is broken or hung up counts in any case. `interrupt`: others, of which
     each ends it with Interrupted as soon as it is ready.
     """
+    import math
+    import select
+
     interrupt = interrupt or {}
     poll = select.poll()  # not select(), which fails in a program that has more than 1,024 descriptors
     for fd, events in (*watched.items(), *interrupt.items()):
@@ -115,122 +251,115 @@ def ready(watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[
     return found
 
 
-def _try_all(
-    named: str | None, hello: Hello, version: str, patience: float, interrupt: Mapping[int, int] | None
+def _greet(
+    begun: Begun, connected: _socket.socket, hello: Hello, patience: float, interrupt: Mapping[int, int] | None
 ) -> Line:
-    failures: list[str] = []
-    found: str = ""
-    denied = False
-    for path in paths.client_sockets(named):
-        try:
-            connected = _connect(path)
-        except OSError as error:
-            found = paths.found_at(path, error)
-            denied = denied or found == FORBIDDEN
-            hint = f": name the one in it, {_inside(path)}" if found == DIRECTORY else ""
-            failures.append(f"{path}: {found}{hint}")
-            continue
-        try:
-            _check_owner(connected, path, named is not None)
-            return _greet(connected, path, hello, version, patience, interrupt)
-        except AccessDenied as error:
-            connected.close()
-            denied = True
-            failures.append(f"{path}: {error}")
-        except BaseException:
-            connected.close()
-            raise
-    raise _nobody(failures, named, found, denied=denied)
+    """Greet, unless that has been done, and be greeted; where that fails the connection is closed."""
+    from talkcli.splitter import LineSplitter
 
-
-def _connect(path: str) -> _socket.socket:
-    connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
+    splitter = LineSplitter()
     try:
-        # Not blocking: a server that is stopped and whose backlog is full would hold the client for ever.
-        connected.setblocking(False)
-        connected.connect(path)
-    except BlockingIOError:
-        connected.close()
-        raise _BacklogFull(f"the server at {path} does not take up connections: restart it if it hangs") from None
+        lines = splitter.feed(begun.received)
+        if not begun.greeted:
+            _say(connected, hello)
+        end = time.monotonic() + patience
+        while not lines:
+            lines = splitter.feed(_heard(connected, begun.path, end, interrupt))
+        greeting = _checked(lines.pop(0), begun.path)
     except BaseException:
         connected.close()
         raise
-    return connected
+    boot, pid = greeting.get("boot"), greeting.get("pid")
+    return Line(
+        connected,
+        begun.path,
+        boot if isinstance(boot, str) else "",
+        pid if isinstance(pid, int) else None,
+        splitter,
+        lines,
+        begun.sent,
+    )
 
 
-def _check_owner(connected: _socket.socket, path: str, named: bool) -> None:
-    """Refuse a server that somebody else has put where ours would be: it would hear every sentence."""
-    _, uid = peers.credentials(connected)
-    if uid not in {os.getuid(), 0} and not named and path != paths.SYSTEM_SOCKET:
-        raise AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
+def _say(connected: _socket.socket, hello: Hello) -> None:
+    from talkcli.protocol.requests import request_line
 
-
-def _greet(
-    connected: _socket.socket,
-    path: str,
-    hello: Hello | None,
-    version: str,
-    patience: float,
-    interrupt: Mapping[int, int] | None,
-    received: bytes = b"",
-) -> Line:
-    """Greet, unless that has been done, and be greeted; `received`: what has been read of that."""
-    splitter = LineSplitter()
-    lines = splitter.feed(received)
     try:
-        try:
-            if hello:
-                connected.send(request_line(hello))
-        except BrokenPipeError:
-            pass  # it has hung up already, but it may have said why
-        end = time.monotonic() + patience
-        while not lines:
-            if not ready({connected.fileno(): select.POLLIN}, end - time.monotonic(), interrupt):
-                raise ServerUnavailable(f"the server at {path} does not answer; {_next_step(connected)}")
-            data = connected.recv(65536)
-            if not data:
-                raise ServerUnavailable(f"the server at {path} closed the connection before it answered")
-            lines = splitter.feed(data)
+        connected.send(request_line(hello))
     except (BrokenPipeError, ConnectionResetError):
-        raise ServerUnavailable(f"the server at {path} closed the connection before it answered") from None
+        pass  # it has hung up already, but it may have said why
+
+
+def _heard(connected: _socket.socket, path: str, end: float, interrupt: Mapping[int, int] | None) -> bytes:
+    """Return what a server says that has not greeted yet; `end`: until when it may take for that."""
+    from select import POLLIN
+
+    from talkcli.errors import ServerUnavailable
+
+    if not ready({connected.fileno(): POLLIN}, end - time.monotonic(), interrupt):
+        raise ServerUnavailable(f"the server at {path} does not answer; {_next_step(connected)}")
     try:
-        greeting = decode(lines.pop(0))
+        data = connected.recv(65536)
+    except ConnectionResetError:
+        data = b""
+    if not data:
+        raise ServerUnavailable(f"the server at {path} closed the connection before it answered")
+    return data
+
+
+def _checked(line: bytes, path: str) -> JsonObject:
+    """Return a greeting; ServerUnavailable, ProtocolMismatch, Busy or AccessDenied for what greets nobody."""
+    from talkcli import __version__
+    from talkcli.errors import AccessDenied, BadRequest, ServerUnavailable
+    from talkcli.protocol.lines import decode
+    from talkcli.protocol.replies import check_greeting
+
+    try:
+        greeting = decode(line)
     except BadRequest:
-        raise ServerUnavailable(f"what answers at {path} is no talk server") from None
+        greeting = {}
     if "talk" not in greeting:
         raise ServerUnavailable(f"what answers at {path} is no talk server")
-    replies.check_greeting(greeting, version)
+    check_greeting(greeting, __version__)
     if "error" in greeting:
         from talkcli.terminal.text import printable  # no start pays for it
 
         raise AccessDenied(f"the server refuses: {printable(str(greeting.get('message') or greeting['error']))}")
-    boot, pid, server_version = greeting.get("boot"), greeting.get("pid"), greeting.get("version")
-    return Line(
-        connected,
-        path,
-        boot if isinstance(boot, str) else "",
-        pid if isinstance(pid, int) else None,
-        server_version if isinstance(server_version, str) else None,
-        splitter,
-        lines,
-    )
+    return greeting
 
 
 def _next_step(connected: _socket.socket) -> str:
+    from talkcli import peers
+
     pid, _ = peers.credentials(connected)
     return f"look at process {pid}, and restart it if it hangs"
 
 
-def _nobody(failures: list[str], named: str | None, found: str, *, denied: bool) -> TalkError:
-    """Return the error; `found`: what is at the last place, the only one where one was named."""
-    tried = "\n".join(f"  {each}" for each in failures)
+def _nobody(begun: Begun, named: str | None) -> TalkError:
+    """Return the error that says what was tried."""
+    from talkcli.errors import AccessDenied, ServerUnavailable
+
+    if begun.full:
+        path = begun.failures[-1][0]
+        return ServerUnavailable(f"the server at {path} does not take up connections: restart it if it hangs")
+    tried = ""
+    found = ""  # at the last place, the only one where one was named
+    denied = False
+    for path, error in begun.failures:
+        words = str(error)
+        if isinstance(error, OSError):
+            words = found = paths.found_at(path, error)
+            if found == DIRECTORY:
+                words += f": name the one in it, {_inside(path)}"
+        denied = denied or isinstance(error, AccessDenied) or found == FORBIDDEN
+        tried += f"  {path}: {words}\n"
     step = _named_step(named, found, denied=denied) if named else f"{_LET_IN}\n{_OWN}" if denied else _START
     hint = paths.sudo_hint()
     if hint and not os.environ.get("TALK_SOCKET"):
         step += f"\nthe server of the user who called sudo would be reached with: talk --socket {hint}"
     if denied:
-        return AccessDenied(f"no server that may be used, tried:\n{tried}\n{step}")
-    return ServerUnavailable(f"no server, tried:\n{tried}\n{step}")
+        return AccessDenied(f"no server that may be used, tried:\n{tried}{step}")
+    return ServerUnavailable(f"no server, tried:\n{tried}{step}")
 
 
 def _named_step(named: str, found: str, *, denied: bool) -> str:

@@ -1,8 +1,7 @@
-"""A client's connection to a server: requests go out, replies and events come in. Any number of threads may use it.
+"""A client's connection to a server: requests go out, replies and events come in, each to whom it is for.
 
-There is no thread behind it: whoever waits for something reads for all, and hands on what is for others. It holds no
-lock while it waits for the server. What was read is handed out under one lock, `changed`, and under it alone: a wait
-whose `done` looks at several things sees them together.
+`Connection` is what the rest of the library knows of one, whatever it leads through; `SocketConnection` is that over a
+Unix socket. Nothing here knows what a client asks for, or what a goal's handle makes of its events.
 """
 
 from __future__ import annotations
@@ -16,25 +15,148 @@ from _socket import SHUT_RDWR, SHUT_WR  # see `peers`
 from collections import deque
 from collections.abc import Callable
 
-from talkcli.client.connect import ANSWER_LIMIT, dial, ready
+from talkcli import paths, peers
+from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, ready, sender
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import Say
+from talkcli.goals.states import State
+from talkcli.protocol import events
+from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.protocol.lines import decode
 from talkcli.protocol.requests import request_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from typing import Protocol
+    from weakref import WeakSet
 
-    from talkcli.client.opening import Opened
+    from talkcli.client.connect import Begun
+    from talkcli.client.event_buffer import EventBuffer
     from talkcli.goals.goal import JsonObject
-    from talkcli.protocol.requests import Hello, Request
+    from talkcli.protocol.events import Event
+    from talkcli.protocol.requests import Request
+else:
+    Protocol = object
 
 #: Seconds of silence from a server that somebody waits for; it says that it is alive every 5.
 SILENCE_LIMIT = 15.0
 
 
 OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
+
+
+class Followed:
+    """Who is told what of the events that come in: of one goal, of all speech, of everything. Used under one lock."""
+
+    def __init__(self) -> None:
+        self._goals: dict[str, list[Callable[[Event], None]]] = {}
+        self._watches: WeakSet[EventBuffer] | None = None
+
+    def add(self, goal_id: str, hear: Callable[[Event], None]) -> None:
+        """Tell of a goal, and of speech that is held or goes on, until the goal's Result, which is the last."""
+        self._goals.setdefault(goal_id, []).append(hear)
+
+    def watch(self, buffer: EventBuffer) -> None:
+        """Put everything that happens into this buffer, as long as somebody holds it."""
+        from weakref import WeakSet  # few watch, and all would wait for the import
+
+        # A watch ends when nobody holds its iterator any more.
+        self._watches = WeakSet() if self._watches is None else self._watches
+        self._watches.add(buffer)
+
+    def hear(self, message: JsonObject) -> None:
+        """Hand on an event; ValueError where it is none."""
+        event = events.from_json(message)
+        if isinstance(event, Result):
+            for hear in self._goals.pop(event.goal.id, ()):
+                hear(event)
+        elif isinstance(event, StateChanged | WordHeard | PausedChanged):
+            if isinstance(event, PausedChanged):
+                hearing = [hear for each in self._goals.values() for hear in each]
+            else:
+                hearing = self._goals.get(event.id, [])
+            for hear in hearing:
+                hear(event)
+            # Of the goals that are waited for the states come twice: with the whole goal to those who watch.
+            if not isinstance(event, StateChanged) or event.goal or not _tells_all(event.state):
+                for buffer in self._watches or ():
+                    buffer.add(event)
+
+
+def _tells_all(state: State) -> bool:
+    """Whether those who watch are told the whole goal with this state."""
+    return state is State.PENDING or state.terminal
+
+
+class Connection(Protocol):
+    """A way to one server that has greeted: all that a client and its goals need of it. Any number of threads use it.
+
+    What it sends a server is carried out once or not at all, in the order in which it was sent; it never sends anything
+    again by itself, nor connects anew. Replies and events are taken in in the server's order, each before whatever the
+    server said after it: under `changed`, and under it alone, so that a wait whose `done` looks at several things sees
+    them together. Nothing is taken in but while somebody waits in `request` or `wait_until`; whoever does so does it
+    for all. No lock is held while a server is waited for.
+
+    It ends once and for ever, with `close`, or where nothing more can come: `ended` says why from then on. What came
+    before is handed out first. What waits is told so, and what is asked afterwards is ServerUnavailable: nothing was
+    sent then.
+    """
+
+    #: where the server is, as people are told
+    path: str
+    #: the server's boot id: the first half of its goals' ids
+    boot: str
+    #: the server's process, as it says
+    pid: int | None
+    #: the lock under which all that comes is handed out; notified whenever something was
+    changed: threading.Condition
+    #: why nothing more comes, once that is so
+    ended: str | None
+    #: who is told of events; used under `changed`
+    followed: Followed
+
+    @property
+    def listener(self) -> int | None:
+        """The process of this machine that listens there, as its kernel tells it; None where there is none."""
+
+    def request(
+        self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
+    ) -> tuple[JsonObject, list[JsonObject]]:
+        """Send a request and return its reply and the lines of its list.
+
+        RequestRefused or a class of it if the server says no; ServerUnavailable if it says nothing in time, or Lost
+        where what was sent may still have an effect that the sender does not know of. `on_reply` is called with both,
+        once the server said yes, before any event that comes after the reply; `slow`: the answer may take any time, in
+        which the server says that it is alive. Interrupted as in `wait_until`, but for a goal that may be accepted
+        already: its sender could not cancel it.
+        """
+
+    def post(self, request: Request) -> None:
+        """Send a request whose reply nobody waits for; ServerUnavailable where that is impossible."""
+
+    def wait_until(
+        self,
+        done: Callable[[], bool],
+        deadline: Callable[[], float | None],
+        silence: float | None = None,
+        *,
+        since: float | None = None,
+        interruptible: bool = True,
+    ) -> bool:
+        """Read until `done()`, and return True; False at the deadline (monotonic), or once the connection ended.
+
+        `done` is called under `changed`, and no more once it was true; what has arrived by the deadline counts.
+        `silence`: seconds without a word from the server after which the connection counts as ended, counted from this
+        call on, or from `since` (monotonic). What interrupts the connection's waits does so here, with Interrupted,
+        unless it is not `interruptible`.
+        """
+
+    def close(self) -> None:
+        """Close the connection, from any thread; goals that were sent are spoken all the same. It may be called again.
+
+        In a forked child it closes the child's copy alone.
+        """
 
 
 def _refusal(reply: JsonObject, items: list[JsonObject]) -> RequestRefused:
@@ -59,29 +181,43 @@ class _Exchange:
         self.touched = time.monotonic()
 
 
-class Connection:
-    """`on_event` gets every event, in the server's order, in the thread that happens to read, under `changed`."""
+class SocketConnection:
+    """A connection by a Unix socket. There is no thread behind it."""
 
     def __init__(
         self,
-        socket: str | None,
-        hello: Hello,
-        version: str,
-        on_event: Callable[[JsonObject], None],
-        interrupt: Mapping[int, int] | None = None,
+        socket: str | None = None,
+        *,
+        name: str | None = None,
+        urgent: bool = False,
+        interrupt: Mapping[int, int] | int | None = None,
         patience: float = ANSWER_LIMIT,
-        opened: Opened | None = None,
+        begun: Begun | None = None,
     ) -> None:
-        self.line = dial(socket, hello, version, patience, interrupt, opened)
-        self._process = os.getpid()
+        """Connect.
+
+        `socket`: path of the server's socket, default TALK_SOCKET, then the usual places; `name`: what the sender calls
+        itself, default TALK_NAME; `urgent`: for status and cancel alone, for which a full server keeps some places;
+        `interrupt`: a descriptor that ends any waiting with Interrupted as soon as it is readable, or several, each
+        with the events of poll that do so (broken and hung up always do); `patience`: seconds in which the server must
+        greet, and answer; `begun`: how far it has come already, maybe with what is to be the first request sent.
+
+        UsageError for a name that is too long; ServerUnavailable, AccessDenied, Busy or ProtocolMismatch where there is
+        no server to be had: nothing was sent then.
+        """
+        self._interrupt = {interrupt: select.POLLIN} if isinstance(interrupt, int) else interrupt
+        hello = sender(name, urgent=urgent)
+        line = connect(paths.named_socket(socket), hello, patience, self._interrupt, begun)
+        self.path, self.boot, self.pid = line.path, line.boot, line.pid
+        self._socket, self._splitter = line.socket, line.splitter
+        self._lines = deque(line.lines)
         # The beginning of the first line to be sent, if that was sent before there was this connection.
-        self._sent_early = opened.sent if opened else b""
+        self._sent_early = line.sent
+        self._process = os.getpid()
         self._patience = patience
-        self._on_event = on_event
-        self._interrupt = interrupt
-        self._lines: deque[bytes] = deque(self.line.lines)
         self._exchanges: dict[int, _Exchange] = {}
-        self._numbers = itertools.count(1)
+        self._numbers = itertools.count(FIRST)
+        self.followed = Followed()
         self.changed = threading.Condition()
         self._sending = threading.Lock()
         self._reading = False
@@ -91,33 +227,30 @@ class Connection:
         self._told: str | None = None
         #: why nothing more can be sent, once that is so; what was sent before may still be answered
         self._mute: str | None = None
-        #: why there is nothing more to come, once that is so
         self.ended: str | None = None
 
+    @property
+    def listener(self) -> int:
+        """The process that listens, as the kernel tells it."""
+        return peers.credentials(self._socket)[0]
+
     def close(self) -> None:
-        """Close the connection; goals that were sent are spoken all the same. A forked child closes its copy alone."""
         if os.getpid() != self._process:
             # To shut it down would cut the parent's; and a thread of the parent's may have held the lock at the fork.
             self.ended = self.ended or "the connection was closed"
-            self.line.socket.close()
+            self._socket.close()
             return
         with self.changed:
             self.ended = self.ended or "the connection was closed"
             self._closing = True
             self._shut(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
             if not self._reading:  # else it would poll a descriptor that may be another file's by now
-                self.line.socket.close()
+                self._socket.close()
             self.changed.notify_all()
 
     def request(
         self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
     ) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request and return its reply and the lines of its list.
-
-        RequestRefused or a class of it if the server says no; ServerUnavailable or Lost if it says nothing in time.
-        `on_reply` is called with both, once the server said yes, before any event that comes after the reply;
-        `slow`: the answer may take any time, in which the server says that it is alive.
-        """
         number = next(self._numbers)
         exchange = _Exchange(on_reply)
         self._exchanges[number] = exchange
@@ -141,12 +274,11 @@ class Connection:
         return exchange.reply, exchange.items
 
     def post(self, request: Request) -> None:
-        """Send a request whose reply nobody waits for."""
         self._send(request_line(request, next(self._numbers)))
 
     def _no_reply(self, request: Request) -> TalkError:
         why = self.ended or f"it did not reply within {self._patience:g} s"
-        words = f"{request.kind} was sent to the server at {self.line.path}, but {why}"
+        words = f"{request.kind} was sent to the server at {self.path}, but {why}"
         # Only a goal can still have an effect that the sender does not know of.
         return Lost(f"{words}; it may still be spoken") if isinstance(request, Say) else ServerUnavailable(words)
 
@@ -159,11 +291,6 @@ class Connection:
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Read until `done()`, and return True; False at the deadline (monotonic), or once the connection ended.
-
-        `done` is called under `changed`, and no more once it was true; `silence`: seconds without a line from the
-        server after which the connection counts as ended, counted from this call on, or from `since` (monotonic).
-        """
         began = time.monotonic() if since is None else since
         last = False
         while True:
@@ -193,7 +320,7 @@ class Connection:
                 with self.changed:
                     self._reading = False
                     if self._closing:
-                        self.line.socket.close()
+                        self._socket.close()
                     self.changed.notify_all()
 
     def _read(self, timeout: float | None, interruptible: bool) -> None:
@@ -211,10 +338,10 @@ class Connection:
 
     def _fill(self, timeout: float | None, interruptible: bool) -> bool:
         try:
-            watched = {self.line.socket.fileno(): select.POLLIN}
+            watched = {self._socket.fileno(): select.POLLIN}
             if not ready(watched, timeout, self._interrupt if interruptible else None):
                 return False
-            data = self.line.socket.recv(262144)
+            data = self._socket.recv(262144)
         except BlockingIOError:
             return False
         except ConnectionResetError:  # it left without having read all that was sent
@@ -226,12 +353,12 @@ class Connection:
             self.ended = self.ended or self._told or "the server went away"
             return False
         self._heard = time.monotonic()
-        self._lines.extend(self.line.splitter.feed(data))
+        self._lines.extend(self._splitter.feed(data))
         return bool(self._lines)
 
     def _dispatch(self, message: JsonObject) -> None:
         if "event" in message:
-            self._on_event(message)
+            self.followed.hear(message)
             return
         number = message.get("seq")
         if number is None and message.get("ok") is False:
@@ -249,7 +376,7 @@ class Connection:
 
     def _shut(self, direction: int) -> None:
         try:
-            self.line.socket.shutdown(direction)
+            self._socket.shutdown(direction)
         except OSError:
             pass  # the server has hung up
 
@@ -259,21 +386,21 @@ class Connection:
         with self._sending:
             why = self.ended or self._mute
             if why:
-                raise ServerUnavailable(f"nothing was sent to the server at {self.line.path}: {why}")
+                raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}")
             if not data.startswith(self._sent_early):
                 raise AssertionError(f"{self._sent_early!r} was sent early instead of {data!r}")
             rest = memoryview(data)[len(self._sent_early) :]
             self._sent_early = b""
             while rest:
                 try:
-                    rest = rest[self.line.socket.send(rest) :]
+                    rest = rest[self._socket.send(rest) :]
                 except BlockingIOError:
-                    if not ready({self.line.socket.fileno(): select.POLLOUT}, end - time.monotonic()):
+                    if not ready({self._socket.fileno(): select.POLLOUT}, end - time.monotonic()):
                         # Half a line may be out: nothing that follows could be understood.
                         self._mute = f"it took nothing for {ANSWER_LIMIT:g} s"
                         self._shut(SHUT_WR)
-                        raise ServerUnavailable(f"the server at {self.line.path} does not answer") from None
+                        raise ServerUnavailable(f"the server at {self.path} does not answer") from None
                 except OSError as error:
                     self._mute = "the server went away"
-                    words = f"the server at {self.line.path} went away: {error.strerror}"
+                    words = f"the server at {self.path} went away: {error.strerror}"
                     raise ServerUnavailable(words) from None

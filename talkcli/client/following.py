@@ -1,6 +1,6 @@
 """What happens to several goals, as one stream in the server's order. `GoalHandle.events` is that of a single goal.
 
-It waits, as a handle does, on the client's connection; it prints nothing and cancels nothing.
+It waits, as a handle does, on their connection; it prints nothing and cancels nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Iterate over what happens to these goals of one client, each event with its goal, until all have ended.
+    """Iterate over what happens to these goals of one connection, each event with its goal, until all have ended.
 
     Each goal's last is its Result. That speech is held, which all of them hear, comes once. TimeoutError where they
     have not all ended `timeout` seconds after the first step; where the server goes away, the rest are LOST.
@@ -28,7 +28,7 @@ def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Itera
     stream = _Stream(handles)
     late = False
     while stream.going:
-        connection = stream.going[0]._client._connection
+        connection = stream.going[0]._connection
         if late:  # what had arrived by the deadline counts, nothing after it
             with connection.changed:
                 found = stream.arrived()

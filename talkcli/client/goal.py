@@ -1,7 +1,8 @@
 """A goal that was sent, or is followed: its state, its events as they come, its end.
 
-It reads nothing by itself: whoever waits on the client's connection reads for all, and `Followed` hands on what is for
-which handle. Whatever changes a handle does so under the connection's lock, and never after the goal has ended.
+It needs a connection, and knows no client. It reads nothing by itself: whoever waits on the connection reads for all,
+and what is for this goal comes to `_hear`. Whatever changes a handle does so under the connection's lock, and never
+after the goal has ended.
 """
 
 from __future__ import annotations
@@ -12,31 +13,19 @@ from talkcli.client.connection import SILENCE_LIMIT
 from talkcli.client.event_buffer import EventBuffer
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
+from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel
 from talkcli.goals.states import State
-from talkcli.protocol import events
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
+from talkcli.protocol.replies import Canceled, goals
+from talkcli.protocol.requests import Status, Wait
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-    from typing import Protocol
-    from weakref import WeakSet
+    from collections.abc import Iterator
 
     from talkcli.client.connection import Connection
-    from talkcli.goals.goal import Goal, JsonObject
+    from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
-    from talkcli.protocol.replies import Canceled
-
-    class Client(Protocol):
-        """What a handle needs of the client that made it."""
-
-        _connection: Connection
-
-        def cancel(self, ids: Iterable[str] | None = None) -> Canceled: ...
-
-        def goal(self, goal_id: str) -> Goal: ...
-
-        def _follow_late(self, handle: GoalHandle, *, feedback: bool) -> None: ...
 
 
 class GoalHandle:
@@ -47,8 +36,8 @@ class GoalHandle:
     iterator is for one thread; another calls for its own.
     """
 
-    def __init__(self, client: Client, goal: Goal) -> None:
-        self._client = client
+    def __init__(self, connection: Connection, goal: Goal) -> None:
+        self._connection = connection
         #: the goal as it was last heard of
         self.goal = goal
         #: whether another `say` had sent this goal before, with the same id: this one only watches
@@ -82,7 +71,7 @@ class GoalHandle:
         """
         end = _end(timeout)
         self._follow(feedback=False)
-        if not self._client._connection.wait_until(lambda: self.state.terminal, lambda: end, SILENCE_LIMIT):
+        if not self._connection.wait_until(lambda: self.state.terminal, lambda: end, SILENCE_LIMIT):
             self._give_up(timeout)
         return self.goal
 
@@ -123,8 +112,8 @@ class GoalHandle:
 
         if not (self._followed or self.state.terminal):
             raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
-        connection, now = self._client._connection, time.monotonic()
-        if not connection.wait_until(arrived, lambda: now, SILENCE_LIMIT, since=self._followed_at, interruptible=False):
+        now, since = time.monotonic(), self._followed_at
+        if not self._connection.wait_until(arrived, lambda: now, SILENCE_LIMIT, since=since, interruptible=False):
             self._lose()
         if event is None and self.state.terminal and not self._told:
             event = self._result()
@@ -133,17 +122,25 @@ class GoalHandle:
     def request_cancel(self) -> None:
         """Ask for the goal to be cancelled, without waiting for it: `wait` tells how it ended."""
         if self.id:
-            self._client._connection.post(Cancel((self.id,)))
+            self._connection.post(Cancel((self.id,)))
 
     def cancel(self) -> Goal:
         """Cancel the goal, and return it once it has ended: silent, if it was being spoken."""
         if not self.state.terminal:
-            found = self._client.cancel([self.id])
+            found = Canceled.from_items(self._connection.request(Cancel((self.id,)))[1])
             goal = next((each for each in (*found.canceled, *found.ended) if each.id == self.id), None)
-            self._settle(goal or self._client.goal(self.id))
+            self._settle(goal or Goal.from_json(self._connection.request(Status(self.id))[0].get("goal")))
         return self.goal
 
     # -- inside
+
+    def _listen(self, *, feedback: bool) -> None:
+        """Hear of the goal from now on, which the server tells this connection of; under the connection's lock."""
+        self._fed = self._fed or feedback
+        if not (self._followed or self.state.terminal):
+            self._connection.followed.add(self.id, self._hear)
+            self._followed_at = time.monotonic()
+        self._followed = True
 
     def _hear(self, event: Event) -> None:
         """Take up an event of this goal, or of all speech."""
@@ -166,7 +163,7 @@ class GoalHandle:
 
     def _settle(self, goal: Goal) -> None:
         """Take up what the server says of the goal now, unless it is known to have ended."""
-        with self._client._connection.changed:
+        with self._connection.changed:
             if not self.state.terminal:
                 self.goal = goal
 
@@ -181,10 +178,10 @@ class GoalHandle:
         late = False
         while True:
             if late:  # what had arrived by the deadline counts, nothing after it: the goal may go on for ever
-                with self._client._connection.changed:
+                with self._connection.changed:
                     found = arrived()
             else:
-                found = self._client._connection.wait_until(arrived, lambda: end, SILENCE_LIMIT)
+                found = self._connection.wait_until(arrived, lambda: end, SILENCE_LIMIT)
                 late = end is not None and time.monotonic() >= end
             if not found:
                 self._give_up(timeout)
@@ -199,8 +196,14 @@ class GoalHandle:
 
     def _follow(self, *, feedback: bool) -> None:
         """Have this connection told of the goal, if it isn't yet."""
-        if not (self.state.terminal or (self._followed and (self._fed or not feedback))):
-            self._client._follow_late(self, feedback=feedback)
+        if self.state.terminal or (self._followed and (self._fed or not feedback)):
+            return
+
+        def accepted(_: JsonObject, items: list[JsonObject]) -> None:
+            self._settle(next(goals(items, "goal")))
+            self._listen(feedback=feedback)
+
+        self._connection.request(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
         """Conclude that the goal is lost, where nothing more can be heard of it; else raise TimeoutError."""
@@ -209,61 +212,11 @@ class GoalHandle:
 
     def _lose(self) -> bool:
         """Conclude that the goal is lost, and return True, where nothing more can be heard of it."""
-        ended = self._client._connection.ended
+        ended = self._connection.ended
         if ended is not None:
             words = f"Talk lost: {ended}; it may still be spoken"
             self._settle(replace(self.goal, state=State.LOST, reason="lost", message=words))
         return ended is not None
-
-
-class Followed:
-    """Who is told what: handles of the goals that are followed, and those who watch all. Used under one lock."""
-
-    def __init__(self) -> None:
-        self._handles: dict[str, list[GoalHandle]] = {}
-        self._watches: WeakSet[EventBuffer] | None = None
-
-    def add(self, handle: GoalHandle, *, feedback: bool) -> None:
-        """Tell a handle of its goal from now on."""
-        handle._fed = handle._fed or feedback
-        if not (handle._followed or handle.state.terminal):
-            self._handles.setdefault(handle.id, []).append(handle)
-            handle._followed_at = time.monotonic()
-        handle._followed = True
-
-    def watch(self, buffer: EventBuffer) -> None:
-        """Put everything that happens into this buffer, as long as somebody holds it."""
-        from weakref import WeakSet  # few watch, and all would wait for the import
-
-        # A watch ends when nobody holds its iterator any more.
-        self._watches = WeakSet() if self._watches is None else self._watches
-        self._watches.add(buffer)
-
-    def hear(self, message: JsonObject) -> None:
-        """Hand on an event; ValueError where it is none."""
-        event = events.from_json(message)
-        if isinstance(event, Result):
-            for handle in self._handles.pop(event.goal.id, ()):
-                handle._hear(event)
-        elif isinstance(event, StateChanged | WordHeard | PausedChanged):
-            self._tell_handles(event)
-            # Of the goals that are waited for the states come twice: with the whole goal to those who watch.
-            if not isinstance(event, StateChanged) or event.goal or not _tells_all(event.state):
-                for buffer in self._watches or ():
-                    buffer.add(event)
-
-    def _tell_handles(self, event: StateChanged | WordHeard | PausedChanged) -> None:
-        if isinstance(event, PausedChanged):
-            handles = [handle for each in self._handles.values() for handle in each]
-        else:
-            handles = self._handles.get(event.id, [])
-        for handle in handles:
-            handle._hear(event)
-
-
-def _tells_all(state: State) -> bool:
-    """Whether those who watch are told the whole goal with this state."""
-    return state is State.PENDING or state.terminal
 
 
 def _end(timeout: float | None) -> float | None:

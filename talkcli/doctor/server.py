@@ -12,6 +12,7 @@ import time
 
 from talkcli import __version__, paths, peers
 from talkcli.client.client import Client
+from talkcli.client.connection import SocketConnection
 from talkcli.doctor.machine import owner
 from talkcli.doctor.report import Finding, done, failed, warning
 from talkcli.doctor.sentence import remedy
@@ -89,7 +90,7 @@ def connect(option: str | None, interrupt: int | None) -> tuple[Client | None, P
     by = "--socket" if option else "TALK_SOCKET" if named else None
     tried = paths.client_sockets(named)
     try:
-        client = Client(option, name=_NAME, interrupt=interrupt)
+        client = Client.over(SocketConnection(option, name=_NAME, interrupt=interrupt))
     except TalkError as error:
         found = tuple(_place(each, trusted=_trusted(each, named)) for each in tried)
         trouble = _trouble(error.message.splitlines(), found)
@@ -167,8 +168,8 @@ def process_here(client: Client) -> int | None:
 
     Of a socket unit's socket the kernel names systemd, which has made it, as the one who listens.
     """
-    pid, _ = peers.credentials(client._connection.line.socket)
-    here = pid == client.server_pid or peers.command_of(pid) == "systemd"
+    pid = client._connection.listener
+    here = pid is not None and (pid == client.server_pid or peers.command_of(pid) == "systemd")
     return client.server_pid if here else None
 
 

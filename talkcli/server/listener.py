@@ -11,8 +11,8 @@ import socket
 import stat
 import sys
 
-from talkcli import __version__, paths, peers
-from talkcli.client import connect
+from talkcli import paths, peers
+from talkcli.client.connect import connect
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
 from talkcli.protocol.requests import Hello
 from talkcli.server.lock import Lock, identity, serves_already
@@ -147,7 +147,7 @@ def listen(named: str | None, mode: int) -> Listener | InheritedListener:
 def _refuse_second_server(named: str | None) -> None:
     """Refuse where clients would find another server before or instead of this one."""
     try:
-        found = connect.dial(named, Hello(urgent=True), __version__)
+        found = connect(named, Hello(urgent=True))
     except (ServerUnavailable, AccessDenied):
         return  # nobody there who would answer our clients
     except TalkError as error:

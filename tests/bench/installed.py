@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from talkcli import Client
+from talkcli.client.connection import SocketConnection
 from talkcli.errors import TalkError
 from tests.bench.failure import FailedError
 from tests.support.census import descendants
@@ -120,7 +121,7 @@ def serve(command: list[str], sound: Mapping[str, str]) -> Iterator[Server]:
 def _await_engine(process: subprocess.Popen[bytes], socket: str, log: str) -> None:
     end = time.monotonic() + _START
     while True:
-        with contextlib.suppress(TalkError), Client(socket, patience=1) as client:
+        with contextlib.suppress(TalkError), Client.over(SocketConnection(socket, patience=1)) as client:
             if client.status().server.get("engine") == "ready":
                 return
         if process.poll() is not None or time.monotonic() > end:

@@ -35,7 +35,6 @@ PURE = [
     "quota",
     "splitter",
     "client.event_buffer",
-    "client.outgoing",
     "engine.gap",
     "engine.synthesizers.guard",
 ]
