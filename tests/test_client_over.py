@@ -1,0 +1,140 @@
+"""The library over a connection that is no socket: all that it needs of one is in the interface."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli import Client, State
+from talkcli.client.connection import Followed
+from talkcli.client.following import merged
+from talkcli.client.goal import GoalHandle
+from talkcli.errors import Lost, ServerUnavailable
+from talkcli.goals.goal import Goal
+from talkcli.goals.options import Cancel, Say
+from talkcli.protocol.events import Result, StateChanged
+from talkcli.protocol.requests import Log, Status, Wait, Watch
+from tests.support.scripted_peer import goal, result
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from talkcli.client.connection import Connection, OnReply
+    from talkcli.goals.goal import JsonObject
+    from talkcli.protocol.requests import Request
+
+
+class Scripted:
+    """A server that is asked by calls, takes every goal, and speaks one while somebody waits."""
+
+    def __init__(self) -> None:
+        self.path, self.boot = "nowhere", "fake"
+        self.pid: int | None = None
+        self.listener: int | None = None
+        self.changed = threading.Condition()
+        self.followed = Followed()
+        self.ended: str | None = None
+        self.asked: list[Request] = []
+        #: what is to come
+        self.coming: list[JsonObject] = []
+
+    def request(
+        self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
+    ) -> tuple[JsonObject, list[JsonObject]]:
+        if self.ended:
+            raise ServerUnavailable(self.ended)
+        self.asked.append(request)
+        reply: JsonObject = {"ok": True, "server": {}, "active": None, "goal": goal("PENDING"), "slow": slow}
+        items: list[JsonObject] = []
+        if isinstance(request, Cancel):
+            items = [{"canceled": goal("RECALLED")}]
+        elif isinstance(request, Wait | Log):
+            items = [{"goal": goal("ACTIVE")}]
+        if on_reply:
+            with self.changed:
+                on_reply(reply, items)
+        return reply, items
+
+    def post(self, request: Request) -> None:
+        self.asked.append(request)
+
+    def wait_until(
+        self,
+        done: Callable[[], bool],
+        deadline: Callable[[], float | None],
+        silence: float | None = None,
+        *,
+        since: float | None = None,
+        interruptible: bool = True,
+    ) -> bool:
+        del deadline, silence, since, interruptible  # nothing takes time here
+        with self.changed:
+            while not done():
+                if not self.coming:
+                    self.ended = self.ended or "that was all"
+                    return False
+                self.followed.hear(self.coming.pop(0))
+        return True
+
+    def close(self) -> None:
+        self.ended = self.ended or "the connection was closed"
+
+
+@pytest.fixture
+def scripted() -> Scripted:
+    return Scripted()
+
+
+def state(name: str, number: int) -> JsonObject:
+    return {"event": "state", "id": "g", "state": name, "n": number, "at": 0.0}
+
+
+def test_a_goal_is_sent_followed_and_ends(scripted: Scripted) -> None:
+    with Client.over(scripted) as client:
+        handle = client.say("a b c")
+        assert (client.path, client.server_pid, handle.state) == ("nowhere", None, State.PENDING)
+        scripted.coming = [state("ACTIVE", 1), result()]
+        assert [type(each) for each in handle.events()] == [StateChanged, Result]
+        assert scripted.asked == [Say("a b c", wait=True)]
+    with pytest.raises(ServerUnavailable, match="closed"):
+        client.status()
+
+
+def test_a_number_is_a_goal_of_the_server_that_was_reached(scripted: Scripted) -> None:
+    client = Client.over(scripted)
+    client.goal("12")
+    client.cancel(["12", "mine"])
+    assert scripted.asked == [Status("fake-12"), Cancel(("fake-12", "mine"))]
+
+
+def test_a_handle_needs_no_client(scripted: Scripted) -> None:
+    connection: Connection = scripted
+    handle = GoalHandle(connection, Goal("g", State.PENDING))
+    handle.request_cancel()
+    assert handle.cancel().state is State.RECALLED
+    assert scripted.asked == [Cancel(("g",)), Cancel(("g",))]
+    late = GoalHandle(connection, Goal("g", State.PENDING))
+    late.events()
+    assert late.state is State.ACTIVE, "as the server says that it is by now"
+    scripted.coming = [result()]
+    assert late.wait().state is State.SUCCEEDED
+    assert scripted.asked[2:] == [Wait(("g",))]
+
+
+def test_goals_are_followed_as_one_stream(scripted: Scripted) -> None:
+    (handle,) = Client.over(scripted).follow(["g"])
+    scripted.coming = [state("PREEMPTING", 1), result("PREEMPTED")]
+    assert [(each, type(event)) for each, event in merged([handle])] == [(handle, StateChanged), (handle, Result)]
+
+
+def test_what_nothing_more_is_heard_of_is_lost(scripted: Scripted) -> None:
+    client = Client.over(scripted)
+    handle, watch = client.say("a"), client.events()
+    next(watch)
+    assert handle.wait().state is State.LOST
+    assert "that was all" in (handle.goal.message or "")
+    with pytest.raises(Lost, match="at nowhere: that was all"):
+        next(watch)
+    assert isinstance(scripted.asked[-1], Watch)
