@@ -86,6 +86,31 @@ def test_it_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> Non
     assert said == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
 
 
+def test_a_server_that_hangs_up_on_whoever_asks_early_is_asked_once_more() -> None:
+    """As one does that ends, where a socket unit starts the next."""
+    said: list[dict[str, Any]] = []
+
+    def serve() -> None:
+        connected, _ = listening.accept()
+        with connected:
+            connected.recv(1, socket.MSG_PEEK)  # unread when it is closed, which breaks the connection
+        connected, _ = listening.accept()
+        with connected, connected.makefile("rb") as file:
+            connected.sendall(GREETING)
+            said.extend(json.loads(file.readline()) for _ in range(2))
+            connected.sendall(json.dumps({"seq": said[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
+
+    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(f"{directory}/s")
+        listening.listen()
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        done = run([*TALK, "say", "hello"], clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}))
+        thread.join(PATIENCE)
+    assert (done.code, done.out, done.err) == (0, "g\n", "")
+    assert said == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
+
+
 def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
     """What it costs whoever waits for the first word: none of what follows is there when the request is out."""
     code = (

@@ -58,7 +58,7 @@ def asks_at_once(plain: Plain) -> bool:
     return plain.command.name in _EARLY and not plain.given.get("lines") and plain.given.get("text") != ("-",)
 
 
-def _begin(plain: Plain, before: Callable[[], None]) -> Begun:
+def _begin(plain: Plain, before: Callable[[], None]) -> Begun | None:
     """Return the command's connection, as far as it comes in no time; `before`: called before its request is sent."""
     begun = reach(plain.common.get("socket") or os.environ.get("TALK_SOCKET") or None)
     if begun.socket is None:

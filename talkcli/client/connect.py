@@ -129,10 +129,11 @@ def _foreign(connected: _socket.socket) -> AccessDenied | None:
     return AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
 
 
-def ask(begun: Begun, hello: Hello, request: Request, before: Callable[[], None]) -> Begun:
+def ask(begun: Begun, hello: Hello, request: Request, before: Callable[[], None]) -> Begun | None:
     """Say hello, and send the first request as soon as the server has greeted; return how far that has come.
 
-    `before`: called before the request is sent, which is not done where the server greets otherwise, or not at once.
+    None where the connection broke before: nothing was sent that could have an effect. `before`: called before the
+    request is sent, which is not done where the server greets otherwise, or not at once.
     """
     from talkcli.protocol.requests import request_line
 
@@ -146,8 +147,11 @@ def ask(begun: Begun, hello: Hello, request: Request, before: Callable[[], None]
         if received.startswith(GREETING) and b"\n" in received:
             before()
             sent = line[: connected.send(line)]
-    except OSError:  # it may have more to do than to greet, or has hung up: whoever reads on will find out
-        pass
+    except TimeoutError:
+        pass  # it may have more to do than to greet
+    except OSError:
+        connected.close()
+        return None
     connected.setblocking(False)
     return replace(begun, greeted=True, received=received, sent=sent)
 
