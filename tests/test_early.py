@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.client.connect import Begun, ask, connect, reach, stand_back
+from talkcli.client.connect import Begun, ask, connect, hello, reach, stand_back
 from talkcli.errors import AccessDenied
 from talkcli.frozen import replace
 from talkcli.paths import client_sockets
-from talkcli.protocol.requests import Hello, Status
 from tests.conformance.bareserve import TALK, run
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import GREETING, Peer, goal, result, serving
@@ -247,26 +246,24 @@ def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(ear
                     heard.append(connected.recv(65536))
 
     def begun() -> Begun | None:
-        return ask(reach(None), Hello(), Status(), lambda: None) if early else None
+        return ask(reach(None), hello(None, urgent=False), {"request": "status"}, lambda: None) if early else None
 
     refusal = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
     with short_directory() as directory, contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_RUNTIME_DIR", f"{directory}/runtime")
-        patch.setenv("TMPDIR", directory)
-        first, second = f"{directory}/runtime/talk/talk.sock", f"{directory}/runtime-{os.getuid()}/talk/talk.sock"
+        first, second = f"{directory}/first", f"{directory}/second"
+        patch.setattr("talkcli.paths.client_sockets", lambda _: [first, second])
         for path, greeting in ((first, refusal), (second, GREETING)):
-            os.makedirs(os.path.dirname(path))
             listening = stack.enter_context(socket.socket(socket.AF_UNIX))
             listening.bind(path)
             listening.listen()
             thread = threading.Thread(target=serve, args=(listening, greeting), daemon=True)
             thread.start()
-        line = connect(None, Hello(), begun=begun())
+            stack.callback(thread.join, PATIENCE)
+            stack.callback(listening.shutdown, socket.SHUT_RDWR)
+        line = connect(None, hello(None, urgent=False), begun=begun())
         assert (line.path, line.sent) == (second, b"")
         line.socket.close()
         os.unlink(second)
         with pytest.raises(AccessDenied, match=f"(?s)tried:\n  {first}: the server refuses: not you\n"):
-            connect(None, Hello(), begun=begun())
-        listening.shutdown(socket.SHUT_RDWR)
-        thread.join(PATIENCE)
+            connect(None, hello(None, urgent=False), begun=begun())
     assert set(heard) == {b'{"request": "hello"}\n'}, "what was asked is for the server that takes it"

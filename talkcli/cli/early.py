@@ -11,9 +11,9 @@ import _signal
 import os
 import time
 
-from talkcli.client.connect import ask, reach, sender, stand_back
+from talkcli.client.connect import ask, hello, reach, sender, stand_back
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.option import MAX_ID
+from talkcli.goals.option import MAX_ID, MAX_NAME
 from talkcli.goals.options import MAX_CHARACTERS, Cancel, Say, bad_key
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from talkcli.cli.plain import Plain
     from talkcli.client.connect import Begun
-    from talkcli.protocol.requests import Hello, Request
+    from talkcli.goals.goal import JsonObject
 
 #: The commands whose request may be sent early.
 _EARLY = ("say", "cancel", "status", "pause", "resume")
@@ -68,35 +68,31 @@ def _begin(plain: Plain, before: Callable[[], None]) -> Begun | None:
     return ask(begun, *said, before) if said else begun
 
 
-def first(plain: Plain) -> tuple[Hello, Request] | None:
+def first(plain: Plain) -> tuple[JsonObject, JsonObject] | None:
     """Return what a command says first, and its request; None where that may be refused, or only the library knows."""
-    from talkcli.errors import UsageError
-
-    request = _request(plain)
-    if request is None:
+    command, name = plain.command.name, sender(plain.given.get("name"))
+    request = _request(command, plain.given)
+    if request is None or len(name or "") > MAX_NAME:
         return None
-    try:
-        return sender(plain.given.get("name"), urgent=plain.command.name in _URGENT), request
-    except UsageError:
-        return None
+    return hello(name, urgent=command in _URGENT), request
 
 
-def _request(plain: Plain) -> Request | None:
-    from talkcli.protocol.requests import Pause, Resume, Status
+def _request(command: str, given: dict[str, Any]) -> JsonObject | None:
+    from talkcli.protocol.encoder import write_request
 
-    command, given = plain.command.name, plain.given
     if command == "say":
-        return _say(given)
+        say = _say(given)
+        return write_request(say) if say else None
     if command == "cancel":
         ids, before, key = given["ids"], given["before"], given["key"]
         # More ids may be too many for a request, or the same.
         if len(ids) > 1 or not all(map(_whole, [*ids, before or "-"])) or (key and bad_key(key)):
             return None
-        return Cancel(ids or None, given["current"], before, key)
-    if command == "status":
-        goal_id = given["goal_id"]
-        return Status(goal_id) if goal_id is None or _whole(goal_id) else None
-    return Pause() if command == "pause" else Resume()
+        return write_request(Cancel(ids or None, given["current"], before, key))
+    goal_id = given.get("goal_id")
+    if goal_id is None:
+        return {"request": command}
+    return {"request": command, "id": goal_id} if _whole(goal_id) else None
 
 
 def _whole(goal_id: str) -> bool:

@@ -21,10 +21,11 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.option import MAX_ID, MAX_IDS, MAX_LOG
 from talkcli.goals.options import Cancel, Say, Set, bad_key, bad_option
 from talkcli.goals.states import State
+from talkcli.protocol.encoder import request_line, write_request
 from talkcli.protocol.events import Snapshot
 from talkcli.protocol.lines import MAX_LINE
 from talkcli.protocol.replies import Canceled, ServerStatus, goal_in, goals
-from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch, request_line
+from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -356,7 +357,7 @@ def check(request: Say | Set) -> None:
 def too_long(request: Say) -> Goal | None:
     """Return the goal that the server would have made of a text that doesn't fit into a request, None if it fits."""
     try:
-        line = request_line(request, _LONGEST_NUMBER)
+        line = request_line({"seq": _LONGEST_NUMBER, **write_request(request)})
     except ValueError as error:  # NaN in `data`
         raise UsageError(f"'data' is no JSON: {error}") from None
     if len(line) <= MAX_LINE:

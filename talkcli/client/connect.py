@@ -15,14 +15,12 @@ import time
 
 from talkcli import paths
 from talkcli.frozen import TYPE_CHECKING, frozen, replace
-from talkcli.paths import DIRECTORY, FILE, FORBIDDEN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from talkcli.errors import AccessDenied, TalkError
     from talkcli.goals.goal import JsonObject
-    from talkcli.protocol.requests import Hello, Request
     from talkcli.splitter import LineSplitter
 
 #: How a server of this protocol begins its greeting, as `protocol.lines` writes it; a test compares the two.
@@ -129,15 +127,15 @@ def _foreign(connected: _socket.socket) -> AccessDenied | None:
     return AccessDenied(f"belongs to uid {uid}; to use it all the same, name it with --socket")
 
 
-def ask(begun: Begun, hello: Hello, request: Request, before: Callable[[], None]) -> Begun | None:
+def ask(begun: Begun, hello: JsonObject, request: JsonObject, before: Callable[[], None]) -> Begun | None:
     """Say hello, and send the first request as soon as the server has greeted; return how far that has come.
 
     None where the connection broke before: nothing was sent that could have an effect. `before`: called before the
     request is sent, which is not done where the server greets otherwise, or not at once.
     """
-    from talkcli.protocol.requests import request_line
+    from talkcli.protocol.encoder import request_line
 
-    connected, line = begun.socket, request_line(request, FIRST)
+    connected, line = begun.socket, request_line({"seq": FIRST, **request})
     assert connected
     received = sent = b""
     connected.settimeout(AT_ONCE)
@@ -183,22 +181,21 @@ def stand_back(begun: Begun, timeout: float | None) -> Begun:
     return replace(begun, received=received)
 
 
-def sender(name: str | None, *, urgent: bool = False) -> Hello:
-    """Return what is said first by whoever has this name, or else that of TALK_NAME; UsageError for one too long."""
-    from talkcli.errors import UsageError
-    from talkcli.protocol.requests import MAX_NAME, Hello
-
+def sender(name: str | None) -> str | None:
+    """Return what a sender calls itself: by this name, or else by that of TALK_NAME."""
     # Bytes in a variable that are no UTF-8 keep nobody from cancelling.
     called = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
-    name = name or called or None
-    if name and len(name) > MAX_NAME:
-        raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
-    return Hello(name, urgent)
+    return name or called or None
+
+
+def hello(name: str | None, *, urgent: bool) -> JsonObject:
+    """Return what is said first: `requests.Hello`, as it is written, without the import; a test compares the two."""
+    return {"request": "hello", **({"name": name} if name else {}), **({"urgent": True} if urgent else {})}
 
 
 def connect(
     named: str | None,
-    hello: Hello,
+    hello: JsonObject,
     patience: float = ANSWER_LIMIT,
     interrupt: Mapping[int, int] | None = None,
     begun: Begun | None = None,
@@ -256,7 +253,7 @@ def ready(watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[
 
 
 def _greet(
-    begun: Begun, connected: _socket.socket, hello: Hello, patience: float, interrupt: Mapping[int, int] | None
+    begun: Begun, connected: _socket.socket, hello: JsonObject, patience: float, interrupt: Mapping[int, int] | None
 ) -> Line:
     """Greet, unless that has been done, and be greeted; where that fails the connection is closed."""
     from talkcli.splitter import LineSplitter
@@ -285,8 +282,8 @@ def _greet(
     )
 
 
-def _say(connected: _socket.socket, hello: Hello) -> None:
-    from talkcli.protocol.requests import request_line
+def _say(connected: _socket.socket, hello: JsonObject) -> None:
+    from talkcli.protocol.encoder import request_line
 
     try:
         connected.send(request_line(hello))
@@ -342,6 +339,7 @@ def _next_step(connected: _socket.socket) -> str:
 def _nobody(begun: Begun, named: str | None) -> TalkError:
     """Return the error that says what was tried."""
     from talkcli.errors import AccessDenied, ServerUnavailable
+    from talkcli.paths import DIRECTORY, FORBIDDEN
 
     if begun.full:
         path = begun.failures[-1][0]
@@ -370,6 +368,7 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
     """Return what to do next where the only place was one that the user named."""
     import shlex  # it loads `re`
 
+    from talkcli.paths import DIRECTORY, FILE
     from talkcli.terminal.text import printable
 
     by_variable = named == os.environ.get("TALK_SOCKET")

@@ -16,15 +16,16 @@ from collections import deque
 from collections.abc import Callable
 
 from talkcli import paths, peers
-from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, ready, sender
-from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, refusal
+from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, hello, ready, sender
+from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, UsageError, refusal
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Say
 from talkcli.goals.states import State
 from talkcli.protocol import events
+from talkcli.protocol.encoder import request_line, write_request
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.protocol.lines import decode
-from talkcli.protocol.requests import request_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -206,8 +207,11 @@ class SocketConnection:
         no server to be had: nothing was sent then.
         """
         self._interrupt = {interrupt: select.POLLIN} if isinstance(interrupt, int) else interrupt
-        hello = sender(name, urgent=urgent)
-        line = connect(paths.named_socket(socket), hello, patience, self._interrupt, begun)
+        name = sender(name)
+        if name and len(name) > MAX_NAME:
+            raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
+        greeting = hello(name, urgent=urgent)
+        line = connect(paths.named_socket(socket), greeting, patience, self._interrupt, begun)
         self.path, self.boot, self.pid = line.path, line.boot, line.pid
         self._socket, self._splitter = line.socket, line.splitter
         self._lines = deque(line.lines)
@@ -258,7 +262,7 @@ class SocketConnection:
         # waits for room isn't accepted yet: who hangs up takes it back.
         interruptible = slow or not isinstance(request, Say)
         try:
-            self._send(request_line(request, number))
+            self._send(request_line({"seq": number, **write_request(request)}))
             self.wait_until(
                 lambda: exchange.reply is not None,
                 lambda: None if slow else exchange.touched + self._patience,
@@ -274,7 +278,7 @@ class SocketConnection:
         return exchange.reply, exchange.items
 
     def post(self, request: Request) -> None:
-        self._send(request_line(request, next(self._numbers)))
+        self._send(request_line({"seq": next(self._numbers), **write_request(request)}))
 
     def _no_reply(self, request: Request) -> TalkError:
         why = self.ended or f"it did not reply within {self._patience:g} s"

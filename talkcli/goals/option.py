@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 MAX_ID = 64
 #: Ids in one request; more would not fit into a line anyway.
 MAX_IDS = 4096
+#: What a sender calls itself is shown on one line of a terminal.
+MAX_NAME = 64
 #: `data` that travels with a goal, in bytes of JSON: a label for programs, not something that the server has to store.
 MAX_DATA = 1024
 #: Goals that one request for the log asks for: as many as are kept.

@@ -3,27 +3,20 @@
 Rules for this file: form only; whether a goal is admitted is the scheduler's business. A request is one class and the
 rows of its fields; what a goal is and a server's settings are is in `goals.options`. A field may be added, never
 renamed or given another meaning. A field that is not in the rows is an error: an option that this server doesn't know
-is refused, never dropped. The first sentence of a request's docstring is its meaning in the wire's table. A client
-imports it before it sends anything, so it imports nothing heavy, not even `json`.
+is refused, never dropped. The first sentence of a request's docstring is its meaning in the wire's table.
 """
 
 from __future__ import annotations
 
-from _json import encode_basestring, encode_basestring_ascii
-
 from talkcli.errors import BadRequest
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.option import FLAG, ID, IDS, MAX_IDS, MAX_LOG, Kind, Option
+from talkcli.goals.option import FLAG, ID, IDS, MAX_IDS, MAX_LOG, MAX_NAME, Kind, Option
 from talkcli.goals.options import Cancel, Say, Set
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from typing import ClassVar
 
     from talkcli.goals.goal import JsonObject
-
-#: What a sender calls itself is shown on one line of a terminal.
-MAX_NAME = 64
 
 
 def _bad_name(value: str) -> str | None:
@@ -152,46 +145,3 @@ def read_request(message: JsonObject) -> Request:
     if request is Say and "text" not in fields:
         raise BadRequest("say needs a text", "bad_field")
     return request(**fields)  # type: ignore[arg-type]
-
-
-def write_request(request: Request) -> JsonObject:
-    """Return a request as the object that goes over the wire; fields at their defaults are left out."""
-    message: JsonObject = {"request": request.kind}
-    for option in request.options:
-        value = getattr(request, option.name)
-        if value != option.default or option.name == "text":
-            message[option.name] = list(value) if isinstance(value, tuple) else value
-    return message
-
-
-def request_line(request: Request, number: int | None = None) -> bytes:
-    """Return a request as the line that goes over the wire, with this `seq`: what `lines.encode` makes of the object.
-
-    ValueError or TypeError where something in `data` is no JSON.
-    """
-    fields = write_request(request) if number is None else {"seq": number, **write_request(request)}
-    try:
-        return _line(fields, encode_basestring)
-    except UnicodeEncodeError:  # only what UTF-8 cannot hold is escaped
-        return _line(fields, encode_basestring_ascii)
-
-
-def _line(fields: JsonObject, quoted: Callable[[str], str]) -> bytes:
-    shown = ", ".join(f'"{name}": {_value(value, quoted)}' for name, value in fields.items())
-    return f"{{{shown}}}\n".encode()
-
-
-def _value(value: object, quoted: Callable[[str], str]) -> str:
-    if isinstance(value, str):
-        return quoted(value)
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int):
-        return int.__repr__(value)
-    if isinstance(value, float) and value - value == 0:  # neither NaN nor infinite
-        return float.__repr__(value)
-    if isinstance(value, list):
-        return f"[{', '.join(_value(each, quoted) for each in value)}]"
-    import json
-
-    return json.dumps(value, ensure_ascii=quoted is encode_basestring_ascii, allow_nan=False)

@@ -12,9 +12,8 @@ import stat
 import sys
 
 from talkcli import paths, peers
-from talkcli.client.connect import connect
+from talkcli.client.connect import connect, hello
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
-from talkcli.protocol.requests import Hello
 from talkcli.server.lock import Lock, identity, serves_already
 
 #: Connections that may wait to be accepted; the system's own limit applies too (net.core.somaxconn).
@@ -147,7 +146,7 @@ def listen(named: str | None, mode: int) -> Listener | InheritedListener:
 def _refuse_second_server(named: str | None) -> None:
     """Refuse where clients would find another server before or instead of this one."""
     try:
-        found = connect(named, Hello(urgent=True))
+        found = connect(named, hello(None, urgent=True))
     except (ServerUnavailable, AccessDenied):
         return  # nobody there who would answer our clients
     except TalkError as error:

@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest
-from talkcli.goals.option import MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG
+from talkcli.goals.option import MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME
 from talkcli.goals.options import Cancel, Say, Set
+from talkcli.protocol.encoder import request_line, write_request
 from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.replies import failure
 from talkcli.protocol.requests import (
     KINDS,
-    MAX_NAME,
     Hello,
     Log,
     Pause,
@@ -26,8 +26,6 @@ from talkcli.protocol.requests import (
     Wait,
     Watch,
     read_request,
-    request_line,
-    write_request,
 )
 
 if TYPE_CHECKING:
@@ -113,20 +111,20 @@ def test_a_request_goes_over_the_wire_and_is_the_same(request: Request) -> None:
 
 @given(requests, integers)
 def test_a_request_s_line_is_what_json_makes_of_it(request: Request, number: int | None) -> None:
-    message = write_request(request) if number is None else {"seq": number, **write_request(request)}
-    assert request_line(request, number) == encode(message)
+    message: JsonObject = {"seq": number, **write_request(request)}
+    assert request_line(message) == encode(message)
 
 
 @pytest.mark.parametrize("text", ["\ud800", "Grüße \udc80", '"\\\b\n\x00\x7f\u2028🤖'])
 def test_any_text_has_a_line(text: str) -> None:
     for request in (Say(text, key=text, data={text: [text, None, 1e300, True]}), Cancel((text, text), before=text)):
-        assert request_line(request, 1) == encode({"seq": 1, **write_request(request)})
+        assert request_line(write_request(request)) == encode(write_request(request))
 
 
 @pytest.mark.parametrize("data", [{"x": float("nan")}, {"x": [-float("inf")]}, {"x": object()}])
 def test_what_is_no_json_has_no_line(data: JsonObject) -> None:
     with pytest.raises((ValueError, TypeError)):
-        request_line(Say("a", data=data))
+        request_line({"data": data})
 
 
 @pytest.mark.parametrize(
