@@ -25,6 +25,8 @@ from tests.support.scripted_peer import GREETING, Peer, goal, result, serving
 from tests.support.surroundings import clean_environment, short_directory
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from tests.support.processes import Talk
 
 
@@ -50,6 +52,19 @@ def test_a_signal_before_the_client_is_whole_cancels_the_goal_that_was_sent(numb
     assert (client.returncode, out) == (128 + number, "g\n"), err
 
 
+def assert_hello_is_sent_once(serve: Callable[[socket.socket], None], said: list[dict[str, Any]]) -> None:
+    """Have `talk say hello` meet this server, which leaves in `said` what it was asked."""
+    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(f"{directory}/s")
+        listening.listen()
+        thread = threading.Thread(target=serve, args=[listening], daemon=True)
+        thread.start()
+        done = run([*TALK, "say", "hello"], clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}))
+        thread.join(PATIENCE)
+    assert (done.code, done.out, done.err) == (0, "g\n", "")
+    assert said == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
+
+
 @pytest.mark.parametrize(
     "greeting",
     [
@@ -64,7 +79,7 @@ def test_a_signal_before_the_client_is_whole_cancels_the_goal_that_was_sent(numb
 def test_it_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> None:
     said: list[dict[str, Any]] = []
 
-    def serve() -> None:
+    def serve(listening: socket.socket) -> None:
         connected, _ = listening.accept()
         with connected, connected.makefile("rb") as file:
             for part in greeting:
@@ -74,22 +89,14 @@ def test_it_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> Non
             connected.sendall(json.dumps({"seq": said[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
             said.extend(json.loads(each) for each in file)
 
-    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
-        listening.bind(f"{directory}/s")
-        listening.listen()
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        done = run([*TALK, "say", "hello"], clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}))
-        thread.join(PATIENCE)
-    assert (done.code, done.out, done.err) == (0, "g\n", "")
-    assert said == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
+    assert_hello_is_sent_once(serve, said)
 
 
 def test_a_server_that_hangs_up_on_whoever_asks_early_is_asked_once_more() -> None:
     """As one does that ends, where a socket unit starts the next."""
     said: list[dict[str, Any]] = []
 
-    def serve() -> None:
+    def serve(listening: socket.socket) -> None:
         connected, _ = listening.accept()
         with connected:
             connected.recv(1, socket.MSG_PEEK)  # unread when it is closed, which breaks the connection
@@ -99,15 +106,7 @@ def test_a_server_that_hangs_up_on_whoever_asks_early_is_asked_once_more() -> No
             said.extend(json.loads(file.readline()) for _ in range(2))
             connected.sendall(json.dumps({"seq": said[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
 
-    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
-        listening.bind(f"{directory}/s")
-        listening.listen()
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        done = run([*TALK, "say", "hello"], clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}))
-        thread.join(PATIENCE)
-    assert (done.code, done.out, done.err) == (0, "g\n", "")
-    assert said == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
+    assert_hello_is_sent_once(serve, said)
 
 
 def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:

@@ -27,7 +27,7 @@ _MAX_SPOKEN = 40
 
 def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
     """Cancel what these select, or everything, and return the exit code."""
-    with options.connect(urgent=True) as client:
+    with options.connect() as client:
         try:
             done = client.cancel(ids or None, current=current, before=before, key=key)
             _show_canceled(done, options)
@@ -46,7 +46,7 @@ def status(options: Common, goal_id: str | None) -> int:
     from talkcli.goals.goal import Goal
     from talkcli.terminal.goals import goal_lines, status_lines
 
-    with options.connect(urgent=True) as client:
+    with options.connect() as client:
         found = client.status() if goal_id is None else client.goal(goal_id)
     if options.json:
         show_json(found.to_json())

@@ -82,6 +82,8 @@ class Command:
     exit_codes: Codes
     options: tuple[Option, ...] = ()
     argument: Argument | None = None
+    #: whether it finds a place where a server is full
+    urgent: bool = False
     #: what is said besides of an option that there isn't
     no_such_option: str = ""
     #: whether scripts call it all the time: a plain line of it is read without click
@@ -95,6 +97,7 @@ class Command:
 
     def carry_out(self, options: Common, given: Mapping[str, Any]) -> int | None:
         """Carry it out with what was given, and return the exit code; None for 0."""
+        options.urgent = self.urgent
         module, _, name = self.runs.partition(":")
         run: Callable[..., int | None] = getattr(__import__(f"talkcli.cli.{module}", fromlist=[name]), name)
         return run(options, **given)

@@ -308,6 +308,7 @@ _ROWS = (
         options=tuple(each for each in Cancel.options if each.flags),
         argument=_IDS,
         plain=True,
+        urgent=True,
     ),
     Command(
         name="status",
@@ -328,6 +329,7 @@ _ROWS = (
         },
         argument=Argument("goal_id", "[ID]", offers="known_ids"),
         plain=True,
+        urgent=True,
     ),
     Command(
         name="watch",

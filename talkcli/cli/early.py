@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 #: The commands whose request may be sent early.
 _EARLY = ("say", "cancel", "status", "pause", "resume")
-#: Those that find a place where a server is full.
-_URGENT = ("cancel", "status")
 
 
 def carry_out(plain: Plain) -> int:
@@ -70,11 +68,11 @@ def _begin(plain: Plain, before: Callable[[], None]) -> Begun | None:
 
 def first(plain: Plain) -> tuple[JsonObject, JsonObject] | None:
     """Return what a command says first, and its request; None where that may be refused, or only the library knows."""
-    command, name = plain.command.name, sender(plain.given.get("name"))
-    request = _request(command, plain.given)
+    command, name = plain.command, sender(plain.given.get("name"))
+    request = _request(command.name, plain.given)
     if request is None or len(name or "") > MAX_NAME:
         return None
-    return hello(name, urgent=command in _URGENT), request
+    return hello(name, urgent=command.urgent), request
 
 
 def _request(command: str, given: dict[str, Any]) -> JsonObject | None:

@@ -42,7 +42,7 @@ _NO_BREAK = "\0"
 class Common:
     """What every command is given: the options that all have, and what was done before it is carried out."""
 
-    __slots__ = ("began", "begun", "held", "json", "quiet", "socket", "typed")
+    __slots__ = ("began", "begun", "held", "json", "quiet", "socket", "typed", "urgent")
 
     def __init__(
         self,
@@ -66,13 +66,15 @@ class Common:
         #: signals that wait for somebody to take them
         self.held = held
         self.typed = typed
+        #: whether the command finds a place where the server is full
+        self.urgent = False
 
     def connect(self, **options: Any) -> Client:
         """Return a client connected to the server; see `SocketConnection` for the options."""
         from talkcli.client.client import Client
         from talkcli.client.connection import SocketConnection
 
-        return Client.over(SocketConnection(self.socket, begun=self.begun, **options))
+        return Client.over(SocketConnection(self.socket, begun=self.begun, **{"urgent": self.urgent, **options}))
 
 
 class OutputClosed(Exception):
