@@ -25,8 +25,7 @@ UNITS = ("user", "system", "user-socket", "system-socket")
 
 def _timeout(words: str) -> Option:
     """Return the option --timeout; `words` is its help: what the command does when the time is over."""
-    limits = (0, None)
-    return Option("timeout", NUMBER, limits=limits, above=True, flags="-t, --timeout", metavar="SEC", help=words)
+    return Option("timeout", NUMBER, limits=(0, None), above=True, flags="-t, --timeout", metavar="SEC", help=words)
 
 
 def _to_say() -> tuple[Option, ...]:
@@ -38,8 +37,7 @@ def _to_say() -> tuple[Option, ...]:
         elif each.flags:
             found.append(each)
         if each.name == "wait":
-            words = "With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124."
-            found.append(_timeout(words))
+            found.append(_timeout("With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124."))
         elif each.name == "id":
             what = "What the sender calls itself."
             found.append(Option("name", WORD, flags="--as", metavar="NAME", help=what, env="TALK_NAME"))
@@ -91,23 +89,8 @@ def _say_rule(given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
     return None
 
 
-def _to_set(option: Option) -> Option:
-    """Return a setting as `talk set` takes it: without a default, as what isn't given stays."""
-    assert option.setting
-    setting = option.setting
-    return replace(option, env="", flags=setting.flags or option.flags, help=setting.to_set or option.help)
-
-
-def _to_serve(option: Option) -> Option:
-    """Return a setting as `talk serve` takes it."""
-    assert option.setting
-    setting = option.setting
-    flags = (setting.flags or option.flags).split("/")[0]
-    return replace(option, default=setting.initial, flags=flags, help=setting.at_start or option.help)
-
-
 _SERVE = (
-    *map(_to_serve, SETTINGS),
+    *(each.at_start() for each in SETTINGS),
     # At two seconds a sentence, more than three minutes of speech that nobody can still want to hear; at most, five
     # hours, and to look at all that wait still takes no more than a millisecond or so.
     Option("max_queue", INTEGER, default=100, limits=(1, 10_000), flags="--max-queue", help="Goals that may wait."),
@@ -158,13 +141,7 @@ _SERVE = (
         metavar="NAME",
         help="A driver of pyttsx3's. [default: the one for this system]",
     ),
-    Option(
-        "socket_mode",
-        MODE,
-        default="0600",
-        flags="--socket-mode",
-        help="Who may connect: the socket's file mode.",
-    ),
+    Option("socket_mode", MODE, default="0600", flags="--socket-mode", help="Who may connect: the socket's file mode."),
     Option("greeting", TEXT, flags="--greeting", help="A sentence to speak at the start."),
     Option(
         "print_unit",
@@ -322,11 +299,7 @@ _ROWS = (
         talk status 12                          goal 12 of this server
         talk --json status | jq .active.text
         """,
-        exit_codes={
-            **ASKING,
-            0: "the server runs",
-            8: "unknown goal",
-        },
+        exit_codes={**ASKING, 0: "the server runs", 8: "unknown goal"},
         argument=Argument("goal_id", "[ID]", offers="known_ids"),
         plain=True,
         urgent=True,
@@ -372,10 +345,7 @@ _ROWS = (
         talk log -n 100 | grep patrol
         talk --json log | jq -r 'select(.state == "ABORTED").message'
         """,
-        exit_codes={
-            **ASKING,
-            0: "listed",
-        },
+        exit_codes={**ASKING, 0: "listed"},
         options=(
             Option(
                 "count",
@@ -417,10 +387,7 @@ _ROWS = (
         examples="""
         talk resume
         """,
-        exit_codes={
-            **ASKING,
-            0: "speech goes on",
-        },
+        exit_codes={**ASKING, 0: "speech goes on"},
         plain=True,
     ),
     Command(
@@ -443,7 +410,7 @@ _ROWS = (
             0: "changed, or printed",
             2: "usage: a value out of its range, or an unknown voice; nothing was changed",
         },
-        options=tuple(map(_to_set, SETTINGS)),
+        options=tuple(each.to_set() for each in SETTINGS),
         plain=True,
     ),
     Command(
@@ -460,11 +427,7 @@ _ROWS = (
         talk serve --voice en-us
         talk say --voice en-us+f3 "a variant"
         """,
-        exit_codes={
-            **ASKING,
-            0: "listed",
-            1: "no voice speaks that language, or the engine can't list them",
-        },
+        exit_codes={**ASKING, 0: "listed", 1: "no voice speaks that language, or the engine can't list them"},
         options=(
             Option(
                 "language",

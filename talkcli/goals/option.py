@@ -9,7 +9,7 @@ it before it sends anything, so it imports nothing heavy.
 
 from __future__ import annotations
 
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING, frozen, replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -161,6 +161,19 @@ class Option:
             wanted = wanted if self.limits[1] is None else "not within"
             return f"the {self.name} {value} is {wanted} {self.range}{self.unit}"
         return self.refuses(value) if self.refuses else None
+
+    def to_set(self) -> Option:
+        """Return a setting as `talk set` takes it: without a default, as what isn't given stays."""
+        setting = self.setting
+        assert setting
+        return replace(self, env="", flags=setting.flags or self.flags, help=setting.to_set or self.help)
+
+    def at_start(self) -> Option:
+        """Return a setting as `talk serve` takes it."""
+        setting = self.setting
+        assert setting
+        flags = (setting.flags or self.flags).split("/")[0]
+        return replace(self, default=setting.initial, flags=flags, help=setting.at_start or self.help)
 
     @property
     def range(self) -> str:

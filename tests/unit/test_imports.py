@@ -45,7 +45,7 @@ IMPURE = {
 #: What stands at the top of the project; beside it only files and folders whose names begin with a dot.
 TOP = {"pyproject.toml", "talkcli", "tests", "completions", "README.md", "LICENSE"}
 #: The longest that a module may be: what can be kept in mind as one thing.
-LONGEST = 600
+LONGEST = 500
 #: Who may name these, by the first part of a module's name.
 ONLY = {
     "pyttsx3": {"engine"},
