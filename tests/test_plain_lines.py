@@ -11,7 +11,7 @@ from click.core import ParameterSource
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from talkcli.cli import early, plain
+from talkcli.cli import plain
 from talkcli.cli.click_app import talk
 from talkcli.cli.command import COMMON
 from talkcli.cli.commands import COMMANDS
@@ -186,7 +186,7 @@ def test_anything_else_is_click_s(line: list[str]) -> None:
 
 def sent_early(found: plain.Plain) -> tuple[JsonObject, JsonObject] | None:
     """Return what is said early for a command, None where nothing is."""
-    return early.first(found) if early.asks_at_once(found) else None
+    return plain.first(found) if plain.asks_at_once(found) else None
 
 
 def library_sends(found: plain.Plain) -> tuple[Hello, Request]:

@@ -39,14 +39,10 @@ def _run_plain(arguments: list[str]) -> int | None:
     _prepare_streams()
     if "_TALK_COMPLETE" in os.environ:
         return None
-    from talkcli.cli.plain import read
+    from talkcli.cli.plain import carry_out, read
 
     plain = read(arguments, os.environ)
-    if plain is None:
-        return None
-    from talkcli.cli.early import carry_out
-
-    return carry_out(plain)
+    return None if plain is None else carry_out(plain)
 
 
 def _run_by_click(arguments: list[str]) -> int:

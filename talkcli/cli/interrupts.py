@@ -2,7 +2,7 @@
 
 The first three become a descriptor that is readable then, so that they never cut a read or a write in two. The last is
 seen at standard output itself, which is waited for together with that. Until there is one of these, a signal for a goal
-that was sent early is held, by `early`.
+that was sent early is held, by `plain`.
 """
 
 from __future__ import annotations

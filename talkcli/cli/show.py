@@ -55,7 +55,7 @@ class Common:
         held: Iterable[int] = (),
         typed: AbstractSet[str] = frozenset(),
     ) -> None:
-        """`typed`: the options that stand on the command line; for `began`, `begun` and `held` see `early`."""
+        """`typed`: the options that stand on the command line; for `began`, `begun` and `held` see `plain`."""
         self.socket = socket
         self.json = json
         self.quiet = quiet
