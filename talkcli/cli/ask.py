@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import sys
 
+from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_json
-from talkcli.cli.values import nearest
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
 

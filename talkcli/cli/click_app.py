@@ -14,11 +14,10 @@ import click
 from click.core import ParameterSource
 
 from talkcli import __version__
-from talkcli.cli import complete, values
-from talkcli.cli.command import ALL_EXIT_CODES, COMMON, FILE, spelt
+from talkcli.cli import complete
+from talkcli.cli.command import ALL_EXIT_CODES, COMMON, FILE, limits, nearest, read_value, spelt
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import Common, OutputClosed, ended, note, show_error
-from talkcli.cli.values import nearest
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, UsageError
 from talkcli.goals.option import FLAG, INTEGER, NUMBER, SECONDS
 
@@ -49,7 +48,7 @@ _ELSEWHERE = {
 
 
 class _Value(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """The value of an option, as `values` reads it."""
+    """The value of an option, as `command` reads it."""
 
     name = "value"
 
@@ -58,7 +57,7 @@ class _Value(click.ParamType):  # type: ignore[type-arg,unused-ignore]
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         try:
-            return values.read(self._option, str(value))
+            return read_value(self._option, str(value))
         except ValueError as error:
             raise click.BadParameter(str(error), ctx, param, self._came_from(ctx)) from error
 
@@ -79,7 +78,7 @@ class _Number(_Value, click.FloatRange):
         return None
 
     def _describe_range(self) -> str:
-        return values.limits(self._option)
+        return limits(self._option)
 
 
 def _option(option: Option, *, common: bool = False) -> click.Option:

@@ -14,8 +14,7 @@ import _signal
 import os
 import time
 
-from talkcli.cli import values
-from talkcli.cli.command import COMMON, FILE
+from talkcli.cli.command import COMMON, FILE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.client.connect import ask, hello, reach, sender, stand_back
 from talkcli.frozen import TYPE_CHECKING, frozen
@@ -101,7 +100,7 @@ def _take(options: Spellings, word: str, rest: Iterator[str], given: dict[str, A
     if option.kind is FILE or (option.kind is FLAG and equals):
         return False
     try:
-        given[option.name] = value if option.kind is FLAG else values.read(option, text if equals else next(rest))
+        given[option.name] = value if option.kind is FLAG else read_value(option, text if equals else next(rest))
     except StopIteration:
         return False
     return True
@@ -116,7 +115,7 @@ def _complete(
     for option in command.options:
         if option.name not in given:
             text = environment.get(option.env) if option.env else None
-            given[option.name] = values.read(option, text) if text else option.default
+            given[option.name] = read_value(option, text) if text else option.default
     argument = command.argument
     if argument:
         if len(words) > 1 and not argument.many:

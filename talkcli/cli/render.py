@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from talkcli.cli.command import read_value, readable
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import regardless, show_if_possible
 from talkcli.cli.show import note, show_json
-from talkcli.cli.values import read, readable
 from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, UsageError
 from talkcli.goals.options import SOUND
@@ -59,7 +59,7 @@ def _settings(chosen: Mapping[str, Any]) -> dict[str, Any]:
         value, text = chosen[option.name], os.environ.get(option.env) if option.env else None
         if value is None and text:
             try:
-                value = read(option, text)
+                value = read_value(option, text)
             except ValueError as error:
                 words = f"{option.env} in the environment: {error}"
                 raise click.UsageError(words, click.get_current_context()) from error

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 
+from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts, give_up_unread, watched_output
 from talkcli.cli.outcome import (
     SPEECH_IS_PAUSED,
@@ -18,7 +19,6 @@ from talkcli.cli.outcome import (
     until_ended,
 )
 from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
-from talkcli.cli.values import readable
 from talkcli.client.connect import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost
 from talkcli.frozen import TYPE_CHECKING

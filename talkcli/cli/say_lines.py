@@ -11,6 +11,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
+from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.outcome import (
     SILENCE,
@@ -23,7 +24,6 @@ from talkcli.cli.outcome import (
 )
 from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.stdin import LineReader
-from talkcli.cli.values import readable
 from talkcli.client.connect import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
 from talkcli.goals.goal import Goal

@@ -6,8 +6,8 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from talkcli.cli import units
+from talkcli.cli.command import nearest
 from talkcli.cli.show import note
-from talkcli.cli.values import nearest
 
 if TYPE_CHECKING:
     from talkcli.cli.show import Common

@@ -263,7 +263,7 @@ COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", 
         ("import talkcli.cli, talkcli.cli.plain", [*HEAVY, *COSTLY, "json", "re", "enum", "signal"]),
         ("import talkcli.protocol.encoder", [*HEAVY, *COSTLY, "_json", "json", "re", "enum", "signal"]),
         ("import talkcli.cli.ask, talkcli.cli.say, talkcli.cli.wait", [*HEAVY, *COSTLY]),
-        ("import talkcli.terminal.goals, talkcli.terminal.transcript, talkcli.cli.show, talkcli.cli.values", HEAVY),
+        ("import talkcli.terminal.goals, talkcli.terminal.transcript, talkcli.cli.show, talkcli.cli.command", HEAVY),
     ],
 )
 def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> None:

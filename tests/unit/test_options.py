@@ -15,9 +15,8 @@ from hypothesis import given as given_any
 from hypothesis import strategies as st
 
 from talkcli import Client, Goal
-from talkcli.cli.command import MODE
+from talkcli.cli.command import MODE, read_value
 from talkcli.cli.commands import COMMANDS
-from talkcli.cli.values import read
 from talkcli.engine import protocol
 from talkcli.frozen import fields, replace
 from talkcli.goals.option import INTEGER, NUMBER, Option
@@ -224,7 +223,7 @@ def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
     assert server.pop("goals") == Set(**{name: row.default for name, row in rows.items() if row.setting})
     assert server.pop("socket") is None
     assert server == {
-        name: read(row, row.default) if row.kind is MODE else row.default
+        name: read_value(row, row.default) if row.kind is MODE else row.default
         for name, row in rows.items()
         if not row.setting and name != "print_unit"
     }
@@ -249,15 +248,15 @@ def test_limits_hold_on_the_wire_and_on_the_command_line_alike() -> None:
     refused: list[list[float]] = [[0, -1, 1.5], [0, -5], []]
     for option, good, bad in zip(LIMITED, taken, refused, strict=True):
         for value in good:
-            assert (option.refusal(value), read(option, str(value))) == (None, value)
+            assert (option.refusal(value), read_value(option, str(value))) == (None, value)
         for value in bad:
             assert f"{value}" in str(option.refusal(value))
             with pytest.raises(ValueError, match=f"'{value}' is not a"):
-                read(option, str(value))
+                read_value(option, str(value))
     wanted = ["a number from 0 to 1", "a whole number from 1 on", "a valid integer"]
     for option, words in zip(LIMITED, wanted, strict=True):
         with pytest.raises(ValueError, match=f"'abc' is not {words}$"):
-            read(option, "abc")
+            read_value(option, "abc")
 
 
 def test_a_plain_line_is_read_before_an_option_is_worth_compiling() -> None:
