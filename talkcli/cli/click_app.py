@@ -14,7 +14,6 @@ import click
 from click.core import ParameterSource
 
 from talkcli import __version__
-from talkcli.cli import complete
 from talkcli.cli.command import ALL_EXIT_CODES, COMMON, FILE, limits, nearest, read_value, spelt
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import Common, OutputClosed, ended, note, show_error
@@ -22,6 +21,8 @@ from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, UsageError
 from talkcli.goals.option import FLAG, INTEGER, NUMBER, SECONDS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from click.shell_completion import CompletionItem
 
     from talkcli.cli.command import Argument, Codes, Command
@@ -93,7 +94,7 @@ def _option(option: Option, *, common: bool = False) -> click.Option:
         help=option.help,
         envvar=option.env or None,
         show_envvar=bool(option.env),
-        shell_complete=getattr(complete, option.offers) if option.offers else None,
+        shell_complete=_offering(option.offers),
         callback=_store if common else None,
         expose_value=not common,
     )
@@ -114,8 +115,20 @@ def _argument(argument: Argument) -> click.Argument:
         required=bool(argument.choices),
         type=click.Choice(argument.choices) if argument.choices else None,
         metavar=argument.metavar,
-        shell_complete=getattr(complete, argument.offers) if argument.offers else None,
+        shell_complete=_offering(argument.offers),
     )
+
+
+def _offering(name: str) -> Callable[..., list[CompletionItem]] | None:
+    """Return what offers values to a shell, "" for nothing: that of `completion` of this name, once a shell asks."""
+
+    def offer(*arguments: Any) -> list[CompletionItem]:
+        from talkcli.cli import completion
+
+        found: list[CompletionItem] = getattr(completion, name)(*arguments)
+        return found
+
+    return offer if name else None
 
 
 def _store(context: click.Context, parameter: click.Parameter, value: object) -> None:
@@ -278,9 +291,9 @@ def _main(arguments: list[str], options: Common) -> object:
 
 def _complete(options: Common) -> int:
     """Answer a shell that asks for completion: what there is to offer, and never a word besides."""
-    from talkcli.cli import shells
+    from talkcli.cli import completion
 
-    shells.register()
+    completion.register()
     try:
         talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # ends by itself
     except Exception:

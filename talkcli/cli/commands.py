@@ -483,7 +483,7 @@ _ROWS = (
         Tab then completes commands, options and their values, and what the running server knows: goals, keys,
         voices.
         """,
-        runs="shells:completion",
+        runs="completion:completion",
         examples="""
         eval "$(talk completion bash)"   the last line of ~/.bashrc
         eval "$(talk completion zsh)"    the last line of ~/.zshrc

@@ -126,7 +126,7 @@ class Option:
     help: str = ""
     #: the variable of the environment that stands for it
     env: str = ""
-    #: what a shell offers for its value: a function of `cli.complete`
+    #: what a shell offers for its value: a function of `cli.completion`
     offers: str = ""
     #: what it is for a server, where one has a value of its own for it
     setting: Setting | None = None
