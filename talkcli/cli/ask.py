@@ -1,6 +1,6 @@
-"""The commands that ask the server one thing and show what it says: cancel, status, log, voices, set, pause, resume.
+"""The commands that ask the server and show what it says: cancel, status, watch, log, voices, set, pause, resume.
 
-They know no click: plain command lines come here without it.
+They know no click: plain command lines come here without it. What watching takes is imported for that alone.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ import sys
 
 from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_json
-from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
+from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from typing import Any
 
     from talkcli.cli.show import Common
@@ -55,6 +55,35 @@ def status(options: Common, goal_id: str | None) -> int:
     else:
         _show_lines(status_lines(found, screen()))
     return EXIT_OK
+
+
+def watch(options: Common, words: bool) -> int:
+    """Show all goals as they happen, and each word as it is heard, too, if asked for; return the exit code."""
+    from talkcli.cli.interrupts import Interrupts, has_reader
+    from talkcli.client.connect import Interrupted
+
+    if not has_reader():
+        return EXIT_SIGPIPE
+    with Interrupts() as interrupts:
+        interrupts.watch_output()  # in `talk watch | head`, the next event may be far
+        try:
+            _watch(options, interrupts.watched, words=words)
+        except Interrupted:
+            interrupts.look()
+    return interrupts.exit_code
+
+
+def _watch(options: Common, interrupt: Mapping[int, int], *, words: bool) -> None:
+    from talkcli.terminal.transcript import Transcript
+
+    transcript = Transcript(full=screen().width is None, words=words)
+    with options.connect(interrupt=interrupt) as client:
+        for event in client.events():
+            if options.json:
+                show_json(event.to_json())
+                continue
+            for line in transcript.lines(event, screen()):
+                show(line)
 
 
 def log(options: Common, count: int) -> int:

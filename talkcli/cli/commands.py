@@ -315,7 +315,7 @@ _ROWS = (
 
         With --json each event is an object a line, words included; the first is {"event": "snapshot", ...}.
         """,
-        runs="watch:watch",
+        runs="ask:watch",
         examples="""
         talk watch
         ssh robot talk watch

@@ -10,8 +10,8 @@ import click
 
 from talkcli.cli.command import read_value, readable
 from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.outcome import regardless, show_if_possible
 from talkcli.cli.show import note, show_json
+from talkcli.cli.wait import regardless, show_if_possible
 from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, UsageError
 from talkcli.goals.options import SOUND

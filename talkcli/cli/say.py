@@ -9,7 +9,8 @@ import time
 
 from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts, give_up_unread, watched_output
-from talkcli.cli.outcome import (
+from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.cli.wait import (
     SPEECH_IS_PAUSED,
     give_up,
     regardless,
@@ -18,7 +19,6 @@ from talkcli.cli.outcome import (
     show_if_possible,
     until_ended,
 )
-from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.client.connect import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost
 from talkcli.frozen import TYPE_CHECKING

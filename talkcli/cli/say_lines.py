@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.outcome import (
+from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.cli.stdin import LineReader
+from talkcli.cli.wait import (
     SILENCE,
     SPEECH_IS_PAUSED,
     exit_code,
@@ -22,8 +24,6 @@ from talkcli.cli.outcome import (
     show_if_possible,
     until_ended,
 )
-from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
-from talkcli.cli.stdin import LineReader
 from talkcli.client.connect import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, TalkError, UnknownGoal
 from talkcli.goals.goal import Goal

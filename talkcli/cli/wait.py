@@ -1,19 +1,128 @@
-"""`talk wait`: waits for goals, whoever sent them. It knows no click: plain command lines come here without it."""
+"""Waiting for goals and telling how they ended, as `say` and `wait` do it; and `talk wait` itself, which owns none.
+
+None of this depends on whether standard output can be written. It knows no click: plain command lines come here
+without it.
+"""
 
 from __future__ import annotations
 
+import time
+
 from talkcli.cli.interrupts import Interrupts, give_up_unread
-from talkcli.cli.outcome import regardless, report, rest, show_if_possible
-from talkcli.cli.show import note
+from talkcli.cli.show import (
+    give_up_output,
+    never_readable,
+    no_room,
+    note,
+    output_failed,
+    reader_is_gone,
+    show_json,
+)
 from talkcli.client.connect import ANSWER_LIMIT, Interrupted
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.states import State
+from talkcli.goals.states import EXIT_CODES, State
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any, TypeVar
+
     from talkcli.cli.feedback import Feedback
     from talkcli.cli.show import Common
     from talkcli.client.client import GoalHandle
+    from talkcli.goals.goal import Goal
+
+    _T = TypeVar("_T")
+
+#: Seconds for which a goal that was given up is awaited to be silent.
+SILENCE = 1.0
+#: What the sender of a goal is told that nobody hears yet.
+SPEECH_IS_PAUSED = "speech is paused: talk resume"
+
+
+def rest(end: float | None) -> float | None:
+    """Return the seconds that are left until a monotonic time."""
+    return None if end is None else max(0.0, end - time.monotonic())
+
+
+def show_if_possible(put: Callable[..., None], *what: object) -> None:
+    """Show something, with a function for that; where there is no room for it, all goes on without.
+
+    A reader that is gone is raised: see `reader_is_gone`.
+    """
+    try:
+        put(*what)
+    except OSError as error:
+        if never_readable(error):
+            give_up_output()
+        elif no_room(error):
+            output_failed(error)
+        else:
+            raise
+
+
+def regardless(act: Callable[..., _T], *given: Any) -> _T:
+    """Do this; where the reader of standard output is gone, again, and then nothing is shown."""
+    try:
+        return act(*given)
+    except OSError as error:
+        if not reader_is_gone(error):
+            raise
+        give_up_output()
+        return act(*given)
+
+
+def until_ended(goal: GoalHandle, timeout: float | None, shown: Feedback | None) -> None:
+    """Wait until a goal has ended, and show what happens meanwhile; TimeoutError, Interrupted."""
+    if shown is None:
+        goal.wait(timeout)
+        return
+    for event in goal.events(timeout):
+        show_if_possible(shown.show, goal.goal, event)
+
+
+def give_up(goal: GoalHandle, interrupts: Interrupts, options: Common, shown: Feedback | None) -> int:
+    """Cancel a goal, wait a moment for its silence, tell how it ended, and return the exit code for that.
+
+    Ctrl-C may have ended the reader, too, and a terminal is gone soon after SIGHUP.
+    """
+    interrupts.clear()
+    unknown = ""
+    try:
+        goal.request_cancel()
+        regardless(until_ended, goal, SILENCE, shown)
+    except TimeoutError:
+        unknown = f"the server did not confirm within {SILENCE:g} s that it is silent"
+    except (Interrupted, ServerUnavailable) as error:
+        unknown = f"it is not known whether it is silent: {error or 'interrupted'}"
+    if unknown:
+        regardless(shown.aside if shown else note, f"{goal.id}: cancelled, but {unknown}")
+    return regardless(report, goal.goal, options, shown)
+
+
+def report(goal: Goal, options: Common, shown: Feedback | None = None) -> int:
+    """Tell how a goal ended, or how it stands, and return the exit code for it.
+
+    `shown`: what has shown it already on standard output.
+    """
+    if options.json and shown is None:
+        show_if_possible(show_json, goal.to_json())
+    if goal.state is not State.SUCCEEDED and goal.state.terminal and not options.quiet:
+        from talkcli.terminal.goals import ending
+
+        tell = shown.aside if shown else note
+        words = ending(goal)
+        if goal.state is State.ABORTED and goal.reason != "nothing_to_say":
+            words += "; see 'talk doctor'"
+        tell(words)
+    return exit_code(goal)
+
+
+def exit_code(goal: Goal) -> int:
+    """Return the exit code for how a goal ended."""
+    if goal.reason == "throttled":
+        return EXIT_OK  # not speaking was what the sender asked for
+    return EXIT_CODES.get(goal.state, EXIT_TIMEOUT)
 
 
 def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
