@@ -53,7 +53,7 @@ def say(
     if output is None:
         give_up_unread()
     if lines:
-        from talkcli.cli.say_lines import say_lines
+        from talkcli.cli.stdin import say_lines
 
         return say_lines(options, name, chosen, wait, feedback, timeout)
     sentence = " ".join(text)

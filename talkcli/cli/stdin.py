@@ -1,21 +1,47 @@
-"""Standard input, where `say` is told to read it: as one text, or line by line. It never holds more than one text."""
+"""`say` from standard input: read as one text, or spoken line by line, each a goal as it arrives, over one connection.
+
+It never holds more than one text. Of lines, the main thread reads and sends them, waiting for room in the server's
+queue; with --wait a second thread waits for the goals, in their order. Of a goal that has ended nothing is kept but the
+exit code: the input may have no end.
+"""
 
 from __future__ import annotations
 
 import os
 import select
+import threading
 import time
-from typing import TYPE_CHECKING
+from collections import deque
 
-from talkcli.client.connect import ready
-from talkcli.errors import EXIT_TIMEOUT, TalkError, UsageError
-from talkcli.frozen import frozen
+from talkcli.cli.command import readable
+from talkcli.cli.interrupts import Interrupts
+from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.cli.wait import (
+    SILENCE,
+    SPEECH_IS_PAUSED,
+    exit_code,
+    regardless,
+    report,
+    show_if_possible,
+    until_ended,
+)
+from talkcli.client.connect import ANSWER_LIMIT, Interrupted, ready
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, TalkError, UnknownGoal, UsageError
+from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
 from talkcli.goals.states import EXIT_CODES, State
+from talkcli.protocol.replies import Canceled
 from talkcli.splitter import Cut, LineSplitter
+from talkcli.terminal.goals import ending
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
+    from typing import Any
+
+    from talkcli.cli.feedback import Feedback
+    from talkcli.cli.show import Common
+    from talkcli.client.client import Client, GoalHandle
 
 #: Bytes that are read at once: what a pipe holds.
 _CHUNK = 65_536
@@ -113,3 +139,289 @@ def _read(count: int) -> bytes | None:
 def _decoded(data: bytes) -> str:
     # What is not UTF-8 stays recognisable, as in arguments: see `utf8`.
     return data.decode(errors="surrogateescape").rstrip("\r\n")
+
+
+def say_lines(
+    options: Common, name: str | None, chosen: dict[str, Any], wait: bool, feedback: bool, timeout: float | None
+) -> int:
+    """Speak standard input line by line, and return the exit code.
+
+    `name`: what the sender calls itself; `chosen`: options of each goal; `timeout`: seconds for all of it.
+    """
+    shown = None
+    if feedback:
+        from talkcli.cli.feedback import feedback as feedback_for
+
+        shown = feedback_for(options)
+    with Interrupts(timeout) as interrupts:
+        if wait:
+            interrupts.watch_output()
+        patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
+        try:
+            with options.connect(name=name, interrupt=interrupts.watched, patience=patience) as client:
+                return _Lines(client, interrupts, options, chosen, wait, shown).run()
+        except Interrupted:  # while it connected
+            interrupts.look()
+            return interrupts.exit_code
+        finally:
+            if shown:
+                regardless(shown.close)
+
+
+class _Lines:
+    """One run of the command."""
+
+    def __init__(
+        self,
+        client: Client,
+        interrupts: Interrupts,
+        options: Common,
+        chosen: dict[str, Any],
+        wait: bool,
+        shown: Feedback | None,
+    ) -> None:
+        self._client = client
+        self._interrupts = interrupts
+        self._options = options
+        self._chosen = chosen
+        self._shown = shown
+        self._tell = shown.aside if shown else note
+        self._tally = _Tally(options, interrupts, shown) if wait else None
+        #: exit code of the first line that was refused
+        self._refused = EXIT_OK
+        #: the line that is being sent
+        self._sending: Line | None = None
+        self._told_of_pause = False
+
+    def run(self) -> int:
+        """Send all lines; with --wait, see them end."""
+        if self._tally:
+            self._tally.start()
+        try:
+            self._send_all()
+            if self._tally:
+                self._tally.finish()
+        except Interrupted:
+            return self._interrupted()
+        except TalkError as error:
+            return self._lost(error)
+        except BaseException as error:
+            if self._tally and isinstance(error, OSError) and reader_is_gone(error):
+                self._interrupts.gone = True
+                return self._interrupted()
+            if self._tally:
+                self._tally.stop()
+            raise
+        return self._tally.code if self._tally else self._refused
+
+    def _send_all(self) -> None:
+        for line in LineReader(self._interrupts.watched).lines():
+            if line.text is not None and not line.text.strip():
+                continue
+            self._sending = line
+            if line.text is None:
+                self._refuse(line, _too_long(line))
+            else:
+                text, unreadable = readable(line.text, line.number)
+                if unreadable and not self._options.quiet:
+                    self._tell(unreadable)
+                self._send(line, text)
+            self._sending = None
+
+    def _send(self, line: Line, text: str) -> None:
+        wait = self._tally is not None
+        handle = self._client.say(text, follow=wait, feedback=self._shown is not None, patient=True, **self._chosen)
+        if handle.state is State.REJECTED:
+            self._refuse(line, handle.goal)
+            return
+        if self._options.json:
+            if not wait:
+                self._print(lambda: show_json(handle.goal.to_json()))
+        elif not self._options.quiet and self._shown is None:
+            self._print(lambda: show(handle.id))
+        if handle.speech_paused and not (self._options.quiet or self._told_of_pause):
+            self._tell(SPEECH_IS_PAUSED)
+        self._told_of_pause = handle.speech_paused
+        if self._tally:
+            self._tally.add(handle)
+
+    def _refuse(self, line: Line, goal: Goal) -> None:
+        """Tell of a line that is no goal, and go on."""
+        if self._options.json:
+            self._print(lambda: self._show(goal) if self._shown else show_json(goal.to_json()))
+        if not self._options.quiet:
+            self._tell(f"line {line.number}: {ending(goal)}")
+        code = exit_code(goal)
+        self._refused = self._refused or code
+        if self._tally:
+            self._tally.add(code)
+
+    def _print(self, put: Callable[[], None]) -> None:
+        """Show something; where its reader is gone, who waits ends as by a signal, and who doesn't goes on without."""
+        try:
+            show_if_possible(put)
+        except OSError as error:
+            if not reader_is_gone(error):
+                raise
+            if self._tally:
+                self._interrupts.gone = True
+                raise Interrupted from error
+            give_up_output()
+
+    def _interrupted(self) -> int:
+        """End before the input does: by a signal, by the timeout, because its output has no reader any more or the
+        tally can't go on.
+        """
+        self._interrupts.look()
+        if self._interrupts.gone:
+            give_up_output()
+        elif self._tally and self._interrupts.number is None and not self._interrupts.late:
+            self._tally.finish()
+            self._tell_of_the_rest()
+            return self._tally.code
+        if self._tally:
+            self._tally.stop()
+            # Who hangs up takes back the line that waits for room: else it would get that of the goals that end now.
+            self._client.close()
+            self._interrupts.clear()
+            self._cancel([each.id for each in self._tally.unfinished])
+        self._tell_of_the_rest()
+        return self._interrupts.exit_code
+
+    def _cancel(self, ids: list[str]) -> None:
+        """Cancel what was sent and has not ended, and tell how it ended."""
+        try:
+            with self._options.connect(interrupt=self._interrupts.watched, patience=SILENCE, urgent=True) as client:
+                # With the one that was accepted in the moment in which this command hung up, if there was one.
+                ids = list(dict.fromkeys([*ids, *_own(client)]))
+                if not ids:
+                    return
+                ended = _cancelled(client, ids)
+        except (TalkError, Interrupted) as error:
+            self._tell(f"cancelled, but it is not known whether it is silent: {str(error) or 'interrupted'}")
+            return
+        recalled = [each for each in ended if each.state is State.RECALLED]
+        for goal in ended:
+            if self._shown:
+                regardless(self._show, goal)
+            elif self._options.json or goal.state is not State.RECALLED:
+                regardless(report, goal, self._options)
+        if recalled and not (self._shown or self._options.json or self._options.quiet):
+            note(f"{len(recalled)} that waited: recalled")
+
+    def _lost(self, error: TalkError) -> int:
+        """End because the server takes no more lines, or because standard input can't be read."""
+        code = self._refused
+        if self._tally:
+            self._tally.finish()
+            code = self._tally.code
+        if self._shown:
+            self._shown.close()
+        show_error(error, json=self._options.json)
+        self._tell_of_the_rest()
+        return code or error.exit_code
+
+    def _tell_of_the_rest(self) -> None:
+        """Say from which line on nothing was accepted, as far as that is known."""
+        if self._sending is not None and not self._options.quiet:
+            self._tell(f"line {self._sending.number} may not have been accepted; what follows it was not sent")
+
+    def _show(self, goal: Goal) -> None:
+        from talkcli.protocol.events import Result
+
+        if self._shown:
+            self._shown.show(goal, Result(goal))
+
+
+class _Tally(threading.Thread):
+    """Waits for the goals in their order, tells how each ended, and keeps the first exit code that is no success."""
+
+    def __init__(self, options: Common, interrupts: Interrupts, shown: Feedback | None) -> None:
+        super().__init__(name="tally", daemon=True)
+        self._options = options
+        self._interrupts = interrupts
+        self._shown = shown
+        self._changed = threading.Condition()
+        #: goals that have not ended, as far as this thread knows, and exit codes of lines that are no goals
+        self._waiting: deque[GoalHandle | int] = deque()
+        self._closed = False
+        self._error: BaseException | None = None
+        #: the exit code of all lines so far
+        self.code = EXIT_OK
+
+    @property
+    def unfinished(self) -> list[GoalHandle]:
+        """The goals that were not seen to end."""
+        with self._changed:
+            return [each for each in self._waiting if not isinstance(each, int)]
+
+    def add(self, sent: GoalHandle | int) -> None:
+        """Wait for this one, too, or count this exit code when its turn comes."""
+        with self._changed:
+            self._waiting.append(sent)
+            self._changed.notify()
+
+    def finish(self) -> None:
+        """Return when all have ended; what stopped this thread before that is raised."""
+        self._close()
+        self.join()
+        if self._error is not None:
+            raise self._error
+
+    def stop(self) -> None:
+        """End the thread as soon as that can be done, whatever has not ended."""
+        self._close()
+        self._interrupts.wake()
+        # It may hang on a standard output that nobody reads: then it ends with the process.
+        self.join(SILENCE)
+
+    def run(self) -> None:
+        """Wait for one after the other."""
+        try:
+            while (sent := self._next()) is not None:
+                code = sent if isinstance(sent, int) else self._see_end(sent)
+                with self._changed:
+                    self._waiting.popleft()
+                    self.code = self.code or code
+        except BaseException as error:  # noqa: BLE001 - whatever it is, the main thread raises it
+            self._error = error
+            self._interrupts.wake()
+
+    def _next(self) -> GoalHandle | int | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._closed)
+            return self._waiting[0] if self._waiting else None
+
+    def _see_end(self, handle: GoalHandle) -> int:
+        if self._shown:
+            self._shown.begin([handle.goal])
+        until_ended(handle, None, self._shown)
+        if handle.state is State.LOST:
+            self._interrupts.wake()  # nothing more can be sent
+        return report(handle.goal, self._options, self._shown)
+
+    def _close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+
+def _own(client: Client) -> list[str]:
+    """Return the ids of all goals of this process that have not ended."""
+    status = client.status()
+    going = [*status.pending, *([status.active] if status.active else [])]
+    return [each.id for each in going if each.client is not None and each.client.pid == os.getpid()]
+
+
+def _cancelled(client: Client, ids: list[str]) -> list[Goal]:
+    """Cancel these goals, and return them, in this order, as they ended."""
+    try:
+        done = client.cancel(ids)
+    except UnknownGoal as error:
+        done = Canceled.from_items(error.items)
+    return sorted((*done.ended, *done.canceled), key=lambda each: ids.index(each.id) if each.id in ids else len(ids))
+
+
+def _too_long(line: Line) -> Goal:
+    words = f"Talk rejected: the line has {line.size:,} bytes, the longest text allowed has {MAX_BYTES:,}"
+    return Goal("", State.REJECTED, reason="text_too_long", message=words)
