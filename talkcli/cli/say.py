@@ -1,13 +1,16 @@
-"""`talk say`: one sentence is sent, waited for, and how it ended is told; of lines and files others take care.
+"""`talk say`: one sentence is sent, waited for, and how it ended is told; or, with `-o`, written into a file.
 
-It knows no click: plain command lines come here without it.
+Of lines `stdin` takes care. It knows no click: plain command lines come here without it. What a file takes, which is by
+an engine of this command's own and knows no server, is imported for that alone.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 
-from talkcli.cli.command import readable
+from talkcli.cli.command import read_value, readable
 from talkcli.cli.interrupts import Interrupts, give_up_unread, watched_output
 from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.wait import (
@@ -20,11 +23,13 @@ from talkcli.cli.wait import (
     until_ended,
 )
 from talkcli.client.connect import ANSWER_LIMIT, Interrupted
-from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost
+from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.options import SOUND
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from typing import Any
 
     from talkcli.cli.feedback import Feedback
@@ -70,9 +75,7 @@ def say(
             end_line()  # that the terminal has shown ^C on
             raise
     if output is not None:
-        from talkcli.cli.render import render_to
-
-        return render_to(output, sentence, chosen, rest(end), options)
+        return _render(output, sentence, chosen, rest(end), options)
     return _say(options, sentence, chosen, name, timeout, end, wait=wait, feedback=feedback)
 
 
@@ -196,3 +199,51 @@ def _leave(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> 
         tell = shown.aside if shown else note
         tell(f"{goal.id} has not ended within the time, and goes on: it was sent before")
     return interrupts.exit_code
+
+
+def _render(path: str, text: str, chosen: Mapping[str, Any], timeout: float | None, options: Common) -> int:
+    """Write the text into the file, "-" for standard output, and return the exit code; what goes wrong is raised.
+
+    `chosen`: the options of a goal; those that the engine isn't told of mean nothing here. `timeout`: seconds.
+    """
+    from talkcli.engine.render import STANDARD_OUTPUT, render
+
+    settings = _settings(chosen)
+    if path in STANDARD_OUTPUT:
+        if options.json:
+            raise UsageError("--json prints to standard output, where the sound goes: leave one of them out")
+        if sys.stdout is None:
+            raise BrokenPipeError("standard output is closed")
+    text, unreadable = readable(text)
+    if unreadable and not options.quiet:
+        note(unreadable)
+    with Interrupts() as interrupts:
+        try:
+            seconds = render(text, path, timeout=timeout, interrupt=interrupts.descriptor, **settings)
+        except Interrupted:
+            return interrupts.exit_code
+        except TimeoutError as error:
+            note(str(error))
+            return EXIT_TIMEOUT
+    if options.json:
+        done = {"output": path, "seconds": seconds, "text": text, **settings}
+        regardless(show_if_possible, show_json, done)  # the file is there
+    return EXIT_OK
+
+
+def _settings(chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what to speak with: the options, else the environment, as a server has its own; none that neither has."""
+    found = {}
+    for option in SOUND:
+        value, text = chosen[option.name], os.environ.get(option.env) if option.env else None
+        if value is None and text:
+            import click
+
+            try:
+                value = read_value(option, text)
+            except ValueError as error:
+                words = f"{option.env} in the environment: {error}"
+                raise click.UsageError(words, click.get_current_context()) from error
+        if value is not None:
+            found[option.name] = value
+    return found
