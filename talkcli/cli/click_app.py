@@ -16,8 +16,8 @@ from click.core import ParameterSource
 from talkcli import __version__
 from talkcli.cli.command import ALL_EXIT_CODES, COMMON, FILE, limits, nearest, read_value, spelt
 from talkcli.cli.commands import COMMANDS
-from talkcli.cli.show import Common, OutputClosed, ended, note, show_error
-from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, UsageError
+from talkcli.cli.show import Common, end_line, ended, note, show_error
+from talkcli.errors import EXIT_ERROR, UsageError
 from talkcli.goals.option import FLAG, INTEGER, NUMBER, SECONDS
 
 if TYPE_CHECKING:
@@ -133,28 +133,65 @@ def _offering(name: str) -> Callable[..., list[CompletionItem]] | None:
 
 def _store(context: click.Context, parameter: click.Parameter, value: object) -> None:
     if value:
-        setattr(common(context), parameter.name or "", value)
+        setattr(context.ensure_object(Common), parameter.name or "", value)
 
 
-def common(context: click.Context) -> Common:
-    """Return what holds for this run of the command."""
-    return context.find_root().ensure_object(Common)
+class _Documented(click.Command):
+    """Has the sections of our help: examples, its own options, those that all have, and exit codes."""
+
+    examples: str
+    exit_codes: Codes
+    #: the heading of the options that all have
+    shared = "Options of every command"
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Return what is offered, with as much help as a shell has room for: what stands before its first stop."""
+        found = super().shell_complete(ctx, incomplete)
+        for each in found:
+            each.help = re.split(r"[.;](?:\s|$)", each.help or "", maxsplit=1)[0] + "."
+        return found
+
+    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        super().format_help_text(ctx, formatter)
+        with formatter.section("Examples"):
+            _write_lines(self.examples, formatter)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        sections: dict[str, list[tuple[str, str]]] = {"Options": [], self.shared: []}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record and isinstance(parameter, click.Option):
+                sections["Options" if parameter.expose_value else self.shared].append(record)
+        for heading, records in sections.items():
+            if records:
+                with formatter.section(heading):
+                    formatter.write_dl(records)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        rows = sorted(self.exit_codes.items(), key=lambda row: row[0] if isinstance(row[0], int) else 128)
+        with formatter.section("Exit codes"):
+            formatter.write_dl([(str(code), words) for code, words in rows])
 
 
-class ClickCommand(click.Command):
+class ClickCommand(_Documented):
     """A command, as its row says."""
 
     def __init__(self, row: Command) -> None:
         self.row = row
+        self.examples, self.exit_codes = row.examples, row.exit_codes
         arguments: list[click.Parameter] = [_argument(row.argument)] if row.argument else []
         own, shared = map(_option, row.options), [_option(each, common=True) for each in COMMON]
         super().__init__(
-            row.name, params=[*arguments, *own, *shared], help=cleandoc(row.about), callback=self._carry_out
+            row.name,
+            params=[*arguments, *own, *shared],
+            help=cleandoc(row.about),
+            short_help=row.summary,
+            callback=self._carry_out,
         )
 
     def _carry_out(self, **given: Any) -> int | None:
         context = click.get_current_context()
-        options = common(context)
+        options: Common = context.obj
         options.typed = {each for each in given if context.get_parameter_source(each) is ParameterSource.COMMANDLINE}
         fault = self.row.fault(given, options.typed)
         if fault:
@@ -178,34 +215,12 @@ class ClickCommand(click.Command):
             raise click.UsageError(f"'{ctx.command_path}' takes {takes}: what is '{' '.join(rest)}'?", ctx)
         return rest
 
-    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        return _with_short_help(super().shell_complete(ctx, incomplete))
 
-    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        super().format_help_text(ctx, formatter)
-        _write_examples(self.row.examples, formatter)
-
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        _write_options(self, ctx, formatter, "Options of every command")
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        _write_exit_codes(self.row.exit_codes, formatter)
-
-
-class _Commands(click.Group):
+class _Commands(_Documented, click.Group):
     """All of them: each is made of its row when it is needed."""
 
-    def make_context(self, *arguments: Any, **extra: Any) -> click.Context:
-        try:
-            return super().make_context(*arguments, **extra)
-        except BrokenPipeError as error:
-            raise OutputClosed from error
-
-    def invoke(self, ctx: click.Context) -> object:
-        try:
-            return super().invoke(ctx)
-        except BrokenPipeError as error:
-            raise OutputClosed from error
+    examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
+    shared = "Options, before or after the command"
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         return list(COMMANDS)
@@ -213,37 +228,17 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
         return ClickCommand(COMMANDS[cmd_name]) if cmd_name in COMMANDS else None
 
-    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        from click.shell_completion import CompletionItem
-
-        rows = [each for each in COMMANDS.values() if each.name.startswith(incomplete)]
-        named = [CompletionItem(each.name, help=each.summary) for each in rows]
-        return named + _with_short_help(click.Command.shell_complete(self, ctx, incomplete))
-
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        name = args[0] if args else ""
-        if ctx.resilient_parsing:  # a shell asks for completion: nothing may be said
-            return super().resolve_command(ctx, args)
-        if name and not name.startswith("-") and name not in COMMANDS:
+        unknown = args[0] not in COMMANDS and args[0][:1] not in ("", "-")
+        if unknown and not ctx.resilient_parsing:  # a shell that asks for completion is told nothing
             raise click.UsageError(_unknown_command(args), ctx)
         return super().resolve_command(ctx, args)
 
-    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        super().format_help_text(ctx, formatter)
-        _write_examples(_EXAMPLES, formatter)
-
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         self.format_commands(ctx, formatter)
-        _write_options(self, ctx, formatter, "Options, before or after the command")
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        with formatter.section("Commands"):
-            formatter.write_dl([(each.name, each.summary) for each in COMMANDS.values()])
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        _write_exit_codes(ALL_EXIT_CODES, formatter)
+        super().format_options(ctx, formatter)
 
 
 @click.group(
@@ -257,7 +252,6 @@ class _Commands(click.Group):
 @click.pass_context
 def talk(context: click.Context) -> None:
     """Speech for robots: sentences that can be awaited, cancelled and preempted."""
-    context.ensure_object(Common)
     if context.invoked_subcommand is None:
         click.echo(_first_screen(context))
 
@@ -280,9 +274,13 @@ def run(arguments: list[str], options: Common) -> int:
 
 def _main(arguments: list[str], options: Common) -> object:
     try:
-        return talk.main(arguments, prog_name="talk", standalone_mode=False, obj=options)
-    except click.Abort:
-        return EXIT_SIGINT
+        with talk.make_context("talk", [*arguments], obj=options) as context:
+            return talk.invoke(context)
+    except click.exceptions.Exit as end:  # of help, and of the version
+        return end.exit_code
+    except KeyboardInterrupt:
+        end_line()  # that the terminal has shown ^C on
+        raise
     except click.ClickException as error:
         # The options may not have been read as far as --json when the error was found.
         _show_click_error(error, json=options.json or "--json" in arguments)
@@ -316,44 +314,10 @@ def _show_click_error(error: click.ClickException, *, json: bool) -> None:
         note(f"see '{context.command_path if context else 'talk'} --help'")
 
 
-def _with_short_help(options: list[CompletionItem]) -> list[CompletionItem]:
-    """Have a shell show of an option's help what it has room for beside it: what stands before its first stop."""
-    for each in options:
-        each.help = re.split(r"[.;](?:\s|$)", each.help or "", maxsplit=1)[0] + "."
-    return options
-
-
-def _write_examples(examples: str, formatter: click.HelpFormatter) -> None:
-    """Write a section of command lines, as they are."""
-    with formatter.section("Examples"):
-        _write_lines(examples, formatter)
-
-
 def _write_lines(text: str, formatter: click.HelpFormatter) -> None:
     """Write lines as they are, indented as the formatter is at this moment."""
     for line in text.strip().splitlines():
         formatter.write(f"{'':{formatter.current_indent}}{line.strip()}\n")
-
-
-def _write_options(command: click.Command, ctx: click.Context, formatter: click.HelpFormatter, shared: str) -> None:
-    """Write the command's own options, and then, under the heading `shared`, those that all have."""
-    own: list[tuple[str, str]] = []
-    common: list[tuple[str, str]] = []
-    for parameter in command.get_params(ctx):
-        record = parameter.get_help_record(ctx)
-        if record and isinstance(parameter, click.Option):
-            (own if parameter.expose_value else common).append(record)
-    for heading, records in (("Options", own), (shared, common)):
-        if records:
-            with formatter.section(heading):
-                formatter.write_dl(records)
-
-
-def _write_exit_codes(exit_codes: Codes, formatter: click.HelpFormatter) -> None:
-    """Write a section of exit codes, in their order."""
-    rows = sorted(exit_codes.items(), key=lambda row: row[0] if isinstance(row[0], int) else 128)
-    with formatter.section("Exit codes"):
-        formatter.write_dl([(str(code), words) for code, words in rows])
 
 
 def _unknown_command(words: list[str]) -> str:

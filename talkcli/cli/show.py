@@ -77,10 +77,6 @@ class Common:
         return Client.over(SocketConnection(self.socket, begun=self.begun, **{"urgent": self.urgent, **options}))
 
 
-class OutputClosed(Exception):
-    """Standard output is closed. Under its own name, because click ends the process with 1 for a broken pipe."""
-
-
 def ended(command: Callable[[], object], options: Common) -> int:
     """Run a command, and return its exit code: what it returns, if that is a number, else 0; or that of its error."""
     try:
@@ -96,7 +92,7 @@ def ended(command: Callable[[], object], options: Common) -> int:
         note(_without_memory())
         return EXIT_ERROR
     except Exception as error:
-        if isinstance(error, OutputClosed) or reader_is_gone(error) or never_readable(error):
+        if reader_is_gone(error) or never_readable(error):
             give_up_output()
             return EXIT_SIGPIPE
         if no_room(error):
