@@ -13,7 +13,7 @@ from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
     from typing import Any
 
     from talkcli.cli.show import Common
@@ -60,30 +60,20 @@ def status(options: Common, goal_id: str | None) -> int:
 def watch(options: Common, words: bool) -> int:
     """Show all goals as they happen, and each word as it is heard, too, if asked for; return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
-    from talkcli.client.connect import Interrupted
+    from talkcli.terminal.transcript import Transcript
 
     if not has_reader():
         return EXIT_SIGPIPE
+    transcript = Transcript(full=screen().width is None, words=words)
     with Interrupts() as interrupts:
         interrupts.watch_output()  # in `talk watch | head`, the next event may be far
-        try:
-            _watch(options, interrupts.watched, words=words)
-        except Interrupted:
-            interrupts.look()
+        with options.connect(interrupt=interrupts.watched) as client:
+            for event in client.events():
+                if options.json:
+                    show_json(event.to_json())
+                else:
+                    _show_lines(transcript.lines(event, screen()))
     return interrupts.exit_code
-
-
-def _watch(options: Common, interrupt: Mapping[int, int], *, words: bool) -> None:
-    from talkcli.terminal.transcript import Transcript
-
-    transcript = Transcript(full=screen().width is None, words=words)
-    with options.connect(interrupt=interrupt) as client:
-        for event in client.events():
-            if options.json:
-                show_json(event.to_json())
-                continue
-            for line in transcript.lines(event, screen()):
-                show(line)
 
 
 def log(options: Common, count: int) -> int:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, screen, show, show_json
-from talkcli.client.connect import Interrupted
 from talkcli.doctor.examine import Examination
 from talkcli.doctor.report import heard, lines, verdict
 from talkcli.goals.states import EXIT_CODES, State
@@ -22,18 +21,17 @@ def doctor(options: Common, silent: bool) -> int:
     """Show each finding and, at last, the one thing to do next; return the exit code."""
     found = []
     with Interrupts() as interrupts:
-        try:
-            for finding in Examination(options.socket, silent=silent, interrupt=interrupts.descriptor).findings():
-                found.append(finding)
-                if options.json:
-                    show_json(finding.to_json())
-                else:
-                    for line in lines(finding, screen()):
-                        show(line)
-                if interrupts.number is not None:
-                    return interrupts.exit_code
-        except Interrupted:
-            return interrupts.exit_code
+        for finding in Examination(options.socket, silent=silent, interrupt=interrupts.descriptor).findings():
+            found.append(finding)
+            if options.json:
+                show_json(finding.to_json())
+            else:
+                for line in lines(finding, screen()):
+                    show(line)
+            if interrupts.number is not None:
+                break
+    if interrupts.number is not None:
+        return interrupts.exit_code
     if not options.json and not options.quiet:
         note(verdict(found, screen()))
     return 0 if heard(found) else _NOT_HEARD

@@ -5,15 +5,13 @@ It must not wait, and not know who owns a goal: it is told of events, one after 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import signal
 import sys
 import threading
-from typing import Protocol
 
-from talkcli.cli.show import colourful, note, show, show_json
+from talkcli.cli.show import USUAL_WIDTH, Feedback, colourful, columns, note, show, show_json
 from talkcli.client.connect import ready
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
@@ -29,29 +27,11 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Event
 
-#: Columns of a terminal that doesn't say how many it has.
-_USUAL_WIDTH = 80
 #: With fewer columns than this for the text beside id and state, these are left out.
 _LEAST_TEXT = 20
 _LIT, _AHEAD, _PLAIN = "\x1b[1;7m", "\x1b[2m", "\x1b[0m"
 #: Back to the line's beginning, and clear it.
 _AGAIN = "\r\x1b[2K"
-
-
-class Feedback(Protocol):
-    """Shows what happens to goals."""
-
-    def begin(self, goals: Sequence[Goal]) -> None:
-        """Show how these goals stand, before their first event."""
-
-    def show(self, goal: Goal, event: Event) -> None:
-        """Show an event of this goal's."""
-
-    def aside(self, words: str) -> None:
-        """Write a note to standard error."""
-
-    def close(self) -> None:
-        """Leave standard output so that something else can be written."""
 
 
 def feedback(options: Common) -> Feedback:
@@ -63,31 +43,23 @@ def feedback(options: Common) -> Feedback:
     return _Light() if utf_8 and colourful() else _Lines()
 
 
-class _Objects:
+class _Objects(Feedback):
     """The events as they came, an object a line."""
 
-    def begin(self, goals: Sequence[Goal]) -> None:
-        """An event is what the server said, so there is none yet."""
+    shows = True
 
     def show(self, goal: Goal, event: Event) -> None:  # noqa: ARG002
         show_json(event.to_json())
 
-    def aside(self, words: str) -> None:
-        note(words)
 
-    def close(self) -> None:
-        """There is nothing to leave."""
-
-
-class _Lines:
+class _Lines(Feedback):
     """A line an event, its fields separated by blanks; what may have blanks in it comes last."""
+
+    shows = True
 
     def __init__(self) -> None:
         #: the state that was shown last, by id, of goals that have not ended
         self._shown: dict[str, State] = {}
-
-    def begin(self, goals: Sequence[Goal]) -> None:
-        """A line is an event, so there is none yet."""
 
     def show(self, goal: Goal, event: Event) -> None:  # noqa: ARG002
         if isinstance(event, StateChanged):
@@ -107,25 +79,17 @@ class _Lines:
             self._shown[goal_id] = state
             show(f"{printable(goal_id)} {state.name}")
 
-    def aside(self, words: str) -> None:
-        note(words)
 
-    def close(self) -> None:
-        """There is nothing to leave."""
-
-
-class _Light:
+class _Light(Feedback):
     """The sentence on a line of the terminal, each word lit as it is heard; the whole of it at its end.
 
     The line is written over in place, so it is never wider than the terminal: of a long text a part is shown.
     """
 
+    shows = True
+
     def __init__(self) -> None:
-        self._goal: Goal | None = None
-        self._sentence = Sentence("")
-        self._state = State.PENDING
-        self._paused = False
-        self._word = (0, 0)
+        self._line: _Line | None = None
         #: held while the terminal is written to
         self._painting = threading.Lock()
         self._stale = False
@@ -133,27 +97,29 @@ class _Light:
 
     def begin(self, goals: Sequence[Goal]) -> None:
         going = [each for each in goals if not each.state.terminal]
-        if going and self._goal is None:
-            self._begin(next((each for each in going if each.state is not State.PENDING), going[0]))
+        if going and self._line is None:
+            self._line = _Line(next((each for each in going if each.state is not State.PENDING), going[0]))
             self._paint()
 
     def show(self, goal: Goal, event: Event) -> None:
+        line = self._line
         if isinstance(event, Result):
             self._end(event.goal)
         elif isinstance(event, PausedChanged):  # of all speech, whichever goal was told of it
-            self._paused = event.paused
-            self._paint()
-        elif self._takes(goal, event):
-            if isinstance(event, StateChanged):
-                # A line begins with the goal as it is now, which may be further than its first event.
-                self._state = self._state if event.state is State.PENDING else event.state
-            elif isinstance(event, WordHeard):
-                self._word = (event.start, event.end)
-            self._paint()
+            if line:
+                line.paused = event.paused
+        elif line is None or (line.goal.id != goal.id and _is_spoken(event)):
+            self._line = _Line(goal)
+            self._line.take(event)
+        elif line.goal.id == goal.id:
+            line.take(event)
+        else:  # the line is another's, until this one is spoken
+            return
+        self._paint()
 
     def aside(self, words: str) -> None:
         with self._painting:
-            if self._goal is not None:
+            if self._line:
                 _write(_AGAIN)
             note(words)
         self._paint()
@@ -161,44 +127,25 @@ class _Light:
     def close(self) -> None:
         """Leave the line whole, as it stands, if there is one."""
         signal.signal(signal.SIGWINCH, self._before)
-        if self._goal is not None:
-            self._leave(self._goal, self._state, self._word[1])
-            self._goal = None
-
-    def _takes(self, goal: Goal, event: Event) -> bool:
-        """Whether the line is this goal's, which it gets when it is spoken, or while no other has it."""
-        if self._goal is not None and self._goal.id == goal.id:
-            return True
-        spoken = isinstance(event, WordHeard) or (isinstance(event, StateChanged) and event.state is State.ACTIVE)
-        if self._goal is not None and not spoken:
-            return False
-        self._begin(goal)
-        return True
-
-    def _begin(self, goal: Goal) -> None:
-        self._goal, self._paused = goal, goal.paused
-        self._state = State.PENDING if goal.state.terminal else goal.state
-        self._sentence = Sentence(_text(goal))
-        heard = len(goal.spoken or "")
-        self._word = (heard, heard)
+        if self._line:
+            self._leave(self._line)
+            self._line = None
 
     def _end(self, goal: Goal) -> None:
-        heard = self._word[1] if self._goal is not None and self._goal.id == goal.id else 0
-        other = self._goal if self._goal is not None and self._goal.id != goal.id else None
-        kept = (self._sentence, self._state, self._paused, self._word)
-        self._begin(goal)
-        self._leave(goal, goal.state, max(heard, self._word[1]))
-        self._goal = other
-        if other is not None:
-            self._sentence, self._state, self._paused, self._word = kept
-            self._paint()
+        line, ended = self._line, _Line(goal)
+        ended.state = goal.state
+        if line and line.goal.id == goal.id:
+            ended.word = max(line.word, ended.word, key=lambda word: word[1])
+            self._line = None
+        self._leave(ended)
 
-    def _leave(self, goal: Goal, state: State, heard: int) -> None:
+    def _leave(self, line: _Line) -> None:
         """Write the whole sentence, on as many lines as it takes, with what became of it."""
-        before, after = (self._sentence.whole, "") if state is State.SUCCEEDED else self._sentence.split(heard)
+        ended = line.state is State.SUCCEEDED
+        before, after = (line.sentence.whole, "") if ended else line.sentence.split(line.word[1])
         with self._painting:
-            name = Screen(colour=True).painted(f"{state.name:<9}", state)
-            _write(f"{_AGAIN}{printable(goal.id)}  {name}  {before}{_AHEAD}{after}{_PLAIN}\n")
+            name = Screen(colour=True).painted(f"{line.state.name:<9}", line.state)
+            _write(f"{_AGAIN}{printable(line.goal.id)}  {name}  {before}{_AHEAD}{after}{_PLAIN}\n")
 
     def _paint(self) -> None:
         # Whoever paints sees to what came meanwhile, from another thread or from a resize that interrupted this one.
@@ -206,37 +153,49 @@ class _Light:
         while self._stale and self._painting.acquire(blocking=False):
             try:
                 self._stale = False
-                _write(self._line())
+                _write(self._line.painted() if self._line else "")
             finally:
                 self._painting.release()
-
-    def _line(self) -> str:
-        goal = self._goal
-        if goal is None:
-            return ""
-        # The last column stays free: some terminals go on to the next line as soon as it is written.
-        columns = _columns() - 1
-        name = "PAUSED" if self._paused and self._state is State.ACTIVE else self._state.name
-        head = f"{printable(goal.id)}  {name:<9}  "
-        if columns - len(head) < _LEAST_TEXT:
-            head = ""
-        view = self._sentence.view(*self._word, columns - len(head))
-        head = head.replace(name, Screen(colour=True).painted(name, self._state), 1) if head else ""
-        lit = f"{_LIT}{view.word}{_PLAIN}" if view.word else ""
-        return f"{_AGAIN}{head}{view.heard}{lit}{_AHEAD}{view.ahead}{_PLAIN}"
 
     def _on_resize(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         self._paint()
 
 
-def _text(goal: Goal) -> str:
-    return "(text no longer kept)" if goal.text is None else goal.text
+class _Line:
+    """The goal that is on the line: how it stands, and what of it is heard."""
+
+    def __init__(self, goal: Goal) -> None:
+        self.goal = goal
+        self.paused = goal.paused
+        self.state = State.PENDING if goal.state.terminal else goal.state
+        self.sentence = Sentence("(text no longer kept)" if goal.text is None else goal.text)
+        heard = len(goal.spoken or "")
+        #: where the word begins and ends that is being heard
+        self.word = (heard, heard)
+
+    def take(self, event: Event) -> None:
+        if isinstance(event, WordHeard):
+            self.word = (event.start, event.end)
+        elif isinstance(event, StateChanged) and event.state is not State.PENDING:
+            # A line begins with the goal as it is now, which may be further than its first event.
+            self.state = event.state
+
+    def painted(self) -> str:
+        """Return what it looks like now, in one line of the terminal."""
+        # The last column stays free: some terminals go on to the next line as soon as it is written.
+        room = (columns(sys.stdout) or USUAL_WIDTH) - 1
+        name = "PAUSED" if self.paused and self.state is State.ACTIVE else self.state.name
+        head = f"{printable(self.goal.id)}  {name:<9}  "
+        if room - len(head) < _LEAST_TEXT:
+            head = ""
+        view = self.sentence.view(*self.word, room - len(head))
+        head = head.replace(name, Screen(colour=True).painted(name, self.state), 1) if head else ""
+        lit = f"{_LIT}{view.word}{_PLAIN}" if view.word else ""
+        return f"{_AGAIN}{head}{view.heard}{lit}{_AHEAD}{view.ahead}{_PLAIN}"
 
 
-def _columns() -> int:
-    with contextlib.suppress(OSError):
-        return os.get_terminal_size(sys.stdout.fileno()).columns or _USUAL_WIDTH
-    return _USUAL_WIDTH
+def _is_spoken(event: Event) -> bool:
+    return isinstance(event, WordHeard) or (isinstance(event, StateChanged) and event.state is State.ACTIVE)
 
 
 def _write(text: str) -> None:

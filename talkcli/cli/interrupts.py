@@ -13,6 +13,7 @@ import signal
 import sys
 
 from talkcli.cli.show import OUTPUT, give_up_output
+from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_SIGNAL, EXIT_SIGPIPE, EXIT_TIMEOUT
 from talkcli.frozen import TYPE_CHECKING
 
@@ -54,7 +55,7 @@ class Interrupts:
     SIGHUP: of a terminal that is closed the shell tells its commands, and then the system.
 
     `descriptor` becomes readable. `watched` has all that there is to wait for, as `connect.ready` takes it; it
-    may change.
+    may change. That it ends the waiting ends the `with`, too; `exit_code` then says why.
     """
 
     def __init__(self, timeout: float | None = None, held: Iterable[int] = ()) -> None:
@@ -93,13 +94,16 @@ class Interrupts:
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    ) -> bool:
+        if kind is Interrupted:
+            self.look()
         if self._timeout is not None:
             signal.setitimer(signal.ITIMER_REAL, 0)
         for each, handler in self._before.items():
             signal.signal(each, handler)
         os.close(self.descriptor)
         os.close(self._write)
+        return kind is Interrupted
 
     def watch_output(self) -> None:
         """Have a reader of standard output that goes away from now on end the waiting, too."""

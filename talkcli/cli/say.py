@@ -7,14 +7,24 @@ an engine of this command's own and knows no server, is imported for that alone.
 from __future__ import annotations
 
 import os
-import sys
 import time
 
 from talkcli.cli.command import read_value, readable
 from talkcli.cli.interrupts import Interrupts, give_up_unread, watched_output
-from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.cli.show import (
+    Feedback,
+    end_line,
+    give_up_output,
+    note,
+    reader_is_gone,
+    show,
+    show_error,
+    show_json,
+    standard_output,
+)
 from talkcli.cli.wait import (
     SPEECH_IS_PAUSED,
+    feedback_for,
     give_up,
     regardless,
     report,
@@ -32,9 +42,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
 
-    from talkcli.cli.feedback import Feedback
     from talkcli.cli.show import Common
     from talkcli.client.client import GoalHandle
+    from talkcli.goals.goal import Goal
 
 
 def say(
@@ -63,12 +73,12 @@ def say(
         return say_lines(options, name, chosen, wait, feedback, timeout)
     sentence = " ".join(text)
     if text == ("-",):
-        from talkcli.cli.stdin import InputTooLong, read_text
+        from talkcli.cli.stdin import InputTooLong, read_text, rejected
 
         try:
             sentence = read_text(end, watched_output() if wait else {}, whole=output is not None)
         except InputTooLong as error:
-            return _refuse(f"Talk rejected: {error}", error.code, options, feedback=feedback)
+            return _refuse(rejected(str(error)), options, feedback_for(options, asked=feedback))
         except Interrupted:  # nothing was sent
             return EXIT_SIGPIPE
         except KeyboardInterrupt:
@@ -76,70 +86,62 @@ def say(
             raise
     if output is not None:
         return _render(output, sentence, chosen, rest(end), options)
-    return _say(options, sentence, chosen, name, timeout, end, wait=wait, feedback=feedback)
+    return _say(_readable(sentence, options), chosen, name, timeout, options, wait=wait, feedback=feedback)
 
 
 def _say(
-    options: Common,
     text: str,
     chosen: dict[str, Any],
     name: str | None,
     timeout: float | None,
-    end: float | None,
+    options: Common,
     *,
     wait: bool,
     feedback: bool,
 ) -> int:
-    """Speak one text; `end`: when the `timeout` is over, by the monotonic clock."""
-    if not text.isascii():
-        text, unreadable = readable(text)
-        if unreadable and not options.quiet:
-            note(unreadable)
+    """Speak one text."""
+    end = None if timeout is None else options.began + timeout
     with Interrupts(held=options.held) as interrupts:
         if wait:
             interrupts.watch_output()
         try:
-            patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
+            patience = min(ANSWER_LIMIT, timeout or ANSWER_LIMIT)
             with options.connect(name=name, interrupt=interrupts.watched, patience=patience) as client:
                 if interrupts.number is not None and not (options.begun and options.begun.sent):
                     raise Interrupted  # what has been sent is cancelled, once its id is known
                 goal = client.say(text, follow=wait, feedback=feedback, **chosen)
-                shown = _feedback(options) if feedback else None
+                shown = feedback_for(options, asked=feedback)
                 if not wait or goal.state is State.REJECTED:
                     return regardless(_tell, goal, options, shown)
                 return _wait(goal, interrupts, end, options, shown)
-        except Interrupted:
-            interrupts.look()
-            return interrupts.exit_code
         except Lost as error:
             if interrupts.number is None and (end is None or time.monotonic() < end):
                 raise
             show_error(error, json=options.json)
-            return interrupts.exit_code
+    return interrupts.exit_code
 
 
-def _refuse(message: str, reason: str, options: Common, *, feedback: bool) -> int:
+def _readable(text: str, options: Common) -> str:
+    """Return a text without the bytes in it that are no UTF-8, and tell of them."""
+    text, unreadable = readable(text)
+    if unreadable and not options.quiet:
+        note(unreadable)
+    return text
+
+
+def _refuse(goal: Goal, options: Common, shown: Feedback) -> int:
     """Tell of a goal that is REJECTED before it is sent, as if a server had done so, and return the exit code."""
-    from talkcli.goals.goal import Goal
     from talkcli.protocol.events import Result
 
-    goal = Goal("", State.REJECTED, reason=reason, message=message)
-    shown = _feedback(options) if feedback else None
-    if shown and options.json:
+    if options.json:
         regardless(show_if_possible, shown.show, goal, Result(goal))
     return regardless(report, goal, options, shown)
 
 
-def _feedback(options: Common) -> Feedback:
-    from talkcli.cli.feedback import feedback
-
-    return feedback(options)
-
-
-def _tell(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
+def _tell(goal: GoalHandle, options: Common, shown: Feedback) -> int:
     """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
     if goal.state is State.REJECTED:
-        if shown and options.json:
+        if options.json:
             until_ended(goal, None, shown)
         code = report(goal.goal, options, shown)
         if goal.goal.reason == "text_too_long" and not options.quiet:
@@ -147,30 +149,29 @@ def _tell(goal: GoalHandle, options: Common, shown: Feedback | None) -> int:
         return code
     _introduce(goal, options, shown)
     if goal.state.terminal:
-        return report(goal.goal, options)
+        return report(goal.goal, options, shown)
     if options.json:
         show_if_possible(show_json, goal.goal.to_json())
     return EXIT_OK
 
 
-def _introduce(goal: GoalHandle, options: Common, shown: Feedback | None) -> None:
+def _introduce(goal: GoalHandle, options: Common, shown: Feedback) -> None:
     """Print the id of a goal that was accepted, and why it may take long."""
     if options.quiet:
         return
-    if not options.json and shown is None:
+    if not options.json and not shown.shows:
         show_if_possible(show, goal.id)
     if goal.speech_paused and not goal.state.terminal:
         note(SPEECH_IS_PAUSED)
 
 
-def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common, shown: Feedback | None) -> int:
+def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common, shown: Feedback) -> int:
     """Wait for a goal. It is this command's own: where it can't wait any longer, the goal ends too; unless another
     `say` had sent it before, with the same id.
     """
     try:
         _introduce(goal, options, shown)
-        if shown:
-            shown.begin([goal.goal])
+        shown.begin([goal.goal])
         until_ended(goal, rest(end), shown)
     except (Interrupted, OSError) as error:
         if isinstance(error, OSError) and not isinstance(error, TimeoutError):
@@ -181,24 +182,17 @@ def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: 
         timed_out = interrupts.number is None and not interrupts.gone
         if interrupts.gone:
             give_up_output()
-        if goal.attached:
-            return _leave(goal, interrupts, shown)
+        if goal.attached:  # it is another's, and goes on
+            if timed_out:
+                shown.aside(f"{goal.id} has not ended within the time, and goes on: it was sent before")
+            return interrupts.exit_code
         code = give_up(goal, interrupts, options, shown)
         if not timed_out:
             return interrupts.exit_code
         return code if goal.state is State.SUCCEEDED else EXIT_TIMEOUT
     finally:
-        if shown:
-            regardless(shown.close)
+        regardless(shown.close)
     return report(goal.goal, options, shown)
-
-
-def _leave(goal: GoalHandle, interrupts: Interrupts, shown: Feedback | None) -> int:
-    """Stop watching a goal that is another's, which goes on."""
-    if interrupts.number is None and not interrupts.gone:
-        tell = shown.aside if shown else note
-        tell(f"{goal.id} has not ended within the time, and goes on: it was sent before")
-    return interrupts.exit_code
 
 
 def _render(path: str, text: str, chosen: Mapping[str, Any], timeout: float | None, options: Common) -> int:
@@ -212,11 +206,8 @@ def _render(path: str, text: str, chosen: Mapping[str, Any], timeout: float | No
     if path in STANDARD_OUTPUT:
         if options.json:
             raise UsageError("--json prints to standard output, where the sound goes: leave one of them out")
-        if sys.stdout is None:
-            raise BrokenPipeError("standard output is closed")
-    text, unreadable = readable(text)
-    if unreadable and not options.quiet:
-        note(unreadable)
+        standard_output()
+    text = _readable(text, options)
     with Interrupts() as interrupts:
         try:
             seconds = render(text, path, timeout=timeout, interrupt=interrupts.descriptor, **settings)

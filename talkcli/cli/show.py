@@ -16,13 +16,14 @@ from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, TalkError
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
     from collections.abc import Set as AbstractSet
     from typing import Any, TextIO
 
     from talkcli.client.client import Client
     from talkcli.client.connect import Begun
-    from talkcli.goals.goal import JsonObject
+    from talkcli.goals.goal import Goal, JsonObject
+    from talkcli.protocol.events import Event
     from talkcli.terminal.text import Screen
 
 #: Standard output's descriptor.
@@ -32,7 +33,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 #: Whether there was no room for what was to be shown: a command that went on without ends as one that failed.
 _failed = False
 #: Columns of a terminal that doesn't say how many it has.
-_USUAL_WIDTH = 80
+USUAL_WIDTH = 80
 #: Columns into which what is said always goes; a terminal that says it has fewer is not believed.
 _NARROWEST = 40
 #: Stands for a blank at which no line ends.
@@ -42,32 +43,22 @@ _NO_BREAK = "\0"
 class Common:
     """What every command is given: the options that all have, and what was done before it is carried out."""
 
-    __slots__ = ("began", "begun", "held", "json", "quiet", "socket", "typed", "urgent")
+    socket: str | None = None
+    json = False
+    quiet = False
+    #: how far its connection has come already, maybe with its request sent: see `plain`
+    begun: Begun | None = None
+    #: signals that wait for somebody to take them
+    held: Iterable[int] = ()
+    #: the options that stand on the command line
+    typed: AbstractSet[str] = frozenset()
+    #: whether the command finds a place where the server is full
+    urgent = False
 
-    def __init__(
-        self,
-        socket: str | None = None,
-        *,
-        json: bool = False,
-        quiet: bool = False,
-        began: float | None = None,
-        begun: Begun | None = None,
-        held: Iterable[int] = (),
-        typed: AbstractSet[str] = frozenset(),
-    ) -> None:
-        """`typed`: the options that stand on the command line; for `began`, `begun` and `held` see `plain`."""
-        self.socket = socket
-        self.json = json
-        self.quiet = quiet
+    def __init__(self, **given: Any) -> None:
         #: when the command began, by the monotonic clock
-        self.began = time.monotonic() if began is None else began
-        #: how far its connection has come already, maybe with its request sent
-        self.begun = begun
-        #: signals that wait for somebody to take them
-        self.held = held
-        self.typed = typed
-        #: whether the command finds a place where the server is full
-        self.urgent = False
+        self.began = time.monotonic()
+        vars(self).update(given)
 
     def connect(self, **options: Any) -> Client:
         """Return a client connected to the server; see `SocketConnection` for the options."""
@@ -153,12 +144,18 @@ def output_failed(error: Exception) -> None:
     note(f"standard output can't be written: {error.strerror if isinstance(error, OSError) else error}")
 
 
-def show(line: str) -> None:
-    """Write a line of data to standard output, at once; BrokenPipeError where that is closed."""
+def standard_output() -> TextIO:
+    """Return standard output; BrokenPipeError where it is closed."""
     if sys.stdout is None:
         raise BrokenPipeError("standard output is closed")
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
+    return sys.stdout
+
+
+def show(line: str) -> None:
+    """Write a line of data to standard output, at once; BrokenPipeError where that is closed."""
+    stream = standard_output()
+    stream.write(f"{line}\n")
+    stream.flush()
 
 
 def show_json(message: JsonObject) -> None:
@@ -166,9 +163,7 @@ def show_json(message: JsonObject) -> None:
 
     On a terminal what isn't plainly visible is escaped, as it is in all that is shown there.
     """
-    if sys.stdout is None:
-        raise BrokenPipeError("standard output is closed")
-    _write_json(sys.stdout, message)
+    _write_json(standard_output(), message)
 
 
 def _write_json(stream: TextIO, message: JsonObject) -> None:
@@ -186,34 +181,34 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 
 def note(words: str) -> None:
     """Write something for people to standard error, if they are there; a terminal's lines end between two words."""
+    lines = f"talk: {words}"
+    if sys.stderr is not None and len(lines) > _NARROWEST and sys.stderr.isatty():
+        lines = _folded(lines)
+    end_line(lines)
+
+
+def end_line(words: str = "") -> None:
+    """End a line on standard error, with these words; one may have been begun by somebody else, a terminal for one."""
     if sys.stderr is not None:
-        lines = f"talk: {words}"
-        if len(lines) > _NARROWEST and sys.stderr.isatty():
-            lines = _folded(lines)
         # Whoever read it may have gone, and have taken standard output along: what is to be done is done all the same.
         try:
-            sys.stderr.write(f"{lines}\n")
+            sys.stderr.write(f"{words}\n")
             sys.stderr.flush()
         except OSError:
             _discard(2)
 
 
-def end_line() -> None:
-    """End a line on standard error that somebody else has begun, a terminal for one."""
-    if sys.stderr is not None:
-        try:
-            sys.stderr.write("\n")
-            sys.stderr.flush()
-        except OSError:
-            _discard(2)  # as in `note`
+def columns(stream: TextIO) -> int:
+    """Return how many columns a terminal has; 0 where it doesn't say, and of what is none."""
+    try:
+        return os.get_terminal_size(stream.fileno()).columns
+    except OSError:
+        return 0
 
 
 def _folded(text: str) -> str:
     """Return the text in lines that a terminal needs not break."""
-    try:
-        width = os.get_terminal_size(sys.stderr.fileno()).columns or _USUAL_WIDTH
-    except OSError:
-        width = _USUAL_WIDTH
+    width = columns(sys.stderr) or USUAL_WIDTH
     if all(len(line) <= width for line in text.split("\n")):
         return text
     import re
@@ -236,7 +231,27 @@ def show_error(error: TalkError, *, json: bool) -> None:
         try:
             _write_json(sys.stderr, {"error": fields})
         except OSError:
-            _discard(2)  # as in `note`
+            _discard(2)  # as in `end_line`
+
+
+class Feedback:
+    """Shows what happens to goals: nothing, where that was not asked for. What shows something is in `feedback`."""
+
+    #: whether each event is shown, and so neither ids nor how a goal ended have to be
+    shows = False
+
+    def begin(self, goals: Sequence[Goal]) -> None:
+        """Show how these goals stand, before their first event."""
+
+    def show(self, goal: Goal, event: Event) -> None:
+        """Show an event of this goal's."""
+
+    def aside(self, words: str) -> None:
+        """Write a note to standard error."""
+        note(words)
+
+    def close(self) -> None:
+        """Leave standard output so that something else can be written."""
 
 
 def colourful() -> bool:
@@ -251,11 +266,8 @@ def screen() -> Screen:
     if sys.stdout is None or not sys.stdout.isatty():
         return Screen()
     # The terminal first: a COLUMNS that a shell once exported knows nothing of a window that was resized.
-    try:
-        width = os.get_terminal_size(sys.stdout.fileno()).columns
-    except OSError:
-        width = 0
+    width = columns(sys.stdout)
     if not width:
         told = os.environ.get("COLUMNS", "")
         width = int(told) if told.isascii() and told.isdecimal() else 0
-    return Screen(width or _USUAL_WIDTH, colourful())
+    return Screen(width or USUAL_WIDTH, colourful())

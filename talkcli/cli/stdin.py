@@ -10,27 +10,29 @@ from __future__ import annotations
 import os
 import select
 import threading
-import time
 from collections import deque
 
 from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.cli.show import Feedback, give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.wait import (
     SILENCE,
     SPEECH_IS_PAUSED,
     exit_code,
+    feedback_for,
     regardless,
     report,
+    rest,
     show_if_possible,
     until_ended,
 )
 from talkcli.client.connect import ANSWER_LIMIT, Interrupted, ready
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, TalkError, UnknownGoal, UsageError
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
-from talkcli.goals.states import EXIT_CODES, State
+from talkcli.goals.states import State
+from talkcli.protocol.events import Result
 from talkcli.protocol.replies import Canceled
 from talkcli.splitter import Cut, LineSplitter
 from talkcli.terminal.goals import ending
@@ -39,7 +41,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from typing import Any
 
-    from talkcli.cli.feedback import Feedback
     from talkcli.cli.show import Common
     from talkcli.client.client import Client, GoalHandle
 
@@ -56,23 +57,8 @@ class InputLate(TalkError):
     exit_code = EXIT_TIMEOUT
 
 
-class InputTooLong(TalkError):
+class InputTooLong(Exception):
     """There is more on standard input than one text may have."""
-
-    code = "text_too_long"
-    exit_code = EXIT_CODES[State.REJECTED]
-
-
-@frozen
-class Line:
-    """A line of standard input, without its end."""
-
-    #: 1 for the first
-    number: int
-    #: None where it is longer than any text may be
-    text: str | None
-    #: bytes that it has
-    size: int
 
 
 def read_text(end: float | None, interrupt: Mapping[int, int], *, whole: bool = False) -> str:
@@ -83,61 +69,49 @@ def read_text(end: float | None, interrupt: Mapping[int, int], *, whole: bool = 
     """
     data = bytearray()
     while whole or len(data) <= _MOST:
-        if not ready({0: select.POLLIN}, None if end is None else max(0.0, end - time.monotonic()), interrupt):
-            raise InputLate("standard input has not ended within the time: nothing was sent")
-        more = _read(_CHUNK if whole else _MOST + 1 - len(data))
-        if more == b"":
+        more = _read(_CHUNK if whole else _MOST + 1 - len(data), interrupt, end)
+        if not more:
             return _decoded(bytes(data))
-        data += more or b""
+        data += more
     raise InputTooLong(
         f"standard input has more than {MAX_BYTES:,} bytes, and a text at most {MAX_CHARACTERS:,} characters: "
         "'talk say --lines' speaks it line by line"
     )
 
 
-class LineReader:
-    """Cuts standard input into lines. A line that is too long is read to its end, counted and not kept."""
-
-    def __init__(self, interrupt: Mapping[int, int]) -> None:
-        """`interrupt`: what ends the reading with Interrupted, as in `connect.ready`."""
-        self._interrupt = interrupt
-        # One byte above the longest text: the CR of a line that ends in CRLF.
-        self._splitter = LineSplitter(MAX_BYTES + 1)
-        self._number = 0
-
-    def lines(self) -> Iterator[Line]:
-        """Iterate over the lines, each as soon as its newline has come; the last one may lack it."""
-        while True:
-            ready({0: select.POLLIN}, None, self._interrupt)
-            data = _read(_CHUNK)
-            if data is None:
-                continue
-            if not data:
-                break
-            for each in self._splitter.feed(data):
-                yield self._line(each)
-        if self._splitter.size:
-            yield self._line(self._splitter.end())
-
-    def _line(self, line: bytes) -> Line:
-        self._number += 1
-        if isinstance(line, Cut):
-            return Line(self._number, None, line.size)
-        return Line(self._number, _decoded(line), len(line))
+def rejected(words: str) -> Goal:
+    """Return the goal that a server would have made of a text that is too long to be sent."""
+    return Goal("", State.REJECTED, reason="text_too_long", message=f"Talk rejected: {words}")
 
 
-def _read(count: int) -> bytes | None:
-    """Return what there is of standard input, at most so many bytes; b"" at its end, None if there was nothing yet."""
-    try:
-        return os.read(0, count)
-    except BlockingIOError:  # whoever started this has made it so
-        return None
-    except OSError as error:
-        raise UsageError(f"standard input cannot be read: {error.strerror}") from error
+def _lines(interrupt: Mapping[int, int]) -> Iterator[bytes]:
+    """Iterate over standard input's lines, each as soon as its newline has come; the last one may lack it.
+
+    One that is too long is read to its end, and `Cut`. `interrupt`: as in `read_text`.
+    """
+    # One byte above the longest text: the CR of a line that ends in CRLF.
+    splitter = LineSplitter(MAX_BYTES + 1)
+    while data := _read(_CHUNK, interrupt):
+        yield from splitter.feed(data)
+    if splitter.size:
+        yield splitter.end()
+
+
+def _read(count: int, interrupt: Mapping[int, int], end: float | None = None) -> bytes:
+    """Return what there is of standard input once there is something, at most so many bytes; b"" at its end."""
+    while True:
+        if not ready({0: select.POLLIN}, rest(end), interrupt):
+            raise InputLate("standard input has not ended within the time: nothing was sent")
+        try:
+            return os.read(0, count)
+        except BlockingIOError:  # whoever started this has made it so
+            continue
+        except OSError as error:
+            raise UsageError(f"standard input cannot be read: {error.strerror}") from error
 
 
 def _decoded(data: bytes) -> str:
-    # What is not UTF-8 stays recognisable, as in arguments: see `utf8`.
+    # What is not UTF-8 stays recognisable, as in arguments: see `readable`.
     return data.decode(errors="surrogateescape").rstrip("\r\n")
 
 
@@ -148,24 +122,17 @@ def say_lines(
 
     `name`: what the sender calls itself; `chosen`: options of each goal; `timeout`: seconds for all of it.
     """
-    shown = None
-    if feedback:
-        from talkcli.cli.feedback import feedback as feedback_for
-
-        shown = feedback_for(options)
+    shown = feedback_for(options, asked=feedback)
     with Interrupts(timeout) as interrupts:
         if wait:
             interrupts.watch_output()
-        patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
+        patience = min(ANSWER_LIMIT, timeout or ANSWER_LIMIT)
         try:
             with options.connect(name=name, interrupt=interrupts.watched, patience=patience) as client:
                 return _Lines(client, interrupts, options, chosen, wait, shown).run()
-        except Interrupted:  # while it connected
-            interrupts.look()
-            return interrupts.exit_code
         finally:
-            if shown:
-                regardless(shown.close)
+            regardless(shown.close)
+    return interrupts.exit_code
 
 
 class _Lines:
@@ -178,92 +145,86 @@ class _Lines:
         options: Common,
         chosen: dict[str, Any],
         wait: bool,
-        shown: Feedback | None,
+        shown: Feedback,
     ) -> None:
         self._client = client
         self._interrupts = interrupts
         self._options = options
         self._chosen = chosen
+        self._wait = wait
         self._shown = shown
-        self._tell = shown.aside if shown else note
-        self._tally = _Tally(options, interrupts, shown) if wait else None
-        #: exit code of the first line that was refused
-        self._refused = EXIT_OK
-        #: the line that is being sent
-        self._sending: Line | None = None
+        self._tally = _Tally(options, interrupts, shown)
+        #: the number of the line that is being sent
+        self._sending: int | None = None
         self._told_of_pause = False
 
     def run(self) -> int:
         """Send all lines; with --wait, see them end."""
-        if self._tally:
-            self._tally.start()
+        self._tally.start()
         try:
             self._send_all()
-            if self._tally:
-                self._tally.finish()
+            self._tally.finish()
         except Interrupted:
             return self._interrupted()
         except TalkError as error:
             return self._lost(error)
         except BaseException as error:
-            if self._tally and isinstance(error, OSError) and reader_is_gone(error):
+            if self._wait and isinstance(error, OSError) and reader_is_gone(error):
                 self._interrupts.gone = True
                 return self._interrupted()
-            if self._tally:
-                self._tally.stop()
+            self._tally.stop()
             raise
-        return self._tally.code if self._tally else self._refused
+        return self._tally.code
 
     def _send_all(self) -> None:
-        for line in LineReader(self._interrupts.watched).lines():
-            if line.text is not None and not line.text.strip():
+        for number, line in enumerate(_lines(self._interrupts.watched), start=1):
+            if not isinstance(line, Cut) and not line.strip():
                 continue
-            self._sending = line
-            if line.text is None:
-                self._refuse(line, _too_long(line))
+            self._sending = number
+            if isinstance(line, Cut):
+                words = f"the line has {line.size:,} bytes, the longest text allowed has {MAX_BYTES:,}"
+                self._refuse(number, rejected(words))
             else:
-                text, unreadable = readable(line.text, line.number)
+                text, unreadable = readable(_decoded(line), number)
                 if unreadable and not self._options.quiet:
-                    self._tell(unreadable)
-                self._send(line, text)
+                    self._shown.aside(unreadable)
+                self._send(number, text)
             self._sending = None
 
-    def _send(self, line: Line, text: str) -> None:
-        wait = self._tally is not None
-        handle = self._client.say(text, follow=wait, feedback=self._shown is not None, patient=True, **self._chosen)
+    def _send(self, number: int, text: str) -> None:
+        handle = self._client.say(text, follow=self._wait, feedback=self._shown.shows, patient=True, **self._chosen)
         if handle.state is State.REJECTED:
-            self._refuse(line, handle.goal)
+            self._refuse(number, handle.goal)
             return
         if self._options.json:
-            if not wait:
-                self._print(lambda: show_json(handle.goal.to_json()))
-        elif not self._options.quiet and self._shown is None:
-            self._print(lambda: show(handle.id))
+            if not self._wait:
+                self._print(show_json, handle.goal.to_json())
+        elif not self._options.quiet and not self._shown.shows:
+            self._print(show, handle.id)
         if handle.speech_paused and not (self._options.quiet or self._told_of_pause):
-            self._tell(SPEECH_IS_PAUSED)
+            self._shown.aside(SPEECH_IS_PAUSED)
         self._told_of_pause = handle.speech_paused
-        if self._tally:
+        if self._wait:
             self._tally.add(handle)
 
-    def _refuse(self, line: Line, goal: Goal) -> None:
+    def _refuse(self, number: int, goal: Goal) -> None:
         """Tell of a line that is no goal, and go on."""
-        if self._options.json:
-            self._print(lambda: self._show(goal) if self._shown else show_json(goal.to_json()))
+        if self._shown.shows and self._options.json:
+            self._print(self._shown.show, goal, Result(goal))
+        elif self._options.json:
+            self._print(show_json, goal.to_json())
         if not self._options.quiet:
-            self._tell(f"line {line.number}: {ending(goal)}")
-        code = exit_code(goal)
-        self._refused = self._refused or code
-        if self._tally:
-            self._tally.add(code)
+            self._shown.aside(f"line {number}: {ending(goal)}")
+        self._tally.add(exit_code(goal))
 
-    def _print(self, put: Callable[[], None]) -> None:
+    def _print(self, put: Callable[..., None], *what: object) -> None:
         """Show something; where its reader is gone, who waits ends as by a signal, and who doesn't goes on without."""
         try:
-            show_if_possible(put)
+            show_if_possible(put, *what)
         except OSError as error:
             if not reader_is_gone(error):
                 raise
-            if self._tally:
+            if self._wait:
                 self._interrupts.gone = True
                 raise Interrupted from error
             give_up_output()
@@ -275,12 +236,12 @@ class _Lines:
         self._interrupts.look()
         if self._interrupts.gone:
             give_up_output()
-        elif self._tally and self._interrupts.number is None and not self._interrupts.late:
+        elif self._interrupts.number is None and not self._interrupts.late:
             self._tally.finish()
             self._tell_of_the_rest()
             return self._tally.code
-        if self._tally:
-            self._tally.stop()
+        self._tally.stop()
+        if self._wait:
             # Who hangs up takes back the line that waits for room: else it would get that of the goals that end now.
             self._client.close()
             self._interrupts.clear()
@@ -298,45 +259,35 @@ class _Lines:
                     return
                 ended = _cancelled(client, ids)
         except (TalkError, Interrupted) as error:
-            self._tell(f"cancelled, but it is not known whether it is silent: {str(error) or 'interrupted'}")
+            self._shown.aside(f"cancelled, but it is not known whether it is silent: {str(error) or 'interrupted'}")
             return
-        recalled = [each for each in ended if each.state is State.RECALLED]
         for goal in ended:
-            if self._shown:
-                regardless(self._show, goal)
+            if self._shown.shows:
+                regardless(self._shown.show, goal, Result(goal))
             elif self._options.json or goal.state is not State.RECALLED:
-                regardless(report, goal, self._options)
-        if recalled and not (self._shown or self._options.json or self._options.quiet):
-            note(f"{len(recalled)} that waited: recalled")
+                regardless(report, goal, self._options, self._shown)
+        recalled = sum(each.state is State.RECALLED for each in ended)
+        if recalled and not (self._shown.shows or self._options.json or self._options.quiet):
+            note(f"{recalled} that waited: recalled")
 
     def _lost(self, error: TalkError) -> int:
         """End because the server takes no more lines, or because standard input can't be read."""
-        code = self._refused
-        if self._tally:
-            self._tally.finish()
-            code = self._tally.code
-        if self._shown:
-            self._shown.close()
+        self._tally.finish()
+        self._shown.close()
         show_error(error, json=self._options.json)
         self._tell_of_the_rest()
-        return code or error.exit_code
+        return self._tally.code or error.exit_code
 
     def _tell_of_the_rest(self) -> None:
         """Say from which line on nothing was accepted, as far as that is known."""
         if self._sending is not None and not self._options.quiet:
-            self._tell(f"line {self._sending.number} may not have been accepted; what follows it was not sent")
-
-    def _show(self, goal: Goal) -> None:
-        from talkcli.protocol.events import Result
-
-        if self._shown:
-            self._shown.show(goal, Result(goal))
+            self._shown.aside(f"line {self._sending} may not have been accepted; what follows it was not sent")
 
 
 class _Tally(threading.Thread):
     """Waits for the goals in their order, tells how each ended, and keeps the first exit code that is no success."""
 
-    def __init__(self, options: Common, interrupts: Interrupts, shown: Feedback | None) -> None:
+    def __init__(self, options: Common, interrupts: Interrupts, shown: Feedback) -> None:
         super().__init__(name="tally", daemon=True)
         self._options = options
         self._interrupts = interrupts
@@ -393,8 +344,7 @@ class _Tally(threading.Thread):
             return self._waiting[0] if self._waiting else None
 
     def _see_end(self, handle: GoalHandle) -> int:
-        if self._shown:
-            self._shown.begin([handle.goal])
+        self._shown.begin([handle.goal])
         until_ended(handle, None, self._shown)
         if handle.state is State.LOST:
             self._interrupts.wake()  # nothing more can be sent
@@ -420,8 +370,3 @@ def _cancelled(client: Client, ids: list[str]) -> list[Goal]:
     except UnknownGoal as error:
         done = Canceled.from_items(error.items)
     return sorted((*done.ended, *done.canceled), key=lambda each: ids.index(each.id) if each.id in ids else len(ids))
-
-
-def _too_long(line: Line) -> Goal:
-    words = f"Talk rejected: the line has {line.size:,} bytes, the longest text allowed has {MAX_BYTES:,}"
-    return Goal("", State.REJECTED, reason="text_too_long", message=words)

@@ -10,6 +10,7 @@ import time
 
 from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.show import (
+    Feedback,
     give_up_output,
     never_readable,
     no_room,
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any, TypeVar
 
-    from talkcli.cli.feedback import Feedback
     from talkcli.cli.show import Common
     from talkcli.client.client import GoalHandle
     from talkcli.goals.goal import Goal
@@ -72,16 +72,22 @@ def regardless(act: Callable[..., _T], *given: Any) -> _T:
         return act(*given)
 
 
-def until_ended(goal: GoalHandle, timeout: float | None, shown: Feedback | None) -> None:
+def feedback_for(options: Common, *, asked: bool) -> Feedback:
+    """Return what shows the events of goals: nothing, unless that was asked for."""
+    if not asked:
+        return Feedback()
+    from talkcli.cli.feedback import feedback
+
+    return feedback(options)
+
+
+def until_ended(goal: GoalHandle, timeout: float | None, shown: Feedback) -> None:
     """Wait until a goal has ended, and show what happens meanwhile; TimeoutError, Interrupted."""
-    if shown is None:
-        goal.wait(timeout)
-        return
     for event in goal.events(timeout):
         show_if_possible(shown.show, goal.goal, event)
 
 
-def give_up(goal: GoalHandle, interrupts: Interrupts, options: Common, shown: Feedback | None) -> int:
+def give_up(goal: GoalHandle, interrupts: Interrupts, options: Common, shown: Feedback) -> int:
     """Cancel a goal, wait a moment for its silence, tell how it ended, and return the exit code for that.
 
     Ctrl-C may have ended the reader, too, and a terminal is gone soon after SIGHUP.
@@ -96,25 +102,21 @@ def give_up(goal: GoalHandle, interrupts: Interrupts, options: Common, shown: Fe
     except (Interrupted, ServerUnavailable) as error:
         unknown = f"it is not known whether it is silent: {error or 'interrupted'}"
     if unknown:
-        regardless(shown.aside if shown else note, f"{goal.id}: cancelled, but {unknown}")
+        regardless(shown.aside, f"{goal.id}: cancelled, but {unknown}")
     return regardless(report, goal.goal, options, shown)
 
 
-def report(goal: Goal, options: Common, shown: Feedback | None = None) -> int:
-    """Tell how a goal ended, or how it stands, and return the exit code for it.
-
-    `shown`: what has shown it already on standard output.
-    """
-    if options.json and shown is None:
+def report(goal: Goal, options: Common, shown: Feedback) -> int:
+    """Tell how a goal ended, or how it stands, and return the exit code for it."""
+    if options.json and not shown.shows:
         show_if_possible(show_json, goal.to_json())
     if goal.state is not State.SUCCEEDED and goal.state.terminal and not options.quiet:
         from talkcli.terminal.goals import ending
 
-        tell = shown.aside if shown else note
         words = ending(goal)
         if goal.state is State.ABORTED and goal.reason != "nothing_to_say":
             words += "; see 'talk doctor'"
-        tell(words)
+        shown.aside(words)
     return exit_code(goal)
 
 
@@ -128,29 +130,27 @@ def exit_code(goal: Goal) -> int:
 def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
     """Wait until these goals have ended, or all that have not, and return the exit code; `timeout` in seconds."""
     end = None if timeout is None else options.began + timeout
-    patience = ANSWER_LIMIT if timeout is None else min(ANSWER_LIMIT, timeout)
     give_up_unread()
     with Interrupts() as interrupts:
         interrupts.watch_output()
         try:
+            patience = min(ANSWER_LIMIT, timeout or ANSWER_LIMIT)
             with options.connect(interrupt=interrupts.watched, patience=patience) as client:
                 goals = client.follow(ids or None, feedback=feedback)
-                shown = _show(goals, end, interrupts, options) if feedback else None
+                shown = feedback_for(options, asked=feedback)
+                if feedback:
+                    _show(goals, end, interrupts, shown)
                 return _wait(goals, end, options, shown, named=bool(ids))
-        except Interrupted:
-            interrupts.look()
-            return interrupts.exit_code
         except TimeoutError as error:
             note(str(error))
             return EXIT_TIMEOUT
+    return interrupts.exit_code
 
 
-def _show(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, options: Common) -> Feedback:
+def _show(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, shown: Feedback) -> None:
     """Show what happens to the goals until all have ended."""
-    from talkcli.cli.feedback import feedback
     from talkcli.client.following import merged
 
-    shown = feedback(options)
     try:
         shown.begin([each.goal for each in goals])
         for goal, event in merged(goals, rest(end)):
@@ -160,10 +160,9 @@ def _show(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, op
         raise
     finally:
         regardless(shown.close)
-    return shown
 
 
-def _wait(goals: list[GoalHandle], end: float | None, options: Common, shown: Feedback | None, *, named: bool) -> int:
+def _wait(goals: list[GoalHandle], end: float | None, options: Common, shown: Feedback, *, named: bool) -> int:
     """Wait for the goals in their order; how those ended that were not named is nobody's failure."""
     first_failure = EXIT_OK
     for goal in goals:
