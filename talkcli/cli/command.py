@@ -44,17 +44,16 @@ ASKING: Codes = {
 }
 #: All of them, as the README's table has them; each command's help says which are its own.
 ALL_EXIT_CODES: Codes = {
+    **ASKING,
     0: "accepted; with --wait succeeded: all of it was played",
     1: "anything not named here; a bug says so, and TALK_DEBUG=1 where",
     2: "usage",
-    3: "no server: nothing was sent, so it is safe to try again",
     4: "aborted: engine or audio failed, or nothing in the text can be spoken",
     5: "rejected: never queued",
     6: "recalled: taken out of the queue before it was spoken",
     7: "preempted: stopped while it was spoken",
     8: "unknown goal",
     9: "client and server speak different versions of the protocol",
-    10: "permission denied",
     11: "the socket is served already, or its directory is not safe",
     12: "lost: it was sent, then the server went away; it may still be spoken",
     124: "timed out",
@@ -113,17 +112,22 @@ class Command:
         return run(options, **given)
 
 
+def option(flags: str, kind: Kind, words: str, **more: Any) -> Option:
+    """Return an option of commands alone, named as its long form is; `words` is its help. A flag's default is no."""
+    name = flags.rpartition("--")[2].replace("-", "_")
+    return Option(name, kind, flags=flags, help=words, **{"default": False if kind is FLAG else None, **more})
+
+
 #: The options that may stand before and after every command.
 COMMON = (
-    Option(
-        "socket",
+    option(
+        "--socket",
         PATH,
-        flags="--socket",
-        help="Socket of the server.  [env var: TALK_SOCKET; default: the usual places, as 'talk doctor' lists]",
+        "Socket of the server.  [env var: TALK_SOCKET; default: the usual places, as 'talk doctor' lists]",
         offers="files",
     ),
-    Option("json", FLAG, default=False, flags="--json", help="For programs: one JSON object a line; errors, too."),
-    Option("quiet", FLAG, default=False, flags="-q, --quiet", help="No ids, no notes."),
+    option("--json", FLAG, "For programs: one JSON object a line; errors, too."),
+    option("-q, --quiet", FLAG, "No ids, no notes."),
 )
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 
-from talkcli.cli.command import ASKING, FILE, MODE, Argument, Command, spelt
+from talkcli.cli.command import ASKING, FILE, MODE, Argument, Command, option, spelt
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.option import FLAG, IDS, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
 from talkcli.goals.options import MAX_CHARACTERS, MAX_LEAD_IN, OPTIONS, SETTINGS, SOUND, Cancel
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from collections.abc import Set as AbstractSet
     from typing import Any
 
@@ -25,42 +25,25 @@ UNITS = ("user", "system", "user-socket", "system-socket")
 
 def _timeout(words: str) -> Option:
     """Return the option --timeout; `words` is its help: what the command does when the time is over."""
-    return Option("timeout", NUMBER, limits=(0, None), above=True, flags="-t, --timeout", metavar="SEC", help=words)
+    return option("-t, --timeout", NUMBER, words, limits=(0, None), above=True, metavar="SEC")
 
 
-def _to_say() -> tuple[Option, ...]:
-    """Return the options of `say`: those of a goal, and its own."""
-    found: list[Option] = []
+def _to_say() -> Iterator[Option]:
+    """Make the options of `say`: those of a goal, and its own."""
     for each in OPTIONS:
-        if each.flags and each.env:
-            found.append(replace(each, env="", help=f"{each.help}  [env var, with -o: {each.env}]"))
-        elif each.flags:
-            found.append(each)
+        if each.flags:
+            yield replace(each, env="", help=f"{each.help}  [env var, with -o: {each.env}]") if each.env else each
         if each.name == "wait":
-            found.append(_timeout("With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124."))
+            yield _timeout("With --wait: cancel it after SEC seconds; time in the queue counts; exit code 124.")
         elif each.name == "id":
             what = "What the sender calls itself."
-            found.append(Option("name", WORD, flags="--as", metavar="NAME", help=what, env="TALK_NAME"))
-    return (
-        *found,
-        Option(
-            "lines",
-            FLAG,
-            default=False,
-            flags="--lines",
-            help="Speak each line of standard input, as it comes; no TEXT then.",
-        ),
-        Option(
-            "output",
-            FILE,
-            flags="-o, --output",
-            metavar="FILE.wav",
-            help="Write it into a file instead; '-' is standard output. Needs no server.",
-        ),
-    )
+            yield Option("name", WORD, flags="--as", metavar="NAME", help=what, env="TALK_NAME")
+    yield option("--lines", FLAG, "Speak each line of standard input, as it comes; no TEXT then.")
+    words = "Write it into a file instead; '-' is standard output. Needs no server."
+    yield option("-o, --output", FILE, words, metavar="FILE.wav")
 
 
-_SAY = _to_say()
+_SAY = tuple(_to_say())
 #: Options of `say` that mean something without a server, too.
 _WITHOUT_SERVER = {"timeout", "output", *(each.name for each in SOUND)}
 #: Endings by which a file of another format than WAV would be meant.
@@ -93,62 +76,45 @@ _SERVE = (
     *(each.at_start() for each in SETTINGS),
     # At two seconds a sentence, more than three minutes of speech that nobody can still want to hear; at most, five
     # hours, and to look at all that wait still takes no more than a millisecond or so.
-    Option("max_queue", INTEGER, default=100, limits=(1, 10_000), flags="--max-queue", help="Goals that may wait."),
-    Option(
-        "max_text",
-        INTEGER,
-        default=MAX_CHARACTERS,
-        limits=(1, MAX_CHARACTERS),
-        flags="--max-text",
-        help="Characters of one text.",
-    ),
+    option("--max-queue", INTEGER, "Goals that may wait.", default=100, limits=(1, 10_000)),
+    option("--max-text", INTEGER, "Characters of one text.", default=MAX_CHARACTERS, limits=(1, MAX_CHARACTERS)),
     # Each takes a descriptor of the 1,024 that a process usually has.
-    Option("max_clients", INTEGER, default=256, limits=(1, None), flags="--max-clients", help="Clients at once."),
-    Option(
-        "player",
+    option("--max-clients", INTEGER, "Clients at once.", default=256, limits=(1, None)),
+    option(
+        "--player",
         TEXT,
-        flags="--player",
-        metavar="PLAYER",
-        help="What plays the sound. One of aplay, pacat and pw-cat; null (silent, in real time); file:PATH.wav; or a "
+        "What plays the sound. One of aplay, pacat and pw-cat; null (silent, in real time); file:PATH.wav; or a "
         "command that reads 16-bit mono PCM, with {rate} for its rate and {device} for the --device. [default: the "
         "first of the three that works]",
+        metavar="PLAYER",
         env="TALK_PLAYER",
         offers="players",
     ),
-    Option(
-        "device",
+    option(
+        "--device",
         TEXT,
-        flags="--device",
-        metavar="NAME",
-        help="Device, by the player's own name for it. For aplay one that 'aplay -L' lists, such as plughw:1,0; for "
+        "Device, by the player's own name for it. For aplay one that 'aplay -L' lists, such as plughw:1,0; for "
         "pacat one of 'pactl list short sinks'; for pw-cat the name of a node, as in 'pw-cli ls Node'. Name the "
         "--player, too.",
+        metavar="NAME",
     ),
-    Option(
-        "lead_in",
+    option(
+        "--lead-in",
         INTEGER,
+        "Milliseconds of silence before a sentence; only where the output was idle: HDMI, USB and Bluetooth "
+        "outputs fall asleep, and swallow what comes while they wake.",
         default=0,
         limits=(0, MAX_LEAD_IN),
-        flags="--lead-in",
         metavar="MS",
-        help="Milliseconds of silence before a sentence; only where the output was idle: HDMI, USB and Bluetooth "
-        "outputs fall asleep, and swallow what comes while they wake.",
     ),
-    Option(
-        "driver",
+    option("--driver", TEXT, "A driver of pyttsx3's. [default: the one for this system]", metavar="NAME"),
+    option("--socket-mode", MODE, "Who may connect: the socket's file mode.", default="0600"),
+    option("--greeting", TEXT, "A sentence to speak at the start."),
+    option(
+        "--print-unit",
         TEXT,
-        flags="--driver",
-        metavar="NAME",
-        help="A driver of pyttsx3's. [default: the one for this system]",
-    ),
-    Option("socket_mode", MODE, default="0600", flags="--socket-mode", help="Who may connect: the socket's file mode."),
-    Option("greeting", TEXT, flags="--greeting", help="A sentence to speak at the start."),
-    Option(
-        "print_unit",
-        TEXT,
-        flags="--print-unit",
+        f"Print a systemd unit with these options, and end. One of {', '.join(UNITS)}; it says where it goes.",
         metavar="UNIT",
-        help=f"Print a systemd unit with these options, and end. One of {', '.join(UNITS)}; it says where it goes.",
         choices=UNITS,
     ),
 )
@@ -257,7 +223,7 @@ _ROWS = (
         },
         options=(
             _timeout("Wait no longer than SEC seconds; the goals go on; exit code 124."),
-            Option("feedback", FLAG, default=False, flags="-f, --feedback", help="Show each word as it is heard."),
+            option("-f, --feedback", FLAG, "Show each word as it is heard."),
         ),
         argument=_IDS,
         plain=True,
@@ -290,9 +256,7 @@ _ROWS = (
     Command(
         name="status",
         summary="What is being said, what will be, what was.",
-        about="""
-        Show what is being said, what will be and what was; with an ID, all that is known of that goal.
-        """,
+        about="Show what is being said, what will be and what was; with an ID, all that is known of that goal.",
         runs="ask:status",
         examples="""
         talk status
@@ -326,9 +290,7 @@ _ROWS = (
             12: "lost: the server went away",
             "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
         },
-        options=(
-            Option("words", FLAG, default=False, flags="-f, --words", help="A line for each word as it is heard, too."),
-        ),
+        options=(option("-f, --words", FLAG, "A line for each word as it is heard, too."),),
     ),
     Command(
         name="log",
@@ -346,16 +308,7 @@ _ROWS = (
         talk --json log | jq -r 'select(.state == "ABORTED").message'
         """,
         exit_codes={**ASKING, 0: "listed"},
-        options=(
-            Option(
-                "count",
-                INTEGER,
-                default=20,
-                limits=(1, MAX_LOG),
-                flags="-n, --count",
-                help="The last N goals that ended.",
-            ),
-        ),
+        options=(option("-n, --count", INTEGER, "The last N goals that ended.", default=20, limits=(1, MAX_LOG)),),
         plain=True,
     ),
     Command(
@@ -367,9 +320,7 @@ _ROWS = (
         Nothing is spoken until then, whoever sends it and however urgent it is. Goals can be sent and cancelled.
         """,
         runs="ask:pause",
-        examples="""
-        talk pause; listen_to_the_operator; talk resume
-        """,
+        examples="talk pause; listen_to_the_operator; talk resume",
         exit_codes={
             **ASKING,
             0: "speech is held, and it is silent",
@@ -380,13 +331,9 @@ _ROWS = (
     Command(
         name="resume",
         summary="Go on where speech was held.",
-        about="""
-        Go on where 'talk pause' held speech. Twice is success, and so is without a pause.
-        """,
+        about="Go on where 'talk pause' held speech. Twice is success, and so is without a pause.",
         runs="ask:resume",
-        examples="""
-        talk resume
-        """,
+        examples="talk resume",
         exit_codes={**ASKING, 0: "speech goes on"},
         plain=True,
     ),
@@ -428,15 +375,7 @@ _ROWS = (
         talk say --voice en-us+f3 "a variant"
         """,
         exit_codes={**ASKING, 0: "listed", 1: "no voice speaks that language, or the engine can't list them"},
-        options=(
-            Option(
-                "language",
-                TEXT,
-                flags="--language",
-                metavar="CODE",
-                help="Only this language, with its variants: en, pt-br.",
-            ),
-        ),
+        options=(option("--language", TEXT, "Only this language, with its variants: en, pt-br.", metavar="CODE"),),
         plain=True,
     ),
     Command(
@@ -464,15 +403,7 @@ _ROWS = (
             4: "it would not, as without a server",
             "128+n": "ended by signal n",
         },
-        options=(
-            Option(
-                "silent",
-                FLAG,
-                default=False,
-                flags="--silent",
-                help="Play half a second of zeros, which is no goal and no sound.",
-            ),
-        ),
+        options=(option("--silent", FLAG, "Play half a second of zeros, which is no goal and no sound."),),
     ),
     Command(
         name="completion",
