@@ -118,8 +118,11 @@ class _Line(ShellComplete):
         return words[1:-1], words[-1]
 
     def format_completion(self, item: CompletionItem[str]) -> str:
-        """Return a line for what is offered: `file`, or a kind and what the shell shall insert."""
-        return "file" if item.type == "file" else f"plain,{item.value}"
+        return "file" if item.type == "file" else self.line(item.value, item.help)
+
+    def line(self, value: str, words: str | None) -> str:  # noqa: ARG002
+        """Return a line for what is offered: a kind, and what the shell shall insert."""
+        return f"plain,{value}"
 
 
 class Bash(_Line):
@@ -128,17 +131,14 @@ class Bash(_Line):
     name = "bash"
     source_template = _BASH
 
-    def format_completion(self, item: CompletionItem[str]) -> str:
-        if item.type == "file":
-            return "file"
+    def line(self, value: str, words: str | None) -> str:  # noqa: ARG002
         typed, quote = _last_word(os.environ["COMP_WORDS"])
         replaced = os.environ["COMP_CWORD"]
         if replaced in {":", "="}:
             replaced = ""  # so bash-completion says, behind sudo for one, that nothing follows what bash cuts at
         stays = typed.removesuffix(replaced) if replaced else typed
-        value = _whole(item.value, typed)
         kept = "".join(split_arg_string(stays))
-        return f"plain,{_quoted(value.removeprefix(kept), quote)}"
+        return f"plain,{_quoted(_whole(value, typed).removeprefix(kept), quote)}"
 
 
 class Zsh(_Line):
@@ -147,10 +147,10 @@ class Zsh(_Line):
     name = "zsh"
     source_template = _ZSH
 
-    def format_completion(self, item: CompletionItem[str]) -> str:
-        if item.type == "file" or not item.help:
-            return super().format_completion(item)
-        value, words = (each.replace("\\", "\\\\") for each in (item.value, item.help))
+    def line(self, value: str, words: str | None) -> str:
+        if not words:
+            return super().line(value, words)
+        value, words = (each.replace("\\", "\\\\") for each in (value, words))
         value = value.replace(":", "\\:")
         return f"described,{value}:{words}"
 
@@ -161,12 +161,9 @@ class Fish(_Line):
     name = "fish"
     source_template = _FISH
 
-    def format_completion(self, item: CompletionItem[str]) -> str:
-        if item.type == "file":
-            return "file"
+    def line(self, value: str, words: str | None) -> str:
         typed, _ = _last_word(os.environ["COMP_WORDS"])
-        words = f"\t{item.help}" if item.help else ""
-        return f"plain,{_whole(item.value, typed)}{words}"
+        return f"plain,{_whole(value, typed)}" + (f"\t{words}" if words else "")
 
 
 #: Each of them by its shell's name.
@@ -228,11 +225,7 @@ def goal_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Ite
 
 def known_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Return the ids of goals, the ended ones too: first what is not over, then the newest."""
-
-    def both(client: Client) -> tuple[ServerStatus, list[Goal]]:
-        return client.status(), client.log(_ENDED)
-
-    found = _ask(context, both)
+    found = _ask(context, lambda client: (client.status(), client.log(_ENDED)))
     if found is None:
         return []
     status, ended = found
@@ -298,9 +291,8 @@ def _ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Items:
     offered = []
     for each in goals:
         number = each.id.removeprefix(own)
-        offered += [
-            (name, _goal_help(each)) for name in ((number, each.id) if digits and number != each.id else (each.id,))
-        ]
+        names = [number, each.id] if digits and number != each.id else [each.id]
+        offered += [(name, _goal_help(each)) for name in names]
     return _items(offered, incomplete)
 
 
@@ -313,12 +305,9 @@ def _keys(goals: Iterable[Goal], incomplete: str) -> Items:
 
 
 def _items(offered: Iterable[tuple[str, str]], incomplete: str) -> Items:
-    return [CompletionItem(value, help=words) for value, words in offered if _fits(value, incomplete)]
-
-
-def _fits(value: str, incomplete: str) -> bool:
     # What can't be seen can't be chosen either, and would reach the terminal raw.
-    return bool(value) and value.startswith(incomplete) and value.isprintable()
+    fitting = ((value, words) for value, words in offered if value.startswith(incomplete) and value.isprintable())
+    return [CompletionItem(value, help=words) for value, words in fitting if value]
 
 
 def _goal_help(goal: Goal) -> str:
