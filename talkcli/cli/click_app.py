@@ -48,13 +48,12 @@ _ELSEWHERE = {
 }
 
 
-class _Value(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """The value of an option, as `command` reads it."""
-
-    name = "value"
+class _Value(click.FloatRange):
+    """The value of an option, as `command` reads it. Of a number, help shows the limits; others have none."""
 
     def __init__(self, option: Option) -> None:
         self._option = option
+        super().__init__(*option.limits, min_open=option.above)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         try:
@@ -63,20 +62,11 @@ class _Value(click.ParamType):  # type: ignore[type-arg,unused-ignore]
             raise click.BadParameter(str(error), ctx, param, self._came_from(ctx)) from error
 
     def _came_from(self, ctx: click.Context | None) -> str | None:
-        """Return where the value came from: the option, or a variable instead of it; None for click's own words."""
+        """Return where a value came from, the option or a variable; None for a number: click's own words say it."""
+        if self._option.kind in (INTEGER, NUMBER, SECONDS):
+            return None
         typed = ctx and ctx.get_parameter_source(self._option.name) is not ParameterSource.ENVIRONMENT
         return spelt(self._option) if typed else f"{self._option.env} in the environment"
-
-
-class _Number(_Value, click.FloatRange):
-    """A number: click shows its limits in help."""
-
-    def __init__(self, option: Option) -> None:
-        _Value.__init__(self, option)
-        click.FloatRange.__init__(self, *option.limits, min_open=option.above)
-
-    def _came_from(self, ctx: click.Context | None) -> str | None:  # noqa: ARG002
-        return None
 
     def _describe_range(self) -> str:
         return limits(self._option)
@@ -103,9 +93,7 @@ def _option(option: Option, *, common: bool = False) -> click.Option:
 def _type(option: Option) -> Any:
     if option.choices:
         return click.Choice(option.choices)
-    if option.kind is FILE:
-        return click.Path(dir_okay=False)
-    return _Number(option) if option.kind in (INTEGER, NUMBER, SECONDS) else _Value(option)
+    return click.Path(dir_okay=False) if option.kind is FILE else _Value(option)
 
 
 def _argument(argument: Argument) -> click.Argument:
