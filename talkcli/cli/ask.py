@@ -9,11 +9,11 @@ import sys
 
 from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_json
-from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, TalkError, UnknownGoal
+from talkcli.errors import EXIT_SIGPIPE, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from typing import Any
 
     from talkcli.cli.show import Common
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 _MAX_SPOKEN = 40
 
 
-def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
-    """Cancel what these select, or everything, and return the exit code."""
+def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> None:
+    """Cancel what these select, or everything."""
     with options.connect() as client:
         try:
             done = client.cancel(ids or None, current=current, before=before, key=key)
@@ -38,23 +38,20 @@ def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | N
 
             _show_canceled(Canceled.from_items(error.items), options)
             raise
-    return EXIT_OK
 
 
-def status(options: Common, goal_id: str | None) -> int:
-    """Show how the server stands, or one goal, and return the exit code."""
+def status(options: Common, goal_id: str | None) -> None:
+    """Show how the server stands, or one goal."""
     from talkcli.goals.goal import Goal
     from talkcli.terminal.goals import goal_lines, status_lines
 
     with options.connect() as client:
         found = client.status() if goal_id is None else client.goal(goal_id)
-    if options.json:
-        show_json(found.to_json())
-    elif isinstance(found, Goal):
-        _show_lines(goal_lines(found, screen()))
-    else:
-        _show_lines(status_lines(found, screen()))
-    return EXIT_OK
+
+    def lines() -> Iterable[str]:
+        return goal_lines(found, screen()) if isinstance(found, Goal) else status_lines(found, screen())
+
+    _show_found(options, [found.to_json()], lines)
 
 
 def watch(options: Common, words: bool) -> int:
@@ -72,26 +69,22 @@ def watch(options: Common, words: bool) -> int:
                 if options.json:
                     show_json(event.to_json())
                 else:
-                    _show_lines(transcript.lines(event, screen()))
+                    for line in transcript.lines(event, screen()):
+                        show(line)
     return interrupts.exit_code
 
 
-def log(options: Common, count: int) -> int:
-    """Show the goals that ended last, and return the exit code."""
+def log(options: Common, count: int) -> None:
+    """Show the goals that ended last."""
     from talkcli.terminal.transcript import log_lines
 
     with options.connect() as client:
         goals = client.log(count)
-    if options.json:
-        for goal in goals:
-            show_json(goal.to_json())
-    else:
-        _show_lines(log_lines(goals, screen()))
-    return EXIT_OK
+    _show_found(options, (each.to_json() for each in goals), lambda: log_lines(goals, screen()))
 
 
-def voices(options: Common, language: str | None) -> int:
-    """Show the engine's voices, or those of a language with its variants, and return the exit code."""
+def voices(options: Common, language: str | None) -> None:
+    """Show the engine's voices, or those of a language with its variants."""
     from talkcli.terminal.goals import voice_lines
 
     with options.connect() as client:
@@ -101,30 +94,21 @@ def voices(options: Common, language: str | None) -> int:
         found = [each for each in every if _language(each) == wanted or _language(each).startswith(f"{wanted}-")]
         if not found:
             raise TalkError(_no_voice(language, every))
-    if options.json:
-        for voice in found:
-            show_json(voice)
-    else:
-        _show_lines(voice_lines(found))
-    return EXIT_OK
+    _show_found(options, found, lambda: voice_lines(found))
 
 
-def change(options: Common, **settings: Any) -> int:
-    """Change those settings of the server that aren't None, or show them all, and return the exit code."""
+def change(options: Common, **settings: Any) -> None:
+    """Change those settings of the server that aren't None, or show them all."""
     from talkcli.terminal.goals import setting_lines
 
     asked = {name: value for name, value in settings.items() if value is not None}
     with options.connect() as client:
         found = client.set(**asked) if asked else client.settings()
-    if options.json:
-        show_json(found)
-    elif not asked:
-        _show_lines(setting_lines(found))
-    return EXIT_OK
+    _show_found(options, [found], lambda: [] if asked else setting_lines(found))
 
 
-def pause(options: Common) -> int:
-    """Hold speech, and return the exit code."""
+def pause(options: Common) -> None:
+    """Hold speech."""
     with options.connect() as client:
         held = client.pause()
     from talkcli.terminal.text import printable
@@ -133,18 +117,16 @@ def pause(options: Common) -> int:
     where = f', after "{printable(heard)}"' if heard else ""
     words = f"{printable(held.id)} is held{where}" if held else "nothing is being spoken, and nothing will be"
     _tell(options, held, paused=True, words=f"{words}; 'talk resume' goes on")
-    return EXIT_OK
 
 
-def resume(options: Common) -> int:
-    """Go on where speech is held, and return the exit code."""
+def resume(options: Common) -> None:
+    """Go on where speech is held."""
     with options.connect() as client:
         goal = client.resume()
     from talkcli.terminal.text import printable
 
     words = f"speech goes on with {printable(goal.id)}" if goal else "speech goes on"
     _tell(options, goal, paused=False, words=words)
-    return EXIT_OK
 
 
 def _show_canceled(done: Canceled, options: Common) -> None:
@@ -184,9 +166,14 @@ def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     return f"no voice speaks '{printable(language)}': {hint}"
 
 
-def _show_lines(lines: Iterable[str]) -> None:
-    for line in lines:
-        show(line)
+def _show_found(options: Common, found: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
+    """Show what the server said: as it is, for programs, or in lines for people."""
+    if options.json:
+        for each in found:
+            show_json(each)
+    else:
+        for line in lines():
+            show(line)
 
 
 def _language(voice: JsonObject) -> str:
