@@ -80,26 +80,19 @@ def ended(command: Callable[[], object], options: Common) -> int:
     except KeyboardInterrupt:
         return EXIT_SIGINT
     except MemoryError:
-        note(_without_memory())
+        from talkcli import resources
+
+        note(f"there is not enough memory for talk: {resources.limits()}")
         return EXIT_ERROR
     except Exception as error:
-        if reader_is_gone(error) or never_readable(error):
-            give_up_output()
-            return EXIT_SIGPIPE
-        if no_room(error):
-            output_failed(error)
-            return EXIT_ERROR
+        given_up = give_up_failed(error)
+        if given_up is not None:
+            return given_up
         if os.environ.get("TALK_DEBUG"):
             raise
         note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
         return EXIT_ERROR
     return (code if isinstance(code, int) else 0) or (EXIT_ERROR if _failed else 0)
-
-
-def _without_memory() -> str:
-    from talkcli import resources
-
-    return f"there is not enough memory for talk: {resources.limits()}"
 
 
 def give_up_output() -> None:
@@ -115,33 +108,39 @@ def _discard(descriptor: int) -> None:
     os.close(nowhere)
 
 
-def reader_is_gone(error: Exception) -> bool:
+def reader_is_gone(error: OSError) -> bool:
     """Whether this error is from a standard output that nobody reads any more: a pipe, a terminal that is gone."""
-    if isinstance(error, OSError) and error.errno == errno.EIO:  # which a broken disk gives, too
+    if error.errno == errno.EIO:  # which a broken disk gives, too
         return stat.S_ISCHR(os.fstat(OUTPUT).st_mode)
     return isinstance(error, BrokenPipeError)
 
 
-def never_readable(error: Exception) -> bool:
+def give_up_failed(error: Exception) -> int | None:
+    """Write nothing more to standard output, if this error is from there, and return the exit code for that, or None.
+
+    Where there is no room for what is written, that is told, and the command ends as one that failed.
+    """
+    global _failed  # noqa: PLW0603 - as standard output is the process's
+    if not isinstance(error, OSError):
+        return None
+    if reader_is_gone(error) or _is_for_reading(error):
+        give_up_output()
+        return EXIT_SIGPIPE
+    if error.errno not in _FULL:
+        return None
+    _failed = True
+    give_up_output()
+    note(f"standard output can't be written: {error.strerror}")
+    return EXIT_ERROR
+
+
+def _is_for_reading(error: OSError) -> bool:
     """Whether this error is from a standard output that is open for reading alone."""
-    if not isinstance(error, OSError) or error.errno != errno.EBADF:
+    if error.errno != errno.EBADF:
         return False
     import fcntl
 
     return fcntl.fcntl(OUTPUT, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
-
-
-def no_room(error: Exception) -> bool:
-    """Whether this error is from a standard output that takes no more, though there may be somebody to read it."""
-    return isinstance(error, OSError) and error.errno in _FULL and not reader_is_gone(error)
-
-
-def output_failed(error: Exception) -> None:
-    """Tell why standard output can't be written, and write nothing more to it. The command ends as one that failed."""
-    global _failed  # noqa: PLW0603 - as standard output is the process's
-    _failed = True
-    give_up_output()
-    note(f"standard output can't be written: {error.strerror if isinstance(error, OSError) else error}")
 
 
 def standard_output() -> TextIO:

@@ -11,11 +11,9 @@ import time
 from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.show import (
     Feedback,
+    give_up_failed,
     give_up_output,
-    never_readable,
-    no_room,
     note,
-    output_failed,
     reader_is_gone,
     show_json,
 )
@@ -53,11 +51,7 @@ def show_if_possible(put: Callable[..., None], *what: object) -> None:
     try:
         put(*what)
     except OSError as error:
-        if never_readable(error):
-            give_up_output()
-        elif no_room(error):
-            output_failed(error)
-        else:
+        if reader_is_gone(error) or give_up_failed(error) is None:
             raise
 
 
