@@ -55,7 +55,7 @@ def read(arguments: list[str], environment: Mapping[str, str]) -> Plain | None:
     """Return what a command line says; None where click has to read it."""
     try:
         return _read(arguments, environment)
-    except ValueError:
+    except (ValueError, StopIteration):
         return None
 
 
@@ -92,17 +92,16 @@ def _spellings(options: Iterable[Option]) -> Spellings:
 
 
 def _take(options: Spellings, word: str, rest: Iterator[str], given: dict[str, Any]) -> bool:
-    """Take an option, whose value may be the next word; False, or ValueError for its value, where it isn't plain."""
+    """Take an option, whose value may be the next word; where it isn't plain, False, or ValueError
+    for its value, or StopIteration for none.
+    """
     name, equals, text = word.partition("=")
     if name not in options or (equals and name[:2] != "--"):
         return False
     option, value = options[name]
     if option.kind is FILE or (option.kind is FLAG and equals):
         return False
-    try:
-        given[option.name] = value if option.kind is FLAG else read_value(option, text if equals else next(rest))
-    except StopIteration:
-        return False
+    given[option.name] = value if option.kind is FLAG else read_value(option, text if equals else next(rest))
     return True
 
 
