@@ -12,7 +12,7 @@ import click
 import pytest
 
 from talkcli import errors
-from talkcli.cli import commands, completion, serve, show
+from talkcli.cli import commands, completion, show
 from talkcli.cli.click_app import ClickCommand, talk
 from talkcli.cli.command import ALL_EXIT_CODES
 from talkcli.engine import devices
@@ -112,7 +112,6 @@ def test_every_option_says_what_it_is_for(name: str) -> None:
 
 def test_a_choice_is_one_of_what_there_is() -> None:
     assert tuple(completion.SHELLS) == commands.SHELLS
-    assert tuple(serve.UNITS) == commands.UNITS
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)

@@ -19,11 +19,10 @@ from talkcli.cli.command import MODE, nearest, spelt
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import note, show
 from talkcli.errors import UsageError
-from talkcli.frozen import frozen, replace
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from typing import Any
 
     from talkcli.cli.show import Common
@@ -160,70 +159,10 @@ _SYSTEM_SOCKET_HEAD = """\
 """
 
 
-@frozen
-class Wanted:
-    """What a unit is made from."""
-
-    #: the command that runs `talk`, its program an absolute path
-    program: tuple[str, ...]
-    #: what the program is made of: its script, its interpreter, its package
-    files: tuple[str, ...]
-    #: the options of `serve`, as they were given
-    options: tuple[str, ...]
-    #: the socket that the user named
-    socket: str | None
-    #: the mode of its file, if it was given
-    mode: int | None
-
-
-def _user(wanted: Wanted) -> str:
-    service = _SERVICE.format(
-        order="After=pipewire.service pipewire-pulse.service pulseaudio.service\n",
-        command=_command(wanted),
-        hardening=_USER_HARDENING,
-        target="default.target",
-    )
-    return f"{_USER_HEAD}{service}"
-
-
-def _system(wanted: Wanted) -> str:
-    if wanted.mode is None:
-        wanted = replace(wanted, options=("--socket-mode=0660", *wanted.options))
-    home = "read-only" if any(each.startswith(_HOMES) for each in wanted.files) else "yes"
-    service = _SERVICE.format(
-        order="After=sound.target\n",
-        command=_command(wanted),
-        hardening=_SYSTEM_HARDENING.format(group=GROUP, home=home),
-        target="multi-user.target",
-    )
-    return f"{_SYSTEM_HEAD.format(socket=printable(wanted.socket or paths.SYSTEM_SOCKET), group=GROUP)}{service}"
-
-
-def _user_socket(wanted: Wanted) -> str:
-    path = _place(wanted.socket) if wanted.socket else f"%t/talk/{paths.SOCKET}"
-    mode = 0o600 if wanted.mode is None else wanted.mode
-    return _USER_SOCKET_HEAD + _SOCKET.format(path=path, mode=f"{mode:04o}", extra="DirectoryMode=0700\n")
-
-
-def _system_socket(wanted: Wanted) -> str:
-    path = _place(wanted.socket or paths.SYSTEM_SOCKET)
-    mode = 0o660 if wanted.mode is None else wanted.mode
-    return _SYSTEM_SOCKET_HEAD + _SOCKET.format(
-        path=path, mode=f"{mode:04o}", extra=f"SocketGroup={GROUP}\nDirectoryMode=0755\n"
-    )
-
-
 #: What would end a line of a unit, or is no UTF-8.
 _CONTROLS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
 #: What ProtectHome= hides.
 _HOMES = ("/home/", "/root/", "/run/user/")
-#: What --print-unit prints, by its name.
-UNITS: dict[str, Callable[[Wanted], str]] = {
-    "user": _user,
-    "system": _system,
-    "user-socket": _user_socket,
-    "system-socket": _system_socket,
-}
 
 
 def serve(options: Common, print_unit: str | None, **given: Any) -> int:
@@ -279,13 +218,24 @@ def _warn_of_player(player: str) -> None:
 
 def _print_unit(options: Common, name: str, given: Mapping[str, Any]) -> None:
     """Print the unit of this name; `given`: the options of `serve`. Tell where the system's own user can't run it."""
+    system = name.startswith("system")
     typed = [each for each in COMMANDS["serve"].options if each.name in options.typed and each.name in given]
-    mode = given["socket_mode"] if "socket_mode" in options.typed else None
-    path = os.path.abspath(options.socket) if options.socket else None
+    words = [_written(each, given[each.name]) for each in typed]
+    socket = os.path.abspath(options.socket) if options.socket else None
+    if socket:
+        words.insert(0, f"--socket={socket}")
+    mode = given["socket_mode"]
+    if system and "socket_mode" not in options.typed:
+        mode = 0o660
+        words.insert(0, "--socket-mode=0660")
     program = _program(sys.argv[0])
     files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
-    words = [*([f"--socket={path}"] if path else []), *(_written(each, given[each.name]) for each in typed)]
-    show(UNITS[name](Wanted(program, files, tuple(words), path, mode)).rstrip("\n"))
+    if name.endswith("-socket"):
+        unit = _socket_unit(socket, mode, system=system)
+    else:
+        command = " ".join(map(_quoted, (*program, "serve", *words)))
+        unit = _system_service(command, socket, files) if system else _user_service(command)
+    show(unit.rstrip("\n"))
     hidden = _hidden_from_others(files) if name == "system" else None
     if hidden:
         file, directory = hidden
@@ -294,6 +244,37 @@ def _print_unit(options: Common, name: str, given: Mapping[str, Any]) -> None:
             "it for all, as with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in a "
             "checkout, then print the unit"
         )
+
+
+def _user_service(command: str) -> str:
+    return _USER_HEAD + _SERVICE.format(
+        order="After=pipewire.service pipewire-pulse.service pulseaudio.service\n",
+        command=command,
+        hardening=_USER_HARDENING,
+        target="default.target",
+    )
+
+
+def _system_service(command: str, socket: str | None, files: Sequence[str]) -> str:
+    """Return the unit; `files`: what the program is made of, its script, its interpreter, its package."""
+    home = "read-only" if any(each.startswith(_HOMES) for each in files) else "yes"
+    head = _SYSTEM_HEAD.format(socket=printable(socket or paths.SYSTEM_SOCKET), group=GROUP)
+    return head + _SERVICE.format(
+        order="After=sound.target\n",
+        command=command,
+        hardening=_SYSTEM_HARDENING.format(group=GROUP, home=home),
+        target="multi-user.target",
+    )
+
+
+def _socket_unit(socket: str | None, mode: int, *, system: bool) -> str:
+    if system:
+        head, path = _SYSTEM_SOCKET_HEAD, _place(socket or paths.SYSTEM_SOCKET)
+        extra = f"SocketGroup={GROUP}\nDirectoryMode=0755\n"
+    else:
+        head, path = _USER_SOCKET_HEAD, _place(socket) if socket else f"%t/talk/{paths.SOCKET}"
+        extra = "DirectoryMode=0700\n"
+    return head + _SOCKET.format(path=path, mode=f"{mode:04o}", extra=extra)
 
 
 def _program(started_as: str) -> tuple[str, ...]:
@@ -319,10 +300,6 @@ def _hidden_from_others(files: Sequence[str]) -> tuple[str, str] | None:
             if not os.stat(directory).st_mode & stat.S_IXOTH:
                 return path, directory
     return None
-
-
-def _command(wanted: Wanted) -> str:
-    return " ".join(_quoted(each) for each in (*wanted.program, "serve", *wanted.options))
 
 
 def _quoted(word: str) -> str:
