@@ -26,12 +26,8 @@ if TYPE_CHECKING:
 FILE = Kind("string", (str,), "must be a string")
 MODE = Kind("string", (str,), "must be a string", "MODE")
 
-#: What is said of an empty word: it comes from a variable that isn't set, and selects nothing.
-_EMPTY = "empty; is the variable set that it comes from?"
 #: Stands for what could not be read; the engine takes it for a blank.
 _REPLACEMENT = "\ufffd"
-#: How Python shows the bytes from 0x80 on where they are no UTF-8, in arguments and with `surrogateescape`.
-_FIRST, _LAST = "\udc80", "\udcff"
 
 #: Exit codes of every command that asks the server for something; a command says more of those that mean more to it.
 ASKING: Codes = {
@@ -95,8 +91,8 @@ class Command:
     urgent: bool = False
     #: what is said besides of an option that there isn't
     no_such_option: str = ""
-    #: whether scripts call it all the time: a plain line of it is read without click
-    plain: bool = False
+    #: whether a plain line of it is read without click: scripts call most of them all the time
+    plain: bool = True
     rule: Rule | None = None
 
     def fault(self, given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
@@ -144,14 +140,13 @@ def read_value(option: Option, text: str) -> Any:
         return _number(option, text)
     if kind is MODE:
         return _mode(text)
-    names = kind in (WORD, ID)
-    if names:
+    if kind in (WORD, ID):
         text = _decoded(text)
-    if not text and (names or kind is PATH):
-        raise ValueError(_EMPTY)
-    byte = _unreadable(text) if names else None
-    if byte is not None:
-        raise ValueError(f"the byte 0x{byte:02x} in it is not UTF-8")
+        unreadable = next(filter(_is_byte, text), None)
+        if unreadable:
+            raise ValueError(f"the byte {_byte(unreadable)} in it is not UTF-8")
+    if not text and kind in (WORD, ID, PATH):  # it would select nothing
+        raise ValueError("empty; is the variable set that it comes from?")
     return text
 
 
@@ -191,9 +186,13 @@ def _decoded(text: str) -> str:
     return text.encode(errors="surrogateescape").decode(errors="surrogateescape")
 
 
-def _unreadable(text: str) -> int | None:
-    """Return the first byte of such a text that is no UTF-8, if there is one."""
-    return next((ord(each) - 0xDC00 for each in text if _FIRST <= each <= _LAST), None)
+def _is_byte(character: str) -> bool:
+    """Whether a character stands for a byte that is no UTF-8: from 0x80 on Python shows them so, as `_decoded` does."""
+    return "\udc80" <= character <= "\udcff"
+
+
+def _byte(character: str) -> str:
+    return f"0x{ord(character) - 0xDC00:02x}"
 
 
 def readable(text: str, line: int = 1) -> tuple[str, str | None]:
@@ -202,16 +201,16 @@ def readable(text: str, line: int = 1) -> tuple[str, str | None]:
     `line`: the number of its first line.
     """
     text = _decoded(text)
-    found = [place for place, each in enumerate(text) if _FIRST <= each <= _LAST]
+    found = [place for place, each in enumerate(text) if _is_byte(each)]
     if not found:
         return text, None
     first = found[0]
     line += text.count("\n", 0, first)
     column = first - text.rfind("\n", 0, first)
-    words = f"line {line}, column {column}: the byte 0x{ord(text[first]) - 0xDC00:02x} is not UTF-8, and is not spoken"
+    words = f"line {line}, column {column}: the byte {_byte(text[first])} is not UTF-8, and is not spoken"
     if len(found) > 1:
         words += f" (the first of {len(found):,})"
-    return "".join(_REPLACEMENT if _FIRST <= each <= _LAST else each for each in text), words
+    return "".join(_REPLACEMENT if _is_byte(each) else each for each in text), words
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:

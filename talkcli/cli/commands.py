@@ -143,6 +143,7 @@ _ROWS = (
         units.
         """,
         runs="serve:serve",
+        plain=False,
         examples="""
         talk serve --rate 150
         talk serve --player null       no sound, same timing: for simulation and CI
@@ -192,7 +193,6 @@ _ROWS = (
         options=_SAY,
         argument=Argument("text", "TEXT...", many=True),
         no_such_option="To speak a text that starts with '-', write: talk say -- TEXT",
-        plain=True,
         rule=_say_rule,
     ),
     Command(
@@ -226,7 +226,6 @@ _ROWS = (
             option("-f, --feedback", FLAG, "Show each word as it is heard."),
         ),
         argument=_IDS,
-        plain=True,
     ),
     Command(
         name="cancel",
@@ -250,7 +249,6 @@ _ROWS = (
         },
         options=tuple(each for each in Cancel.options if each.flags),
         argument=_IDS,
-        plain=True,
         urgent=True,
     ),
     Command(
@@ -265,7 +263,6 @@ _ROWS = (
         """,
         exit_codes={**ASKING, 0: "the server runs", 8: "unknown goal"},
         argument=Argument("goal_id", "[ID]", offers="known_ids"),
-        plain=True,
         urgent=True,
     ),
     Command(
@@ -280,6 +277,7 @@ _ROWS = (
         With --json each event is an object a line, words included; the first is {"event": "snapshot", ...}.
         """,
         runs="ask:watch",
+        plain=False,
         examples="""
         talk watch
         ssh robot talk watch
@@ -309,7 +307,6 @@ _ROWS = (
         """,
         exit_codes={**ASKING, 0: "listed"},
         options=(option("-n, --count", INTEGER, "The last N goals that ended.", default=20, limits=(1, MAX_LOG)),),
-        plain=True,
     ),
     Command(
         name="pause",
@@ -326,7 +323,6 @@ _ROWS = (
             0: "speech is held, and it is silent",
             1: "speech is held, but that it is silent was not known within 2 seconds",
         },
-        plain=True,
     ),
     Command(
         name="resume",
@@ -335,7 +331,6 @@ _ROWS = (
         runs="ask:resume",
         examples="talk resume",
         exit_codes={**ASKING, 0: "speech goes on"},
-        plain=True,
     ),
     Command(
         name="set",
@@ -358,7 +353,6 @@ _ROWS = (
             2: "usage: a value out of its range, or an unknown voice; nothing was changed",
         },
         options=tuple(each.to_set() for each in SETTINGS),
-        plain=True,
     ),
     Command(
         name="voices",
@@ -376,7 +370,6 @@ _ROWS = (
         """,
         exit_codes={**ASKING, 0: "listed", 1: "no voice speaks that language, or the engine can't list them"},
         options=(option("--language", TEXT, "Only this language, with its variants: en, pt-br.", metavar="CODE"),),
-        plain=True,
     ),
     Command(
         name="doctor",
@@ -390,6 +383,7 @@ _ROWS = (
         and none is in the log.
         """,
         runs="doctor:doctor",
+        plain=False,
         examples="""
         talk doctor
         talk doctor --silent                    at night: all of it, without a sound
@@ -415,6 +409,7 @@ _ROWS = (
         voices.
         """,
         runs="completion:completion",
+        plain=False,
         examples="""
         eval "$(talk completion bash)"   the last line of ~/.bashrc
         eval "$(talk completion zsh)"    the last line of ~/.zshrc
