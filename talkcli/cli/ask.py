@@ -11,6 +11,7 @@ from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_json
 from talkcli.errors import EXIT_SIGPIPE, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.protocol.replies import Canceled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from talkcli.cli.show import Common
     from talkcli.client.client import Client
     from talkcli.goals.goal import Goal, JsonObject
-    from talkcli.protocol.replies import Canceled
-
 #: Characters of what was heard last that are shown of a goal that is held.
 _MAX_SPOKEN = 40
 
@@ -34,8 +33,6 @@ def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | N
             if key and not done.canceled and not options.quiet and sys.stderr and sys.stderr.isatty():
                 _suggest_key(key, client)
         except UnknownGoal as error:
-            from talkcli.protocol.replies import Canceled
-
             _show_canceled(Canceled.from_items(error.items), options)
             raise
 

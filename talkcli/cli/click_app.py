@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from click.shell_completion import CompletionItem
 
-    from talkcli.cli.command import Argument, Codes, Command
+    from talkcli.cli.command import Codes, Command
     from talkcli.goals.option import Option
 
 _EXAMPLES = """
@@ -96,10 +96,10 @@ def _type(option: Option) -> Any:
     return click.Path(dir_okay=False) if option.kind is FILE else _Value(option)
 
 
-def _argument(argument: Argument) -> click.Argument:
+def _argument(argument: Option) -> click.Argument:
     return click.Argument(
         [argument.name],
-        nargs=-1 if argument.many else 1,
+        nargs=-1 if argument.metavar.endswith("...") else 1,
         required=bool(argument.choices),
         type=click.Choice(argument.choices) if argument.choices else None,
         metavar=argument.metavar,
@@ -293,11 +293,8 @@ def _show_click_error(error: click.ClickException, *, json: bool) -> None:
     from talkcli.terminal.text import printable
 
     words = printable(_what_is_wrong(error))
-    if json:
-        show_error(UsageError(words), json=True)
-        return
-    note(words)
-    if "--help" not in words:
+    show_error(UsageError(words), json=json)
+    if not json and "--help" not in words:
         context = getattr(error, "ctx", None)
         note(f"see '{context.command_path if context else 'talk'} --help'")
 

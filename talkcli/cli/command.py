@@ -26,9 +26,6 @@ if TYPE_CHECKING:
 FILE = Kind("string", (str,), "must be a string")
 MODE = Kind("string", (str,), "must be a string", "MODE")
 
-#: Stands for what could not be read; the engine takes it for a blank.
-_REPLACEMENT = "\ufffd"
-
 #: Exit codes of every command that asks the server for something; a command says more of those that mean more to it.
 ASKING: Codes = {
     1: "anything not named here; a bug says so",
@@ -58,19 +55,6 @@ ALL_EXIT_CODES: Codes = {
 
 
 @frozen
-class Argument:
-    """What a command takes besides options."""
-
-    name: str
-    metavar: str
-    #: whether it takes any number of words
-    many: bool = False
-    offers: str = ""
-    #: the only values that there are; one of them must be given
-    choices: tuple[str, ...] = ()
-
-
-@frozen
 class Command:
     """A command."""
 
@@ -86,7 +70,8 @@ class Command:
     #: what each exit code means after this command
     exit_codes: Codes
     options: tuple[Option, ...] = ()
-    argument: Argument | None = None
+    #: what it takes besides options; any number of words, where its metavar ends with dots
+    argument: Option | None = None
     #: whether it finds a place where a server is full
     urgent: bool = False
     #: what is said besides of an option that there isn't
@@ -200,6 +185,8 @@ def readable(text: str, line: int = 1) -> tuple[str, str | None]:
 
     `line`: the number of its first line.
     """
+    if text.isascii():
+        return text, None
     text = _decoded(text)
     found = [place for place, each in enumerate(text) if _is_byte(each)]
     if not found:
@@ -210,7 +197,7 @@ def readable(text: str, line: int = 1) -> tuple[str, str | None]:
     words = f"line {line}, column {column}: the byte {_byte(text[first])} is not UTF-8, and is not spoken"
     if len(found) > 1:
         words += f" (the first of {len(found):,})"
-    return "".join(_REPLACEMENT if _is_byte(each) else each for each in text), words
+    return "".join("\ufffd" if _is_byte(each) else each for each in text), words  # the engine takes it for a blank
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:

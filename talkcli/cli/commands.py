@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 
-from talkcli.cli.command import ASKING, FILE, MODE, Argument, Command, option, spelt
+from talkcli.cli.command import ASKING, FILE, MODE, Command, option, spelt
 from talkcli.frozen import TYPE_CHECKING, replace
-from talkcli.goals.option import FLAG, IDS, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
+from talkcli.goals.option import FLAG, ID, IDS, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
 from talkcli.goals.options import MAX_CHARACTERS, MAX_LEAD_IN, OPTIONS, SETTINGS, SOUND, Cancel
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def _serve_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
     return None
 
 
-_IDS = Argument("ids", IDS.metavar, many=True, offers="goal_ids")
+_IDS = Option("ids", IDS, metavar=IDS.metavar, offers="goal_ids")
 
 #: The commands, in the order in which help lists them: what a newcomer needs first comes first.
 _ROWS = (
@@ -191,7 +191,7 @@ _ROWS = (
             "128+n": "ended by signal n, and cancelled; 141: whoever read its output went away while it waited",
         },
         options=_SAY,
-        argument=Argument("text", "TEXT...", many=True),
+        argument=Option("text", TEXT, metavar="TEXT..."),
         no_such_option="To speak a text that starts with '-', write: talk say -- TEXT",
         rule=_say_rule,
     ),
@@ -262,7 +262,7 @@ _ROWS = (
         talk --json status | jq .active.text
         """,
         exit_codes={**ASKING, 0: "the server runs", 8: "unknown goal"},
-        argument=Argument("goal_id", "[ID]", offers="known_ids"),
+        argument=Option("goal_id", ID, metavar="[ID]", offers="known_ids"),
         urgent=True,
     ),
     Command(
@@ -420,7 +420,7 @@ _ROWS = (
             1: "anything not named here; a bug says so",
             2: "usage: a shell that there is no script for",
         },
-        argument=Argument("shell", "SHELL", choices=SHELLS),
+        argument=Option("shell", WORD, metavar="SHELL", choices=SHELLS),
     ),
 )
 COMMANDS = {each.name: each for each in _ROWS}

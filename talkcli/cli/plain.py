@@ -117,9 +117,10 @@ def _complete(
             given[option.name] = read_value(option, text) if text else option.default
     argument = command.argument
     if argument:
-        if len(words) > 1 and not argument.many:
+        many = argument.metavar.endswith("...")
+        if len(words) > 1 and not many:
             return None
-        given[argument.name] = tuple(words) if argument.many else next(iter(words), None)
+        given[argument.name] = tuple(words) if many else next(iter(words), None)
     elif words:
         return None
     return None if command.fault(given, typed) else Plain(command, given, common, typed)

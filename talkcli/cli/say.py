@@ -37,6 +37,7 @@ from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import SOUND
 from talkcli.goals.states import State
+from talkcli.protocol.events import Result
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -130,9 +131,7 @@ def _readable(text: str, options: Common) -> str:
 
 
 def _refuse(goal: Goal, options: Common, shown: Feedback) -> int:
-    """Tell of a goal that is REJECTED before it is sent, as if a server had done so, and return the exit code."""
-    from talkcli.protocol.events import Result
-
+    """Tell of a goal that is REJECTED, be it before it is sent, and return the exit code."""
     if options.json:
         regardless(show_if_possible, shown.show, goal, Result(goal))
     return regardless(report, goal, options, shown)
@@ -141,18 +140,13 @@ def _refuse(goal: Goal, options: Common, shown: Feedback) -> int:
 def _tell(goal: GoalHandle, options: Common, shown: Feedback) -> int:
     """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
     if goal.state is State.REJECTED:
-        if options.json:
-            until_ended(goal, None, shown)
-        code = report(goal.goal, options, shown)
+        code = _refuse(goal.goal, options, shown)
         if goal.goal.reason == "text_too_long" and not options.quiet:
             note("'talk say --lines' speaks standard input line by line, each line a goal of its own")
         return code
     _introduce(goal, options, shown)
-    if goal.state.terminal:
-        return report(goal.goal, options, shown)
-    if options.json:
-        show_if_possible(show_json, goal.goal.to_json())
-    return EXIT_OK
+    code = report(goal.goal, options, shown)
+    return code if goal.state.terminal else EXIT_OK
 
 
 def _introduce(goal: GoalHandle, options: Common, shown: Feedback) -> None:
