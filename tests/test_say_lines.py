@@ -65,7 +65,8 @@ class Typing:
 
 
 def test_each_line_is_a_goal_and_its_id_is_printed(scripted: Talk) -> None:
-    done = scripted.run("say", "--lines", stdin="length=0 one\n\n   \nlength=0 two\r\nlength=0 -x 日本\nlength=0 last")
+    lines = "length=0 one\n\n   \n\u3000\nlength=0 two\r\nlength=0 -x 日本\nlength=0 last"
+    done = scripted.run("say", "--lines", stdin=lines)
     assert (done.code, done.err) == (0, "")
     ids = done.out.split()
     assert len(ids) == 4

@@ -178,14 +178,13 @@ class _Lines:
 
     def _send_all(self) -> None:
         for number, line in enumerate(_lines(self._interrupts.watched), start=1):
-            if not isinstance(line, Cut) and not line.strip():
-                continue
             self._sending = number
+            text = _decoded(line)
             if isinstance(line, Cut):
                 words = f"the line has {line.size:,} bytes, the longest text allowed has {MAX_BYTES:,}"
                 self._refuse(number, rejected(words))
-            else:
-                text, unreadable = readable(_decoded(line), number)
+            elif text.strip():
+                text, unreadable = readable(text, number)
                 if unreadable and not self._options.quiet:
                     self._shown.aside(unreadable)
                 self._send(number, text)
