@@ -59,14 +59,13 @@ class _Value(click.FloatRange):
         try:
             return read_value(self._option, str(value))
         except ValueError as error:
-            raise click.BadParameter(str(error), ctx, param, self._came_from(ctx)) from error
-
-    def _came_from(self, ctx: click.Context | None) -> str | None:
-        """Return where a value came from, the option or a variable; None for a number: click's own words say it."""
-        if self._option.kind in (INTEGER, NUMBER, SECONDS):
-            return None
-        typed = ctx and ctx.get_parameter_source(self._option.name) is not ParameterSource.ENVIRONMENT
-        return spelt(self._option) if typed else f"{self._option.env} in the environment"
+            if self._option.kind in (INTEGER, NUMBER, SECONDS):
+                came_from = None  # click's own words say it
+            elif ctx and ctx.get_parameter_source(self._option.name) is not ParameterSource.ENVIRONMENT:
+                came_from = spelt(self._option)
+            else:
+                came_from = f"{self._option.env} in the environment"
+            raise click.BadParameter(str(error), ctx, param, came_from) from error
 
     def _describe_range(self) -> str:
         return limits(self._option)
@@ -270,8 +269,15 @@ def _main(arguments: list[str], options: Common) -> object:
         end_line()  # that the terminal has shown ^C on
         raise
     except click.ClickException as error:
+        from talkcli.terminal.text import printable
+
         # The options may not have been read as far as --json when the error was found.
-        _show_click_error(error, json=options.json or "--json" in arguments)
+        json = options.json or "--json" in arguments
+        words = printable(_what_is_wrong(error))  # what was typed may be text of somebody else's
+        show_error(UsageError(words), json=json)
+        if not json and "--help" not in words:
+            found = getattr(error, "ctx", None)
+            note(f"see '{found.command_path if found else 'talk'} --help'")
         return error.exit_code
 
 
@@ -286,17 +292,6 @@ def _complete(options: Common) -> int:
         if os.environ.get("TALK_DEBUG"):
             raise
     return EXIT_ERROR
-
-
-def _show_click_error(error: click.ClickException, *, json: bool) -> None:
-    """Show a usage error. What was typed may be text of somebody else's, so its controls are escaped."""
-    from talkcli.terminal.text import printable
-
-    words = printable(_what_is_wrong(error))
-    show_error(UsageError(words), json=json)
-    if not json and "--help" not in words:
-        context = getattr(error, "ctx", None)
-        note(f"see '{context.command_path if context else 'talk'} --help'")
 
 
 def _write_lines(text: str, formatter: click.HelpFormatter) -> None:
