@@ -55,7 +55,7 @@ def read(arguments: list[str], environment: Mapping[str, str]) -> Plain | None:
     """Return what a command line says; None where click has to read it."""
     try:
         return _read(arguments, environment)
-    except (ValueError, StopIteration):
+    except (ValueError, StopIteration):  # an option's value is none, or is missing
         return None
 
 
@@ -67,18 +67,16 @@ def _read(arguments: list[str], environment: Mapping[str, str]) -> Plain | None:
     for word in rest:
         if command is None and word in COMMANDS:
             command = COMMANDS[word]
-            if not command.plain:
-                return None
             options |= _spellings(command.options)
         elif word == "--" and command:
             words += rest
         elif word[:1] != "-" or word == "-":
-            if command is None:
-                return None
             words.append(word)
         elif not _take(options, word, rest, given):
             return None
-    return None if command is None else _complete(command, given, words, environment)
+        if command is None and words:
+            return None
+    return _complete(command, given, words, environment) if command and command.plain else None
 
 
 def _spellings(options: Iterable[Option]) -> Spellings:
@@ -92,9 +90,7 @@ def _spellings(options: Iterable[Option]) -> Spellings:
 
 
 def _take(options: Spellings, word: str, rest: Iterator[str], given: dict[str, Any]) -> bool:
-    """Take an option, whose value may be the next word; where it isn't plain, False, or ValueError
-    for its value, or StopIteration for none.
-    """
+    """Take an option, whose value may be the next word; False where it isn't plain."""
     name, equals, text = word.partition("=")
     if name not in options or (equals and name[:2] != "--"):
         return False
