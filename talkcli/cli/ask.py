@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from talkcli.cli.show import Common
     from talkcli.client.client import Client
     from talkcli.goals.goal import Goal, JsonObject
+
 #: Characters of what was heard last that are shown of a goal that is held.
 _MAX_SPOKEN = 40
 

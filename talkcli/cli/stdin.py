@@ -130,6 +130,9 @@ def say_lines(
         try:
             with options.connect(name=name, interrupt=interrupts.watched, patience=patience) as client:
                 return _Lines(client, interrupts, options, chosen, wait, shown).run()
+        except Interrupted:
+            interrupts.look()  # while standard output is what it was
+            raise
         finally:
             regardless(shown.close)
     return interrupts.exit_code
