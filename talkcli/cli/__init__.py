@@ -46,15 +46,9 @@ def _run_plain(arguments: list[str]) -> int | None:
 
 
 def _run_by_click(arguments: list[str]) -> int:
-    import _signal
-
     from talkcli.cli.click_app import run as run_by_click
-    from talkcli.cli.show import Common
 
-    # Whoever started this may ignore it, and then no process that is started here leaves an exit status.
-    _signal.signal(_signal.SIGCHLD, _signal.SIG_DFL)
-
-    return run_by_click(arguments, Common())
+    return run_by_click(arguments)
 
 
 def _prepare_streams() -> None:

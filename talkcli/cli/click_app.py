@@ -5,6 +5,7 @@ What carries a command out is imported when it is run, so that no command pays f
 
 from __future__ import annotations
 
+import _signal
 import os
 import re
 from inspect import cleandoc
@@ -254,8 +255,11 @@ def _first_screen(context: click.Context) -> str:
     return formatter.getvalue()
 
 
-def run(arguments: list[str], options: Common) -> int:
+def run(arguments: list[str]) -> int:
     """Run a command line, or answer a shell that asks for completion, and return the exit code."""
+    # Whoever started this may ignore it, and then no process that is started here leaves an exit status.
+    _signal.signal(_signal.SIGCHLD, _signal.SIG_DFL)
+    options = Common()
     return _complete(options) if "_TALK_COMPLETE" in os.environ else ended(lambda: _main(arguments, options), options)
 
 
