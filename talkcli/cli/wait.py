@@ -9,14 +9,7 @@ from __future__ import annotations
 import time
 
 from talkcli.cli.interrupts import Interrupts, give_up_unread
-from talkcli.cli.show import (
-    Feedback,
-    give_up_failed,
-    give_up_output,
-    note,
-    reader_is_gone,
-    show_json,
-)
+from talkcli.cli.show import Feedback, give_up_failed, give_up_output, note, reader_is_gone, show_json
 from talkcli.client.connect import ANSWER_LIMIT, Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.frozen import TYPE_CHECKING
