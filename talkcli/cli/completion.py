@@ -39,6 +39,7 @@ PATIENCE = 0.5
 _ENDED = 100
 #: Characters of a text that stand beside an id.
 _MAX_TEXT = 60
+
 _BASH = """\
 %(complete_func)s() {
     local IFS=$'\\n' program=$1 line
