@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.terminal.highlight import MORE, Sentence, View
-from talkcli.terminal.text import printable, width
+from talkcli.terminal.text import MORE, Sentence, View, printable, width
 
 LONG = "the quick brown fox jumps over the lazy dog"
 #: Plain, wide, combining, joined, escaped: what widths go wrong with.

@@ -16,8 +16,7 @@ from talkcli.client.connect import ready
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
-from talkcli.terminal.highlight import Sentence
-from talkcli.terminal.text import Screen, printable
+from talkcli.terminal.text import Screen, Sentence, printable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
