@@ -17,7 +17,7 @@ import espeakng_loader
 import pytest
 
 import talkcli
-from talkcli.doctor import examine, programs
+from talkcli.doctor import examine, sound
 from talkcli.doctor.report import heard
 from tests.conformance.bareserve import TALK, environment, serving
 from tests.faults.broken import python_path, write
@@ -281,17 +281,17 @@ def test_an_unknown_voice_is_named(home: str) -> None:
     assert 'unknown voice "klingon-7"' in found["voices"]["message"]
 
 
-@pytest.mark.parametrize("limit", [0.3, pytest.param(programs.LIMIT, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("limit", [0.3, pytest.param(sound.LIMIT, marks=pytest.mark.slow)])
 def test_programs_that_hang_delay_it_and_no_more(home: str, monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
     for name in ("pactl", "aplay", "pw-cli"):
         write(Path(home, "run", name), "#!/bin/sh\nexec sleep 98\n", 0o755)
     env = environment(home, TALK_SOCKET=f"{home}/s")
     env["PATH"] = f"{home}/run:{env['PATH']}"
     began = time.monotonic()
-    if limit == programs.LIMIT:
+    if limit == sound.LIMIT:
         found = doctor(env)
     else:
-        monkeypatch.setattr(programs, "LIMIT", limit)
+        monkeypatch.setattr(sound, "LIMIT", limit)
         monkeypatch.setattr(examine, "LIMIT", 2 * limit)
         found = within(env, monkeypatch)
     assert time.monotonic() - began < LIMIT / 2

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.doctor import machine, programs, sound
+from talkcli.doctor import machine, sound
 from talkcli.doctor.machine import Cards, Session
 from talkcli.doctor.sound import SoundServer
 from tests.faults.broken import write
@@ -40,22 +40,22 @@ def env_with(directory: Path, **scripts: str) -> dict[str, str]:
 
 def test_what_a_program_says_is_kept_and_its_complaint_is_one_line(tmp_path: Path) -> None:
     env = env_with(tmp_path, good='echo out; echo "$LC_ALL"', bad="echo; echo 'first line' >&2; echo more >&2; exit 3")
-    good, bad = programs.said("good", env=env), programs.said("bad", env=env)
+    good, bad = sound.asked("good", env=env), sound.asked("bad", env=env)
     assert (good.well, good.out) == (True, "out\nC\n")
     assert (bad.well, bad.code, bad.complaint) == (False, 3, "first line")
-    assert programs.said("missing", env=env) == programs.Said(None)
+    assert sound.asked("missing", env=env) == sound.Said(None)
     write(tmp_path / "broken", "#!/no/such/interpreter\n", 0o755)
-    assert "No such file" in programs.said("broken", env=env).err
+    assert "No such file" in sound.asked("broken", env=env).err
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
 def test_a_program_that_hangs_is_killed_with_all_that_it_has_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(programs, "LIMIT", 0.3)
+    monkeypatch.setattr(sound, "LIMIT", 0.3)
     env = env_with(tmp_path, hangs=f"/bin/sleep 98 & echo $! > {tmp_path}/pid; /bin/sleep 98")
     began = time.monotonic()
-    said = programs.said("hangs", env=env)
+    said = sound.asked("hangs", env=env)
     assert said.late
     assert not said.well
     assert time.monotonic() - began < 20
@@ -68,7 +68,7 @@ def test_a_program_that_hangs_is_killed_with_all_that_it_has_started(
 
 def test_a_program_that_leaves_a_child_with_its_output_is_not_waited_for(tmp_path: Path) -> None:
     began = time.monotonic()
-    said = programs.said("leaves", env=env_with(tmp_path, leaves="echo out; /bin/sleep 2.7 &"))
+    said = sound.asked("leaves", env=env_with(tmp_path, leaves="echo out; /bin/sleep 2.7 &"))
     assert (said.out, said.late) == ("out\n", False)
     assert time.monotonic() - began < 2.7
 
@@ -96,7 +96,7 @@ def test_devices_are_named_as_their_player_names_them(tmp_path: Path) -> None:
 
 
 def test_devices_that_cannot_be_listed_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(programs, "LIMIT", 0.3)
+    monkeypatch.setattr(sound, "LIMIT", 0.3)
     env = env_with(tmp_path, aplay="exec /bin/sleep 98", pactl="echo Connection refused >&2; exit 1")
     troubles = [each.trouble for player in ("aplay", "pacat", "pw-cat") if (each := sound.devices(env, player, None))]
     assert troubles == ["no answer within 0.3 s", "Connection refused", "pw-cli is not there"]

@@ -1,16 +1,22 @@
 """What makes a sound of samples: players, devices, sound servers, and how loud the output is.
 
-Programs of others tell it; asking wakes no device. Only a sentence proves that there is sound: what may be in its way
+Programs of others tell it, each with a limit of time and of output: one that is missing or hangs is an answer, too.
+Asking wakes no device. Only a sentence proves that there is sound: what may be in its way
 is a warning here. Without a player it is certain.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
 import shlex
+import shutil
+import signal
+import subprocess
+import tempfile
 from typing import TYPE_CHECKING
 
-from talkcli.doctor import programs
 from talkcli.doctor.machine import judge_cards, seen_from
 from talkcli.doctor.report import Finding, done, failed, some, warning
 from talkcli.engine.devices import sound_servers
@@ -35,6 +41,34 @@ _LOUDNESS = "loudness"
 _FAINT = 20
 #: ALSA's controls that a loudspeaker hangs on, as `amixer scontrols` names them.
 _CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
+
+
+#: Seconds that a program may take. All of them answer within milliseconds, or wait for a sound server that hangs.
+LIMIT = 3.0
+#: Bytes of its output that are read: the devices of a large machine take a tenth.
+_MOST = 64 * 1024
+
+
+@frozen
+class Said:
+    """What a program said."""
+
+    #: its exit status; None where it is not there, cannot be run, or took too long
+    code: int | None
+    out: str = ""
+    err: str = ""
+    #: whether it took too long
+    late: bool = False
+
+    @property
+    def well(self) -> bool:
+        return self.code == 0
+
+    @property
+    def complaint(self) -> str:
+        """The line that says why it failed: the first one that it wrote to standard error."""
+        lines = [line.strip() for line in (self.err or self.out).splitlines() if line.strip()]
+        return lines[0] if lines else "it said nothing"
 
 
 @frozen
@@ -98,6 +132,51 @@ class Level:
     louder: str
 
 
+def path_of(program: str, env: Mapping[str, str]) -> str | None:
+    """Return where a program is on the PATH of an environment; None where it is not."""
+    return shutil.which(program, path=env.get("PATH", os.defpath))
+
+
+def asked(program: str, *words: str, env: Mapping[str, str]) -> Said:
+    """Run a program to its end, in its own language, and return what it said."""
+    path = path_of(program, env)
+    if path is None:
+        return Said(None)
+    # Files, not pipes: what a program leaves running behind it would hold a pipe open.
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        try:
+            process = subprocess.Popen(
+                [path, *words],
+                env={**env, "LC_ALL": "C"},
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                start_new_session=True,
+            )
+        except OSError as error:
+            return Said(None, err=str(error))
+        try:
+            code = process.wait(LIMIT)
+        except subprocess.TimeoutExpired:
+            code = None
+        finally:
+            _end(process)
+        return Said(code, _read(out.fileno()), _read(err.fileno()), late=code is None)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.returncode is None:
+        # Its group is its own, and it is not reaped: nobody else can be hit.
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+        with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs in a driver: init will reap it
+            process.wait(1)
+
+
+def _read(descriptor: int) -> str:
+    return os.pread(descriptor, _MOST, 0).decode("utf-8", "replace")
+
+
 def is_silent(player: str | None) -> bool:
     """Tell whether a player makes no sound by its nature."""
     return player is not None and (player == SILENT or player.startswith(FILE))
@@ -119,11 +198,11 @@ def program_of(command: str) -> str | None:
 
 def players(env: Mapping[str, str], wanted: str | None, by: str | None) -> Players:
     """Return which players there are; `wanted`: the setting, `by` whom it is."""
-    found = tuple(each for each in PACKAGES if programs.path_of(each, env))
+    found = tuple(each for each in PACKAGES if path_of(each, env))
     runs = True
     if wanted is not None and not is_silent(wanted):
         program = program_of(wanted)
-        runs = bool(program and programs.path_of(program, env))
+        runs = bool(program and path_of(program, env))
     return Players(found, wanted, by, runs)
 
 
@@ -133,25 +212,25 @@ def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> D
         return None
     command, names = _LISTING[player]
     program, *words = command.split()
-    said = programs.said(program, *words, env=env)
-    return Devices(command, tuple(names(said)), None if said.well else _trouble(program, said), wanted)
+    found = asked(program, *words, env=env)
+    return Devices(command, tuple(names(found)), None if found.well else _trouble(program, found), wanted)
 
 
-def _alsa_names(said: programs.Said) -> list[str]:
+def _alsa_names(said: Said) -> list[str]:
     return [each for each in said.out.splitlines() if each and not each[0].isspace() and each not in _NO_DEVICES]
 
 
-def _sinks(said: programs.Said) -> list[tuple[str, str]]:
+def _sinks(said: Said) -> list[tuple[str, str]]:
     """Return names and states of the sinks: number, name, module, format, state, with tabs between them."""
     lines = [each.split("\t") for each in said.out.splitlines()]
     return [(each[1], each[-1].strip()) for each in lines if said.well and len(each) > 2]
 
 
-def _sink_names(said: programs.Said) -> list[str]:
+def _sink_names(said: Said) -> list[str]:
     return [name for name, _ in _sinks(said)]
 
 
-def _node_names(said: programs.Said) -> list[str]:
+def _node_names(said: Said) -> list[str]:
     nodes = re.split(r"^\s*id \d+,", said.out, flags=re.MULTILINE)
     found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
     return [each[1] for each in found if each]
@@ -159,38 +238,38 @@ def _node_names(said: programs.Said) -> list[str]:
 
 _SINKS = "pactl list short sinks"
 #: How the devices of a player are listed, and read from what that says.
-_LISTING: dict[str | None, tuple[str, Callable[[programs.Said], list[str]]]] = {
+_LISTING: dict[str | None, tuple[str, Callable[[Said], list[str]]]] = {
     "aplay": ("aplay -L", _alsa_names),
     "pacat": (_SINKS, _sink_names),
     "pw-cat": ("pw-cli ls Node", _node_names),
 }
 
 
-def _trouble(program: str, said: programs.Said) -> str:
+def _trouble(program: str, said: Said) -> str:
     if said.late:
-        return f"no answer within {programs.LIMIT:g} s"
+        return f"no answer within {LIMIT:g} s"
     return f"{program} is not there" if said.code is None and not said.err else said.complaint
 
 
 def suspended(env: Mapping[str, str]) -> tuple[str, ...]:
     """Return the sinks that take no data; while nothing plays, those that are asleep, too."""
-    said = programs.said(*_SINKS.split(), env=env)
-    return tuple(name for name, state in _sinks(said) if state == "SUSPENDED")
+    found = asked(*_SINKS.split(), env=env)
+    return tuple(name for name, state in _sinks(found) if state == "SUSPENDED")
 
 
 def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
     """Return the sound server that a player of this session finds."""
     named = env.get("PULSE_SERVER") or None
     sockets = tuple(sound_servers(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else [])))
-    pulse = programs.said("pactl", "info", env=env)
+    pulse = asked("pactl", "info", env=env)
     if pulse.well:
         name = _field(pulse.out, "Server Name") or "PulseAudio"
         return SoundServer(name=name, sink=_field(pulse.out, "Default Sink"), sockets=sockets, named=named)
-    wire = programs.Said(None) if pulse.late else programs.said("pw-cli", "info", "0", env=env)
+    wire = Said(None) if pulse.late else asked("pw-cli", "info", "0", env=env)
     if wire.well:
         return SoundServer(name="PipeWire, without its PulseAudio part", sockets=sockets, named=named)
-    askable = any(programs.path_of(each, env) for each in ("pactl", "pw-cli"))
-    trouble = _trouble("pactl", pulse) if programs.path_of("pactl", env) else _trouble("pw-cli", wire)
+    askable = any(path_of(each, env) for each in ("pactl", "pw-cli"))
+    trouble = _trouble("pactl", pulse) if path_of("pactl", env) else _trouble("pw-cli", wire)
     return SoundServer(sockets=sockets, trouble=trouble, hangs=pulse.late or wire.late, askable=askable, named=named)
 
 
@@ -204,18 +283,18 @@ def levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> tuple[L
     if server.hangs:
         return ()
     if server.name is not None:
-        mute = programs.said("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
+        mute = asked("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.well:
-            volume = programs.said("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
+            volume = asked("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
             return (level_of_pactl(mute.out, volume.out),)
-        whole = programs.said("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
+        whole = asked("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
         return (level_of_wpctl(whole.out),) if whole.well else ()
     if not cards.names:
         return ()
-    controls = programs.said("amixer", "scontrols", env=env)
+    controls = asked("amixer", "scontrols", env=env)
     names = re.findall(r"control '([^']*)'", controls.out)
-    asked = [(each, programs.said("amixer", "sget", each, env=env)) for each in _CONTROLS if each in names]
-    return tuple(level_of_amixer(name, said.out) for name, said in asked if said.well)
+    told = [(each, asked("amixer", "sget", each, env=env)) for each in _CONTROLS if each in names]
+    return tuple(level_of_amixer(name, said.out) for name, said in told if said.well)
 
 
 def level_of_pactl(mute: str, volume: str) -> Level:
