@@ -187,10 +187,10 @@ class _Line:
         head = f"{printable(self.goal.id)}  {name:<9}  "
         if room - len(head) < _LEAST_TEXT:
             head = ""
-        view = self.sentence.view(*self.word, room - len(head))
+        heard, word, ahead = self.sentence.view(*self.word, room - len(head))
         head = head.replace(name, Screen(colour=True).painted(name, self.state), 1) if head else ""
-        lit = f"{_LIT}{view.word}{_PLAIN}" if view.word else ""
-        return f"{_AGAIN}{head}{view.heard}{lit}{_AHEAD}{view.ahead}{_PLAIN}"
+        lit = f"{_LIT}{word}{_PLAIN}" if word else ""
+        return f"{_AGAIN}{head}{heard}{lit}{_AHEAD}{ahead}{_PLAIN}"
 
 
 def _is_spoken(event: Event) -> bool:

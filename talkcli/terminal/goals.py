@@ -12,7 +12,7 @@ import time
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
-from talkcli.terminal.text import GAP, LONGEST_ID, Screen, cut, fitted, folded, id_room, pad, printable, width, wrapped
+from talkcli.terminal.text import GAP, LONGEST_ID, Screen, cut, fitted, folded, id_room, pad, printable, width
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -56,7 +56,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float | None = None) -> list[str
         ("priority", str(goal.priority)),
         ("key", goal.key and f'"{printable(goal.key)}"'),
         ("ttl", _ttl(goal, now)),
-        ("data", None if goal.data is None else printable(_json(goal.data))),
+        ("data", None if goal.data is None else printable(encode(goal.data).decode().rstrip("\n"))),
         ("queued", _moment(goal.queued_at)),
         ("started", _moment(goal.started_at)),
         ("ended at", _moment(goal.ended_at)),
@@ -67,7 +67,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float | None = None) -> list[str
         line
         for name, value in rows
         if value
-        for line in folded(value, f"{name:<{_LABEL}}", Screen() if name == "data" else screen)
+        for line in folded(value.split(" "), f"{name:<{_LABEL}}", Screen() if name == "data" else screen)
     ]
 
 
@@ -81,17 +81,17 @@ def status_lines(status: ServerStatus, screen: Screen, now: float | None = None)
         f"up {span(float(uptime) if isinstance(uptime, int | float) else 0.0)}",
         f"{_field(server, 'clients')} of {_field(server, 'max_clients')} clients",
     ]
-    lines = wrapped(about, f"{'server':<{_LABEL}}", screen)
-    lines += wrapped(_engine(server), f"{'engine':<{_LABEL}}", screen)
-    lines += wrapped(_settings(server), f"{'settings':<{_LABEL}}", screen)
+    lines = []
+    for label, parts in (("server", about), ("engine", _engine(server)), ("settings", _settings(server))):
+        lines += folded([*(f"{each}," for each in parts[:-1]), parts[-1]], f"{label:<{_LABEL}}", screen)
     if server.get("paused"):
         lines.append(f"{'paused':<{_LABEL}}{screen.painted('speech is held', State.PREEMPTING)}: talk resume")
-    goals = [*([status.active] if status.active else []), *status.pending, *status.recent]
-    widest = max((width(printable(goal.id)) for goal in goals), default=0)
-    table = _Table(screen, now, min(widest, id_room(screen) or LONGEST_ID))
-    lines += table.rows("now", [status.active] if status.active else [], "silent")
-    lines += table.rows("queue", status.pending, "nothing")
-    lines += table.rows("said", status.recent, "nothing")
+    active = [status.active] if status.active else []
+    tables = (("now", active, "silent"), ("queue", status.pending, "nothing"), ("said", status.recent, "nothing"))
+    widest = max((width(printable(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
+    id_columns = min(widest, id_room(screen) or LONGEST_ID)
+    for label, goals, without in tables:
+        lines += _table(label, goals, id_columns, screen, now) if goals else [f"{label:<{_LABEL}}{without}"]
     return lines
 
 
@@ -119,41 +119,33 @@ def span(seconds: float) -> str:
     return f"{whole} s"
 
 
-class _Table:
-    """The goals in a status: each on a line, that fits the terminal."""
+def _table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
+    """Return a line for each goal in a status, that fits the terminal."""
+    heads = [
+        f"{'' if number else label:<{_LABEL}}{_head(goal, id_columns, screen)}" for number, goal in enumerate(goals)
+    ]
+    tails = [_tails(goal, now) for goal in goals]
+    texts = [quoted(goal, MAX_TEXT) for goal in goals]
+    room = screen.room(max(map(width, heads)))
+    if room is None:
+        return [GAP.join([head + text, *tail[:1]]) for head, text, tail in zip(heads, texts, tails, strict=True)]
+    said = fitted(texts, [tail or [""] for tail in tails], weights=(1, 1), room=room)
+    return [head + words for head, words in zip(heads, said, strict=True)]
 
-    def __init__(self, screen: Screen, now: float, id_columns: int) -> None:
-        self._screen = screen
-        self._now = now
-        self._id_columns = id_columns
 
-    def rows(self, label: str, goals: Sequence[Goal], without: str) -> list[str]:
-        """Return a line for each goal, or the one word where there is none."""
-        if not goals:
-            return [f"{label:<{_LABEL}}{without}"]
-        heads = [f"{'' if number else label:<{_LABEL}}{self._head(goal)}" for number, goal in enumerate(goals)]
-        tails = [self._tails(goal) for goal in goals]
-        texts = [quoted(goal, MAX_TEXT) for goal in goals]
-        room = self._screen.room(max(map(width, heads)))
-        if room is None:
-            return [GAP.join([head + text, *tail[:1]]) for head, text, tail in zip(heads, texts, tails, strict=True)]
-        said = fitted(texts, [tail or [""] for tail in tails], weights=(1, 1), room=room)
-        return [head + words for head, words in zip(heads, said, strict=True)]
+def _head(goal: Goal, id_columns: int, screen: Screen) -> str:
+    """Return what stands before a goal's text."""
+    goal_id = pad(cut(printable(goal.id), id_room(screen)), id_columns)
+    head = f"{goal_id}{GAP}{screen.painted(pad(goal.state.name, 9), goal.state)}{GAP}"
+    return f"{clock(goal.ended_at)}{GAP}{head}" if goal.state.terminal else head
 
-    def _head(self, goal: Goal) -> str:
-        """Return what stands before a goal's text."""
-        goal_id = pad(cut(printable(goal.id), id_room(self._screen)), self._id_columns)
-        state = self._screen.painted(pad(goal.state.name, 9), goal.state)
-        head = f"{goal_id}{GAP}{state}{GAP}"
-        return f"{clock(goal.ended_at)}{GAP}{head}" if goal.state.terminal else head
 
-    def _tails(self, goal: Goal) -> list[str]:
-        """Return what stands after a goal's text, the longest form first."""
-        if goal.state.terminal:
-            return [] if goal.state is State.SUCCEEDED else why_forms(goal)
-        # The sender first: what does not fit is cut at its end.
-        notes = _notes(goal, self._now)
-        return [", ".join([f"from {each}", *notes]) for each in who_forms(goal.client)]
+def _tails(goal: Goal, now: float) -> list[str]:
+    """Return what stands after a goal's text, the longest form first."""
+    if goal.state.terminal:
+        return [] if goal.state is State.SUCCEEDED else why_forms(goal)
+    # The sender first: what does not fit is cut at its end.
+    return [", ".join([f"from {each}", *_notes(goal, now)]) for each in who_forms(goal.client)]
 
 
 def quoted(goal: Goal, limit: int | None = None) -> str:
@@ -194,11 +186,8 @@ def who(sender: Sender | None) -> str:
     """Return who sent something: the script that one looks for, and what it calls itself."""
     if sender is None:
         return _NOBODY
-    parts = [_program(sender)]
-    if sender.pid is not None:
-        parts.append(f"pid {sender.pid}")
-    if sender.uid is not None:
-        parts.append(f"uid {sender.uid}")
+    numbers = {"pid": sender.pid, "uid": sender.uid}
+    parts = [_program(sender), *(f"{name} {number}" for name, number in numbers.items() if number is not None)]
     if sender.name:
         parts.append(f'calls itself "{printable(sender.name)}"')
     return ", ".join(parts)
@@ -222,9 +211,7 @@ def who_forms(sender: Sender | None) -> list[str]:
 
 def by_whom(by: By) -> str:
     """Return what ended a goal."""
-    if by.goal is not None:
-        return f"by {printable(by.goal)}"
-    return f"by {who(by.client)}" if by.client else "by nobody known"
+    return f"by {who(by.client) if by.goal is None else printable(by.goal)}"
 
 
 def why_forms(goal: Goal) -> list[str]:
@@ -297,10 +284,6 @@ def _value(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:g}" if isinstance(value, float) else printable(str(value))
-
-
-def _json(data: JsonObject) -> str:
-    return encode(data).decode().rstrip("\n")
 
 
 def clock(seconds: float | None) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from bisect import bisect_right
+from itertools import accumulate
 
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
@@ -22,7 +22,7 @@ GAP = "  "
 LONGEST_ID = 20
 #: A terminal that says it is narrower is not believed: a line of less would show nothing.
 NARROWEST = 40
-#: Stands for what is left out at either end of a sentence.
+#: Stands for what is left out.
 MORE = "…"
 
 #: East Asian wide and full-width characters, most emoji among them, take two columns.
@@ -37,7 +37,6 @@ _FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
 #: Controls, format characters (bidi marks and overrides, zero-width), line and paragraph separators, halves of pairs,
 #: and what is not assigned.
 _ESCAPED = frozenset({"Cc", "Cf", "Zl", "Zp", "Cs", "Co", "Cn"})
-_SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t", "\\": "\\\\"}
 
 _COLOURING = re.compile("\x1b\\[[0-9;]*m")
 _COLOURS = {
@@ -73,7 +72,7 @@ class Screen:
 
 def printable(text: str, limit: int | None = None) -> str:
     """Return the text with everything that isn't plainly visible escaped, cut after `limit` characters with an …."""
-    kept = text if limit is None or len(text) <= limit else text[:limit]
+    kept = text[:limit]
     if not (kept.isascii() and kept.isprintable() and "\\" not in kept):
         kept = "".join(map(_shown, kept))
     return kept if limit is None or len(text) <= limit else f"{kept}…"
@@ -81,7 +80,12 @@ def printable(text: str, limit: int | None = None) -> str:
 
 def printable_json(line: str) -> str:
     """Return a line of JSON, which stays the same JSON, with everything that isn't plainly visible escaped."""
-    return line if line.isascii() and line.isprintable() else "".join(map(_escaped, line))
+    if line.isascii() and line.isprintable():
+        return line
+    import json
+
+    # None of these characters stands outside of a string.
+    return "".join(json.dumps(each)[1:-1] if _is_hidden(each) else each for each in line)
 
 
 def width(text: str) -> int:
@@ -89,8 +93,7 @@ def width(text: str) -> int:
 
     Where that is in doubt it is the larger: a line that is too short looks odd, one that is too long breaks.
     """
-    if "\x1b" in text:
-        text = _COLOURING.sub("", text)
+    text = _COLOURING.sub("", text)
     return len(text) if text.isascii() else sum(map(_columns, text))
 
 
@@ -98,12 +101,8 @@ def cut(text: str, columns: int | None) -> str:
     """Return the text, ended with an … where it is wider than so many columns; it must not be coloured."""
     if columns is None or width(text) <= columns:
         return text
-    taken = 0
-    for place, character in enumerate(text):
-        taken += _columns(character)
-        if taken > columns - 1:
-            return f"{text[:place]}…" if columns > 0 else ""
-    return text
+    kept = sum(end < columns for end in accumulate(map(_columns, text)))
+    return f"{text[:kept]}{MORE}" if columns > 0 else ""
 
 
 def shortened(text: str, columns: int | None) -> str:
@@ -126,10 +125,7 @@ def pad(text: str, columns: int) -> str:
 
 def longest_that_fits(forms: Sequence[str], columns: int | None) -> str:
     """Return the first of the forms, longest first, that fits; the last one cut if none does."""
-    for form in forms:
-        if columns is None or width(form) <= columns:
-            return form
-    return cut(forms[-1], columns)
+    return next((each for each in forms if columns is None or width(each) <= columns), cut(forms[-1], columns))
 
 
 def share(wanted: Sequence[int], weights: Sequence[int], room: int) -> list[int]:
@@ -163,38 +159,19 @@ def fitted(texts: Sequence[str], *others: Sequence[Sequence[str]], weights: Sequ
     ]
 
 
-def wrapped(parts: Sequence[str], first: str, screen: Screen) -> list[str]:
-    """Return the parts, joined by commas, as lines that begin under the end of `first` and break between two parts."""
-    return _lines([*(f"{each}," for each in parts[:-1]), parts[-1]], first, screen)
+def folded(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
+    """Return the pieces, joined by blanks, as lines that begin under the end of `first` and break between two pieces.
 
-
-def folded(text: str, first: str, screen: Screen) -> list[str]:
-    """Return a text as lines that begin under the end of `first` and break between two words."""
-    return _lines(text.split(" "), first, screen)
-
-
-def _lines(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
-    """Return the pieces, joined by blanks; one that is wider than a line is left to the terminal to break."""
+    One that is wider than a line is left to the terminal to break.
+    """
     room = screen.room(width(first))
-    lines = []
-    line = pieces[0]
+    lines = [pieces[0]]
     for piece in pieces[1:]:
-        if room is not None and width(line) + 1 + width(piece) > room:
-            lines.append(line)
-            line = piece
+        if room is not None and width(lines[-1]) + 1 + width(piece) > room:
+            lines.append(piece)
         else:
-            line += f" {piece}"
-    lines.append(line)
+            lines[-1] += f" {piece}"
     return [f"{' ' * width(first) if number else first}{each}" for number, each in enumerate(lines)]
-
-
-@frozen
-class View:
-    """A part of a sentence, fit to be shown: what was heard, the word being heard, what is still to come."""
-
-    heard: str
-    word: str
-    ahead: str
 
 
 class Sentence:
@@ -203,9 +180,7 @@ class Sentence:
     def __init__(self, text: str) -> None:
         self._shown = [printable(each) for each in text]
         #: the column at which each character begins, and at last the one at which the text ends
-        self._columns = [0]
-        for each in self._shown:
-            self._columns.append(self._columns[-1] + width(each))
+        self._columns = [0, *accumulate(map(width, self._shown))]
 
     @property
     def whole(self) -> str:
@@ -216,72 +191,54 @@ class Sentence:
         """Return the text up to a character that was heard, and the rest, both fit to be shown."""
         return self._part(0, heard), self._part(heard, len(self._shown))
 
-    def view(self, start: int, end: int, columns: int) -> View:
+    def view(self, start: int, end: int, columns: int) -> tuple[str, str, str]:
         """Return what fits into `columns` of the text, around the word from character `start` up to `end`.
 
-        The word keeps to the first third, so that what comes next can be read before it is heard.
+        What was heard, the word, and what is still to come. The word keeps to the first third, so that what comes next
+        can be read before it is heard.
         """
         last = len(self._shown)
         start = min(max(start, 0), last)
         end = min(max(end, start), last)
-        total = self._columns[last]
-        if total <= columns:
-            return View(self._part(0, start), self._part(start, end), self._part(end, last))
-        if columns < 3:  # no room for a … at both ends and something between
-            return View("", "", "")
-        wanted = min(self._columns[start] - columns // 3, total - columns)
+        too_much = self._columns[last] - columns
+        if too_much > 0 and columns < 3:  # no room for a … at both ends and something between
+            return "", "", ""
+        first = self._first(min(self._columns[start] - columns // 3, too_much), start)
         # One column at each end that is cut is the …'s own.
-        first = 0 if wanted <= 0 else self._from(wanted + 1)
-        first = min(first, start)
         room = columns - (first > 0)
         stop = self._upto(self._columns[first] + room)
         if stop < last:
             stop = self._upto(self._columns[first] + room - 1)
         before = MORE if first > 0 else ""
         after = MORE if stop < last else ""
-        return View(
-            before + self._part(first, min(start, stop)),
-            self._part(min(start, stop), min(end, stop)),
-            self._part(min(end, stop), stop) + after,
-        )
+        start, end = min(start, stop), min(end, stop)
+        return before + self._part(first, start), self._part(start, end), self._part(end, stop) + after
 
     def _part(self, start: int, end: int) -> str:
         return "".join(self._shown[start:end])
 
-    def _from(self, column: int) -> int:
-        """Return the first character that begins at this column or later, and is not drawn over the one before it."""
-        place = bisect_right(self._columns, column - 1)
-        while place < len(self._shown) and self._columns[place] == self._columns[place + 1]:
-            place += 1
-        return place
+    def _first(self, column: int, start: int) -> int:
+        """Return the first character to be shown, where so many columns are left out: no later than the word's."""
+        if column <= 0:
+            return 0
+        # One column more, for the …; and no character that is drawn over the one before it.
+        begins = (place for place in range(start) if column < self._columns[place] < self._columns[place + 1])
+        return next(begins, start)
 
     def _upto(self, column: int) -> int:
         """Return the end of the characters that end at this column or earlier."""
-        return bisect_right(self._columns, column) - 1
+        return sum(each <= column for each in self._columns) - 1
 
 
-def _escaped(character: str) -> str:
-    """Return a character of a JSON line as it is, or as JSON escapes it: none of those stands outside of a string."""
-    if unicodedata.category(character) not in _ESCAPED:
-        return character
-    units = character.encode("utf-16-be", "surrogatepass")
-    return "".join(f"\\u{units[at]:02x}{units[at + 1]:02x}" for at in range(0, len(units), 2))
+def _is_hidden(character: str) -> bool:
+    return unicodedata.category(character) in _ESCAPED
 
 
 def _shown(character: str) -> str:
-    if character in _SHORT:
-        return _SHORT[character]
-    if unicodedata.category(character) not in _ESCAPED:
-        return character
-    code = ord(character)
-    if code < 0x100:
-        return f"\\x{code:02x}"
-    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+    return character.encode("unicode_escape").decode() if character == "\\" or _is_hidden(character) else character
 
 
 def _columns(character: str) -> int:
-    if character.isascii():
-        return 1
     if unicodedata.category(character) in _OVER:
         return int(character == _AS_EMOJI)
     wide = unicodedata.east_asian_width(character) in _WIDE or _FLAG_LETTERS[0] <= character <= _FLAG_LETTERS[1]

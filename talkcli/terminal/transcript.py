@@ -10,7 +10,7 @@ import time
 
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
+from talkcli.protocol.events import PausedChanged, Snapshot, StateChanged, WordHeard
 from talkcli.terminal.goals import clock, quoted, who_forms, why_forms
 from talkcli.terminal.text import (
     GAP,
@@ -54,7 +54,6 @@ class Transcript:
         self._full = full
         self._with_words = words
         self._goals: dict[str, Goal] = {}
-        self._active: set[str] = set()
         self._paused = False
         self._id_columns = _USUAL_ID
 
@@ -70,35 +69,33 @@ class Transcript:
         if isinstance(event, WordHeard) and self._with_words:
             word = f"{printable(event.word)}{GAP}{event.time:.2f} s"
             return [self._head(event.at or now, "word", None, event.id, screen) + word]
-        assert not isinstance(event, Result), "a watcher waits for no goal"
-        return []
+        return []  # a watcher waits for no goal, and has no result
 
     def _begin(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
         status = event.status
         known = ([status.active] if status.active else []) + list(status.pending)
         for goal in known:
             self._goals[goal.id] = goal
-            self._make_room(goal.id, screen)
-        self._active = {goal.id for goal in known if goal.state is not State.PENDING}
+            self._make_room(goal.id, screen)  # before the first line, so that all of them line up
         self._paused = status.server.get("paused") is True
         place = f"server {printable(str(status.server.get('pid')))} on {printable(str(status.server.get('socket')))}"
         waiting = f", {len(status.pending)} waiting" if status.pending else ""
         at_work = "paused" if self._paused else "speaking" if status.active else "silent"
         head = f"{clock(now)}{GAP}{pad('watching', 10)}{GAP}{at_work}{waiting}; {place}"
-        goals = [line for goal in known for line in self._goal(goal, goal.state, _since(goal, now), screen)]
-        return [cut(head, screen.room(0)), *goals]
+        lines = [cut(head, screen.room(0))]
+        for goal in known:
+            since = goal.queued_at if goal.started_at is None else goal.started_at
+            lines += self._goal(goal, goal.state, since or now, screen)
+        return lines
 
     def _changed(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
         if event.goal is not None:
             self._goals[event.id] = event.goal
-        before = bool(self._active or self._paused or len(self._goals) > 1)
+        at_once = not self._paused and len(self._goals) == 1
         goal = self._goals.get(event.id)
         if event.state.terminal:
             self._goals.pop(event.id, None)
-            self._active.discard(event.id)
-        elif event.state is not State.PENDING:
-            self._active.add(event.id)
-        brief = event.state is State.PREEMPTING or (event.state is State.PENDING and not before)
+        brief = event.state is State.PREEMPTING or (event.state is State.PENDING and at_once)
         if brief and not self._full:
             return []
         at = event.at or now
@@ -179,10 +176,6 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float | None = None) -
         )
         for goal, (when, state, goal_id), words in zip(goals, heads, said, strict=True)
     ]
-
-
-def _since(goal: Goal, now: float) -> float:
-    return (goal.queued_at if goal.started_at is None else goal.started_at) or now
 
 
 def _when(seconds: float | None, today: tuple[int, ...]) -> str:
