@@ -113,7 +113,7 @@ def test_a_sound_server_is_found_by_its_own_program_or_by_its_socket(tmp_path: P
     (tmp_path / "run" / "pulse").mkdir(parents=True)
     (tmp_path / "run" / "pulse" / "native").touch()
     found = sound.sound_server({"PATH": "/nowhere", "XDG_RUNTIME_DIR": str(tmp_path / "run")}, STRANGER)
-    assert (found.name, found.askable, found.sockets) == (None, False, (f"{tmp_path}/run/pulse/native",))
+    assert (found.name, found.trouble, found.sockets) == (None, None, (f"{tmp_path}/run/pulse/native",))
 
 
 def test_how_loud_it_is_comes_from_the_mixer_that_is_in_charge(tmp_path: Path) -> None:

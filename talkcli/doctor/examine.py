@@ -70,13 +70,14 @@ class Examination:
                 client, gone = None, error.message
         named = None if client else os.environ.get("TALK_VOICE") or None
         engine = voice.look(Setting(voice=named, interrupt=self._interrupt))
-        yield from voice.judge(voice.python(), engine, server=client is not None)
+        yield voice.python()
+        yield from voice.judge(voice.pyttsx3(), engine, server=client is not None)
         process = self._process = server.process_here(client) if client else None
         here, env = machine.surroundings(process)
         if process is not None and here.server is None:
             self._owner = machine.owner(f"/proc/{process}")
         if client is not None and process is None:
-            yield machine.elsewhere()
+            yield machine.ELSEWHERE
             yield from sound.judge_silent(*self._player(), running=True)
         elif sys.platform.startswith("linux"):
             yield machine.judge_session(here)
@@ -119,7 +120,7 @@ class Examination:
         by_server, speaking = client is not None and not self._silent, False
         if client is not None and self._silent:
             if self._process is None:
-                return sentence.elsewhere()
+                return sentence.ELSEWHERE
             setting = self._setting_of_server(self._process, env)
             played, speaking = sentence.beside(client, lambda: sentence.by_engine(sentence.SHORT, setting, 0.0, LIMIT))
         elif client is not None:

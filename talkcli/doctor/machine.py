@@ -30,6 +30,10 @@ _CONTAINER = ("/.dockerenv", "/run/.containerenv", "/run/systemd/container")
 _GENERATIONS = 8
 _CRON = frozenset({"cron", "crond", "cronie", "anacron"})
 _SSH = frozenset({"ssh", "sshd"})
+#: What is to be said where the server's surroundings can't be seen.
+ELSEWHERE = done(
+    "session", "the server runs on another machine or in a container: run talk doctor there to look at its sound"
+)
 #: An entry of an access control list for one user, or for one group; and the bits for reading and writing.
 _ACL_USER, _ACL_GROUP, _READ_WRITE = 2, 8, 6
 
@@ -218,10 +222,9 @@ def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], sessio
         return True
     if session.uid == found.st_uid:
         return mode >> 6 & _READ_WRITE == _READ_WRITE
-    for tag, permitted, holder in entries:
-        named = (tag == _ACL_USER and holder == session.uid) or (tag == _ACL_GROUP and holder in session.gids)
-        if named and permitted & _READ_WRITE == _READ_WRITE:
-            return True
+    named = {(_ACL_USER, session.uid), *((_ACL_GROUP, each) for each in session.gids)}
+    if any((tag, holder) in named and permitted & _READ_WRITE == _READ_WRITE for tag, permitted, holder in entries):
+        return True
     bits = mode >> 3 if found.st_gid in session.gids else mode
     return bits & _READ_WRITE == _READ_WRITE
 
@@ -242,13 +245,6 @@ def _text(path: str) -> str:
             return file.read()
     except OSError:
         return ""
-
-
-def elsewhere() -> Finding:
-    """Return what is to be said where the server's surroundings can't be seen."""
-    return done(
-        "session", "the server runs on another machine or in a container: run talk doctor there to look at its sound"
-    )
 
 
 def seen_from(session: Session) -> str:
@@ -292,12 +288,8 @@ def _again(session: Session) -> str:
     return "" if session.server is None else " where the server is started, and start it again"
 
 
-def judge_cards(cards: Cards, session: Session, *, served: bool) -> list[Finding]:
-    """Judge the cards, and who may open them; `served`: whether a sound server answers, which opens them itself."""
-    return [_cards(cards, session, served), _access(cards, session, served)]
-
-
-def _cards(cards: Cards, session: Session, served: bool) -> Finding:
+def judge_cards(cards: Cards, session: Session, *, served: bool) -> Finding:
+    """Judge which cards there are; `served`: whether a sound server answers, which opens them itself."""
     if cards.names:
         return done("cards", some(cards.names))
     if served:
@@ -309,15 +301,14 @@ def _cards(cards: Cards, session: Session, served: bool) -> Finding:
     return warning("cards", words, "plug in a loudspeaker or sound card, and look with: aplay -l")
 
 
-def _access(cards: Cards, session: Session, served: bool) -> Finding:
+def judge_access(cards: Cards, session: Session, *, served: bool) -> Finding:
+    """Judge who may open the cards; `served`: as of `judge_cards`."""
     group = cards.group
     if not cards.nodes:
         return done("group", f"nothing in /dev/snd to open, so the group {group} is not needed")
     if not cards.forbidden:
-        member = (
-            f"in the group {group}" if group in session.groups else f"not in the group {group}, and needs not to be"
-        )
-        return done("group", f"user {session.user} may open the cards ({member})")
+        member = "in the group {}" if group in session.groups else "not in the group {}, and needs not to be"
+        return done("group", f"user {session.user} may open the cards ({member.format(group)})")
     words = f"user {session.user} may not open {some(cards.forbidden)}: not in the group {group}"
     if served:
         return done("group", f"{words}; the sound server opens them")

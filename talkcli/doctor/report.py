@@ -86,13 +86,10 @@ def lines(finding: Finding, screen: Screen) -> list[str]:
     if room is None:
         return [head + finding.message + ("" if finding.next is None else f" {_ARROW}{finding.next}")]
     first, *rest = _wrapped(finding.message, room) or [""]
-    step = [] if finding.next is None else _wrapped(finding.next, room - len(_ARROW))
-    arrows = [_ARROW, *[" " * len(_ARROW)] * len(step)]
-    return [
-        head + first,
-        *(_INDENT + each for each in rest),
-        *(_INDENT + arrow + screen.painted(each, None) for arrow, each in zip(arrows, step, strict=False)),
-    ]
+    steps = _wrapped(finding.next or "", room - len(_ARROW))
+    arrows = (_ARROW if number == 0 else " " * len(_ARROW) for number in range(len(steps)))
+    rest += [arrow + screen.painted(each, None) for arrow, each in zip(arrows, steps, strict=True)]
+    return [head + first, *(_INDENT + each for each in rest)]
 
 
 def verdict(findings: Sequence[Finding], screen: Screen) -> str:

@@ -51,6 +51,12 @@ REMEDIES = {
     "late": "see what is in the way with 'talk status', or end it with 'talk cancel'",
     "paused": "talk resume",
 }
+#: What is to be said where a server's player is out of reach for a process of this command's own.
+ELSEWHERE = failed(
+    SENTENCE,
+    "not played: the server runs on another machine or in a container, and so does its player",
+    "run talk doctor --silent there; or here without --silent, so that the server plays",
+)
 _BUSY = "another program holds the device: close it, or play through a sound server (PipeWire, PulseAudio)"
 _OF_PLAYER = frozenset({"audio_device", "audio_lost", "audio_stalled"})
 _OF_SOUND = _OF_PLAYER | {"no_player"}
@@ -141,12 +147,6 @@ def by_engine(text: str, setting: Setting, volume: float, limit: float) -> Playe
     except TimeoutError:
         pass
     return Played(State.ABORTED, "engine_hung", f"it was not over after {limit:g} s")
-
-
-def elsewhere() -> Finding:
-    """Return what is to be said where a server's player is out of reach for a process of this command's own."""
-    words = "not played: the server runs on another machine or in a container, and so does its player"
-    return failed(SENTENCE, words, "run talk doctor --silent there; or here without --silent, so that the server plays")
 
 
 def as_owner(uid: int) -> str:

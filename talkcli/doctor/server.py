@@ -17,13 +17,14 @@ from talkcli.doctor.machine import owner
 from talkcli.doctor.report import Finding, done, failed, warning
 from talkcli.doctor.sentence import remedy
 from talkcli.errors import TalkError
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.options import told
 from talkcli.goals.states import State
 from talkcli.paths import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
+from talkcli.terminal.goals import clock
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Container, Sequence
 
     from talkcli.goals.goal import Goal, JsonObject
 
@@ -47,9 +48,19 @@ _ANSWERS = {
     "busy": "end some of its clients, or give it more places: talk serve --max-clients 512",
     "permission_denied": "have its owner let you in: talk serve --socket-mode 0660, and join the socket's group",
 }
+#: What to do about what is found, that which is most surely in the way first.
+_STEPS = {
+    FORBIDDEN: "have {whose} let you in: talk serve --socket-mode 0660, and join the socket's group; or start your own",
+    FOREIGN: "remove it, and: talk serve; or if you trust uid {uid}: talk --socket {path} doctor",
+    STOPPED: "let it go on: kill -CONT {pid}",
+    MUTE: "restart the server on {path}; if it is none of talk's, remove that",
+    FILE: "remove {path}, and: talk serve",
+    DIRECTORY: "remove {path}, and: talk serve",
+    STALE: "talk serve (it takes the place of what was left over)",
+}
 #: By what names a socket: what stands between it and the name, and how it is not named any more.
 _AS = {"TALK_SOCKET": "=", "--socket": " "}
-_OFF = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
+_OFF: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
 #: Volume below which a server's setting may be why nobody hears it.
 _FAINT = 0.2
 
@@ -62,7 +73,7 @@ class Place:
     what: str
     #: who owns what is there: the uid of a server or of a file
     uid: int | None = None
-    #: the process that listens, where that is known
+    #: the process that listens or serves, where that is known
     pid: int | None = None
 
 
@@ -73,8 +84,6 @@ class Places:
     places: tuple[Place, ...]
     #: what named the only one: "--socket", "TALK_SOCKET"; None for the list
     named: str | None = None
-    #: the server's process, where one was reached
-    pid: int | None = None
     #: what a client's error says beyond the places, where none was, and its code
     trouble: str | None = None
     code: str | None = None
@@ -89,16 +98,21 @@ def connect(option: str | None, interrupt: int | None) -> tuple[Client | None, P
     named = paths.named_socket(option)
     by = "--socket" if option else "TALK_SOCKET" if named else None
     tried = paths.client_sockets(named)
+    #: where a client takes any user's server
+    trusted = {named, paths.SYSTEM_SOCKET}
     try:
         client = Client.over(SocketConnection(option, name=_NAME, interrupt=interrupt))
     except TalkError as error:
-        found = tuple(_place(each, trusted=_trusted(each, named)) for each in tried)
+        found = tuple(_place(each, trusted) for each in tried)
         trouble = _trouble(error.message.splitlines(), found)
-        elsewhere = _server_among(paths.client_sockets(None)) if named else None
-        return None, Places(found, by, None, trouble, error.code, elsewhere, _others(tried))
+        usual = paths.client_sockets(None) if named else []
+        elsewhere = next((each for each in usual if _place(each, set()).what == MUTE), None)
+        # Of other users root sees all, most see none.
+        others = sorted({*glob.glob(f"/run/user/*/talk/{paths.SOCKET}")}.difference(tried))
+        return None, Places(found, by, trouble, error.code, elsewhere, tuple(others))
     before = tried[: tried.index(client.path)]
-    found = (*(_place(each, trusted=_trusted(each, named)) for each in before), Place(client.path, SERVER))
-    return client, Places(found, by, client.server_pid)
+    places = (*(_place(each, trusted) for each in before), Place(client.path, SERVER, pid=client.server_pid))
+    return client, Places(places, by)
 
 
 def _trouble(lines: list[str], found: tuple[Place, ...]) -> str | None:
@@ -110,44 +124,21 @@ def _trouble(lines: list[str], found: tuple[Place, ...]) -> str | None:
     return next((line.removeprefix(each) for line in told for each in answering if line.startswith(each)), None)
 
 
-def _trusted(path: str, named: str | None) -> bool:
-    """Tell whether a client takes any user's server here."""
-    return named is not None or path == paths.SYSTEM_SOCKET
-
-
-def _place(path: str, *, trusted: bool) -> Place:
+def _place(path: str, trusted: Container[str | None]) -> Place:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
             probe.connect(path)
-        except BlockingIOError:  # its backlog is full
-            return Place(path, MUTE, _owner(path))
         except OSError as error:
-            return Place(path, paths.found_at(path, error), _owner(path))
+            full = isinstance(error, BlockingIOError)  # its backlog
+            uid = owner(path)
+            uid = owner(os.path.dirname(path)) if uid is None else uid
+            return Place(path, MUTE if full else paths.found_at(path, error), uid)
         pid, uid = peers.credentials(probe)
-    if not (trusted or uid in {os.getuid(), 0}):
+    if path not in trusted and uid not in {os.getuid(), 0}:
         return Place(path, FOREIGN, uid, pid)
-    return Place(path, STOPPED if _is_stopped(pid) else MUTE, uid, pid)
-
-
-def _is_stopped(pid: int | None) -> bool:
-    """Whether a process was stopped, by Ctrl-Z for one."""
-    return pid is not None and peers.stat_of(pid)[:1] == [b"T"]
-
-
-def _owner(path: str) -> int | None:
-    """Return who owns a socket's file, or else its directory."""
-    found = owner(path)
-    return owner(os.path.dirname(path)) if found is None else found
-
-
-def _server_among(places: list[str]) -> str | None:
-    return next((each for each in places if _place(each, trusted=False).what == MUTE), None)
-
-
-def _others(tried: list[str]) -> tuple[str, ...]:
-    """Return the sockets of other users that can be seen: all of them for root, none for most."""
-    return tuple(each for each in sorted(glob.glob(f"/run/user/*/talk/{paths.SOCKET}")) if each not in tried)
+    stopped = peers.stat_of(pid)[:1] == [b"T"]  # by Ctrl-Z for one
+    return Place(path, STOPPED if stopped else MUTE, uid, pid)
 
 
 def described(client: Client) -> tuple[JsonObject, list[Goal]]:
@@ -179,7 +170,7 @@ def judge_places(found: Places) -> Finding:
     if server is not None:
         before = [each for each in found.places[: found.places.index(server)] if each.what != ABSENT]
         by = f"{found.named}, " if found.named else ""
-        words = f"the server is on {server.path} ({by}process {found.pid})"
+        words = f"the server is on {server.path} ({by}process {server.pid})"
         if before:
             passed = "; ".join(map(_shown, before))
             return warning("socket", f"{words}; before it: {passed}", f"remove what is in the way: {before[0].path}")
@@ -198,38 +189,23 @@ def _shown(place: Place) -> str:
 
 def _step(found: Places) -> str:
     if found.elsewhere is not None:
-        return f"{_OFF[found.named or '--socket']}: a server is on {found.elsewhere}"
-    by_what = {each.what: each for each in reversed(found.places)}
-    if FORBIDDEN in by_what:
-        place = by_what[FORBIDDEN]
-        whose = "its owner" if place.uid is None else f"uid {place.uid}"
-        return f"have {whose} let you in: talk serve --socket-mode 0660, and join the socket's group; or start your own"
-    if FOREIGN in by_what:
-        place = by_what[FOREIGN]
-        return f"remove it, and: talk serve; or if you trust uid {place.uid}: talk --socket {place.path} doctor"
-    if STOPPED in by_what:
-        return f"let it go on: kill -CONT {by_what[STOPPED].pid}"
-    if MUTE in by_what:
-        step = _ANSWERS.get(found.code or "")
-        return step or f"restart the server on {by_what[MUTE].path}; if it is none of talk's, remove that"
-    if FILE in by_what or DIRECTORY in by_what:
-        return _no_socket(by_what.get(FILE) or by_what[DIRECTORY], found.named)
-    if STALE in by_what:
-        return "talk serve (it takes the place of what was left over)"
-    if found.others:
-        return f"talk serve; or use another user's server: talk --socket {found.others[0]} doctor"
-    return _start(found)
-
-
-def _no_socket(place: Place, named: str | None) -> str:
-    if named is None:
-        return f"remove {place.path}, and: talk serve"
-    if place.what == DIRECTORY:
-        return f"name the socket in it: {named}{_AS[named]}{place.path.rstrip('/')}/talk.sock"
-    return f"{_OFF[named]}, or name a socket"
+        return f"{_OFF[found.named]}: a server is on {found.elsewhere}"
+    place = next((each for what in _STEPS for each in found.places if each.what == what), None)
+    if place is None:
+        return _start(found)
+    if place.what == MUTE and found.code in _ANSWERS:
+        return _ANSWERS[found.code]
+    if found.named is not None and place.what == DIRECTORY:
+        return f"name the socket in it: {found.named}{_AS[found.named]}{place.path.rstrip('/')}/talk.sock"
+    if found.named is not None and place.what == FILE:
+        return f"{_OFF[found.named]}, or name a socket"
+    whose = "its owner" if place.uid is None else f"uid {place.uid}"
+    return _STEPS[place.what].format(whose=whose, **fields(place))
 
 
 def _start(found: Places) -> str:
+    if found.others:
+        return f"talk serve; or use another user's server: talk --socket {found.others[0]} doctor"
     if found.named is None:
         return "talk serve"
     option = f" --socket {found.places[0].path}" if found.named == "--socket" else ""
@@ -281,18 +257,13 @@ def _failures(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
         return done("failures", f"none in {many}")
     last = aborted[-1]
     words = (last.message or "").removeprefix("Talk aborted: ")
-    when = "" if last.ended_at is None else f", {_when(last.ended_at, now)}"
+    when = "" if last.ended_at is None else f", {_span(now - last.ended_at)} ago ({clock(last.ended_at)})"
     who = f"{many} ABORTED, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many} ABORTED, last {last.id}"
     told = f"{who}{when}: {last.reason}: {words}"
     after = [each for each in log[log.index(last) + 1 :] if each.state is State.SUCCEEDED]
     if after:
         return done("failures", f"{told}; {len(after)} succeeded since")
     return warning("failures", told, remedy(last.reason, words, server.get("player"), server.get("device")))
-
-
-def _when(at: float, now: float) -> str:
-    ago = f"{_span(now - at)} ago"
-    return f"{ago} ({time.strftime('%H:%M:%S', time.localtime(at))})"
 
 
 def _span(seconds: object) -> str:

@@ -1,8 +1,8 @@
 """What makes a sound of samples: players, devices, sound servers, and how loud the output is.
 
 Programs of others tell it, each with a limit of time and of output: one that is missing or hangs is an answer, too.
-Asking wakes no device. Only a sentence proves that there is sound: what may be in its way
-is a warning here. Without a player it is certain.
+Asking wakes no device. Only a sentence proves that there is sound: what may be in its way is a warning here. Without a
+player it is certain.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import subprocess
 import tempfile
 from typing import TYPE_CHECKING
 
-from talkcli.doctor.machine import judge_cards, seen_from
+from talkcli.doctor.machine import judge_access, judge_cards, seen_from
 from talkcli.doctor.report import Finding, done, failed, some, warning
 from talkcli.engine.devices import sound_servers
 from talkcli.engine.players.programs import PACKAGES
@@ -35,14 +35,16 @@ FILE = "file:"
 _NO_DEVICES = frozenset(
     {"null", "lavrate", "samplerate", "speexrate", "jack", "oss", "speex", "upmix", "vdownmix", "usbstream"}
 )
-#: The name of the check of levels.
-_LOUDNESS = "loudness"
+#: Names of checks.
+_SERVER, _LOUDNESS = "sound server", "loudness"
 #: Per cent below which nobody may hear it across a room.
 _FAINT = 20
 #: ALSA's controls that a loudspeaker hangs on, as `amixer scontrols` names them.
 _CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
-
-
+#: What a sound server's mixer tells of; and, by its program, what undoes a mute of it and what makes it louder.
+_SINK = "the default sink"
+_PACTL = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
+_WPCTL = ("wpctl set-mute @DEFAULT_AUDIO_SINK@ 0", "wpctl set-volume @DEFAULT_AUDIO_SINK@ 0.7")
 #: Seconds that a program may take. All of them answer within milliseconds, or wait for a sound server that hangs.
 LIMIT = 3.0
 #: Bytes of its output that are read: the devices of a large machine take a tenth.
@@ -106,14 +108,12 @@ class SoundServer:
     name: str | None = None
     #: the sink that is played to by default
     sink: str | None = None
-    #: sockets of sound servers that are there, though none answers at them or they are another user's
+    #: where none answers: sockets of sound servers that are there all the same, of another user's for one
     sockets: tuple[str, ...] = ()
-    #: what the client said
+    #: what the client said; None where there is no program that could ask
     trouble: str | None = None
     #: whether the client took too long: the server is there and hangs
     hangs: bool = False
-    #: whether there is a program that could ask
-    askable: bool = True
     #: PULSE_SERVER, where it is set
     named: str | None = None
 
@@ -199,11 +199,8 @@ def program_of(command: str) -> str | None:
 def players(env: Mapping[str, str], wanted: str | None, by: str | None) -> Players:
     """Return which players there are; `wanted`: the setting, `by` whom it is."""
     found = tuple(each for each in PACKAGES if path_of(each, env))
-    runs = True
-    if wanted is not None and not is_silent(wanted):
-        program = program_of(wanted)
-        runs = bool(program and path_of(program, env))
-    return Players(found, wanted, by, runs)
+    program = program_of(wanted or "")
+    return Players(found, wanted, by, runs=bool(program and path_of(program, env)))
 
 
 def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> Devices | None:
@@ -226,10 +223,6 @@ def _sinks(said: Said) -> list[tuple[str, str]]:
     return [(each[1], each[-1].strip()) for each in lines if said.well and len(each) > 2]
 
 
-def _sink_names(said: Said) -> list[str]:
-    return [name for name, _ in _sinks(said)]
-
-
 def _node_names(said: Said) -> list[str]:
     nodes = re.split(r"^\s*id \d+,", said.out, flags=re.MULTILINE)
     found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
@@ -240,7 +233,7 @@ _SINKS = "pactl list short sinks"
 #: How the devices of a player are listed, and read from what that says.
 _LISTING: dict[str | None, tuple[str, Callable[[Said], list[str]]]] = {
     "aplay": ("aplay -L", _alsa_names),
-    "pacat": (_SINKS, _sink_names),
+    "pacat": (_SINKS, lambda said: [name for name, _ in _sinks(said)]),
     "pw-cat": ("pw-cli ls Node", _node_names),
 }
 
@@ -259,18 +252,17 @@ def suspended(env: Mapping[str, str]) -> tuple[str, ...]:
 
 def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
     """Return the sound server that a player of this session finds."""
-    named = env.get("PULSE_SERVER") or None
-    sockets = tuple(sound_servers(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else [])))
     pulse = asked("pactl", "info", env=env)
     if pulse.well:
-        name = _field(pulse.out, "Server Name") or "PulseAudio"
-        return SoundServer(name=name, sink=_field(pulse.out, "Default Sink"), sockets=sockets, named=named)
+        return SoundServer(_field(pulse.out, "Server Name") or "PulseAudio", _field(pulse.out, "Default Sink"))
     wire = Said(None) if pulse.late else asked("pw-cli", "info", "0", env=env)
     if wire.well:
-        return SoundServer(name="PipeWire, without its PulseAudio part", sockets=sockets, named=named)
-    askable = any(path_of(each, env) for each in ("pactl", "pw-cli"))
-    trouble = _trouble("pactl", pulse) if path_of("pactl", env) else _trouble("pw-cli", wire)
-    return SoundServer(sockets=sockets, trouble=trouble, hangs=pulse.late or wire.late, askable=askable, named=named)
+        return SoundServer("PipeWire, without its PulseAudio part")
+    answers = {"pactl": pulse, "pw-cli": wire}
+    trouble = next((_trouble(each, said) for each, said in answers.items() if path_of(each, env)), None)
+    sockets = sound_servers(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else []))
+    named = env.get("PULSE_SERVER") or None
+    return SoundServer(sockets=tuple(sockets), trouble=trouble, hangs=pulse.late or wire.late, named=named)
 
 
 def _field(text: str, name: str) -> str | None:
@@ -299,26 +291,14 @@ def levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> tuple[L
 
 def level_of_pactl(mute: str, volume: str) -> Level:
     """Return what `pactl get-sink-mute` and `get-sink-volume` say of the default sink."""
-    return Level(
-        "the default sink",
-        "yes" in mute.lower(),
-        _percent(volume),
-        "pactl set-sink-mute @DEFAULT_SINK@ 0",
-        "pactl set-sink-volume @DEFAULT_SINK@ 70%",
-    )
+    return Level(_SINK, "yes" in mute.lower(), _percent(volume), *_PACTL)
 
 
 def level_of_wpctl(text: str) -> Level:
     """Return what `wpctl get-volume @DEFAULT_AUDIO_SINK@` says: "Volume: 0.40 [MUTED]"."""
     found = re.search(r"Volume: (\d+(?:\.\d+)?)", text)
     percent = round(float(found[1]) * 100) if found else None
-    return Level(
-        "the default sink",
-        "[MUTED]" in text,
-        percent,
-        "wpctl set-mute @DEFAULT_AUDIO_SINK@ 0",
-        "wpctl set-volume @DEFAULT_AUDIO_SINK@ 0.7",
-    )
+    return Level(_SINK, "[MUTED]" in text, percent, *_WPCTL)
 
 
 def level_of_amixer(control: str, text: str) -> Level:
@@ -347,10 +327,12 @@ def judge(
     players: Players, devices: Devices | None, cards: Cards, server: SoundServer, session: Session, *, running: bool
 ) -> list[Finding]:
     """Judge what plays; `running`: whether a talk server runs, which has a player of its own."""
+    served = server.name is not None
     return judge_silent(players.wanted, players.by, running=running) or [
         _player(players, running=running),
         *([] if devices is None else [_device(devices)]),
-        *judge_cards(cards, session, served=server.name is not None),
+        judge_cards(cards, session, served=served),
+        judge_access(cards, session, served=served),
         _sound_server(server, cards, session),
     ]
 
@@ -379,13 +361,11 @@ def _device(devices: Devices) -> Finding:
         step = f"look at what this says: {devices.listed_by}"
         return warning("device", f"{devices.listed_by}: {devices.trouble}", step)
     if not names:
-        return warning(
-            "device", f"{devices.listed_by} lists none", "plug in a loudspeaker; in a container, hand the device in"
-        )
-    if wanted is None:
-        return done("device", f"the default; {devices.listed_by} lists {some(names)}")
-    if wanted in names or ":" in wanted:  # ALSA makes plughw:1,0 of any card; whether it can, the sentence shows
-        return done("device", f"{wanted}; {devices.listed_by} lists {some(names)}")
+        step = "plug in a loudspeaker; in a container, hand the device in"
+        return warning("device", f"{devices.listed_by} lists none", step)
+    # ALSA makes plughw:1,0 of any card; whether it can, the sentence shows.
+    if wanted is None or wanted in names or ":" in wanted:
+        return done("device", f"{wanted or 'the default'}; {devices.listed_by} lists {some(names)}")
     return warning(
         "device",
         f"{wanted} is not among those that {devices.listed_by} lists: {some(names)}",
@@ -394,42 +374,41 @@ def _device(devices: Devices) -> Finding:
 
 
 def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Finding:
-    check = "sound server"
     where = seen_from(session)
     if server.name is not None:
         sink = f", plays to {server.sink}" if server.sink else ""
-        return done(check, f"{server.name}{sink}")
+        return done(_SERVER, f"{server.name}{sink}")
     if server.hangs:
         step = "restart it: systemctl --user restart pipewire pipewire-pulse (or: pulseaudio -k)"
-        return warning(check, f"there is one, but it does not answer {where}", step)
+        return warning(_SERVER, f"there is one, but it does not answer {where}", step)
     if not server.sockets and server.named is None:
-        alone = "; players use ALSA" if cards.names else ""
         if session.kinds and not cards.names:
             return _out_of_reach(server, session, f"none can be reached {where}")
-        return done(check, f"no PulseAudio or PipeWire runs for user {session.user}{alone}")
+        alone = "; players use ALSA" if cards.names else ""
+        return done(_SERVER, f"no PulseAudio or PipeWire runs for user {session.user}{alone}")
     at = f"at {server.named} (PULSE_SERVER)" if server.named else f"at {some(server.sockets)}"
-    if not server.askable:
+    if server.trouble is None:
         step = "sudo apt-get install -y pulseaudio-utils"
-        return warning(check, f"there is one {at}, but no program to ask it: pactl, pw-cli", step)
-    return _out_of_reach(server, session, f"the one {at} cannot be reached {where}: {server.trouble or 'no answer'}")
+        return warning(_SERVER, f"there is one {at}, but no program to ask it: pactl, pw-cli", step)
+    return _out_of_reach(server, session, f"the one {at} cannot be reached {where}: {server.trouble}")
 
 
 def _out_of_reach(server: SoundServer, session: Session, words: str) -> Finding:
-    check = "sound server"
+    step = "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)"
     if server.named is not None:
-        return warning(check, words, "unset PULSE_SERVER, or start the sound server that it names")
-    if "a container" in session.kinds:
+        step = "unset PULSE_SERVER, or start the sound server that it names"
+    elif "a container" in session.kinds:
+        words += "; a container sees only what it is given"
         step = "start the container with the host's socket and PULSE_SERVER: see the README"
-        return warning(check, f"{words}; a container sees only what it is given", step)
-    if "a system service" in session.kinds:
+    elif "a system service" in session.kinds:
+        words += "; a system service is in no user's session"
         step = "serve as the user whose sound it is: talk serve --print-unit user"
-        return warning(check, f"{words}; a system service is in no user's session", step)
-    if session.sudo_uid is not None:
+    elif session.sudo_uid is not None:
+        words += "; a sound server takes its own user only, not root"
         step = "leave sudo out: run this as the user whose sound it is"
-        return warning(check, f"{words}; a sound server takes its own user only, not root", step)
-    if session.runtime is None and session.usual_runtime is not None:
-        return warning(check, words, f"export XDG_RUNTIME_DIR={session.usual_runtime}")
-    return warning(check, words, "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)")
+    elif session.runtime is None and session.usual_runtime is not None:
+        step = f"export XDG_RUNTIME_DIR={session.usual_runtime}"
+    return warning(_SERVER, words, step)
 
 
 def judge_levels(levels: tuple[Level, ...], *, default: bool) -> list[Finding]:

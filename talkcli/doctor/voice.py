@@ -28,16 +28,6 @@ INSTALL_LIBRARY = "sudo apt-get install -y libespeak-ng1, or: pip install espeak
 
 
 @frozen
-class Python:
-    """The interpreter that runs this."""
-
-    version: str
-    executable: str
-    #: version of the installed pyttsx3; None where none is installed
-    pyttsx3: str | None
-
-
-@frozen
 class Engine:
     """What an engine process said that was started to look."""
 
@@ -65,12 +55,16 @@ class Setting:
     env: Mapping[str, str] | None = None
 
 
-def python() -> Python:
-    """Return what interpreter this is; pyttsx3 is not imported, as it may be broken."""
-    found: str | None = None
+def python() -> Finding:
+    """Return which interpreter runs this."""
+    return done("python", f"Python {platform.python_version()} ({sys.executable})")
+
+
+def pyttsx3() -> str | None:
+    """Return the version of pyttsx3, None where none is installed; it is not imported, as it may be broken."""
     with contextlib.suppress(PackageNotFoundError):
-        found = version("pyttsx3")
-    return Python(platform.python_version(), sys.executable, found)
+        return version("pyttsx3")
+    return None
 
 
 def look(setting: Setting) -> Engine:
@@ -107,35 +101,31 @@ def fault(error: EngineFailed) -> tuple[str, str]:
     return error.reason, str(error)
 
 
-def judge(python: Python, engine: Engine, *, server: bool) -> list[Finding]:
-    """Judge the voice; `server`: whether one runs, so that a sentence needs nothing of this."""
-    return [done("python", f"Python {python.version} ({python.executable})"), *_engine(python, engine, server)]
-
-
-def _engine(python: Python, engine: Engine, server: bool) -> list[Finding]:
+def judge(pyttsx3: str | None, engine: Engine, *, server: bool) -> list[Finding]:
+    """Judge the voice; `pyttsx3`: its version; `server`: whether one runs, so that a sentence needs nothing of this."""
     broken = warning if server else failed
-    version = python.pyttsx3 or "of an unknown version"
-    if engine.reason is None:
-        return [done("pyttsx3", f"{version}, driver {engine.driver}"), *_library(engine)]
     words = engine.words
-    if "pyttsx3 is missing" in words or python.pyttsx3 is None:
-        return [broken("pyttsx3", words or "pyttsx3 is missing", "pip install pyttsx3, into the same Python")]
-    found = done("pyttsx3", version)
+    if engine.reason is None:
+        return [done("pyttsx3", f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"), *_library(engine)]
+    if "pyttsx3 is missing" in words or pyttsx3 is None:
+        step = "pip install pyttsx3, into the same Python"
+        return [broken("pyttsx3", words or "pyttsx3 is missing", step)]
+    found = done("pyttsx3", pyttsx3)
     if engine.reason == "unknown_voice":
         step = "choose one that 'talk voices' lists, in TALK_VOICE or --voice"
         return [found, done("libespeak-ng", "loaded"), broken("voices", words, step)]
+    step = "talk serve logs the engine's own words"
     if "data" in words and "espeak" in words:
-        return [found, broken("libespeak-ng", words, "sudo apt-get install -y espeak-ng-data")]
-    if "libespeak-ng" in words:
-        return [found, broken("libespeak-ng", words, INSTALL_LIBRARY)]
-    if engine.reason == "engine_crashed":
+        step = "sudo apt-get install -y espeak-ng-data"
+    elif "libespeak-ng" in words:
+        step = INSTALL_LIBRARY
+    elif engine.reason == "engine_crashed":
+        words = f"the engine process died while it loaded the library: {words}"
         step = "install it again: sudo apt-get install --reinstall -y libespeak-ng1 espeak-ng-data"
-        return [found, broken("libespeak-ng", f"the engine process died while it loaded the library: {words}", step)]
-    if engine.reason == "engine_hung":
+    elif engine.reason == "engine_hung":
         # It asks PulseAudio at its start, though it is to play nothing itself.
         step = "restart the sound server if that hangs (see below): libespeak-ng waits for it at its start"
-        return [found, broken("libespeak-ng", words, step)]
-    return [found, broken("libespeak-ng", words, "talk serve logs the engine's own words")]
+    return [found, broken("libespeak-ng", words, step)]
 
 
 def _library(engine: Engine) -> list[Finding]:

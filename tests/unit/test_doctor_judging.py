@@ -9,13 +9,12 @@ from talkcli.doctor import report, sentence, server, voice
 from talkcli.doctor.report import DONE, FAILED, WARNING, Finding, done, failed, heard, next_step, warning
 from talkcli.doctor.sentence import Played, behind
 from talkcli.doctor.server import Place, Places
-from talkcli.doctor.voice import Engine, Python
+from talkcli.doctor.voice import Engine
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
 from talkcli.paths import ABSENT, FORBIDDEN, STALE
 from talkcli.terminal.text import Screen, width
 
-PYTHON = Python("3.11.2", "/usr/bin/python3", "2.99")
 ENGINE = Engine("espeak", "eSpeak NG 1.51 (system)", 141)
 SPOKEN = Goal("4k7f-1", State.SUCCEEDED, text="x")
 SERVER: dict[str, object] = {
@@ -91,42 +90,42 @@ def test_text_of_others_is_escaped_in_every_finding() -> None:
 
 
 @pytest.mark.parametrize(
-    ("engine", "python", "check", "step"),
+    ("engine", "pyttsx3", "check", "step"),
     [
-        (Engine(reason="engine_failed", words="pyttsx3 is missing: pip install pyttsx3"), PYTHON, "pyttsx3", "pip"),
-        (Engine(reason="engine_failed", words="libespeak-ng is missing: install it"), PYTHON, "libespeak-ng", "libesp"),
+        (Engine(reason="engine_failed", words="pyttsx3 is missing: pip install pyttsx3"), "2.99", "pyttsx3", "pip"),
+        (Engine(reason="engine_failed", words="libespeak-ng is missing: install it"), "2.99", "libespeak-ng", "libesp"),
         (
             Engine(reason="engine_failed", words="there is no espeak-ng data: install espeak-ng-data"),
-            PYTHON,
+            "2.99",
             "libespeak-ng",
             "espeak-ng-data",
         ),
-        (Engine(reason="engine_crashed", words="it was killed by SIGSEGV"), PYTHON, "libespeak-ng", "reinstall"),
+        (Engine(reason="engine_crashed", words="it was killed by SIGSEGV"), "2.99", "libespeak-ng", "reinstall"),
         (
             Engine(reason="engine_hung", words="the engine process said nothing"),
-            PYTHON,
+            "2.99",
             "libespeak-ng",
             "restart the sound server",
         ),
-        (Engine(reason="unknown_voice", words='unknown voice "x"'), PYTHON, "voices", "talk voices"),
+        (Engine(reason="unknown_voice", words='unknown voice "x"'), "2.99", "voices", "talk voices"),
     ],
 )
-def test_a_voice_that_cannot_speak_is_named(engine: Engine, python: Python, check: str, step: str) -> None:
-    found = of(voice.judge(python, engine, server=False), check)
+def test_a_voice_that_cannot_speak_is_named(engine: Engine, pyttsx3: str | None, check: str, step: str) -> None:
+    found = of(voice.judge(pyttsx3, engine, server=False), check)
     assert found.state == FAILED
     assert engine.words in found.message
     assert step in (found.next or "")
-    assert of(voice.judge(python, engine, server=True), check).state == WARNING, "the server has its own"
+    assert of(voice.judge(pyttsx3, engine, server=True), check).state == WARNING, "the server has its own"
 
 
 def test_a_voice_that_can_speak_is_told_with_its_version_and_voices() -> None:
-    found = voice.judge(PYTHON, ENGINE, server=False)
-    assert [each.check for each in found] == ["python", "pyttsx3", "libespeak-ng", "voices"]
+    found = voice.judge("2.99", ENGINE, server=False)
+    assert [each.check for each in found] == ["pyttsx3", "libespeak-ng", "voices"]
     assert {each.state for each in found} == {DONE}
-    assert "1.51 (system)" in found[2].message
-    assert "141" in found[3].message
+    assert "1.51 (system)" in found[1].message
+    assert "141" in found[2].message
     for voices in (None, 0):
-        assert voice.judge(PYTHON, Engine("espeak", "eSpeak", voices), server=False)[-1].state == WARNING
+        assert voice.judge("2.99", Engine("espeak", "eSpeak", voices), server=False)[-1].state == WARNING
 
 
 PATH = "/run/user/1000/talk/talk.sock"
@@ -142,9 +141,9 @@ PATH = "/run/user/1000/talk/talk.sock"
         (Places((Place(PATH, ABSENT),), "TALK_SOCKET"), "named by TALK_SOCKET", "unset TALK_SOCKET, or"),
         (Places((Place(PATH, ABSENT),), "--socket"), "named by --socket", "leave --socket out, or"),
         (Places((Place("/x", ABSENT),), "TALK_SOCKET", elsewhere=PATH), "/x", f"a server is on {PATH}"),
-        (Places((Place(PATH, server.MUTE),), None, None, "it does not answer"), "it does not answer", "restart"),
-        (Places((Place(PATH, server.MUTE),), None, None, "busy", "busy"), "busy", "--max-clients"),
-        (Places((Place(PATH, server.STOPPED, 0, 7),), None, None, "it does not answer"), "is stopped", "kill -CONT 7"),
+        (Places((Place(PATH, server.MUTE),), None, "it does not answer"), "it does not answer", "restart"),
+        (Places((Place(PATH, server.MUTE),), None, "busy", "busy"), "busy", "--max-clients"),
+        (Places((Place(PATH, server.STOPPED, 0, 7),), None, "it does not answer"), "is stopped", "kill -CONT 7"),
         (Places((Place(PATH, ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
     ],
 )
@@ -156,10 +155,10 @@ def test_where_no_server_is_each_place_is_named_with_what_is_there(found: Places
 
 
 def test_where_a_server_is_what_lies_before_it_is_a_warning() -> None:
-    served = Place(PATH, server.SERVER)
-    found = server.judge_places(Places((Place("/a", ABSENT), served), pid=4711))
+    served = Place(PATH, server.SERVER, pid=4711)
+    found = server.judge_places(Places((Place("/a", ABSENT), served)))
     assert (found.state, found.message) == (DONE, f"the server is on {PATH} (process 4711)")
-    found = server.judge_places(Places((Place("/a", server.FOREIGN, 7), served), pid=4711))
+    found = server.judge_places(Places((Place("/a", server.FOREIGN, 7), served)))
     assert found.state == WARNING
     assert "/a: another user's server (uid 7)" in found.message
 

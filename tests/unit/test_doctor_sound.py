@@ -113,8 +113,10 @@ def test_why_a_sound_server_is_out_of_reach_depends_on_where_this_runs(change: d
 
 def test_a_sound_server_that_hangs_or_is_named_wrongly_or_cannot_be_asked() -> None:
     assert "does not answer" in judged("sound server", server=SoundServer(hangs=True)).message
-    assert "unset PULSE_SERVER" in str(judged("sound server", server=SoundServer(named="unix:/x")).next)
-    found = judged("sound server", server=SoundServer(sockets=("/run/user/1000/pipewire-0",), askable=False))
+    assert "unset PULSE_SERVER" in str(
+        judged("sound server", server=SoundServer(named="unix:/x", trouble="refused")).next
+    )
+    found = judged("sound server", server=SoundServer(sockets=("/run/user/1000/pipewire-0",)))
     assert found.next == "sudo apt-get install -y pulseaudio-utils"
     service = judged("sound server", server=SoundServer(), cards=NO_CARDS, session=replace(PI, kinds=("a cron job",)))
     assert service.state == WARNING
