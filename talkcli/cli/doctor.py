@@ -21,7 +21,7 @@ def doctor(options: Common, silent: bool) -> int:
     """Show each finding and, at last, the one thing to do next; return the exit code."""
     found = []
     with Interrupts() as interrupts:
-        for finding in Examination(options.socket, silent=silent, interrupt=interrupts.descriptor).findings():
+        for finding in Examination(options.socket, silent=silent, interrupt=interrupts.watched).findings():
             found.append(finding)
             if options.json:
                 show_json(finding.to_json())

@@ -12,8 +12,6 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.doctor import machine, sentence, server, sound, voice
-from talkcli.doctor.sentence import Played
-from talkcli.doctor.voice import Setting
 from talkcli.engine.players.programs import PACKAGES
 from talkcli.engine.start import is_own
 from talkcli.errors import TalkError
@@ -24,10 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from talkcli.client.client import Client
-    from talkcli.doctor.machine import Session
     from talkcli.doctor.report import Finding
-    from talkcli.doctor.server import Places
-    from talkcli.doctor.voice import Engine
     from talkcli.goals.goal import Goal, JsonObject
 
 #: Seconds that the sentence may take, its time in the queue included: long enough for one that is being spoken.
@@ -37,8 +32,8 @@ LIMIT = 20.0
 class Examination:
     """One run of the doctor."""
 
-    def __init__(self, socket: str | None, *, silent: bool, interrupt: int | None = None) -> None:
-        """`socket`: --socket; `silent`: play the sentence without sound; `interrupt`: a descriptor that ends it."""
+    def __init__(self, socket: str | None, *, silent: bool, interrupt: Mapping[int, int] | None = None) -> None:
+        """`socket`: --socket; `silent`: play the sentence without sound; `interrupt`: what ends it, as in `ready`."""
         self._option = socket
         self._silent = silent
         self._interrupt = interrupt
@@ -60,7 +55,7 @@ class Examination:
                 self._found.append(each)
                 yield each
 
-    def _all(self, client: Client | None, found: Places) -> Iterator[Finding]:
+    def _all(self, client: Client | None, found: server.Places) -> Iterator[Finding]:
         log: list[Goal] = []
         gone = None
         if client is not None:
@@ -69,7 +64,7 @@ class Examination:
             except TalkError as error:
                 client, gone = None, error.message
         named = None if client else os.environ.get("TALK_VOICE") or None
-        engine = voice.look(Setting(voice=named, interrupt=self._interrupt))
+        engine = voice.look(voice.Setting(voice=named, interrupt=self._interrupt))
         yield voice.python()
         yield from voice.judge(voice.pyttsx3(), engine, server=client is not None)
         process = self._process = server.process_here(client) if client else None
@@ -100,7 +95,7 @@ class Examination:
         value = self._server.get(setting)
         return str(value) if value else None
 
-    def _sound(self, here: Session, env: Mapping[str, str], *, running: bool) -> Iterator[Finding]:
+    def _sound(self, here: machine.Session, env: Mapping[str, str], *, running: bool) -> Iterator[Finding]:
         if not is_own(self._told("driver")):
             return  # it plays by itself
         wanted, by = self._player()
@@ -115,42 +110,36 @@ class Examination:
             default = device is None and used in PACKAGES
             yield from sound.judge_levels(sound.levels(env, found, cards), default=default)
 
-    def _sentence(self, client: Client | None, engine: Engine, env: Mapping[str, str]) -> Finding:
+    def _sentence(self, client: Client | None, engine: voice.Engine, env: Mapping[str, str]) -> Finding:
         wanted, _ = self._player()
-        by_server, speaking = client is not None and not self._silent, False
         if client is not None and self._silent:
             if self._process is None:
                 return sentence.ELSEWHERE
             setting = self._setting_of_server(self._process, env)
-            played, speaking = sentence.beside(client, lambda: sentence.by_engine(sentence.SHORT, setting, 0.0, LIMIT))
+            played = sentence.beside(client, lambda: sentence.by_engine(sentence.SHORT, setting, 0.0, LIMIT))
         elif client is not None:
-            played = replace(sentence.by_server(client, sentence.TEXT, LIMIT), player=wanted)
+            played = replace(sentence.by_server(client, sentence.TEXT, LIMIT), player=wanted, served=True)
         elif engine.reason is not None:
-            played = Played(State.ABORTED, engine.reason, engine.words)
+            played = sentence.Played(State.ABORTED, engine.reason, engine.words)
         else:
-            setting = Setting(wanted, None, os.environ.get("TALK_VOICE") or None, self._interrupt)
+            setting = voice.Setting(wanted, None, os.environ.get("TALK_VOICE") or None, self._interrupt)
             played = sentence.by_engine(sentence.TEXT, setting, 0.0 if self._silent else 1.0, LIMIT)
         custom = sound.is_custom(wanted)
         behind = sentence.behind(self._found, custom=custom)
         if self._silent and self._owner is not None:
             behind = sentence.as_owner(self._owner)
-        stalled = played.reason == "audio_stalled" and not (self._hangs or custom)
-        return sentence.judge(
-            played,
-            silent=self._silent or sound.is_silent(wanted),
-            server=by_server,
-            suspended=sound.suspended(env) if stalled else (),
-            behind=behind,
-            hangs=self._hangs,
-            speaking=speaking,
-            device=self._told("device"),
-        )
+        if played.reason == "audio_stalled" and not (self._hangs or custom):
+            played = replace(played, suspended=sound.suspended(env))
+        silent = self._silent or sound.is_silent(wanted)
+        return sentence.judge(played, silent=silent, behind=behind, hangs=self._hangs, device=self._told("device"))
 
-    def _setting_of_server(self, process: int, env: Mapping[str, str]) -> Setting:
+    def _setting_of_server(self, process: int, env: Mapping[str, str]) -> voice.Setting:
         """Return what the server speaks with, for a process that does as it does, without a sound."""
         player = self._told("player")
         if sound.is_silent(player):
             player = sound.SILENT  # a file would get a sentence more, perhaps in the middle of one of the server's
         elif player in PACKAGES and not machine.names_a_player(process, env):
             player = None  # that one is the first that the server tries, and not the only one
-        return Setting(player, self._told("device"), self._told("voice"), self._interrupt, self._told("driver"), env)
+        return voice.Setting(
+            player, self._told("device"), self._told("voice"), self._interrupt, self._told("driver"), env
+        )

@@ -20,7 +20,8 @@ from talkcli.engine import devices
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
+    from typing import Any
 
 #: The group that Debian's cards belong to.
 _AUDIO = "audio"
@@ -125,9 +126,9 @@ def _session(environment: Mapping[str, str], server: int | None) -> Session:
     usual = f"/run/user/{uid}"
     return Session(
         uid=uid,
-        user=_user(uid),
+        user=_name(pwd.getpwuid, uid),
         server=server,
-        groups=tuple(map(_group, gids)),
+        groups=tuple(_name(grp.getgrgid, each) for each in gids),
         gids=gids,
         sudo_uid=int(caller) if uid == 0 and caller.isdecimal() else None,
         kinds=tuple(_kinds(environment, server)),
@@ -137,18 +138,12 @@ def _session(environment: Mapping[str, str], server: int | None) -> Session:
     )
 
 
-def _user(uid: int) -> str:
+def _name(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
+    """Return the name of a user or a group, which comes first of all that is known of one; its number without one."""
     try:
-        return pwd.getpwuid(uid).pw_name
+        return str(look_up(number)[0])
     except KeyError:
-        return str(uid)
-
-
-def _group(gid: int) -> str:
-    try:
-        return grp.getgrgid(gid).gr_name
-    except KeyError:
-        return str(gid)
+        return str(number)
 
 
 def _groups(pid: int | None) -> tuple[int, ...]:
@@ -195,7 +190,7 @@ def cards(session: Session, kernel: str = "/proc/asound", nodes: str = "/dev/snd
     for each in playing:
         with contextlib.suppress(OSError):
             found = os.stat(each)
-            group = _group(found.st_gid) if found.st_gid else group
+            group = _name(grp.getgrgid, found.st_gid) if found.st_gid else group
             if not _may_open(found, _access_list(each), session):
                 forbidden.append(each)
     return Cards(
@@ -265,11 +260,12 @@ def judge_session(session: Session) -> Finding:
         if session.usual_runtime is None:
             # As on a robot without logind: nothing is missing that there could be.
             return done("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")
+        again = "" if session.server is None else " where the server is started, and start it again"
         return warning(
             "session",
             f"{who}; XDG_RUNTIME_DIR is not set, as under cron, sudo, su and in system services: players find no "
             "PipeWire or PulseAudio of this user",
-            f"export XDG_RUNTIME_DIR={session.usual_runtime}{_again(session)}",
+            f"export XDG_RUNTIME_DIR={session.usual_runtime}{again}",
         )
     words = f"{who}; XDG_RUNTIME_DIR is {session.runtime}"
     if session.runtime_owner is None:
@@ -282,10 +278,6 @@ def judge_session(session: Session) -> Finding:
             f"run this as the user who owns it: sudo -u '#{session.runtime_owner}' talk doctor",
         )
     return done("session", words)
-
-
-def _again(session: Session) -> str:
-    return "" if session.server is None else " where the server is started, and start it again"
 
 
 def judge_cards(cards: Cards, session: Session, *, served: bool) -> Finding:

@@ -14,7 +14,7 @@ from talkcli.doctor.voice import INSTALL_LIBRARY, conversation, fault
 from talkcli.engine import protocol
 from talkcli.engine.once import EngineFailed
 from talkcli.errors import TalkError
-from talkcli.frozen import frozen
+from talkcli.frozen import frozen, replace
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
@@ -77,6 +77,11 @@ class Played:
     #: seconds of audio
     duration: float | None = None
     player: str | None = None
+    #: whether by a server, and whether one spoke meanwhile, with the same device
+    served: bool = False
+    beside_speech: bool = False
+    #: sinks that took no data when it had ended
+    suspended: tuple[str, ...] = ()
 
 
 def by_server(client: Client, text: str, limit: float) -> Played:
@@ -116,16 +121,17 @@ def _played(goal: Goal) -> Played:
     return Played(goal.state, goal.reason, goal.message, goal.duration)
 
 
-def beside(client: Client, play: Callable[[], Played]) -> tuple[Played, bool]:
+def beside(client: Client, play: Callable[[], Played]) -> Played:
     """Play without the server, and return how that went, and whether the server spoke meanwhile."""
     try:
         before = client.status()
         played = play()
         after = client.status()
     except TalkError as error:
-        return Played(State.LOST, "lost", error.message), False
+        return Played(State.LOST, "lost", error.message)
     spoken = {each.id for each in after.recent if each.state in {State.SUCCEEDED, State.PREEMPTED}}
-    return played, bool(before.active or after.active or spoken - {each.id for each in before.recent})
+    spoke = before.active or after.active or spoken - {each.id for each in before.recent}
+    return replace(played, beside_speech=bool(spoke))
 
 
 def by_engine(text: str, setting: Setting, volume: float, limit: float) -> Played:
@@ -182,23 +188,14 @@ def remedy(reason: str | None, words: str | None = None, player: object = None, 
 
 
 def judge(
-    played: Played,
-    *,
-    silent: bool,
-    server: bool,
-    suspended: tuple[str, ...] = (),
-    behind: str | None = None,
-    hangs: bool = False,
-    speaking: bool = False,
-    device: object = None,
+    played: Played, *, silent: bool, behind: str | None = None, hangs: bool = False, device: object = None
 ) -> Finding:
-    """Judge the sentence; `silent`: whether it made no sound; `server`: whether a server has played it.
+    """Judge the sentence; `silent`: whether it made no sound; `behind`: what is to be done about player and device.
 
-    `suspended`: sinks that took no data when it had ended; `behind`: what is to be done about player and device;
-    `hangs`: whether the sound server does, for which engines wait at their start; `speaking`: whether a server spoke
-    with the same device meanwhile; `device`: the one that was named for the player.
+    `hangs`: whether the sound server does, for which engines wait at their start; `device`: the one that was named for
+    the player.
     """
-    how = "through the server" if server else "by an engine of this command's own"
+    how = "through the server" if played.served else "by an engine of this command's own"
     if played.state is State.SUCCEEDED:
         seconds = "" if played.duration is None else f", {played.duration:.1f} s"
         player = f", {played.player}" if played.player else ""
@@ -207,12 +204,12 @@ def judge(
     if played.reason in {"late", "paused"}:
         return failed(SENTENCE, f"not spoken: {played.words}", remedy(played.reason))
     words = (played.words or "it ended without a reason").removeprefix(f"Talk {played.state.name.lower()}: ")
-    if speaking and _is_busy(played.reason, words):
+    if played.beside_speech and _is_busy(played.reason, words):
         return done(SENTENCE, f"the device is busy with what the server speaks at this moment ({words})")
     label = f"{played.state.name}, {played.reason}" if played.reason else played.state.name
-    if played.reason == "audio_stalled" and suspended:
-        words = f"{words}; suspended: {', '.join(suspended)}"
-        return failed(SENTENCE, f"{label}: {words}", f"pactl suspend-sink {suspended[0]} 0")
+    if played.reason == "audio_stalled" and played.suspended:
+        words = f"{words}; suspended: {', '.join(played.suspended)}"
+        return failed(SENTENCE, f"{label}: {words}", f"pactl suspend-sink {played.suspended[0]} 0")
     step = remedy(played.reason, words, played.player, device)
     # Player and device have been looked at from nearer before, unless the player itself names the cause.
     causes = _OF_SOUND | _OF_START if hangs else _OF_SOUND

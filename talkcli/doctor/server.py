@@ -24,7 +24,7 @@ from talkcli.paths import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
 from talkcli.terminal.goals import clock
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Sequence
+    from collections.abc import Container, Mapping, Sequence
 
     from talkcli.goals.goal import Goal, JsonObject
 
@@ -93,7 +93,7 @@ class Places:
     others: tuple[str, ...] = ()
 
 
-def connect(option: str | None, interrupt: int | None) -> tuple[Client | None, Places]:
+def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Places]:
     """Return a client of the server, if one can be had, and what is at each place; `option`: --socket."""
     named = paths.named_socket(option)
     by = "--socket" if option else "TALK_SOCKET" if named else None

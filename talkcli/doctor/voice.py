@@ -7,9 +7,9 @@ here; this one never loads the library.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import platform
-import select
 import sys
 import time
 from importlib.metadata import PackageNotFoundError, version
@@ -48,8 +48,8 @@ class Setting:
     player: str | None = None
     device: str | None = None
     voice: str | None = None
-    #: a descriptor that ends any waiting with Interrupted
-    interrupt: int | None = None
+    #: what ends any waiting with Interrupted, as in `connect.ready`
+    interrupt: Mapping[int, int] | None = None
     driver: str | None = None
     #: the environment in which it is to run; None for this process's
     env: Mapping[str, str] | None = None
@@ -84,14 +84,13 @@ def look(setting: Setting) -> Engine:
     return found  # it is ready; that it lists no voices is for who judges
 
 
-def conversation(setting: Setting, limit: float | None = None) -> Conversation:
+def conversation(setting: Setting, limit: float = math.inf) -> Conversation:
     """Return what talks to an engine process of these settings, for at most `limit` seconds."""
     configure = protocol.Configure(
         os.getpid(), setting.driver, setting.player, setting.device, setting.voice, list_voices=True
     )
-    interrupt = None if setting.interrupt is None else {setting.interrupt: select.POLLIN}
-    deadline = None if limit is None else time.monotonic() + limit
-    return Conversation(configure, env=setting.env, deadline=deadline, interrupt=interrupt)
+    deadline = time.monotonic() + limit
+    return Conversation(configure, env=setting.env, deadline=deadline, interrupt=setting.interrupt)
 
 
 def fault(error: EngineFailed) -> tuple[str, str]:

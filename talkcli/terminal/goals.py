@@ -27,6 +27,17 @@ _LABEL = 9
 #: Characters of a command line that are shown.
 MAX_COMMAND = 60
 
+#: How a server's part is told that does not begin with its name, and which are left out where there is none.
+_ABOUT = {
+    "engine": "{}",
+    "synthesizer": "{}",
+    "lead_in": "lead-in {} ms",
+    "rate": "{} words a minute",
+    "ttl": "ttl {} s",
+    "preempt": "preempts",
+}
+_IF_ANY = frozenset({"synthesizer", "device", "lead_in", "ttl", "preempt"})
+
 _NOBODY = "nobody known"
 #: Programs whose first argument is the script that one looks for.
 _INTERPRETER = re.compile(r"(ba|da|z|fi|k)?sh|python[\d.]*|perl|ruby|node|lua|env|sudo|timeout|nice")
@@ -81,8 +92,10 @@ def status_lines(status: ServerStatus, screen: Screen, now: float | None = None)
         f"up {span(float(uptime) if isinstance(uptime, int | float) else 0.0)}",
         f"{_field(server, 'clients')} of {_field(server, 'max_clients')} clients",
     ]
+    engine = _about(server, "engine", "driver", "synthesizer", "player", "device", "lead_in")
+    settings = _about(server, "rate", "volume", "pitch", "voice", "ttl", "preempt")
     lines = []
-    for label, parts in (("server", about), ("engine", _engine(server)), ("settings", _settings(server))):
+    for label, parts in (("server", about), ("engine", engine), ("settings", settings)):
         lines += folded([*(f"{each}," for each in parts[:-1]), parts[-1]], f"{label:<{_LABEL}}", screen)
     if server.get("paused"):
         lines.append(f"{'paused':<{_LABEL}}{screen.painted('speech is held', State.PREEMPTING)}: talk resume")
@@ -100,7 +113,7 @@ def setting_lines(settings: Mapping[str, object]) -> list[str]:
     shown = {"voice": "default", "ttl": 0}
     rows = [(name, shown.get(name, "-") if value is None else value) for name, value in settings.items()]
     longest = max((len(name) for name, _ in rows), default=0)
-    return [f"{printable(name):<{longest}}{GAP}{_value(value)}" for name, value in rows]
+    return [f"{printable(name):<{longest}}{GAP}{printable(_value(value))}" for name, value in rows]
 
 
 def voice_lines(voices: list[JsonObject]) -> list[str]:
@@ -258,32 +271,16 @@ def _base(path: str) -> str:
     return path.rstrip("/").rpartition("/")[2] or path
 
 
-def _engine(server: JsonObject) -> list[str]:
-    parts = [_field(server, "engine"), f"driver {_field(server, 'driver')}"]
-    if server.get("synthesizer"):
-        parts.append(_field(server, "synthesizer"))
-    parts.append(f"player {_field(server, 'player')}")
-    if server.get("device"):
-        parts.append(f"device {_field(server, 'device')}")
-    if server.get("lead_in"):
-        parts.append(f"lead-in {_field(server, 'lead_in')} ms")
-    return parts
-
-
-def _settings(server: JsonObject) -> list[str]:
-    parts = [f"{_field(server, 'rate')} words a minute", f"volume {_value(server.get('volume'))}"]
-    parts += [f"pitch {_field(server, 'pitch')}", f"voice {_field(server, 'voice')}"]
-    if server.get("ttl"):
-        parts.append(f"ttl {_value(server['ttl'])} s")
-    if server.get("preempt"):
-        parts.append("preempts")
-    return parts
+def _about(server: JsonObject, *names: str) -> list[str]:
+    """Return what these are of a server, in a few words each."""
+    shown = [each for each in names if server.get(each) or each not in _IF_ANY]
+    return [_ABOUT.get(each, f"{each} {{}}").format(_field(server, each)) for each in shown]
 
 
 def _value(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:g}" if isinstance(value, float) else printable(str(value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def clock(seconds: float | None) -> str:
@@ -297,4 +294,4 @@ def _moment(seconds: float | None) -> str | None:
 
 def _field(server: JsonObject, name: str) -> str:
     value = server.get(name)
-    return "default" if value is None else printable(str(value), MAX_TEXT)
+    return "default" if value is None else printable(_value(value), MAX_TEXT)

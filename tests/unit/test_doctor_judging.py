@@ -10,6 +10,7 @@ from talkcli.doctor.report import DONE, FAILED, WARNING, Finding, done, failed, 
 from talkcli.doctor.sentence import Played, behind
 from talkcli.doctor.server import Place, Places
 from talkcli.doctor.voice import Engine
+from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
 from talkcli.paths import ABSENT, FORBIDDEN, STALE
@@ -50,7 +51,7 @@ def test_a_sentence_that_found_no_device_is_cured_where_the_device_was_looked_at
 
     def cure(reason: str, words: str) -> str | None:
         played = Played(State.ABORTED, reason, words)
-        return sentence.judge(played, silent=False, server=True, behind="usermod").next
+        return sentence.judge(played, silent=False, behind="usermod").next
 
     assert cure("audio_device", "aplay: Permission denied") == "usermod"
     assert cure("audio_lost", "unplugged") == "usermod"
@@ -66,7 +67,7 @@ def test_a_player_of_one_s_own_is_cured_by_itself_unless_it_names_a_cause() -> N
 
     def cure(reason: str, words: str, player: str) -> str | None:
         played = Played(State.ABORTED, reason, words, player=player)
-        return sentence.judge(played, silent=False, server=True, device="usb").next
+        return sentence.judge(played, silent=False, device="usb").next
 
     by_hand = "try the player by hand, with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d usb"
     assert cure("audio_stalled", "it took no sound for 5 s", "sox -r {rate} -d {device}") == by_hand
@@ -76,10 +77,10 @@ def test_a_player_of_one_s_own_is_cured_by_itself_unless_it_names_a_cause() -> N
 
 def test_a_device_that_is_busy_is_heard_where_the_server_speaks() -> None:
     busy = Played(State.ABORTED, "audio_device", "aplay: audio open error: Device or resource busy")
-    assert sentence.judge(busy, silent=True, server=False, speaking=True).state == DONE
-    assert sentence.judge(busy, silent=True, server=False).state == FAILED
+    assert sentence.judge(replace(busy, beside_speech=True), silent=True).state == DONE
+    assert sentence.judge(busy, silent=True).state == FAILED
     gone = Played(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
-    assert sentence.judge(gone, silent=True, server=False, speaking=True).state == FAILED
+    assert sentence.judge(replace(gone, beside_speech=True), silent=True).state == FAILED
 
 
 def test_text_of_others_is_escaped_in_every_finding() -> None:
@@ -198,24 +199,24 @@ def test_the_last_failures_are_counted_and_the_last_one_told() -> None:
 
 
 def test_the_sentence_says_how_it_ended_and_what_to_do() -> None:
-    played = Played(State.SUCCEEDED, duration=1.7, player="aplay")
-    found = sentence.judge(played, silent=False, server=True)
+    played = Played(State.SUCCEEDED, duration=1.7, player="aplay", served=True)
+    found = sentence.judge(played, silent=False)
     assert found.state == DONE
     assert found.message.endswith("was played to its end through the server, aplay, 1.7 s")
-    assert "without sound" in sentence.judge(played, silent=True, server=False).message
+    assert "without sound" in sentence.judge(played, silent=True).message
     denied = Played(State.ABORTED, "audio_device", "Talk aborted: aplay: audio open error: Permission denied")
-    found = sentence.judge(denied, silent=False, server=True)
+    found = sentence.judge(denied, silent=False)
     assert found.message == "ABORTED, audio_device: aplay: audio open error: Permission denied"
     assert "usermod -aG audio" in str(found.next)
     stalled = Played(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
-    found = sentence.judge(stalled, silent=False, server=True, suspended=("usb",))
+    found = sentence.judge(replace(stalled, suspended=("usb",)), silent=False)
     assert (found.next, "suspended: usb" in found.message) == ("pactl suspend-sink usb 0", True)
     late = Played(State.RECALLED, "late", "it still waited behind 7 goals after 20 s, and was taken back")
-    found = sentence.judge(late, silent=False, server=True)
+    found = sentence.judge(late, silent=False)
     assert found.message.startswith("not spoken: it still waited behind 7 goals")
     assert "talk status" in str(found.next)
     assert "run talk doctor again" in str(
-        sentence.judge(Played(State.PREEMPTED, "canceled", "Talk preempted"), silent=False, server=True).next
+        sentence.judge(Played(State.PREEMPTED, "canceled", "Talk preempted"), silent=False).next
     )
 
 
