@@ -42,8 +42,6 @@ class Examination:
         self._found: list[Finding] = []
         #: the server's process, where it runs here
         self._process: int | None = None
-        #: its user, where that is another, from whose surroundings nothing can be played
-        self._owner: int | None = None
         #: whether the sound server hangs: whoever asks it again waits again
         self._hangs = False
 
@@ -69,11 +67,9 @@ class Examination:
         yield from voice.judge(voice.pyttsx3(), engine, server=client is not None)
         process = self._process = server.process_here(client) if client else None
         here, env = machine.surroundings(process)
-        if process is not None and here.server is None:
-            self._owner = machine.owner(f"/proc/{process}")
         if client is not None and process is None:
             yield machine.ELSEWHERE
-            yield from sound.judge_silent(*self._player(), running=True)
+            yield from sound.judge_silent(self._player(), running=True)
         elif sys.platform.startswith("linux"):
             yield machine.judge_session(here)
             yield from self._sound(here, env, running=client is not None)
@@ -82,13 +78,11 @@ class Examination:
             yield server.gone(gone)
         if client is not None:
             yield from server.judge(self._server, log, time.time())
-        yield self._sentence(client, engine, env)
+        yield self._sentence(client, engine, here, env)
 
-    def _player(self) -> tuple[str | None, str]:
-        """Return the player that is set, and by whom it would be."""
-        if self._server:
-            return self._told("player"), "the server's"
-        return os.environ.get("TALK_PLAYER") or None, "TALK_PLAYER"
+    def _player(self) -> str | None:
+        """Return the player that is set, by the server or for this process."""
+        return self._told("player") if self._server else os.environ.get("TALK_PLAYER") or None
 
     def _told(self, setting: str) -> str | None:
         """Return a setting of the server's; None where it has none, or there is no server."""
@@ -98,9 +92,8 @@ class Examination:
     def _sound(self, here: machine.Session, env: Mapping[str, str], *, running: bool) -> Iterator[Finding]:
         if not is_own(self._told("driver")):
             return  # it plays by itself
-        wanted, by = self._player()
-        device = self._told("device")
-        players = sound.players(env, wanted, by)
+        wanted, device = self._player(), self._told("device")
+        players = sound.players(env, wanted)
         used = wanted or next(iter(players.found), None)
         devices = sound.devices(env, used, device)
         cards, found = machine.cards(here), sound.sound_server(env, here)
@@ -110,13 +103,14 @@ class Examination:
             default = device is None and used in PACKAGES
             yield from sound.judge_levels(sound.levels(env, found, cards), default=default)
 
-    def _sentence(self, client: Client | None, engine: voice.Engine, env: Mapping[str, str]) -> Finding:
-        wanted, _ = self._player()
+    def _sentence(
+        self, client: Client | None, engine: voice.Engine, here: machine.Session, env: Mapping[str, str]
+    ) -> Finding:
+        wanted = self._player()
         if client is not None and self._silent:
             if self._process is None:
                 return sentence.ELSEWHERE
-            setting = self._setting_of_server(self._process, env)
-            played = sentence.beside(client, lambda: sentence.by_engine(sentence.SHORT, setting, 0.0, LIMIT))
+            played = sentence.beside(client, self._setting_of_server(self._process, env), LIMIT)
         elif client is not None:
             played = replace(sentence.by_server(client, sentence.TEXT, LIMIT), player=wanted, served=True)
         elif engine.reason is not None:
@@ -126,8 +120,9 @@ class Examination:
             played = sentence.by_engine(sentence.TEXT, setting, 0.0 if self._silent else 1.0, LIMIT)
         custom = sound.is_custom(wanted)
         behind = sentence.behind(self._found, custom=custom)
-        if self._silent and self._owner is not None:
-            behind = sentence.as_owner(self._owner)
+        if self._silent and self._process is not None and here.server is None:
+            # Another user's, from whose surroundings nothing can be played.
+            behind = sentence.AS_OWNER.format(machine.owner(f"/proc/{self._process}"))
         if played.reason == "audio_stalled" and not (self._hangs or custom):
             played = replace(played, suspended=sound.suspended(env))
         silent = self._silent or sound.is_silent(wanted)

@@ -107,12 +107,8 @@ def owner(path: str) -> int | None:
 
 def _environment(pid: int) -> dict[str, str] | None:
     """Return the environment of a process of the same user; None for another's, whose sound server shuts us out."""
-    try:
-        with open(f"/proc/{pid}/environ", "rb") as file:
-            data = file.read()
-    except OSError:
-        return None
-    if owner(f"/proc/{pid}") != os.getuid():
+    data = _bytes(f"/proc/{pid}/environ")
+    if data is None or owner(f"/proc/{pid}") != os.getuid():
         return None
     pairs = (each.partition("=") for each in os.fsdecode(data).split("\0") if "=" in each)
     return {name: value for name, _, value in pairs}
@@ -235,16 +231,13 @@ def _access_list(path: str) -> list[tuple[int, int, int]]:
 
 def _text(path: str) -> str:
     """Return a file under /proc; "" where it isn't there, or is another user's."""
-    try:
-        with open(path, encoding="utf-8", errors="replace") as file:
-            return file.read()
-    except OSError:
-        return ""
+    return (_bytes(path) or b"").decode(errors="replace")
 
 
-def seen_from(session: Session) -> str:
-    """Return for people from where the sound was looked at."""
-    return "from here" if session.server is None else f"from the server (process {session.server})"
+def _bytes(path: str) -> bytes | None:
+    with contextlib.suppress(OSError), open(path, "rb") as file:
+        return file.read()
+    return None
 
 
 def judge_session(session: Session) -> Finding:

@@ -18,7 +18,7 @@ from talkcli.frozen import frozen, replace
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from talkcli.client.client import Client
     from talkcli.client.goal import GoalHandle
@@ -57,10 +57,11 @@ ELSEWHERE = failed(
     "not played: the server runs on another machine or in a container, and so does its player",
     "run talk doctor --silent there; or here without --silent, so that the server plays",
 )
+#: What to do where a server's player failed by another user than the server's.
+AS_OWNER = "play as the server's own user, who may have another sound: sudo -u '#{}' talk doctor --silent"
 _BUSY = "another program holds the device: close it, or play through a sound server (PipeWire, PulseAudio)"
-_OF_PLAYER = frozenset({"audio_device", "audio_lost", "audio_stalled"})
-_OF_SOUND = _OF_PLAYER | {"no_player"}
-_OF_START = frozenset({"engine_failed", "engine_hung"})
+_OF_PLAYER = {"audio_device", "audio_lost", "audio_stalled"}
+_OF_START = {"engine_failed", "engine_hung"}
 _AGAIN = "somebody else ended it: run talk doctor again"
 #: Checks of what lies behind the engine, the nearest cause of a sentence's end first.
 _BEHIND = ("player", "device", "sound server", "group", "cards", "session")
@@ -121,11 +122,11 @@ def _played(goal: Goal) -> Played:
     return Played(goal.state, goal.reason, goal.message, goal.duration)
 
 
-def beside(client: Client, play: Callable[[], Played]) -> Played:
-    """Play without the server, and return how that went, and whether the server spoke meanwhile."""
+def beside(client: Client, setting: Setting, limit: float) -> Played:
+    """Play without a sound beside a server, as it would, and return how that went, and whether it spoke meanwhile."""
     try:
         before = client.status()
-        played = play()
+        played = by_engine(SHORT, setting, 0.0, limit)
         after = client.status()
     except TalkError as error:
         return Played(State.LOST, "lost", error.message)
@@ -153,11 +154,6 @@ def by_engine(text: str, setting: Setting, volume: float, limit: float) -> Playe
     except TimeoutError:
         pass
     return Played(State.ABORTED, "engine_hung", f"it was not over after {limit:g} s")
-
-
-def as_owner(uid: int) -> str:
-    """Return what to do where a server's player failed by another user than the server's."""
-    return f"play as the server's own user, who may have another sound: sudo -u '#{uid}' talk doctor --silent"
 
 
 def behind(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
@@ -212,7 +208,7 @@ def judge(
         return failed(SENTENCE, f"{label}: {words}", f"pactl suspend-sink {played.suspended[0]} 0")
     step = remedy(played.reason, words, played.player, device)
     # Player and device have been looked at from nearer before, unless the player itself names the cause.
-    causes = _OF_SOUND | _OF_START if hangs else _OF_SOUND
+    causes = {*_OF_PLAYER, "no_player", *(_OF_START if hangs else ())}
     if played.reason in causes and behind is not None and step != _BUSY:
         step = behind
     return failed(SENTENCE, f"{label}: {words}", step)

@@ -17,7 +17,7 @@ import subprocess
 import tempfile
 from typing import TYPE_CHECKING
 
-from talkcli.doctor.machine import judge_access, judge_cards, seen_from
+from talkcli.doctor.machine import judge_access, judge_cards
 from talkcli.doctor.report import Finding, done, failed, some, warning
 from talkcli.engine.devices import sound_servers
 from talkcli.engine.players.programs import PACKAGES
@@ -69,8 +69,8 @@ class Said:
     @property
     def complaint(self) -> str:
         """The line that says why it failed: the first one that it wrote to standard error."""
-        lines = [line.strip() for line in (self.err or self.out).splitlines() if line.strip()]
-        return lines[0] if lines else "it said nothing"
+        lines = map(str.strip, (self.err or self.out).splitlines())
+        return next(filter(None, lines), "it said nothing")
 
 
 @frozen
@@ -81,8 +81,6 @@ class Players:
     found: tuple[str, ...]
     #: what is to play, by the server's setting or by TALK_PLAYER; None for the first that is there
     wanted: str | None
-    #: by whom that was said, for people: "the server's", "TALK_PLAYER"
-    by: str | None = None
     #: whether a wanted program can be run
     runs: bool = True
 
@@ -196,11 +194,11 @@ def program_of(command: str) -> str | None:
         return None
 
 
-def players(env: Mapping[str, str], wanted: str | None, by: str | None) -> Players:
-    """Return which players there are; `wanted`: the setting, `by` whom it is."""
+def players(env: Mapping[str, str], wanted: str | None) -> Players:
+    """Return which players there are; `wanted`: the setting."""
     found = tuple(each for each in PACKAGES if path_of(each, env))
     program = program_of(wanted or "")
-    return Players(found, wanted, by, runs=bool(program and path_of(program, env)))
+    return Players(found, wanted, runs=bool(program and path_of(program, env)))
 
 
 def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> Devices | None:
@@ -315,26 +313,31 @@ def _percent(text: str) -> int | None:
     return max(found, default=None)
 
 
-def judge_silent(player: str | None, by: str | None, *, running: bool) -> list[Finding]:
-    """Judge a player by its name alone: it may be one that makes no sound; `by`, `running`: as of `judge`."""
+def judge_silent(player: str | None, *, running: bool) -> list[Finding]:
+    """Judge a player by its name alone: it may be one that makes no sound; `running`: as of `judge`."""
     if not is_silent(player):
         return []
     step = "start the server without --player" if running else "unset TALK_PLAYER"
-    return [failed("player", f"{player} ({by}): it keeps the time and makes no sound", step)]
+    return [failed("player", f"{player} ({_by(running)}): it keeps the time and makes no sound", step)]
 
 
 def judge(
     players: Players, devices: Devices | None, cards: Cards, server: SoundServer, session: Session, *, running: bool
 ) -> list[Finding]:
-    """Judge what plays; `running`: whether a talk server runs, which has a player of its own."""
+    """Judge what plays; `running`: whether a talk server runs, which has a player of its own, and set by itself."""
     served = server.name is not None
-    return judge_silent(players.wanted, players.by, running=running) or [
+    return judge_silent(players.wanted, running=running) or [
         _player(players, running=running),
         *([] if devices is None else [_device(devices)]),
         judge_cards(cards, session, served=served),
         judge_access(cards, session, served=served),
         _sound_server(server, cards, session),
     ]
+
+
+def _by(running: bool) -> str:
+    """Return for people by whom a player is set."""
+    return "the server's" if running else "TALK_PLAYER"
 
 
 def _player(players: Players, *, running: bool) -> Finding:
@@ -344,10 +347,10 @@ def _player(players: Players, *, running: bool) -> Finding:
     if wanted is not None:
         if players.runs:
             also = f"; there {'is' if len(others) == 1 else 'are'} also {', '.join(others)}" if others else ""
-            return done("player", f"{wanted} ({players.by}){also}")
+            return done("player", f"{wanted} ({_by(running)}){also}")
         package = PACKAGES.get(wanted)
         step = f"sudo apt-get install -y {package}" if package else "name a program that is there, with --player"
-        return broken("player", f"{wanted} ({players.by}) is not there", step)
+        return broken("player", f"{wanted} ({_by(running)}) is not there", step)
     if not players.found:
         first = next(iter(PACKAGES.values()))
         return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {first}")
@@ -374,7 +377,7 @@ def _device(devices: Devices) -> Finding:
 
 
 def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Finding:
-    where = seen_from(session)
+    where = "from here" if session.server is None else f"from the server (process {session.server})"
     if server.name is not None:
         sink = f", plays to {server.sink}" if server.sink else ""
         return done(_SERVER, f"{server.name}{sink}")

@@ -128,9 +128,8 @@ def judge(pyttsx3: str | None, engine: Engine, *, server: bool) -> list[Finding]
 
 
 def _library(engine: Engine) -> list[Finding]:
-    found = []
-    if engine.synthesizer is not None:
-        found.append(done("libespeak-ng", f"{engine.synthesizer}, with its data"))
+    name = engine.synthesizer
+    found = [] if name is None else [done("libespeak-ng", f"{name}, with its data")]
     if engine.voices is None:
         return [*found, warning("voices", "the engine listed none in time", "run talk doctor again")]
     if not engine.voices:

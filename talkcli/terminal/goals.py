@@ -168,16 +168,14 @@ def quoted(goal: Goal, limit: int | None = None) -> str:
 
 def _notes(goal: Goal, now: float) -> list[str]:
     """Return what is worth knowing of a goal that has not ended, beside its text and its sender."""
-    notes = []
-    if goal.started_at is not None:
-        held = "held, " if goal.paused else ""
-        notes.append(f"{held}for {max(0.0, now - goal.started_at):.1f} s")
-    if goal.priority:
-        notes.append(f"priority {goal.priority}")
-    if goal.key is not None:
-        notes.append(f'key "{printable(goal.key)}"')
-    left = _left(goal, now)
-    return notes if left is None else [*notes, left]
+    held = "held, " if goal.paused else ""
+    notes = [
+        None if goal.started_at is None else f"{held}for {max(0.0, now - goal.started_at):.1f} s",
+        f"priority {goal.priority}" if goal.priority else None,
+        None if goal.key is None else f'key "{printable(goal.key)}"',
+        _left(goal, now),
+    ]
+    return [each for each in notes if each is not None]
 
 
 def _ttl(goal: Goal, now: float) -> str | None:

@@ -47,19 +47,19 @@ def test_no_player_names_the_package() -> None:
 
 
 def test_a_player_that_is_set_and_not_there_is_named() -> None:
-    found = judged("player", Players(("aplay",), "pw-cat", "TALK_PLAYER", runs=False))
+    found = judged("player", Players(("aplay",), "pw-cat", runs=False))
     assert (found.state, found.next) == (FAILED, "sudo apt-get install -y pipewire-bin")
-    found = judged("player", Players(("aplay",), "/opt/play", "TALK_PLAYER", runs=False))
+    found = judged("player", Players(("aplay",), "/opt/play", runs=False))
     assert found.state == FAILED
     assert "/opt/play (TALK_PLAYER)" in found.message
 
 
 @pytest.mark.parametrize("player", ["null", "file:/tmp/x.wav"])
 def test_a_player_without_sound_is_not_heard(player: str) -> None:
-    found = sound.judge(Players((), player, "the server's"), None, CARDS, PULSE, PI, running=True)
+    found = sound.judge(Players((), player), None, CARDS, PULSE, PI, running=True)
     assert [each.state for each in found] == [FAILED]
-    assert found == sound.judge_silent(player, "the server's", running=True)
-    assert sound.judge_silent("aplay", "the server's", running=True) == []
+    assert found == sound.judge_silent(player, running=True)
+    assert sound.judge_silent("aplay", running=True) == []
 
 
 def test_a_device_is_looked_for_among_those_that_the_player_lists() -> None:
