@@ -121,14 +121,14 @@ def test_how_loud_it_is_comes_from_the_mixer_that_is_in_charge(tmp_path: Path) -
     controls = "case $1 in scontrols) echo \"Simple mixer control 'Master',0\";; *) echo 'Mono: 0 [0%] [off]';; esac"
     env = env_with(tmp_path, amixer=controls, wpctl="echo 'Volume: 0.40 [MUTED]'")
     (alsa,) = sound.levels(env, SoundServer(), cards)
-    assert (alsa.name, alsa.muted) == ("Master", True)
+    assert (alsa.name, alsa.muted, alsa.unmute) == ("Master", True, "amixer sset Master unmute")
     (wire,) = sound.levels(env, server, cards)
-    assert (wire.muted, wire.percent) == (True, 40)
+    assert (wire.muted, wire.percent, wire.unmute) == (True, 40, "wpctl set-mute @DEFAULT_AUDIO_SINK@ 0")
     env = env_with(
         tmp_path, pactl="case $1 in get-sink-mute) echo Mute: no;; *) echo 'Volume: mono: 9 / 30% / x';; esac"
     )
     (pulse,) = sound.levels(env, server, cards)
-    assert (pulse.muted, pulse.percent) == (False, 30)
+    assert (pulse.muted, pulse.percent, pulse.louder) == (False, 30, "pactl set-sink-volume @DEFAULT_SINK@ 70%")
     assert sound.levels(env, SoundServer(), Cards(kernel=False)) == ()
     assert sound.levels(env, SoundServer(hangs=True), cards) == ()
 

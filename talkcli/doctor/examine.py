@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from talkcli.client.client import Client
     from talkcli.doctor.report import Finding
-    from talkcli.goals.goal import Goal, JsonObject
+    from talkcli.goals.goal import JsonObject
 
 #: Seconds that the sentence may take, its time in the queue included: long enough for one that is being spoken.
 LIMIT = 20.0
@@ -54,13 +54,13 @@ class Examination:
                 yield each
 
     def _all(self, client: Client | None, found: server.Places) -> Iterator[Finding]:
-        log: list[Goal] = []
-        gone = None
+        itself: list[Finding] = []
         if client is not None:
             try:
                 self._server, log = server.described(client)
+                itself = server.judge(self._server, log, time.time())
             except TalkError as error:
-                client, gone = None, error.message
+                client, itself = None, [server.gone(error.message)]
         named = None if client else os.environ.get("TALK_VOICE") or None
         engine = voice.look(voice.Setting(voice=named, interrupt=self._interrupt))
         yield voice.python()
@@ -74,10 +74,7 @@ class Examination:
             yield machine.judge_session(here)
             yield from self._sound(here, env, running=client is not None)
         yield server.judge_places(found)
-        if gone is not None:
-            yield server.gone(gone)
-        if client is not None:
-            yield from server.judge(self._server, log, time.time())
+        yield from itself
         yield self._sentence(client, engine, here, env)
 
     def _player(self) -> str | None:

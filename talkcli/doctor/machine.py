@@ -84,11 +84,10 @@ def surroundings(server: int | None) -> tuple[Session, Mapping[str, str]]:
 
     The server's player is what plays, so where it can be seen, all that has to do with sound is looked at from there.
     """
-    if server is not None:
-        environment = _environment(server)
-        if environment is not None:
-            return _session(environment, server), environment
-    return _session(os.environ, None), dict(os.environ)
+    environment = None if server is None else _environment(server)
+    if environment is None:
+        return _session(os.environ, None), dict(os.environ)
+    return _session(environment, server), environment
 
 
 def names_a_player(server: int, env: Mapping[str, str]) -> bool:
@@ -143,12 +142,11 @@ def _name(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
 
 
 def _groups(pid: int | None) -> tuple[int, ...]:
-    if pid is not None:
-        status = _text(f"/proc/{pid}/status")
-        found = re.search(r"^Groups:(.*)$", status, re.MULTILINE)
-        mine = re.search(r"^Gid:\s+\d+\s+(\d+)", status, re.MULTILINE)
-        if found and mine:
-            return tuple(sorted({int(mine[1]), *map(int, found[1].split())}))
+    status = _text(f"/proc/{'self' if pid is None else pid}/status")
+    found = re.search(r"^Groups:(.*)$", status, re.MULTILINE)
+    mine = re.search(r"^Gid:\s+\d+\s+(\d+)", status, re.MULTILINE)
+    if found and mine:
+        return tuple(sorted({int(mine[1]), *map(int, found[1].split())}))
     return tuple(sorted({os.getegid(), *os.getgroups()}))
 
 

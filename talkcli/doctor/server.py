@@ -79,7 +79,7 @@ class Place:
 
 @frozen
 class Places:
-    """All places that are tried, in order."""
+    """All places that are tried, in order; where the server is, none is after that."""
 
     places: tuple[Place, ...]
     #: what named the only one: "--socket", "TALK_SOCKET"; None for the list
@@ -166,17 +166,17 @@ def process_here(client: Client) -> int | None:
 
 def judge_places(found: Places) -> Finding:
     """Judge where the server is."""
-    server = next((each for each in found.places if each.what == SERVER), None)
-    if server is not None:
-        before = [each for each in found.places[: found.places.index(server)] if each.what != ABSENT]
+    *tried, server = found.places
+    if server.what == SERVER:
+        before = [each for each in tried if each.what != ABSENT]
         by = f"{found.named}, " if found.named else ""
         words = f"the server is on {server.path} ({by}process {server.pid})"
         if before:
             passed = "; ".join(map(_shown, before))
             return warning("socket", f"{words}; before it: {passed}", f"remove what is in the way: {before[0].path}")
         return done("socket", words)
-    tried = "; ".join(map(_shown, found.places))
-    words = f"no server; {'named by ' + found.named if found.named else 'tried'}: {tried}"
+    places = "; ".join(map(_shown, found.places))
+    words = f"no server; {'named by ' + found.named if found.named else 'tried'}: {places}"
     if found.trouble is not None and not any(each.what == STOPPED for each in found.places):
         words = f"{words}; {found.trouble}"
     return failed("socket", words, _step(found))

@@ -276,41 +276,31 @@ def levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> tuple[L
         mute = asked("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.well:
             volume = asked("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
-            return (level_of_pactl(mute.out, volume.out),)
+            return (level_of(_SINK, mute.out + volume.out, *_PACTL),)
         whole = asked("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
-        return (level_of_wpctl(whole.out),) if whole.well else ()
+        return (level_of(_SINK, whole.out, *_WPCTL),) if whole.well else ()
     if not cards.names:
         return ()
     controls = asked("amixer", "scontrols", env=env)
     names = re.findall(r"control '([^']*)'", controls.out)
     told = [(each, asked("amixer", "sget", each, env=env)) for each in _CONTROLS if each in names]
-    return tuple(level_of_amixer(name, said.out) for name, said in told if said.well)
+    return tuple(
+        level_of(name, said.out, f"amixer sset {name} unmute", f"amixer sset {name} 70%")
+        for name, said in told
+        if said.well
+    )
 
 
-def level_of_pactl(mute: str, volume: str) -> Level:
-    """Return what `pactl get-sink-mute` and `get-sink-volume` say of the default sink."""
-    return Level(_SINK, "yes" in mute.lower(), _percent(volume), *_PACTL)
+def level_of(name: str, text: str, unmute: str, louder: str) -> Level:
+    """Return what a mixer says of an output: pactl, "Mute: no" and "40%"; wpctl, "Volume: 0.40 [MUTED]"; or amixer.
 
-
-def level_of_wpctl(text: str) -> Level:
-    """Return what `wpctl get-volume @DEFAULT_AUDIO_SINK@` says: "Volume: 0.40 [MUTED]"."""
-    found = re.search(r"Volume: (\d+(?:\.\d+)?)", text)
-    percent = round(float(found[1]) * 100) if found else None
-    return Level(_SINK, "[MUTED]" in text, percent, *_WPCTL)
-
-
-def level_of_amixer(control: str, text: str) -> Level:
-    """Return what `amixer sget CONTROL` says; on some channels of several is on."""
+    The loudest of its channels counts; by amixer, "[40%] [on]", it is muted where none is on.
+    """
     switches = re.findall(r"\[(on|off)\]", text)
-    muted = bool(switches) and "on" not in switches
-    words = f"amixer sset {control}"
-    return Level(control, muted, _percent(text), f"{words} unmute", f"{words} 70%")
-
-
-def _percent(text: str) -> int | None:
-    """Return the loudest of the channels."""
-    found = [int(each) for each in re.findall(r"(\d+)%", text)]
-    return max(found, default=None)
+    muted = "Mute: yes" in text or "[MUTED]" in text or (bool(switches) and "on" not in switches)
+    percents = [int(each) for each in re.findall(r"(\d+)%", text)]
+    percents += [round(float(each) * 100) for each in re.findall(r"Volume: (\d+(?:\.\d+)?)", text)]
+    return Level(name, muted, max(percents, default=None), unmute, louder)
 
 
 def judge_silent(player: str | None, *, running: bool) -> list[Finding]:

@@ -7,7 +7,7 @@ import pytest
 from talkcli.doctor import machine, sound
 from talkcli.doctor.machine import Cards, Session
 from talkcli.doctor.report import DONE, FAILED, WARNING, Finding
-from talkcli.doctor.sound import Devices, Players, SoundServer
+from talkcli.doctor.sound import Devices, Level, Players, SoundServer
 from talkcli.frozen import replace
 
 PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)
@@ -134,17 +134,18 @@ def test_without_a_runtime_directory_the_session_says_what_to_set() -> None:
 
 
 def test_what_is_muted_is_not_heard() -> None:
-    pulse = sound.level_of_pactl("Mute: yes\n", "Volume: mono: 65536 / 100% / 0.00 dB\n")
+    def level(name: str, text: str) -> Level:
+        return sound.level_of(name, text, f"unmute {name}", f"{name} 70%")
+
+    pulse = level("sink", "Mute: yes\nVolume: mono: 65536 / 100% / 0.00 dB\n")
     assert (pulse.muted, pulse.percent) == (True, 100)
-    wire = sound.level_of_wpctl("Volume: 0.05\n")
+    wire = level("sink", "Volume: 0.05\n")
     assert (wire.muted, wire.percent) == (False, 5)
-    assert sound.level_of_wpctl("Volume: 0.40 [MUTED]\n").muted
-    alsa = sound.level_of_amixer(
-        "Master", "  Front Left: Playback 0 [0%] [-65.25dB] [off]\n  Front Right: 9 [40%] [on]\n"
-    )
+    assert level("sink", "Volume: 0.40 [MUTED]\n").muted
+    alsa = level("Master", "  Front Left: Playback 0 [0%] [-65.25dB] [off]\n  Front Right: 9 [40%] [on]\n")
     assert (alsa.muted, alsa.percent) == (False, 40)
-    off = sound.level_of_amixer("Master", "  Mono: Playback 0 [0%] [-65.25dB] [off]\n")
-    assert sound.judge_levels((alsa, off), default=True)[0].next == "amixer sset Master unmute"
+    off = level("Master", "  Mono: Playback 0 [0%] [-65.25dB] [off]\n")
+    assert sound.judge_levels((alsa, off), default=True)[0].next == "unmute Master"
     assert sound.judge_levels((pulse,), default=True)[0].state == FAILED
     assert sound.judge_levels((pulse,), default=False)[0].state == WARNING, "another device is played to"
     assert sound.judge_levels((wire,), default=True)[0].state == WARNING
