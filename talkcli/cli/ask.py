@@ -6,6 +6,7 @@ They know no click: plain command lines come here without it. What watching take
 from __future__ import annotations
 
 import sys
+import time
 
 from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_json
@@ -47,7 +48,8 @@ def status(options: Common, goal_id: str | None) -> None:
         found = client.status() if goal_id is None else client.goal(goal_id)
 
     def lines() -> Iterable[str]:
-        return goal_lines(found, screen()) if isinstance(found, Goal) else status_lines(found, screen())
+        now = time.time()
+        return goal_lines(found, screen(), now) if isinstance(found, Goal) else status_lines(found, screen(), now)
 
     _show_found(options, [found.to_json()], lines)
 
@@ -67,7 +69,7 @@ def watch(options: Common, words: bool) -> int:
                 if options.json:
                     show_json(event.to_json())
                 else:
-                    for line in transcript.lines(event, screen()):
+                    for line in transcript.lines(event, screen(), time.time()):
                         show(line)
     return interrupts.exit_code
 
@@ -78,7 +80,7 @@ def log(options: Common, count: int) -> None:
 
     with options.connect() as client:
         goals = client.log(count)
-    _show_found(options, (each.to_json() for each in goals), lambda: log_lines(goals, screen()))
+    _show_found(options, (each.to_json() for each in goals), lambda: log_lines(goals, screen(), time.time()))
 
 
 def voices(options: Common, language: str | None) -> None:

@@ -51,9 +51,11 @@ def ending(goal: Goal) -> str:
     return f"{printable(goal.id)}: {words}" if goal.id else words
 
 
-def goal_lines(goal: Goal, screen: Screen, now: float | None = None) -> list[str]:
-    """Return all that is known of one goal, a line each; on a terminal what is longer goes on under its beginning."""
-    now = time.time() if now is None else now
+def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
+    """Return all that is known of one goal, a line each; on a terminal what is longer goes on under its beginning.
+
+    `now`: seconds since 1970, for how long something takes.
+    """
     state = screen.painted(goal.state.name, goal.state)
     rows = [
         ("id", printable(goal.id)),
@@ -82,9 +84,8 @@ def goal_lines(goal: Goal, screen: Screen, now: float | None = None) -> list[str
     ]
 
 
-def status_lines(status: ServerStatus, screen: Screen, now: float | None = None) -> list[str]:
-    """Return what a server says, will say and said; `now`: seconds since 1970, for how long something takes."""
-    now = time.time() if now is None else now
+def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
+    """Return what a server says, will say and said; `now`: as of `goal_lines`."""
     server = status.server
     uptime = server.get("uptime")
     about = [

@@ -80,8 +80,6 @@ def printable(text: str, limit: int | None = None) -> str:
 
 def printable_json(line: str) -> str:
     """Return a line of JSON, which stays the same JSON, with everything that isn't plainly visible escaped."""
-    if line.isascii() and line.isprintable():
-        return line
     import json
 
     # None of these characters stands outside of a string.

@@ -57,9 +57,8 @@ class Transcript:
         self._paused = False
         self._id_columns = _USUAL_ID
 
-    def lines(self, event: Event, screen: Screen, now: float | None = None) -> list[str]:
+    def lines(self, event: Event, screen: Screen, now: float) -> list[str]:
         """Return what is to be shown of an event; `now`: when it happened, where the event doesn't tell."""
-        now = time.time() if now is None else now
         if isinstance(event, Snapshot):
             return self._begin(event, screen, now)
         if isinstance(event, StateChanged):
@@ -153,9 +152,9 @@ class Transcript:
         return shown
 
 
-def log_lines(goals: Sequence[Goal], screen: Screen, now: float | None = None) -> list[str]:
+def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
     """Return goals that have ended, a line each: when, how, who said what, and why it ended."""
-    today = time.localtime(time.time() if now is None else now)[:3]
+    today = time.localtime(now)[:3]
     heads = [(_when(goal.ended_at, today), goal.state.name, cut(printable(goal.id), id_room(screen))) for goal in goals]
     widths = [max((width(head[place]) for head in heads), default=0) for place in range(3)]
     texts = [quoted(goal) for goal in goals]
