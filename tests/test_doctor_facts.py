@@ -41,11 +41,11 @@ def env_with(directory: Path, **scripts: str) -> dict[str, str]:
 def test_what_a_program_says_is_kept_and_its_complaint_is_one_line(tmp_path: Path) -> None:
     env = env_with(tmp_path, good='echo out; echo "$LC_ALL"', bad="echo; echo 'first line' >&2; echo more >&2; exit 3")
     good, bad = sound.asked("good", env=env), sound.asked("bad", env=env)
-    assert (good.well, good.out) == (True, "out\nC\n")
-    assert (bad.well, bad.code, bad.complaint) == (False, 3, "first line")
-    assert sound.asked("missing", env=env) == sound.Said(None)
+    assert good == sound.Said(None, "out\nC\n")
+    assert bad == sound.Said("first line", "\n")
+    assert sound.asked("missing", env=env) == sound.Said("missing is not there")
     write(tmp_path / "broken", "#!/no/such/interpreter\n", 0o755)
-    assert "No such file" in sound.asked("broken", env=env).err
+    assert "No such file" in str(sound.asked("broken", env=env).trouble)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
@@ -57,7 +57,7 @@ def test_a_program_that_hangs_is_killed_with_all_that_it_has_started(
     began = time.monotonic()
     said = sound.asked("hangs", env=env)
     assert said.late
-    assert not said.well
+    assert said.trouble == "no answer within 0.3 s"
     assert time.monotonic() - began < 20
     child = int((tmp_path / "pid").read_text())
     end = time.monotonic() + 5

@@ -92,9 +92,7 @@ def surroundings(server: int | None) -> tuple[Session, Mapping[str, str]]:
 
 def names_a_player(server: int, env: Mapping[str, str]) -> bool:
     """Whether a server was told its player, so that it tries no other; `env`: its environment."""
-    words = _text(f"/proc/{server}/cmdline").split("\0")
-    named = any(each == "--player" or each.startswith("--player=") for each in words)
-    return named or bool(env.get("TALK_PLAYER"))
+    return bool(env.get("TALK_PLAYER") or re.search(r"\0--player[=\0]", _text(f"/proc/{server}/cmdline")))
 
 
 def owner(path: str) -> int | None:

@@ -165,17 +165,14 @@ def behind(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
     return next((steps[check] for check in _BEHIND[: 1 if custom else None] if steps.get(check) is not None), None)
 
 
-def _is_busy(reason: str | None, words: str | None) -> bool:
-    return reason == "audio_device" and "busy" in (words or "").lower()
-
-
 def remedy(reason: str | None, words: str | None = None, player: object = None, device: object = None) -> str:
     """Return what to do about a goal that ended for this reason; `player`, `device`: what has played it, if known."""
-    if _is_busy(reason, words):
+    said = (words or "").lower()
+    if reason == "audio_device" and "busy" in said:
         return _BUSY
-    if reason == "audio_device" and words and ("denied" in words.lower() or "not permitted" in words.lower()):
+    if reason == "audio_device" and ("denied" in said or "not permitted" in said):
         return "sudo usermod -aG audio USER for the user who serves, log in again, and start the server again"
-    if reason == "engine_failed" and words and "libespeak-ng" in words:
+    if reason == "engine_failed" and "libespeak-ng" in (words or ""):
         return INSTALL_LIBRARY
     if reason in _OF_PLAYER and isinstance(player, str) and is_custom(player):
         command = player.replace("{rate}", "22050").replace("{device}", str(device or "default"))
@@ -200,13 +197,13 @@ def judge(
     if played.reason in {"late", "paused"}:
         return failed(SENTENCE, f"not spoken: {played.words}", remedy(played.reason))
     words = (played.words or "it ended without a reason").removeprefix(f"Talk {played.state.name.lower()}: ")
-    if played.beside_speech and _is_busy(played.reason, words):
+    step = remedy(played.reason, words, played.player, device)
+    if played.beside_speech and step == _BUSY:
         return done(SENTENCE, f"the device is busy with what the server speaks at this moment ({words})")
     label = f"{played.state.name}, {played.reason}" if played.reason else played.state.name
     if played.reason == "audio_stalled" and played.suspended:
         words = f"{words}; suspended: {', '.join(played.suspended)}"
         return failed(SENTENCE, f"{label}: {words}", f"pactl suspend-sink {played.suspended[0]} 0")
-    step = remedy(played.reason, words, played.player, device)
     # Player and device have been looked at from nearer before, unless the player itself names the cause.
     causes = {*_OF_PLAYER, "no_player", *(_OF_START if hangs else ())}
     if played.reason in causes and behind is not None and step != _BUSY:

@@ -55,22 +55,11 @@ _MOST = 64 * 1024
 class Said:
     """What a program said."""
 
-    #: its exit status; None where it is not there, cannot be run, or took too long
-    code: int | None
+    #: why it failed: the first line that it wrote to standard error, for one; None where all went well
+    trouble: str | None
     out: str = ""
-    err: str = ""
     #: whether it took too long
     late: bool = False
-
-    @property
-    def well(self) -> bool:
-        return self.code == 0
-
-    @property
-    def complaint(self) -> str:
-        """The line that says why it failed: the first one that it wrote to standard error."""
-        lines = map(str.strip, (self.err or self.out).splitlines())
-        return next(filter(None, lines), "it said nothing")
 
 
 @frozen
@@ -139,7 +128,7 @@ def asked(program: str, *words: str, env: Mapping[str, str]) -> Said:
     """Run a program to its end, in its own language, and return what it said."""
     path = path_of(program, env)
     if path is None:
-        return Said(None)
+        return Said(f"{program} is not there")
     # Files, not pipes: what a program leaves running behind it would hold a pipe open.
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         try:
@@ -152,14 +141,18 @@ def asked(program: str, *words: str, env: Mapping[str, str]) -> Said:
                 start_new_session=True,
             )
         except OSError as error:
-            return Said(None, err=str(error))
+            return Said(str(error))
         try:
             code = process.wait(LIMIT)
         except subprocess.TimeoutExpired:
             code = None
         finally:
             _end(process)
-        return Said(code, _read(out.fileno()), _read(err.fileno()), late=code is None)
+        said, complaint = _read(out.fileno()), _read(err.fileno())
+    if code is None:
+        return Said(f"no answer within {LIMIT:g} s", said, late=True)
+    lines = filter(None, map(str.strip, (complaint or said).splitlines()))
+    return Said(next(lines, "it said nothing") if code else None, said)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -208,7 +201,7 @@ def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> D
     command, names = _LISTING[player]
     program, *words = command.split()
     found = asked(program, *words, env=env)
-    return Devices(command, tuple(names(found)), None if found.well else _trouble(program, found), wanted)
+    return Devices(command, tuple(names(found)), found.trouble, wanted)
 
 
 def _alsa_names(said: Said) -> list[str]:
@@ -218,7 +211,7 @@ def _alsa_names(said: Said) -> list[str]:
 def _sinks(said: Said) -> list[tuple[str, str]]:
     """Return names and states of the sinks: number, name, module, format, state, with tabs between them."""
     lines = [each.split("\t") for each in said.out.splitlines()]
-    return [(each[1], each[-1].strip()) for each in lines if said.well and len(each) > 2]
+    return [(each[1], each[-1].strip()) for each in lines if said.trouble is None and len(each) > 2]
 
 
 def _node_names(said: Said) -> list[str]:
@@ -236,12 +229,6 @@ _LISTING: dict[str | None, tuple[str, Callable[[Said], list[str]]]] = {
 }
 
 
-def _trouble(program: str, said: Said) -> str:
-    if said.late:
-        return f"no answer within {LIMIT:g} s"
-    return f"{program} is not there" if said.code is None and not said.err else said.complaint
-
-
 def suspended(env: Mapping[str, str]) -> tuple[str, ...]:
     """Return the sinks that take no data; while nothing plays, those that are asleep, too."""
     found = asked(*_SINKS.split(), env=env)
@@ -251,16 +238,16 @@ def suspended(env: Mapping[str, str]) -> tuple[str, ...]:
 def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
     """Return the sound server that a player of this session finds."""
     pulse = asked("pactl", "info", env=env)
-    if pulse.well:
+    if pulse.trouble is None:
         return SoundServer(_field(pulse.out, "Server Name") or "PulseAudio", _field(pulse.out, "Default Sink"))
-    wire = Said(None) if pulse.late else asked("pw-cli", "info", "0", env=env)
-    if wire.well:
+    wire = pulse if pulse.late else asked("pw-cli", "info", "0", env=env)
+    if wire.trouble is None:
         return SoundServer("PipeWire, without its PulseAudio part")
     answers = {"pactl": pulse, "pw-cli": wire}
-    trouble = next((_trouble(each, said) for each, said in answers.items() if path_of(each, env)), None)
+    trouble = next((said.trouble for each, said in answers.items() if path_of(each, env)), None)
     sockets = sound_servers(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else []))
     named = env.get("PULSE_SERVER") or None
-    return SoundServer(sockets=tuple(sockets), trouble=trouble, hangs=pulse.late or wire.late, named=named)
+    return SoundServer(sockets=tuple(sockets), trouble=trouble, hangs=wire.late, named=named)
 
 
 def _field(text: str, name: str) -> str | None:
@@ -274,11 +261,11 @@ def levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> tuple[L
         return ()
     if server.name is not None:
         mute = asked("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
-        if mute.well:
+        if mute.trouble is None:
             volume = asked("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
             return (level_of(_SINK, mute.out + volume.out, *_PACTL),)
         whole = asked("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
-        return (level_of(_SINK, whole.out, *_WPCTL),) if whole.well else ()
+        return (level_of(_SINK, whole.out, *_WPCTL),) if whole.trouble is None else ()
     if not cards.names:
         return ()
     controls = asked("amixer", "scontrols", env=env)
@@ -287,7 +274,7 @@ def levels(env: Mapping[str, str], server: SoundServer, cards: Cards) -> tuple[L
     return tuple(
         level_of(name, said.out, f"amixer sset {name} unmute", f"amixer sset {name} 70%")
         for name, said in told
-        if said.well
+        if said.trouble is None
     )
 
 
@@ -331,21 +318,21 @@ def _by(running: bool) -> str:
 
 
 def _player(players: Players, *, running: bool) -> Finding:
-    wanted = players.wanted
+    wanted, found = players.wanted, players.found
     broken = warning if running else failed
-    others = [each for each in players.found if each != wanted]
-    if wanted is not None:
-        if players.runs:
-            also = f"; there {'is' if len(others) == 1 else 'are'} also {', '.join(others)}" if others else ""
-            return done("player", f"{wanted} ({_by(running)}){also}")
+    if wanted is None and not found:
+        first = next(iter(PACKAGES.values()))
+        return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {first}")
+    if wanted is None:
+        after = f"; then {', '.join(found[1:])}" if len(found) > 1 else ""
+        return done("player", f"{found[0]} is used{after}")
+    if not players.runs:
         package = PACKAGES.get(wanted)
         step = f"sudo apt-get install -y {package}" if package else "name a program that is there, with --player"
         return broken("player", f"{wanted} ({_by(running)}) is not there", step)
-    if not players.found:
-        first = next(iter(PACKAGES.values()))
-        return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {first}")
-    after = f"; then {', '.join(others[1:])}" if len(others) > 1 else ""
-    return done("player", f"{others[0]} is used{after}")
+    others = [each for each in found if each != wanted]
+    also = f"; there {'is' if len(others) == 1 else 'are'} also {', '.join(others)}" if others else ""
+    return done("player", f"{wanted} ({_by(running)}){also}")
 
 
 def _device(devices: Devices) -> Finding:
