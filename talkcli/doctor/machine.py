@@ -185,21 +185,17 @@ def cards(session: Session, kernel: str = "/proc/asound", nodes: str = "/dev/snd
             group = _name(grp.getgrgid, found.st_gid) if found.st_gid else group
             if not _may_open(found, _access_list(each), session):
                 forbidden.append(each)
+    members: list[str] = []
+    with contextlib.suppress(KeyError):
+        members = grp.getgrnam(group).gr_mem
     return Cards(
         kernel=os.path.isdir(kernel),
         names=tuple(each.strip() for each in names),
         nodes=tuple(playing),
         forbidden=tuple(forbidden),
         group=group,
-        from_next_login=session.user in _members(group),
+        from_next_login=session.user in members,
     )
-
-
-def _members(group: str) -> list[str]:
-    try:
-        return grp.getgrnam(group).gr_mem
-    except KeyError:
-        return []
 
 
 def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], session: Session) -> bool:
@@ -218,11 +214,10 @@ def _may_open(found: os.stat_result, entries: list[tuple[int, int, int]], sessio
 
 def _access_list(path: str) -> list[tuple[int, int, int]]:
     """Return the entries of a file's access control list: kind, permissions, whose."""
-    try:
+    with contextlib.suppress(OSError):
         data = os.getxattr(path, "system.posix_acl_access")
-    except OSError:
-        return []
-    return list(struct.iter_unpack("<HHI", data[4 : 4 + (len(data) - 4) // 8 * 8]))
+        return list(struct.iter_unpack("<HHI", data[4 : 4 + (len(data) - 4) // 8 * 8]))
+    return []
 
 
 def _text(path: str) -> str:

@@ -30,7 +30,6 @@ TEXT = "If you hear this, talk works."
 #: What is played beside a server where nobody hears it: short, as a device that takes one player has no place for the
 #: server's meanwhile, and long enough to see that a player doesn't just swallow it.
 SHORT = "talk works well"
-_ID = "doctor"
 #: Words per minute, of what is heard and of what nobody hears: that holds the device no longer than it must.
 _RATE, _SILENT_RATE = 200, 450
 #: What to do about a reason. What isn't here is told by `reason` and message alone.
@@ -62,7 +61,6 @@ AS_OWNER = "play as the server's own user, who may have another sound: sudo -u '
 _BUSY = "another program holds the device: close it, or play through a sound server (PipeWire, PulseAudio)"
 _OF_PLAYER = {"audio_device", "audio_lost", "audio_stalled"}
 _OF_START = {"engine_failed", "engine_hung"}
-_AGAIN = "somebody else ended it: run talk doctor again"
 #: Checks of what lies behind the engine, the nearest cause of a sentence's end first.
 _BEHIND = ("player", "device", "sound server", "group", "cards", "session")
 
@@ -91,8 +89,7 @@ def by_server(client: Client, text: str, limit: float) -> Played:
         goal = client.say(text, preempt=False, ttl=0)
         try:
             if goal.speech_paused:
-                goal.cancel()
-                return Played(goal.state, "paused", "speech is paused")
+                return Played(goal.cancel().state, "paused", "speech is paused")
             return _played(goal.wait(limit))
         except TimeoutError:
             return _taken_back(client, goal, limit)
@@ -144,7 +141,7 @@ def by_engine(text: str, setting: Setting, volume: float, limit: float) -> Playe
                 if isinstance(event, protocol.Ready):
                     player = event.player
                     rate = _RATE if volume else _SILENT_RATE
-                    engine.say(protocol.Say(_ID, text, rate, volume, setting.voice, 50))
+                    engine.say(protocol.Say("doctor", text, rate, volume, setting.voice, 50))
                 elif isinstance(event, protocol.Ended):
                     if event.outcome == protocol.COMPLETED:
                         return Played(State.SUCCEEDED, duration=event.duration, player=player)
@@ -177,7 +174,7 @@ def remedy(reason: str | None, words: str | None = None, player: object = None, 
     if reason in _OF_PLAYER and isinstance(player, str) and is_custom(player):
         command = player.replace("{rate}", "22050").replace("{device}", str(device or "default"))
         return f"try the player by hand, with a second of silence: head -c 44100 /dev/zero | {command}"
-    return REMEDIES.get(reason or "", _AGAIN)
+    return REMEDIES.get(reason or "", "somebody else ended it: run talk doctor again")
 
 
 def judge(

@@ -68,20 +68,19 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("from", who(goal.client)),
         ("priority", str(goal.priority)),
         ("key", goal.key and f'"{printable(goal.key)}"'),
-        ("ttl", _ttl(goal, now)),
+        ("ttl", goal.ttl and ", ".join(filter(None, (f"{goal.ttl:g} s", _left(goal, now))))),
         ("data", None if goal.data is None else printable(encode(goal.data).decode().rstrip("\n"))),
         ("queued", _moment(goal.queued_at)),
         ("started", _moment(goal.started_at)),
         ("ended at", _moment(goal.ended_at)),
         ("duration", None if goal.duration is None else f"{goal.duration:.2f} s of audio"),
     ]
-    # What is JSON is left to the terminal to break: copied from there it is the same still.
-    return [
-        line
-        for name, value in rows
-        if value
-        for line in folded(value.split(" "), f"{name:<{_LABEL}}", Screen() if name == "data" else screen)
-    ]
+    lines = []
+    for name, value in rows:
+        if value:
+            # What is JSON is left to the terminal to break: copied from there it is the same still.
+            lines += folded(value.split(" "), f"{name:<{_LABEL}}", Screen() if name == "data" else screen)
+    return lines
 
 
 def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
@@ -177,13 +176,6 @@ def _notes(goal: Goal, now: float) -> list[str]:
         _left(goal, now),
     ]
     return [each for each in notes if each is not None]
-
-
-def _ttl(goal: Goal, now: float) -> str | None:
-    if not goal.ttl:
-        return None
-    left = _left(goal, now)
-    return f"{goal.ttl:g} s" if left is None else f"{goal.ttl:g} s, {left}"
 
 
 def _left(goal: Goal, now: float) -> str | None:

@@ -40,7 +40,6 @@ _LEAST_TEXT = 16
 _USUAL_ID = 8
 #: Where a line begins that goes on from the one before it: under the state.
 _INDENT = 10
-_DATE = "%b %d %H:%M:%S"
 
 
 class Transcript:
@@ -180,4 +179,4 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
 def _when(seconds: float | None, today: tuple[int, ...]) -> str:
     if seconds is None or time.localtime(seconds)[:3] == today:
         return clock(seconds)
-    return time.strftime(_DATE, time.localtime(seconds))
+    return time.strftime("%b %d %H:%M:%S", time.localtime(seconds))
