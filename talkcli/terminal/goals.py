@@ -1,7 +1,7 @@
 """Goals in words: one with all that is known, those of a status, who sent them, and what ended them; voices, settings.
 
-It prints nothing itself, so that any client can use it; how wide the terminal is and whether it has colour is said by
-its caller. Text from others always goes through `printable`. What happens as it happens is in `transcript`.
+It prints nothing itself, so that any client can use it; how wide the terminal is, whether it has colour and what time
+it is, its caller says. Text from others always goes through `printable`. What happens as it happens is in `transcript`.
 """
 
 from __future__ import annotations
