@@ -1,26 +1,39 @@
 """The listening socket: who may serve at a path, and how its file comes and goes.
 
-A lock that is held for life decides who serves; only its holder removes a socket that an ended server left.
+A lock that is held for life decides who serves; only its holder removes a socket that an ended server left. Cleaners of
+temporary directories and people remove the file while it is served: it is looked after.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import stat
 import sys
+from typing import TYPE_CHECKING
 
 from talkcli import paths, peers
 from talkcli.client.connect import connect, hello
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
+from talkcli.server import log
 from talkcli.server.lock import Lock, identity, serves_already
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
 
 #: Connections that may wait to be accepted; the system's own limit applies too (net.core.somaxconn).
 BACKLOG = 1024
 #: The first descriptor that systemd passes (SD_LISTEN_FDS_START).
 _FIRST_PASSED = 3
 _RESTART_SOCKET = "restart the socket's unit (systemctl restart talk.socket)"
+#: Seconds between two looks. Nobody reaches the server meanwhile, and 30 s is what is promised; it is two calls of
+#: lstat, so it costs a machine at rest nothing.
+LOOK_EVERY = 10.0
+#: What passes, so that the next look may well succeed: no room, no descriptor, a disk that is read-only for a while.
+_PASSING = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 class Listener:
@@ -233,3 +246,55 @@ def _bind(path: str, mode: int) -> socket.socket:
         listening.close()
         raise AddressInUse(f"cannot listen at {path}: {error.strerror or error}") from error
     return listening
+
+
+class Upkeep:
+    """Looks after the file of a listener, from `begin` to `end`: when to look, and what follows."""
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        listener: Listener | InheritedListener,
+        moved: Callable[[socket.socket | None], None],
+        lost: Callable[[AddressInUse], None],
+    ) -> None:
+        """`moved` is called with the former socket when the listener has bound again, `lost` when it can't."""
+        self._loop = loop
+        self._listener = listener
+        self._moved = moved
+        self._lost = lost
+        self._said = ""
+        self._timer: asyncio.TimerHandle | None = None
+
+    def begin(self) -> None:
+        """Look from now on."""
+        self._timer = self._loop.call_later(LOOK_EVERY, self._look)
+
+    def end(self) -> None:
+        """Look no more."""
+        if self._timer:
+            self._timer.cancel()
+            self._timer = None
+
+    def _look(self) -> None:
+        self.begin()
+        if self._listener.in_place():
+            self._said = ""
+            return
+        try:
+            former = self._listener.bind_again()
+        except AddressInUse as error:
+            if not self._listener.passed and not _passes(error):
+                self.end()
+                self._lost(error)
+            elif str(error) != self._said:
+                self._said = str(error)
+                log.line(log.shown(f"clients can't reach this server: {error}"))
+            return
+        self._said = ""
+        log.line(f"the socket's file or its lock was gone or another: bound again at {self._listener.path}")
+        self._moved(former)
+
+
+def _passes(error: AddressInUse) -> bool:
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _PASSING

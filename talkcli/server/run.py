@@ -19,12 +19,11 @@ from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
 from talkcli.server import log
-from talkcli.server.accept import Acceptor, make_room
 from talkcli.server.connection import Connection
-from talkcli.server.listener import InheritedListener, Listener, listen
+from talkcli.server.listener import InheritedListener, Listener, Upkeep, listen
 from talkcli.server.service import DOOR, Service
+from talkcli.server.stream import Acceptor, make_room
 from talkcli.server.systemd import Systemd
-from talkcli.server.upkeep import Upkeep
 
 if TYPE_CHECKING:
     import socket

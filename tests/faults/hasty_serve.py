@@ -7,9 +7,9 @@ import sys
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
 
-from talkcli.server import upkeep
+from talkcli.server import listener
 from tests.support import scripted_serve
 
 if __name__ == "__main__":
-    upkeep.LOOK_EVERY = 0.05
+    listener.LOOK_EVERY = 0.05
     scripted_serve.main()
