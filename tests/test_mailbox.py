@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 from talkcli.engine import protocol
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
-from talkcli.server.mailbox import AT_ONCE, Mailbox
 from talkcli.server.settings import Settings
-from talkcli.server.speech import Speech
+from talkcli.server.speech import AT_ONCE, Mailbox, Speech
 
 if TYPE_CHECKING:
     from talkcli.goals.record import Record

@@ -15,7 +15,7 @@ from talkcli.frozen import replace
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, Say
 from talkcli.goals.states import State
-from talkcli.server import clock, speech
+from talkcli.server import speech
 from talkcli.server.settings import Settings
 from talkcli.server.speech import Speech
 
@@ -74,7 +74,7 @@ def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine_wakes
         served = await _queued_behind_another(ttl=600)
         await asyncio.sleep(0)  # the loop's own timer for the ten minutes is set
         slept.ahead += 3_600
-        await _until(served, "4k7f-2", State.RECALLED, clock.LOOK_EVERY + 1)
+        await _until(served, "4k7f-2", State.RECALLED, speech.LOOK_EVERY + 1)
 
     asyncio.run(scenario())
 
@@ -107,4 +107,4 @@ def test_the_wall_clock_ends_no_goal(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that counts a suspend")
 def test_the_clock_is_the_one_that_counts_a_suspend() -> None:
     before = time.clock_gettime(time.CLOCK_BOOTTIME)
-    assert before <= clock.elapsed() <= time.clock_gettime(time.CLOCK_BOOTTIME)
+    assert before <= speech.elapsed() <= time.clock_gettime(time.CLOCK_BOOTTIME)

@@ -14,12 +14,12 @@ import pytest
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Cancel, Say
 from talkcli.protocol.requests import Status, Wait, Watch
-from talkcli.server import news
+from talkcli.server import subscribers
 from talkcli.server.call import Call
-from talkcli.server.news import News
 from talkcli.server.requests import ALL_WAITING, EACH, Requests
 from talkcli.server.settings import Settings
 from talkcli.server.speech import Speech
+from talkcli.server.subscribers import News
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -244,8 +244,8 @@ def test_a_cancel_of_thousands_of_pending_goals_leaves_the_others_their_turns() 
             server.ask(asking, Status(id="4k7f-1"))
             await asyncio.sleep(0)
             most = max(most, len(ended) - before)
-        assert most <= 2 * news._PORTION
-        assert len(asking.told) > count / news._PORTION / 2
+        assert most <= 2 * subscribers._PORTION
+        assert len(asking.told) > count / subscribers._PORTION / 2
 
     play(scene)
 
@@ -291,8 +291,8 @@ def test_news_are_told_as_fast_as_they_are_read() -> None:
 
 
 def test_news_are_told_though_nobody_reads_and_that_is_waited_for_only_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(news, "_PATIENCE", 0.02)
-    monkeypatch.setattr(news, "_LESS", 0.1)
+    monkeypatch.setattr(subscribers, "_PATIENCE", 0.02)
+    monkeypatch.setattr(subscribers, "_LESS", 0.1)
 
     async def scene() -> None:
         loop, readers, told = asyncio.get_running_loop(), Readers(), []

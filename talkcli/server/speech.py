@@ -8,7 +8,9 @@ calls `tick`. It knows no requests but as those who wait, and are to go on.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
+from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -22,11 +24,8 @@ from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.states import State
 from talkcli.server import log
 from talkcli.server.call import go_on
-from talkcli.server.clock import LOOK_EVERY, elapsed
-from talkcli.server.mailbox import Mailbox
-from talkcli.server.news import News
 from talkcli.server.stream import Streams
-from talkcli.server.subscribers import Subscribers
+from talkcli.server.subscribers import News, Subscribers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,6 +36,21 @@ if TYPE_CHECKING:
     from talkcli.goals.record import Record
     from talkcli.server.call import Place
     from talkcli.server.settings import Settings
+
+#: Linux's monotonic clock stands still while the machine sleeps, the one since the boot does not. Elsewhere, on macOS,
+#: the monotonic one goes on.
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+#: Seconds after which a timer looks at this clock again: the event loop's own timers stand still in a suspend, and what
+#: was due in it must not wait for as long again.
+LOOK_EVERY = 1.0
+#: Reports that are taken before the loop looks at the clients again: to tell fifty watchers of so many words takes it
+#: some milliseconds, on a busy machine a hundredth of a second or two.
+AT_ONCE = 8
+
+
+def elapsed() -> float:
+    """Return seconds since some moment in the past: no change of the wall clock moves it, and a suspend counts."""
+    return time.clock_gettime(_CLOCK)
 
 
 class Speech:
@@ -350,3 +364,46 @@ class Speech:
         """Set `finished`, where everything has ended and that is told."""
         if self.closing and self.scheduler.active is None and self.news.told:
             self.finished.set()
+
+
+class Mailbox:
+    """The reports of one engine thread, on their way into the event loop's: in their order, and a few at a time.
+
+    It looks at none of them. A sentence of many words must not keep clients waiting who ask for something meanwhile:
+    words that come faster than they can be told stay here, and the clients have their turn in between.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        take: Callable[[Report], None],
+        failed: Callable[[str, Exception], None],
+    ) -> None:
+        """`take` is called with each, in the loop's thread; `failed`, where that raised."""
+        self._loop = loop
+        self._take = take
+        self._failed = failed
+        self._waiting: deque[Report] = deque()
+        #: whether the loop has been told that something waits: to wake it for each costs as much as to take one
+        self._due = False
+
+    def post(self, report: Report) -> None:
+        """Hand a report over; from any thread."""
+        self._waiting.append(report)
+        if not self._due:
+            self._due = True
+            with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left who would want to know
+                self._loop.call_soon_threadsafe(self._take_some)
+
+    def _take_some(self) -> None:
+        # Before it looks: what is added after the last look finds it so, and tells the loop again.
+        self._due = False
+        for _ in range(AT_ONCE):
+            if not self._waiting:
+                return
+            try:
+                self._take(self._waiting.popleft())
+            except Exception as error:  # noqa: BLE001 - what comes after it must not be lost
+                self._failed("a report of the engine", error)
+        self._due = True
+        self._loop.call_soon(self._take_some)
