@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from talkcli.engine import protocol
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
-from talkcli.server.settings import Settings
+from talkcli.goals.scheduler import Scheduler
 from talkcli.server.speech import AT_ONCE, Mailbox, Speech
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def test_report_that_meets_a_bug_takes_no_other_with_it() -> None:
 def test_the_engine_gets_to_work_before_clients_are_told() -> None:
     async def play() -> None:
         written: list[str] = []
-        served = Speech("4k7f", Settings())
+        served = Speech(Scheduler("4k7f", max_queue=1))
         served.engine = _Written(written)  # type: ignore[assignment]
         served.scheduler.engine_ready(served.now())
 

@@ -14,9 +14,9 @@ import pytest
 from talkcli.frozen import replace
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, Say
+from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.states import State
 from talkcli.server import speech
-from talkcli.server.settings import Settings
 from talkcli.server.speech import Speech
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class _Clock:
 
 
 async def _queued_behind_another(ttl: float) -> Speech:
-    served = Speech("4k7f", Settings(goals=replace(INITIAL, ttl=ttl)))
+    served = Speech(Scheduler("4k7f", max_queue=1, settings=replace(INITIAL, ttl=ttl)))
     served.engine = _BusyEngine()  # type: ignore[assignment]
     served.scheduler.engine_ready(served.now())
     for text in ("a long sentence", "the door is open"):

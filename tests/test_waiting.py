@@ -13,11 +13,11 @@ import pytest
 
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Cancel, Say
+from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol.requests import Status, Wait, Watch
 from talkcli.server import subscribers
 from talkcli.server.call import Call
 from talkcli.server.requests import ALL_WAITING, EACH, Requests
-from talkcli.server.settings import Settings
 from talkcli.server.speech import Speech
 from talkcli.server.subscribers import News
 
@@ -71,7 +71,7 @@ class Server:
     """What requests wait in: a goal is spoken, and as many wait behind it as may."""
 
     def __init__(self, max_queue: int = 1) -> None:
-        self.speech = Speech("4k7f", Settings(max_queue=max_queue))
+        self.speech = Speech(Scheduler("4k7f", max_queue=max_queue))
         self.speech.engine = cast("Any", Engine())
         self.speech.scheduler.engine_ready(self.speech.now())
         self.requests = Requests(self.speech, dict)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from talkcli import __version__, peers
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import as_shown
+from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol import replies
 from talkcli.protocol.lines import encode
 from talkcli.server.requests import Requests
@@ -35,7 +36,8 @@ class Service:
         self.path = path
         #: whether the socket's mode lets others in than its owner
         self._open_to_others = bool(mode & 0o066)
-        self.speech = Speech(boot, settings)
+        scheduler = Scheduler(boot, max_queue=settings.max_queue, max_text=settings.max_text, settings=settings.goals)
+        self.speech = Speech(scheduler, settings.for_player)
         self.speech.lost = self.end
         self.streams = self.speech.streams
         self._requests = Requests(self.speech, self._describe)

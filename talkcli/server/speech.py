@@ -20,7 +20,6 @@ from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
 from talkcli.goals.options import DEFAULT_VOICE, for_engine
-from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.states import State
 from talkcli.server import log
 from talkcli.server.call import go_on
@@ -28,14 +27,14 @@ from talkcli.server.stream import Streams
 from talkcli.server.subscribers import News, Subscribers
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from typing import Any
 
     from talkcli.engine.supervisor import Supervisor
     from talkcli.goals.goal import By, JsonObject
     from talkcli.goals.record import Record
+    from talkcli.goals.scheduler import Scheduler
     from talkcli.server.call import Place
-    from talkcli.server.settings import Settings
 
 #: Linux's monotonic clock stands still while the machine sleeps, the one since the boot does not. Elsewhere, on macOS,
 #: the monotonic one goes on.
@@ -56,8 +55,10 @@ def elapsed() -> float:
 class Speech:
     """The goals of one server and the engine that speaks them, for as long as it runs."""
 
-    def __init__(self, boot: str, settings: Settings) -> None:
-        self.settings = settings
+    def __init__(self, scheduler: Scheduler, for_player: Sequence[str] = ()) -> None:
+        """`for_player`: the server's options that were given for a player."""
+        self.scheduler = scheduler
+        self._for_player = for_player
         #: set before the first client is there
         self.engine: Supervisor
         #: called, in the loop's thread, when `words` may have changed
@@ -66,13 +67,7 @@ class Speech:
         self.queue_changed: Callable[[], None] = lambda: None
         #: called when nothing can be spoken any more, and why
         self.lost: Callable[[TalkError], None] = lambda _: None
-        self.scheduler = Scheduler(
-            boot,
-            max_queue=settings.max_queue,
-            max_text=settings.max_text,
-            settings=settings.goals,
-        )
-        self.scheduler.engine_lost()  # none is ready yet
+        scheduler.engine_lost()  # none is ready yet
         #: set once everything has ended after `shut_down`
         self.finished = asyncio.Event()
         self.ready: protocol.Ready | None = None
@@ -285,7 +280,7 @@ class Speech:
 
     def _ready(self, ready: protocol.Ready) -> None:
         if self.ready != ready:
-            log.ready(ready, self.settings.for_player)
+            log.ready(ready, self._for_player)
         self.ready, self.engine_words = ready, "ready"
         self.engine_known.set()
         self.apply(self.scheduler.engine_ready(self.now()))
