@@ -6,11 +6,10 @@ import asyncio
 import contextlib
 import json
 import socket
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from talkcli.server.connection import Connection
-from talkcli.server.service import Service
-from talkcli.server.settings import Settings
+from talkcli.server.run import Server, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -37,6 +36,12 @@ class Client:
         return [_word(json.loads(line)) for line in told.splitlines()]
 
 
+class Unused:
+    """A listener: who connects here has a socket already."""
+
+    path, mode = "unused", 0o600
+
+
 def _word(line: dict[str, Any]) -> str:
     return "greeting" if "boot" in line else str(line.get("error") or line["ok"])
 
@@ -44,7 +49,7 @@ def _word(line: dict[str, Any]) -> str:
 @contextlib.contextmanager
 def server_for(clients: int) -> Iterator[Callable[[bytes], Client]]:
     """Give what connects a client, which has said something already, to a server with so many places."""
-    served = Service("4k7f", Settings(max_clients=clients), "unused", 0o600)
+    served = Server(Settings(max_clients=clients), cast("Any", Unused()))
     made: list[Client] = []
 
     def connect(says: bytes = b"") -> Client:

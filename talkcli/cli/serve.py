@@ -173,11 +173,10 @@ def serve(options: Common, print_unit: str | None, **given: Any) -> int:
     if not options.quiet:
         _warn_of_sound(given["player"] or "", given["driver"])
     from talkcli.goals.options import SETTINGS, Set
-    from talkcli.server.run import serve as run
-    from talkcli.server.settings import Settings
+    from talkcli.server import run
 
     goals = Set(**{each.name: given.pop(each.name) for each in SETTINGS})
-    return run(Settings(socket=paths.named_socket(options.socket), goals=goals, **given))
+    return run.serve(run.Settings(socket=paths.named_socket(options.socket), goals=goals, **given))
 
 
 def _warn_of_sound(player: str, driver: str | None) -> None:

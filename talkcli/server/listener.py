@@ -286,6 +286,7 @@ class Upkeep:
         except AddressInUse as error:
             if not self._listener.passed and not _passes(error):
                 self.end()
+                log.line(log.shown(f"ending: {error}"))
                 self._lost(error)
             elif str(error) != self._said:
                 self._said = str(error)

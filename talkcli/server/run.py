@@ -1,4 +1,4 @@
-"""`talk serve`, from the lock to the last goodbye."""
+"""`talk serve`, from the lock to the last goodbye: who is connected to one server, what it says of itself, its end."""
 
 from __future__ import annotations
 
@@ -9,31 +9,68 @@ import os
 import random
 import signal
 import string
+import time
 from typing import TYPE_CHECKING
 
-from talkcli import resources
+from talkcli import __version__, peers, resources
 from talkcli.engine import protocol
 from talkcli.engine.protocol import START_LIMIT
 from talkcli.engine.supervisor import Supervisor
-from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
+from talkcli.errors import EXIT_OK, EXIT_SIGNAL, TalkError
+from talkcli.frozen import frozen
 from talkcli.goals.goal import Sender
-from talkcli.goals.options import Say
+from talkcli.goals.options import INITIAL, MAX_CHARACTERS, Say, Set, as_shown
+from talkcli.goals.scheduler import Scheduler
+from talkcli.protocol import replies
+from talkcli.protocol.lines import encode
 from talkcli.server import log
 from talkcli.server.connection import Connection
 from talkcli.server.listener import InheritedListener, Listener, Upkeep, listen
-from talkcli.server.service import DOOR, Service
+from talkcli.server.requests import Requests
+from talkcli.server.speech import Speech
 from talkcli.server.stream import Acceptor, make_room
 from talkcli.server.systemd import Systemd
 
 if TYPE_CHECKING:
     import socket
 
-    from talkcli.server.settings import Settings
+    from talkcli.goals.goal import JsonObject
+    from talkcli.server.stream import Stream
 
+#: Clients at once. Each takes a descriptor of the 1,024 that a process usually has.
+MAX_CLIENTS = 256
+#: Goals that may wait: at two seconds a sentence, more than three minutes of speech that nobody can still want to hear.
+MAX_QUEUE = 100
+#: Places at the door of a full server, for clients that want to know its status or to silence it.
+DOOR = 16
 #: Seconds in which clients take their last answers before they are let go.
 _GOODBYE = 0.3
 #: Seconds in which the engine process must be gone before the server leaves it to the system.
 _ENGINE_GOODBYE = 1.0
+
+
+@frozen
+class Settings:
+    """What `talk serve` is told by its command line."""
+
+    #: of goals that bring none of their own; all of them are given
+    goals: Set = INITIAL
+    max_queue: int = MAX_QUEUE
+    max_text: int = MAX_CHARACTERS
+    max_clients: int = MAX_CLIENTS
+    player: str | None = None
+    device: str | None = None
+    lead_in: int = 0  # milliseconds of silence before a sentence, where the device has been idle
+    driver: str | None = None
+    socket: str | None = None
+    socket_mode: int = 0o600
+    greeting: str | None = None
+
+    @property
+    def for_player(self) -> list[str]:
+        """The options that were given and are a player's."""
+        given = {"--player": self.player, "--device": self.device, "--lead-in": self.lead_in}
+        return [name for name, value in given.items() if value]
 
 
 def serve(settings: Settings) -> int:
@@ -43,44 +80,55 @@ def serve(settings: Settings) -> int:
     """
     gc.freeze()  # what is imported stays: a full collection that looks at all of it keeps clients waiting for 10 ms
     listener = listen(settings.socket, settings.socket_mode)
+
+    async def run() -> None:
+        await Server(settings, listener).run()
+
     try:
-        asyncio.run(_Server(settings, listener).run())
+        asyncio.run(run())
     finally:
         listener.close()
     return EXIT_OK
 
 
-def _boot() -> str:
-    """Return the four characters that set this server's goals apart from those of one before; see `goals.options`."""
-    choice = random.SystemRandom().choice
-    return "".join(choice(each) for each in (string.digits, string.ascii_lowercase) * 2)
+class Server:
+    """One server, made in its event loop. It is the handler of its connections."""
 
-
-class _Server:
     def __init__(self, settings: Settings, listener: Listener | InheritedListener) -> None:
         self._settings = settings
         self._listener = listener
-        self._service: Service
-        self._systemd: Systemd
-        self._acceptor: Acceptor
+        self._loop = asyncio.get_running_loop()
+        self._scheduler = Scheduler(
+            _boot(), max_queue=settings.max_queue, max_text=settings.max_text, settings=settings.goals
+        )
+        self.speech = Speech(self._scheduler, settings.for_player)
+        self.speech.lost = self._end
+        self.streams = self.speech.streams
+        self._systemd = Systemd(self._loop, os.environ, self.speech.words)
+        self.speech.changed = self._systemd.changed
+        self._requests = Requests(self.speech, self._describe)
+        self.handle = self._requests.handle
+        self.connections: set[Connection] = set()
+        #: set while there is no client
+        self._deserted = asyncio.Event()
+        self._deserted.set()
+        #: why it must end at once: what it was told to do can't be done
+        self._fatal: TalkError | None = None
+        self._began = time.time(), time.monotonic()
         self._ended_by = [signal.SIGTERM]
         # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
         if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
             self._ended_by.append(signal.SIGINT)
 
     async def run(self) -> None:
-        loop = asyncio.get_running_loop()
-        settings = self._settings
+        """Serve until it is told to end."""
+        settings, speech = self._settings, self.speech
         make_room(settings.max_clients + DOOR)
-        service = self._service = Service(_boot(), settings, self._listener.path, self._listener.mode)
-        speech = service.speech
-        systemd = self._systemd = Systemd(loop, os.environ, speech.words)
-        speech.changed = systemd.changed
-        acceptor = self._acceptor = Acceptor(loop, lambda each: Connection(service, loop, each).begin(), log.bug)
-        upkeep = Upkeep(loop, self._listener, self._moved, self._lost)
-        loop.set_exception_handler(self._on_bug)
+        self._acceptor = Acceptor(self._loop, lambda each: Connection(self, self._loop, each).begin(), log.bug)
+        upkeep = Upkeep(self._loop, self._listener, self._moved, self._end)
+        self._loop.set_exception_handler(self._on_bug)
         for number in self._ended_by:
-            loop.add_signal_handler(number, self._on_signal, number)
+            self._loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the voice along
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # whoever started this may have had some of them blocked
         speech.engine = Supervisor(
@@ -89,58 +137,120 @@ class _Server:
             ),
             speech.report,
         )
-        self._start(speech.engine)
         try:
-            acceptor.open(self._listener.socket)
+            speech.engine.start()
+        except RuntimeError as error:  # all that Python says of a thread that it can't have
+            raise TalkError(f"the engine's thread cannot be started: {resources.limits()}") from error
+        try:
+            self._acceptor.open(self._listener.socket)
             upkeep.begin()
             if settings.goals.voice or settings.driver:
                 # Who asked for what can't be had is told so, and nothing else.
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT)
             if not speech.closing:
-                systemd.ready()
+                self._systemd.ready()
                 log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:
-                speech.apply(speech.scheduler.submit(Say(settings.greeting), _self(), speech.now()).effects)
+                itself = Sender(os.getpid(), os.getuid(), "talk")
+                speech.apply(self._scheduler.submit(Say(settings.greeting), itself, speech.now()).effects)
             await speech.finished.wait()
-            systemd.stopping()
             upkeep.end()
-            acceptor.close()
+            self._acceptor.close()
             await self._say_goodbye()
         finally:
             speech.engine.close()
             speech.engine.join(_ENGINE_GOODBYE)
-            systemd.close()
-        if service.fatal:
-            raise service.fatal
-
-    @staticmethod
-    def _start(engine: Supervisor) -> None:
-        try:
-            engine.start()
-        except RuntimeError as error:  # all that Python says of a thread that it can't have
-            raise TalkError(f"the engine's thread cannot be started: {resources.limits()}") from error
+            self._systemd.close()
+        if self._fatal:
+            raise self._fatal
 
     def _moved(self, former: socket.socket | None) -> None:
         """Take up connections where the listener is now; those that there are live on."""
-        self._service.path = self._listener.path
         self._acceptor.open(self._listener.socket)
         if former:
             former.close()
 
-    def _lost(self, error: AddressInUse) -> None:
-        """End: clients find another server, or none; a supervisor that starts this one again will hear why."""
-        log.line(log.shown(f"ending: {error}"))
+    # -- the handler of the connections
+
+    def joined(self, connection: Connection, stream: Stream) -> None:
+        """Admit a client, let it wait at the door of a full server, or turn it away."""
+        pid, uid = peers.credentials(stream.socket)
+        # The socket's mode may let others in than its owner.
+        if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
+            words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
+            refusal = {"talk": replies.PROTOCOL, "error": "permission_denied", "message": words}
+        elif len(self.connections) >= self._settings.max_clients + DOOR:
+            refusal = replies.busy_greeting()
+        else:
+            connection.sender = Sender(pid or None, uid, peers.command_of(pid), peers.parent_command_of(pid))
+            connection.admitted = len(self.connections) < self._settings.max_clients
+            self.connections.add(connection)
+            self._deserted.clear()
+            return
+        stream.write(encode(refusal))
+        stream.close()
+
+    def greeting(self) -> JsonObject:
+        return replies.greeting(__version__, os.getpid(), self._scheduler.boot)
+
+    def owes(self, connection: Connection) -> bool:
+        """Whether a client waits for something."""
+        return self._requests.owes(connection) or self.speech.subscribers.has(connection)
+
+    def left(self, connection: Connection) -> None:
+        """Forget a client; its goals go on."""
+        self.connections.discard(connection)
+        if not self.connections:
+            self._deserted.set()
+        if len(self.connections) >= self._settings.max_clients:  # then somebody may wait at the door for this place
+            waiting = [each for each in self.connections if not each.admitted]
+            if waiting and len(self.connections) - len(waiting) < self._settings.max_clients:
+                waiting[0].admit()
+        self._requests.left(connection)
+        self.speech.subscribers.left(connection)
+
+    # -- what it says of itself
+
+    def _describe(self) -> JsonObject:
+        speech, settings, scheduler, ready = self.speech, self._settings, self._scheduler, self.speech.ready
+        started_at, since = self._began
+        return {
+            "pid": os.getpid(),
+            "version": __version__,
+            "boot": scheduler.boot,
+            "socket": self._listener.path,
+            "started_at": started_at,
+            "uptime": time.monotonic() - since,
+            "engine": speech.engine_words,
+            "driver": ready.driver if ready else settings.driver,
+            "synthesizer": ready.version if ready else None,
+            "player": ready.player if ready else settings.player,
+            "device": settings.device,
+            "lead_in": settings.lead_in,
+            **as_shown(scheduler.settings),
+            "paused": scheduler.paused,
+            "pending": scheduler.pending_count,
+            "max_queue": settings.max_queue,
+            "clients": len(self.connections),
+            "max_clients": settings.max_clients,
+        }
+
+    # -- the end
+
+    def _end(self, fatal: TalkError | None = None) -> None:
+        """End every goal, and then the server. `fatal`: what can't be done any more, for whoever started it."""
+        self._fatal = fatal or self._fatal
         self._systemd.stopping()
-        self._service.end(error)
+        self._requests.shut_down()
 
     async def _say_goodbye(self) -> None:
         """Let every client take what was written for it, but wait for none that doesn't read."""
-        for connection in list(self._service.connections):
+        for connection in list(self.connections):
             connection.close()
         with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._service.deserted.wait(), _GOODBYE)
-        for connection in list(self._service.connections):
+            await asyncio.wait_for(self._deserted.wait(), _GOODBYE)
+        for connection in list(self.connections):
             connection.drop()
 
     def _on_signal(self, number: signal.Signals) -> None:
@@ -148,8 +258,7 @@ class _Server:
         for each in self._ended_by:
             # Not by the loop, which may have a long turn to finish: whoever asks twice wants no goodbye.
             signal.signal(each, self._on_second_signal)
-        self._systemd.stopping()
-        self._service.end()
+        self._end()
 
     def _on_second_signal(self, number: int, _: object) -> None:
         """End at once; the engine process dies with this one."""
@@ -157,7 +266,8 @@ class _Server:
             self._listener.close()
         os._exit(EXIT_SIGNAL + number)
 
-    def _on_bug(self, _: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
+    @staticmethod
+    def _on_bug(_: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
         error = context.get("exception")
         if isinstance(error, Exception):
             log.bug(str(context.get("message")), error)
@@ -165,6 +275,7 @@ class _Server:
             log.line(log.shown(str(context.get("message"))))
 
 
-def _self() -> Sender:
-    """Return the server as a sender: of its greeting."""
-    return Sender(os.getpid(), os.getuid(), "talk")
+def _boot() -> str:
+    """Return the four characters that set this server's goals apart from those of one before; see `goals.options`."""
+    choice = random.SystemRandom().choice
+    return "".join(choice(each) for each in (string.digits, string.ascii_lowercase) * 2)

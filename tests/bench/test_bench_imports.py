@@ -23,7 +23,7 @@ HEAVY = [
         "talkcli.goals.history",
         "talkcli.engine",
         "talkcli.server.run",
-        "talkcli.server.service",
+        "talkcli.server.speech",
     ),
 ]
 #: What only a command that talks to a server needs.

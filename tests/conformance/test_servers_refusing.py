@@ -6,7 +6,7 @@ import contextlib
 import socket
 from typing import TYPE_CHECKING
 
-from talkcli.server.service import DOOR
+from talkcli.server.run import DOOR
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk

@@ -40,7 +40,6 @@ from talkcli.goals.options import (
 )
 from talkcli.protocol.requests import KINDS
 from talkcli.server import run
-from talkcli.server.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -219,7 +218,7 @@ def test_the_engine_is_told_the_goal_s_own_value_else_the_server_s() -> None:
 
 def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
     rows = {each.name: each for each in COMMANDS["serve"].options}
-    server = fields(Settings())
+    server = fields(run.Settings())
     assert server.pop("goals") == Set(**{name: row.default for name, row in rows.items() if row.setting})
     assert server.pop("socket") is None
     assert server == {

@@ -22,7 +22,7 @@ from talkcli.protocol.lines import MAX_LINE
 from talkcli.protocol.requests import KINDS, read_request
 from talkcli.server import connection, stream
 from talkcli.server.requests import ALL_WAITING, EACH, MAX_WAITING, RECENT
-from talkcli.server.settings import MAX_CLIENTS, MAX_QUEUE
+from talkcli.server.run import MAX_CLIENTS, MAX_QUEUE
 from tests.support.documents import DOCUMENTS, README, ROOT, WIRE, first_column, tables, words
 
 if TYPE_CHECKING:
