@@ -55,14 +55,14 @@ def server_for(clients: int) -> Iterator[Callable[[bytes], Client]]:
     def connect(says: bytes = b"") -> Client:
         client = Client(says)
         made.append(client)
-        Connection(served, asyncio.get_running_loop(), client.theirs).begin()
+        Connection(served, served.speech.streams, client.theirs).begin()
         return client
 
     try:
         yield connect
     finally:
         for each in list(served.connections):
-            each.drop()
+            each.stream.abort()
         for client in made:
             client.socket.close()
 

@@ -31,14 +31,14 @@ class Counted(socket.socket):
         return super().send(data, flags)
 
 
-class Told:
+class Told(asyncio.Protocol):
     """Notes all that a stream tells."""
 
     def __init__(self) -> None:
         self.data = b""
         self.ends = 0
         self.congested: list[bool] = []
-        self.lost: list[OSError | None] = []
+        self.lost: list[Exception | None] = []
         self.stays_open = True
         self.fault: Exception | None = None
 
@@ -57,7 +57,7 @@ class Told:
     def resume_writing(self) -> None:
         self.congested.append(False)
 
-    def connection_lost(self, error: OSError | None) -> None:
+    def connection_lost(self, error: Exception | None) -> None:
         self.lost.append(error)
 
 
@@ -71,7 +71,7 @@ class Pair:
             each.setblocking(False)
         self.told = Told()
         loop = asyncio.get_running_loop()
-        self.stream = Stream(loop, Streams(loop), self.socket, self.told, HIGH)
+        self.stream = Stream(Streams(loop), self.socket, self.told, HIGH)
 
     def receive(self) -> bytes:
         """Return what has come at the client's end by now."""
@@ -275,7 +275,7 @@ def test_one_callback_sends_what_all_streams_were_given_in_a_turn() -> None:
         async with paired() as first, paired() as second:
             pairs = [first, second]
             for pair in pairs:
-                pair.stream = Stream(loop, streams, pair.socket, pair.told, HIGH)
+                pair.stream = Stream(streams, pair.socket, pair.told, HIGH)
             loop.call_soon = lambda *values, **named: calls.append(call(*values, **named))  # type: ignore[assignment, method-assign]
             for _ in range(3):
                 for pair in pairs:
@@ -295,7 +295,7 @@ def test_past_what_may_wait_for_all_the_one_that_holds_most_goes_first(monkeypat
         async with contextlib.AsyncExitStack() as stack:
             pairs = [await stack.enter_async_context(paired()) for _ in range(3)]
             for pair in pairs:
-                pair.stream = Stream(loop, streams, pair.socket, pair.told, HIGH)
+                pair.stream = Stream(streams, pair.socket, pair.told, HIGH)
                 pair.stream.write(b"x" * 1_000_000)  # more than the system takes
             taken = 1_000_000 - pairs[0].stream.size
             monkeypatch.setattr(stream, "ALL_OUTPUT", streams.waiting + 3_000)

@@ -22,7 +22,7 @@ from talkcli.server.speech import Speech
 from talkcli.server.subscribers import News
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Iterable
 
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.options import Set
@@ -37,11 +37,11 @@ class Client:
     def __init__(self) -> None:
         self.told: list[JsonObject] = []
 
-    def reply(self, message: JsonObject) -> None:
+    def send(self, message: JsonObject) -> None:
         self.told.append(message)
 
-    def stream(self, items: Any, reply: JsonObject, _: object = ()) -> None:
-        self.told += [*items, reply]
+    def send_list(self, messages: Iterable[JsonObject]) -> None:
+        self.told += messages
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
         """Take note of nothing: these tests count replies."""

@@ -8,6 +8,7 @@ no goals.
 from __future__ import annotations
 
 import asyncio
+from itertools import chain
 from types import coroutine
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
     #: Those who wait for the same, in their order.
     Place = dict["Call", None]
+    #: What is sent as fast as the client reads, if there is any.
+    _Lines = Iterable[JsonObject]
 
 
 class Call:
@@ -95,20 +98,20 @@ class Call:
 
     # -- how it is answered
 
-    def ok(self, **fields: object) -> JsonObject:
-        """Return the reply to what was carried out."""
-        return replies.ok(self.seq, **fields)
+    def answer(self, items: _Lines = (), events: _Lines = (), /, **fields: object) -> None:
+        """Reply that it is carried out, and with what; after the lines of a list, and before events that follow it."""
+        self._reply(replies.ok(self.seq, **fields), items, events)
 
-    def refused(self, code: str, words: str) -> JsonObject:
-        """Return the reply to what can't be had."""
-        return replies.failure(self.seq, code, words)
+    def refuse(self, code: str, words: str, items: _Lines = ()) -> None:
+        """Reply that it can't be had, after the lines of a list."""
+        self._reply(replies.failure(self.seq, code, words), items)
 
-    def answer(self, reply: JsonObject, items: Iterable[JsonObject] = (), events: Iterable[JsonObject] = ()) -> None:
-        """Send the lines of a list as fast as the client reads, if there is one, the reply, and events that follow."""
+    def _reply(self, reply: JsonObject, items: _Lines, events: _Lines = ()) -> None:
         if items or events:
-            self.connection.stream((replies.item(self.seq, **each) for each in items), reply, events)
+            lines = (replies.item(self.seq, **each) for each in items)
+            self.connection.send_list(chain(lines, [reply], events))
         else:
-            self.connection.reply(reply)
+            self.connection.send(reply)
 
 
 def go_on(place: Place) -> None:

@@ -1,14 +1,14 @@
 """One client's connection: lines in, objects out, and its limits. It neither decides nor waits.
 
-What is asked goes to a `Handler` and comes back through `reply`, `stream` and `publish`. A client that doesn't read is
-not read from either; feedback for it is dropped, and at last the client itself.
+What is asked goes to a `Handler` and comes back through `send`, `send_list` and `publish`. A client that doesn't read
+is not read from either; feedback for it is dropped, and at last the client itself.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections import deque
-from itertools import chain
 from typing import TYPE_CHECKING, Protocol
 
 from talkcli.errors import BadRequest, LineTooLong
@@ -20,9 +20,8 @@ from talkcli.protocol.requests import Hello, Request, Status, read_request
 from talkcli.server.stream import Stream
 
 if TYPE_CHECKING:
-    import asyncio
     import socket
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator
 
     from talkcli.goals.goal import JsonObject, Sender
     from talkcli.server.stream import Streams
@@ -49,13 +48,10 @@ READ_AHEAD = 64
 class Handler(Protocol):
     """What a connection needs of the server."""
 
-    #: shared by all its connections
-    streams: Streams
-
     def greeting(self) -> JsonObject:
         """Return the first line for a client that is let in."""
 
-    def joined(self, connection: Connection, stream: Stream) -> None:
+    def joined(self, connection: Connection) -> None:
         """Look who it is: admit a client, let it wait at the door, or close."""
 
     def left(self, connection: Connection) -> None:
@@ -68,53 +64,47 @@ class Handler(Protocol):
         """Whether a client waits for something: then its connection stays open though it sends nothing more."""
 
 
-class Connection:
+class Connection(asyncio.Protocol):
     """A client. One that is not `admitted` waits at the door of a full server until it says that it is urgent."""
 
-    def __init__(self, handler: Handler, loop: asyncio.AbstractEventLoop, connected: socket.socket) -> None:
+    def __init__(self, handler: Handler, streams: Streams, connected: socket.socket) -> None:
         """`connected`: the client's socket, which doesn't block; it is closed with the connection."""
         #: set by the handler when the client joins
         self.sender: Sender
         self.admitted = False
+        self.stream = Stream(streams, connected, self, SOFT_OUTPUT)
         self._handler = handler
-        self._loop = loop
-        self._stream = Stream(loop, handler.streams, connected, self, SOFT_OUTPUT)
+        self._loop = streams.loop
         self._splitter = RequestSplitter()
         self._lines: deque[bytes] = deque()
         #: what has to be sent in its order while a list is on its way: lists, and what came after them
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
-        self._newest: bytes | None = None
-        self._congested = self._half_closed = self._turn_is_due = False
+        #: the newest feedback that is held back, if there is one
+        self._newest = b""
+        self._half_closed = self._turn_is_due = False
         self._bad_lines = 0
-        self._first_limit: asyncio.TimerHandle | None = None
+        self._first_limit = self._limit(FIRST_REQUEST, f"no request came within {FIRST_REQUEST:g} s")
         self._line_limit: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
-        """Greet the client, if it is let in, and take its requests from now on."""
-        self._handler.joined(self, self._stream)
-        if not self._open:
-            return
-        self._first_limit = self._loop.call_later(
-            FIRST_REQUEST, self.refuse, "too_slow", f"no request came within {FIRST_REQUEST:g} s"
-        )
+        """Take the client's requests from now on, if it is let in."""
+        self._handler.joined(self)
         if self.admitted:
-            self._write(self._handler.greeting())
-            self._stream.begin()
+            self.stream.begin()
         else:
             # Not at once: the end of another client may have come before, and be seen only later in this turn.
-            self._loop.call_soon(self._stream.resume_reading)
+            self._loop.call_soon(self.stream.resume_reading)
 
     def admit(self) -> None:
-        """Let a client in that has waited at the door."""
+        """Let the client in: greet it."""
         self.admitted = True
         self._write(self._handler.greeting())
 
     # -- what the stream calls
 
-    def connection_lost(self, error: OSError | None) -> None:
-        for limit in (self._first_limit, self._line_limit):
-            if limit:
-                limit.cancel()
+    def connection_lost(self, error: Exception | None) -> None:
+        self._first_limit.cancel()
+        self._stop_line_limit()
         if error is not None and self.admitted:
             self._hear_last_requests()
         self._lines.clear()
@@ -126,77 +116,29 @@ class Connection:
             self._lines.extend(self._splitter.feed(data))
         except LineTooLong as error:
             self._lines.extend(error.before)
-            while self._open and not self._congested and self._step():
+            while self._may_go_on() and self._step():
                 pass  # they were asked for, and are answered
             self.refuse(error.code, str(error))
             return
         if b"\n" in data:
             self._stop_line_limit()  # what follows the newline is another line
         self._work()
-        self._set_reading()
 
     def eof_received(self) -> bool:
         self._half_closed = True
         self._work()
-        return self._open
+        return not self.stream.closing
 
     def pause_writing(self) -> None:
-        self._congested = True
         self._set_reading()
 
     def resume_writing(self) -> None:
-        self._congested = False
         self._work()
-        self._set_reading()
 
     # -- what the handler calls
 
-    def reply(self, message: JsonObject) -> None:
-        """Answer a request."""
-        self._send(message)
-
-    def stream(self, items: Iterable[JsonObject], reply: JsonObject, events: Iterable[JsonObject] = ()) -> None:
-        """Send a list, as fast as the client reads, its reply, and events that belong to it; what comes after waits."""
-        self._outbox.append(chain(items, [reply], events))
-        self._ask_for_a_turn()
-
-    def publish(self, event: bytes, *, feedback: bool = False) -> None:
-        """Send an encoded event. Feedback is dropped, all but the newest, while the client doesn't read."""
-        if feedback and self._congested:
-            self._newest = event
-            return
-        if self._newest:  # what was the newest is older than this
-            newest, self._newest = self._newest, None
-            self._send(newest)
-        self._send(event)
-
-    def has_hung_up(self) -> bool:
-        """Return whether the client can't be told anything more, as far as can be known by telling it what there is."""
-        self._stream.flush()
-        return not self._open
-
-    def refuse(self, code: str, words: str) -> None:
-        """Say why, and close."""
-        self._write(replies.failure(None, code, words))
-        self.close()
-
-    def close(self) -> None:
-        """Close once what was written is sent."""
-        self._stream.close()
-
-    def drop(self) -> None:
-        """Close at once."""
-        self._stream.abort()
-
-    # -- inside
-
-    @property
-    def _open(self) -> bool:
-        """Whether more can be sent."""
-        return not self._stream.closing
-
-    def _send(self, message: JsonObject | bytes) -> None:
-        """Send a message after the lists that are on their way."""
+    def send(self, message: JsonObject | bytes) -> None:
+        """Send a reply, or what is encoded, after the lists that are on their way."""
         if self._half_closed:  # it may be the last that is owed. Not at once: another request must wait meanwhile
             self._ask_for_a_turn()
         if not self._outbox:
@@ -204,25 +146,55 @@ class Connection:
         elif len(self._outbox) < MAX_HELD:
             line = message if isinstance(message, bytes) else encode(message)
             self._outbox.append(line)
-            self._stream.hold(len(line))
+            self.stream.hold(len(line))
         else:
-            self.drop()
+            self.stream.abort()
+
+    def send_list(self, messages: Iterator[JsonObject]) -> None:
+        """Send a list, as fast as the client reads, its reply, and what belongs to it; what comes after waits."""
+        self._outbox.append(messages)
+        self._ask_for_a_turn()
+
+    def publish(self, event: bytes, *, feedback: bool = False) -> None:
+        """Send an encoded event. Feedback is dropped, all but the newest, while the client doesn't read."""
+        if feedback and self.stream.congested:
+            self._newest = event
+        else:
+            newest, self._newest = self._newest, b""
+            self.send(newest + event)
+
+    def has_hung_up(self) -> bool:
+        """Return whether the client can't be told anything more, as far as can be known by telling it what there is."""
+        self.stream.flush()
+        return self.stream.closing
+
+    def refuse(self, code: str, words: str) -> None:
+        """Say why, and close."""
+        self._write(replies.failure(None, code, words))
+        self.stream.close()
+
+    # -- inside
+
+    def _limit(self, seconds: float, words: str) -> asyncio.TimerHandle:
+        return self._loop.call_later(seconds, self.refuse, "too_slow", words)
+
+    def _may_go_on(self) -> bool:
+        """Whether the client can be told more, and takes it."""
+        return not (self.stream.closing or self.stream.congested)
 
     def _set_reading(self) -> None:
         """Read from the client only while it takes its answers and its requests are kept up with."""
-        if not self._open:
+        if self.stream.closing:
             return
-        reading = not self._congested and len(self._lines) <= READ_AHEAD
+        reading = not self.stream.congested and len(self._lines) <= READ_AHEAD
         if reading:
-            self._stream.resume_reading()
+            self.stream.resume_reading()
         else:
-            self._stream.pause_reading()
+            self.stream.pause_reading()
         if not reading or not self._splitter.size:
             self._stop_line_limit()
         elif self._line_limit is None:
-            self._line_limit = self._loop.call_later(
-                LINE_LIMIT, self.refuse, "too_slow", f"a line took more than {LINE_LIMIT:g} s"
-            )
+            self._line_limit = self._limit(LINE_LIMIT, f"a line took more than {LINE_LIMIT:g} s")
 
     def _stop_line_limit(self) -> None:
         if self._line_limit:
@@ -230,15 +202,15 @@ class Connection:
             self._line_limit = None
 
     def _write(self, message: JsonObject | bytes) -> None:
-        self._stream.write(message if isinstance(message, bytes) else encode(message))
-        if self._stream.size > HARD_OUTPUT:
-            self.drop()
+        self.stream.write(message if isinstance(message, bytes) else encode(message))
+        if self.stream.size > HARD_OUTPUT:
+            self.stream.abort()
 
     def _hear_last_requests(self) -> None:
         """Take what a client sent that closed without reading: the error hid it, but it is still in the socket."""
         try:
             with contextlib.suppress(OSError):
-                while data := self._stream.socket.recv(SOFT_OUTPUT):
+                while data := self.stream.socket.recv(SOFT_OUTPUT):
                     self._lines.extend(self._splitter.feed(data))
         except LineTooLong as error:
             self._lines.extend(error.before)
@@ -248,14 +220,14 @@ class Connection:
     def _work(self) -> None:
         """Do what can be done now: send the lists and what was held back for them, then take requests."""
         for _ in range(TURN):
-            if not self._open or self._congested or not self._step():
+            if not (self._may_go_on() and self._step()):
                 break
         else:
             self._ask_for_a_turn()
-            return
-        idle = not (self._outbox or self._lines or self._congested)
+        idle = not (self._outbox or self._lines or self.stream.congested)
         if self._half_closed and idle and not self._handler.owes(self):
-            self.close()
+            self.stream.close()
+        self._set_reading()
 
     def _ask_for_a_turn(self) -> None:
         if not self._turn_is_due:
@@ -265,21 +237,20 @@ class Connection:
     def _next_turn(self) -> None:
         self._turn_is_due = False
         self._work()
-        self._set_reading()
 
     def _step(self) -> bool:
         if self._outbox:
             first = self._outbox[0]
             if isinstance(first, bytes):
                 self._outbox.popleft()
-                self._stream.hold(-len(first))
+                self.stream.hold(-len(first))
                 self._write(first)
             elif (message := next(first, None)) is None:
                 self._outbox.popleft()
             else:
                 self._write(message)
         elif self._newest:
-            newest, self._newest = self._newest, None
+            newest, self._newest = self._newest, b""
             self._write(newest)
         elif self._lines:
             self._take(self._lines.popleft())
@@ -296,26 +267,20 @@ class Connection:
             request = read_request(message)
         except BadRequest as error:
             self._bad_lines += 1
-            self.reply(replies.failure(seq, error.code, str(error)))
+            self.send(replies.failure(seq, error.code, str(error)))
             if self._bad_lines >= MAX_BAD_LINES or not self.admitted:
-                self.close()
+                self.stream.close()
             return
-        if self._first_limit:
-            self._first_limit.cancel()
-            self._first_limit = None
-        if not self.admitted and not self._let_in(request):
-            return
+        self._first_limit.cancel()
+        if not self.admitted:
+            # Whose business is urgent comes in; a full server sends the others away.
+            if not (isinstance(request, Status | Cancel) or (isinstance(request, Hello) and request.urgent)):
+                self._write(replies.busy_greeting())
+                self.stream.close()
+                return
+            self.admit()
         if isinstance(request, Hello):
             self.sender = replace(self.sender, name=request.name)
-            self.reply(replies.ok(seq))
+            self.send(replies.ok(seq))
         else:
             self._handler.handle(self, seq, request)
-
-    def _let_in(self, request: Request) -> bool:
-        """Let a client in whose business is urgent; send the others away from a full server."""
-        if isinstance(request, Status | Cancel) or (isinstance(request, Hello) and request.urgent):
-            self.admit()
-            return True
-        self._write(replies.busy_greeting())
-        self.close()
-        return False

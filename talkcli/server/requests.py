@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from itertools import chain
 from typing import TYPE_CHECKING
 
-from talkcli.errors import UnknownGoal
+from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals.goal import By
 from talkcli.goals.options import Cancel, Say, Set, as_shown, bad_option, given
@@ -23,10 +24,9 @@ from talkcli.server import log
 from talkcli.server.call import Call, go_on
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterator
+    from collections.abc import Callable, Coroutine, Iterable, Iterator
     from typing import Any
 
-    from talkcli.goals.effects import Cancelled
     from talkcli.goals.goal import JsonObject, Sender
     from talkcli.goals.record import Record
     from talkcli.server.call import Place
@@ -59,7 +59,7 @@ class Requests:
         self._describe = describe
         #: goals that were cancelled while they waited, and are to be told so
         self._canceled: Place = {}
-        #: those that wait, by connection, in their order
+        #: those that are not answered yet, by connection, in their order
         self._calls: dict[Connection, Place] = {}
         #: bytes of all that are kept while they wait
         self._size = 0
@@ -81,9 +81,8 @@ class Requests:
     def handle(self, connection: Connection, seq: int | None, request: Request) -> None:
         """Carry out a request, and answer it now or later."""
         call = Call(connection, seq, request)
+        self._calls.setdefault(connection, {})[call] = None
         call.begin(self._carry_out(call))
-        if call.place is not None:
-            self._calls.setdefault(connection, {})[call] = None
 
     def owes(self, connection: Connection) -> bool:
         """Whether a request of this connection waits."""
@@ -116,28 +115,23 @@ class Requests:
                 self._submit(call, request, call.connection.sender, fault)
             else:
                 await self._by_kind[type(request)](call, request)
-        except UnknownGoal as error:
-            call.answer(call.refused(error.code, str(error)))
+        except RequestRefused as error:
+            call.refuse(error.code, str(error))
         except Exception as error:  # noqa: BLE001 - one client's request must not take the voice from the others
             log.bug(request.kind, error)
-            words = f"{request.kind} failed: a bug of talk's, see its log"
-            call.answer(call.refused("internal_error", words))
+            call.refuse("internal_error", f"{request.kind} failed: a bug of talk's, see its log")
         finally:
             self._size -= call.size
-            if call.connection in self._calls:
-                self._forget(call)
+            mine = self._calls[call.connection]
+            del mine[call]
+            if not mine:
+                del self._calls[call.connection]
 
     # -- who waits
 
     def _waiting(self, connection: Connection) -> list[Call]:
-        """Return the requests of this connection that wait, in their order."""
+        """Return the requests of this connection that are not answered yet, in their order."""
         return list(self._calls.get(connection, ()))
-
-    def _forget(self, call: Call) -> None:
-        mine = self._calls[call.connection]
-        mine.pop(call, None)
-        if not mine:
-            del self._calls[call.connection]
 
     def _must_wait(self, call: Call) -> bool:
         """Whether it can't be carried out yet: the voices are needed, or what came before it needs them."""
@@ -159,7 +153,7 @@ class Requests:
         if call.size:
             return None  # it has waited for something else already
         size = EACH + sum(map(_bytes_of, fields(call.request).values()))
-        if len(self._waiting(call.connection)) >= MAX_WAITING:
+        if len(self._waiting(call.connection)) > MAX_WAITING:  # it is one of them
             return "queue_full", f"{MAX_WAITING:,} requests of this connection are waiting already"
         if self._size + size > ALL_WAITING:
             return "queue_full", f"{ALL_WAITING >> 20} MiB of requests are waiting already"
@@ -249,7 +243,7 @@ class Requests:
         ended = submitted.attached and state.terminal
         if (say.wait or say.feedback) and not ended:
             self._speech.subscribers.await_result(record.id, connection, feedback=say.feedback)
-        call.answer(call.ok(goal=goal, **extra))
+        call.answer(goal=goal, **extra)
         if ended and (say.wait or say.feedback):
             connection.publish(encode({"event": "result", "goal": goal}))
         self._speech.apply(submitted.effects)
@@ -279,7 +273,7 @@ class Requests:
                 if state.terminal:  # the subscribers are told of the others
                     yield {"event": "result", "goal": record.snapshot().to_json()}
 
-        call.answer(call.ok(count=len(records)), goals(), results())
+        call.answer(goals(), results(), count=len(records))
 
     async def _cancel(self, call: Call, selection: Cancel) -> None:
         speech, by = self._speech, By(client=call.connection.sender)
@@ -295,26 +289,14 @@ class Requests:
                 await call.wait(speech.for_silence(done.stopping))
         else:
             await speech.news.until_told(call)
-        done.recalled += [each.ended for each in waiting if each.ended]
-        self._report_cancel(call, done)
-
-    def _report_cancel(self, call: Call, done: Cancelled) -> None:
-        ended = list(done.recalled)
+        ended = done.recalled + [each.ended for each in waiting if each.ended]
         if done.stopping and done.stopping.state is not State.SUCCEEDED:
             ended.append(done.stopping)
-
-        def goals() -> Iterator[JsonObject]:
-            for record in ended:
-                yield {"canceled": record.snapshot().to_json()}
-            for record in done.ended:
-                yield {"ended": record.snapshot().to_json()}
-
+        goals = chain(_listed("canceled", ended), _listed("ended", done.ended))
         if done.unknown:
-            words = ", ".join(repr(each) for each in done.unknown)
-            reply = call.refused(UnknownGoal.code, f"no goal {words} is known: see `talk status`")
+            call.refuse(UnknownGoal.code, _unknown(*done.unknown), goals)
         else:
-            reply = call.ok(count=len(ended))
-        call.answer(reply, goals())
+            call.answer(goals, count=len(ended))
 
     async def _pause(self, call: Call, _: Pause) -> None:
         speech = self._speech
@@ -323,22 +305,21 @@ class Requests:
         active = self._scheduler.active
         if active and active is not speech.silent and not await call.wait(speech.for_silence(active), PAUSE_LIMIT):
             words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_LIMIT:g} s"
-            call.answer(call.refused("not_silent", words))
-        else:
-            self._report_pause(call, active)
+            raise RequestRefused(words, "not_silent")
+        self._report_pause(call, active)
 
     async def _resume(self, call: Call, _: Resume) -> None:
         self._report_pause(call, self._speech.resume(By(client=call.connection.sender)))
 
     def _report_pause(self, call: Call, goal: Record | None) -> None:
         told = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
-        call.answer(call.ok(paused=self._scheduler.paused, goal=told))
+        call.answer(paused=self._scheduler.paused, goal=told)
 
     async def _status(self, call: Call, request: Status) -> None:
         if request.id is None:
             self._send_overview(call)
         else:
-            call.answer(call.ok(goal=self._find(request.id).snapshot().to_json()))
+            call.answer(goal=self._find(request.id).snapshot().to_json())
 
     async def _watch(self, call: Call, _: Watch) -> None:
         await self._speech.news.until_told(call)  # what comes after the overview has happened after it
@@ -348,16 +329,10 @@ class Requests:
     def _send_overview(self, call: Call) -> None:
         pending = list(self._scheduler.pending())
         recent = list(self._scheduler.history.latest(RECENT))
-
-        def goals() -> Iterator[JsonObject]:
-            for record in pending:
-                yield {"pending": record.snapshot().to_json()}
-            for record in reversed(recent):
-                yield {"recent": record.snapshot().to_json()}
-
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
-        call.answer(call.ok(server=self._describe(), active=now), goals())
+        goals = chain(_listed("pending", pending), _listed("recent", reversed(recent)))
+        call.answer(goals, server=self._describe(), active=now)
 
     async def _voices(self, call: Call, _: Voices) -> None:
         voices = self._speech.voices
@@ -365,37 +340,44 @@ class Requests:
             words = f"the engine can't list its voices now: it is {self._speech.engine_words}"
             if self._scheduler.active:
                 words += ", and busy with its first sentence: ask again after that"
-            call.answer(call.refused("engine_failed", words))
-            return
+            raise RequestRefused(words, "engine_failed")
         told: list[JsonObject] = [{"id": each.id, "language": each.language, "name": each.name} for each in voices]
-        call.answer(call.ok(count=len(voices)), ({"voice": each} for each in told))
+        call.answer(({"voice": each} for each in told), count=len(voices))
 
     async def _log(self, call: Call, request: Log) -> None:
         records = list(self._scheduler.history.log(request.count))
-        call.answer(call.ok(count=len(records)), ({"goal": each.snapshot().to_json()} for each in reversed(records)))
+        call.answer(_listed("goal", reversed(records)), count=len(records))
 
     async def _set(self, call: Call, request: Set) -> None:
         words = bad_option(request)
         if words:
-            call.answer(call.refused("bad_option", words))
-            return
+            raise RequestRefused(words, "bad_option")
         fault = self._speech.voice_fault(request.voice)
         if fault:
-            call.answer(call.refused(*fault))
-            return
+            code, words = fault
+            raise RequestRefused(words, code)
         changed = given(request)
         self._scheduler.settings = replace(self._scheduler.settings, **changed)
         self._look()  # what preempts may have room
         if changed:
             values = ", ".join(f"{name} {value}" for name, value in changed.items())
             log.line(f"set to {log.shown(values)} by {log.who(call.connection.sender)}")
-        call.answer(call.ok(settings=as_shown(self._scheduler.settings)))
+        call.answer(settings=as_shown(self._scheduler.settings))
 
     def _find(self, goal_id: str) -> Record:
         record = self._scheduler.find(goal_id)
         if record is None:
-            raise UnknownGoal(f"no goal {goal_id!r} is known: see `talk status`")
+            raise UnknownGoal(_unknown(goal_id))
         return record
+
+
+def _unknown(*ids: str) -> str:
+    return f"no goal {', '.join(map(repr, ids))} is known: see `talk status`"
+
+
+def _listed(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
+    """Return the lines of a list of goals; each is looked at when its turn comes to be sent."""
+    return ({name: each.snapshot().to_json()} for each in records)
 
 
 def _bytes_of(value: object) -> int:

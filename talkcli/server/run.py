@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     import socket
 
     from talkcli.goals.goal import JsonObject
-    from talkcli.server.stream import Stream
 
 #: Clients at once. Each takes a descriptor of the 1,024 that a process usually has.
 MAX_CLIENTS = 256
@@ -103,7 +102,6 @@ class Server:
         )
         self.speech = Speech(self._scheduler, settings.for_player)
         self.speech.lost = self._end
-        self.streams = self.speech.streams
         self._systemd = Systemd(self._loop, os.environ, self.speech.words)
         self.speech.changed = self._systemd.changed
         self._requests = Requests(self.speech, self._describe)
@@ -123,8 +121,8 @@ class Server:
     async def run(self) -> None:
         """Serve until it is told to end."""
         settings, speech = self._settings, self.speech
-        make_room(settings.max_clients + DOOR)
-        self._acceptor = Acceptor(self._loop, lambda each: Connection(self, self._loop, each).begin(), log.bug)
+        descriptors = make_room(settings.max_clients + DOOR)
+        self._acceptor = Acceptor(self._loop, lambda each: Connection(self, speech.streams, each).begin(), descriptors)
         upkeep = Upkeep(self._loop, self._listener, self._moved, self._end)
         self._loop.set_exception_handler(self._on_bug)
         for number in self._ended_by:
@@ -173,9 +171,9 @@ class Server:
 
     # -- the handler of the connections
 
-    def joined(self, connection: Connection, stream: Stream) -> None:
+    def joined(self, connection: Connection) -> None:
         """Admit a client, let it wait at the door of a full server, or turn it away."""
-        pid, uid = peers.credentials(stream.socket)
+        pid, uid = peers.credentials(connection.stream.socket)
         # The socket's mode may let others in than its owner.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
             words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
@@ -184,12 +182,13 @@ class Server:
             refusal = replies.busy_greeting()
         else:
             connection.sender = Sender(pid or None, uid, peers.command_of(pid), peers.parent_command_of(pid))
-            connection.admitted = len(self.connections) < self._settings.max_clients
+            if len(self.connections) < self._settings.max_clients:
+                connection.admit()
             self.connections.add(connection)
             self._deserted.clear()
             return
-        stream.write(encode(refusal))
-        stream.close()
+        connection.stream.write(encode(refusal))
+        connection.stream.close()
 
     def greeting(self) -> JsonObject:
         return replies.greeting(__version__, os.getpid(), self._scheduler.boot)
@@ -247,11 +246,11 @@ class Server:
     async def _say_goodbye(self) -> None:
         """Let every client take what was written for it, but wait for none that doesn't read."""
         for connection in list(self.connections):
-            connection.close()
+            connection.stream.close()
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._deserted.wait(), _GOODBYE)
         for connection in list(self.connections):
-            connection.drop()
+            connection.stream.abort()
 
     def _on_signal(self, number: signal.Signals) -> None:
         log.line(f"{signal.Signals(number).name}: ending")

@@ -1,14 +1,13 @@
 """Clients' sockets, in the event loop's thread: taken up, bytes in, bytes out. It knows no lines and no requests.
 
-A stream is used as a transport of asyncio's would be, and replaces that for three reasons. It loses nothing: what a
-client sent that closed without reading is still there when its end is told, where asyncio's has thrown it away as soon
-as a greeting or an event could not be sent. It is there at once: a client is greeted, and its first request carried
-out, in the turn of the loop in which it connects, not three turns later: the greeting comes in two thirds of the time.
-And what is written in one turn goes out in one piece: the reply to a goal that starts at once and its events are three
-messages, its end is two, and to send one costs as much as to make it.
+A stream is used as a transport of asyncio's would be, and replaces that for three reasons. It loses nothing: asyncio's
+reads no more as soon as a greeting or an event could not be sent, and what a client sent that closed without reading
+would be gone with it. It is there at once: a client is greeted, and its first request carried out, in the turn of the
+loop in which it connects, not three turns later: the greeting comes in two thirds of the time. And what is written in
+one turn goes out in one piece: the reply to a goal that starts at once and its events are three messages, its end is
+two, and to send one costs as much as to make it.
 
-Who takes up connections looks at no client: who is served is their handler's business. It leaves the engine the
-descriptors that it needs.
+Who takes up connections looks at no client, and leaves the engine the descriptors that it needs.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import resource
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from talkcli.protocol import replies
 from talkcli.protocol.lines import encode
@@ -51,25 +50,6 @@ _USED_UP = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 _NONE_THERE = {errno.EAGAIN, errno.ECONNABORTED, errno.EPROTO, errno.EINTR}
 
 
-class Receiver(Protocol):
-    """Who is told what comes in, and how what was written goes out."""
-
-    def data_received(self, data: bytes) -> None:
-        """Take what the client sent."""
-
-    def eof_received(self) -> bool:
-        """Take note that the client sends nothing more; False to close, once what was written is sent."""
-
-    def pause_writing(self) -> None:
-        """Take note that more than `high` bytes wait."""
-
-    def resume_writing(self) -> None:
-        """Take note that it is much less again."""
-
-    def connection_lost(self, error: OSError | None) -> None:
-        """Take note of the end, in a turn of its own; `error`: what the system said, where it broke."""
-
-
 class Streams:
     """The streams of one event loop: what was written in a turn of it is sent at its end, and how much may wait in all.
 
@@ -77,12 +57,13 @@ class Streams:
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-        self._due: list[Stream] = []
+        self.loop = loop
         #: those that have not ended
         self.open: set[Stream] = set()
         #: bytes that wait in all of them
         self.waiting = 0
+        #: those in which something was written in this turn, in their order
+        self._due: dict[Stream, None] = {}
 
     def relieve(self) -> None:
         """Let the clients go for which most waits, until no more waits for all of them than may."""
@@ -92,43 +73,47 @@ class Streams:
             log.seldom("output", f"a client that doesn't read is let go: {ALL_OUTPUT >> 20} MiB wait for all together")
 
     def add(self, stream: Stream) -> None:
-        """Have `end_turn` called at the end of this turn."""
+        """Have what was written in this stream sent at the end of this turn."""
         if not self._due:
-            self._loop.call_soon(self._end)
-        self._due.append(stream)
+            self.loop.call_soon(self._flush)
+        self._due[stream] = None
         if len(self._due) >= _CROWD:
-            self._end()
+            self._flush()
 
-    def _end(self) -> None:
-        due, self._due = self._due, []
+    def _flush(self) -> None:
+        due, self._due = self._due, {}
         for stream in due:
             try:
-                stream.end_turn()
+                stream.flush()
             except Exception as error:  # noqa: BLE001 - one client's must not take the others' answers
                 stream.abort()
-                self._loop.call_exception_handler({"message": "sending to a client", "exception": error})
+                log.bug("sending to a client", error)
 
 
 class Stream:
     """The socket of one client; it is closed at the end, and not before the receiver has been told."""
 
-    def __init__(
-        self, loop: asyncio.AbstractEventLoop, streams: Streams, connected: socket.socket, receiver: Receiver, high: int
-    ) -> None:
-        """`streams`: all of this loop; `high`: bytes that may wait before the receiver is told so."""
+    def __init__(self, streams: Streams, connected: socket.socket, receiver: asyncio.Protocol, high: int) -> None:
+        """`streams`: all of this loop; `high`: bytes that may wait before the receiver is told so.
+
+        The receiver learns of the end in a turn of its own, with what the system said, where the connection broke.
+        """
         self.socket = connected
-        self._loop = loop
         self._streams = streams
-        streams.open.add(self)
+        self._loop = streams.loop
         self._receiver = receiver
         self._high = high
         self._waiting = bytearray()
         #: bytes that wait elsewhere, to be written when the client has read what was sent before them
         self.held = 0
-        #: whether what waits will be sent at the end of this turn, and whether it waits for the client to read
-        self._due = self._blocked = False
-        self._congested = self._reading = self._eof = False
-        self._closing = self._ended = False
+        #: whether nothing more can be written
+        self.closing = False
+        #: whether so much waits that the receiver was told so
+        self.congested = False
+        #: whether what waits will be sent as soon as the client reads
+        self._blocked = False
+        self._reading = self._eof = False
+        streams.open.add(self)
 
     # -- in
 
@@ -141,7 +126,7 @@ class Stream:
 
     def resume_reading(self) -> None:
         """Read what comes. Nothing happens where it is read already, or at its end."""
-        if not (self._reading or self._eof or self._closing):
+        if not (self._reading or self._eof or self.closing):
             self._reading = True
             self._loop.add_reader(self.socket, self._read)
 
@@ -160,19 +145,16 @@ class Stream:
             self._end(error)
             return
         try:
-            self._hand_on(data)
+            if data:
+                self._receiver.data_received(data)
+                return
+            self.pause_reading()
+            self._eof = True
+            if not self._receiver.eof_received():
+                self.close()
         except Exception:
             self.abort()  # a client whose bytes met a bug would wait for its answer
             raise
-
-    def _hand_on(self, data: bytes) -> None:
-        if data:
-            self._receiver.data_received(data)
-            return
-        self.pause_reading()
-        self._eof = True
-        if not self._receiver.eof_received():
-            self.close()
 
     # -- out
 
@@ -181,22 +163,16 @@ class Stream:
         """Bytes that wait to be sent."""
         return len(self._waiting)
 
-    @property
-    def closing(self) -> bool:
-        """Whether nothing more can be written."""
-        return self._closing
-
     def hold(self, size: int) -> None:
         """Count bytes that wait elsewhere; with a negative size, that they do no more."""
-        if self._ended:
-            return
-        self.held += size
-        self._streams.waiting += size
-        self._streams.relieve()
+        if self in self._streams.open:
+            self.held += size
+            self._streams.waiting += size
+            self._streams.relieve()
 
     def write(self, data: bytes) -> None:
         """Send this at the end of this turn, or as soon as the client has read what was sent before it."""
-        if self._closing:
+        if self.closing:
             return
         self._waiting += data
         self._streams.waiting += len(data)
@@ -204,15 +180,9 @@ class Stream:
             self._tell_congestion()
         elif len(self._waiting) >= _PIECE:
             self._send()
-        elif not self._due:
-            self._due = True
+        else:
             self._streams.add(self)
         self._streams.relieve()
-
-    def end_turn(self) -> None:
-        """Send what was written in this turn."""
-        self._due = False
-        self.flush()
 
     def flush(self) -> None:
         """Send what was written in this turn now. A client that is gone is seen by that: then it is `closing`."""
@@ -221,9 +191,9 @@ class Stream:
 
     def close(self) -> None:
         """Close as soon as what was written is sent."""
-        if self._closing:
+        if self.closing:
             return
-        self._closing = True
+        self.closing = True
         self.pause_reading()
         if not self._waiting:
             self._end(None)
@@ -242,35 +212,33 @@ class Stream:
             return
         del self._waiting[:sent]
         self._streams.waiting -= sent
-        if not (self._waiting or self._blocked or self._closing or self._congested):
-            return  # as nearly always
-        if self._blocked != bool(self._waiting):
-            self._blocked = not self._blocked
-            if self._blocked:
-                self._loop.add_writer(self.socket, self._send)
-            else:
-                self._loop.remove_writer(self.socket)
-        if self._closing and not self._waiting:
+        if self._waiting and not self._blocked:
+            self._blocked = True
+            self._loop.add_writer(self.socket, self._send)
+        elif self._blocked and not self._waiting:
+            self._blocked = False
+            self._loop.remove_writer(self.socket)
+        if self.closing and not self._waiting:
             self._end(None)
         else:
             self._tell_congestion()
 
     def _tell_congestion(self) -> None:
-        if not self._congested and len(self._waiting) > self._high:
-            self._congested = True
+        if not self.congested and len(self._waiting) > self._high:
+            self.congested = True
             self._receiver.pause_writing()
-        elif self._congested and len(self._waiting) <= self._high // 4:
-            self._congested = False
+        elif self.congested and len(self._waiting) <= self._high // 4:
+            self.congested = False
             self._receiver.resume_writing()
 
     # -- the end
 
     def _end(self, error: OSError | None) -> None:
-        if self._ended:
+        if self not in self._streams.open:
             return
-        if self._closing:
+        if self.closing:
             error = None  # the end was ours: what the client has sent since is nobody's to hear
-        self._closing = self._ended = True
+        self.closing = True
         self.pause_reading()
         if self._blocked:
             self._loop.remove_writer(self.socket)
@@ -287,48 +255,41 @@ class Stream:
             self.socket.close()
 
 
-def make_room(clients: int) -> None:
-    """Have this process allowed as many descriptors as it needs for so many clients, as far as the system lets it."""
+def make_room(clients: int) -> int:
+    """Have this process allowed as many descriptors as it needs for so many clients; return how many it may have."""
     wanted = clients + RESERVE + OWN
-    allowed, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if allowed == resource.RLIM_INFINITY or allowed >= wanted:
-        return
-    if most == resource.RLIM_INFINITY or most > allowed:
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)
+    if allowed < wanted:
         with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
-            limit = wanted if most == resource.RLIM_INFINITY else min(wanted, most)
-            resource.setrlimit(resource.RLIMIT_NOFILE, (limit, most))
-            allowed = limit
+            resource.setrlimit(resource.RLIMIT_NOFILE, (min(wanted, most), limits[1]))
+            allowed = min(wanted, most)
     if allowed < wanted:
         log.line(
             f"{allowed} files may be open: {max(0, allowed - RESERVE - OWN)} clients fit, not {clients}; "
             f"raise LimitNOFILE= or ulimit -n to {wanted}"
         )
+    return allowed
 
 
 class Acceptor:
     """Takes up the connections of a listening socket; `serve` is given each, and has to close it."""
 
     def __init__(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        serve: Callable[[socket.socket], None],
-        failed: Callable[[str, Exception], None],
+        self, loop: asyncio.AbstractEventLoop, serve: Callable[[socket.socket], None], descriptors: int
     ) -> None:
-        """`failed` is told of a connection that was not made for a reason of the server's own."""
+        """`descriptors`: how many this process may have."""
         self._loop = loop
         self._serve = serve
-        self._failed = failed
+        self._descriptors = descriptors
         self._listening: socket.socket | None = None
         self._retry: asyncio.TimerHandle | None = None
-        self._limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        if self._limit == resource.RLIM_INFINITY:
-            self._limit = 2**31
 
     def open(self, listening: socket.socket) -> None:
         """Take up this socket's connections, and no other's."""
         self.close()
         self._listening = listening
-        self._loop.add_reader(listening, self._accept)
+        self._loop.add_reader(listening, self._accept, listening)
 
     def close(self) -> None:
         """Take up no more connections. The socket stays open; call it before that is closed."""
@@ -339,51 +300,38 @@ class Acceptor:
             self._loop.remove_reader(self._listening)
             self._listening = None
 
-    def _accept(self) -> None:
+    def _accept(self, listening: socket.socket) -> None:
         for _ in range(AT_ONCE):
-            if self._listening is None:
-                return
             try:
-                connected, _ = self._listening.accept()
+                connected, _ = listening.accept()
             except OSError as error:
-                if error.errno in _USED_UP:
-                    self._pause(error)
-                elif error.errno not in _NONE_THERE:
-                    self._failed("taking up a connection", error)
-                    self._pause(error)
+                if error.errno not in _NONE_THERE:
+                    self._pause(listening, error)
                 return
             connected.setblocking(False)
             # The lowest free descriptor is taken, so the number says how many are left.
-            if connected.fileno() >= self._limit - RESERVE:
+            if connected.fileno() >= self._descriptors - RESERVE:
                 self._turn_away(connected)
-            else:
-                self._connect(connected)
-
-    def _connect(self, connected: socket.socket) -> None:
-        try:
-            self._serve(connected)
-        except Exception as error:  # noqa: BLE001 - one connection must not take the others'
-            self._failed("making a connection", error)
-            connected.close()
+                continue
+            try:
+                self._serve(connected)
+            except Exception as error:  # noqa: BLE001 - one connection must not take the others'
+                log.bug("making a connection", error)
+                connected.close()
 
     def _turn_away(self, connected: socket.socket) -> None:
         """Tell a client that the server is full, so that it comes again; the wire's words for it."""
         log.seldom(
             "descriptors",
-            f"clients are turned away: only {self._limit} files may be open (raise LimitNOFILE= or ulimit -n)",
+            f"clients are turned away: only {self._descriptors} files may be open (raise LimitNOFILE= or ulimit -n)",
         )
         with connected, contextlib.suppress(OSError):  # it is gone again
             connected.send(encode(replies.busy_greeting()))
 
-    def _pause(self, error: OSError) -> None:
+    def _pause(self, listening: socket.socket, error: OSError) -> None:
         """Leave the connections waiting for a while: the loop would ask for them without end."""
+        if error.errno not in _USED_UP:
+            log.bug("taking up a connection", error)
         log.seldom("accept", f"no connection can be taken up: {error.strerror}; they wait until one can")
-        assert self._listening
-        listening = self._listening
-        self._loop.remove_reader(listening)
-
-        def again() -> None:
-            self._retry = None
-            self._loop.add_reader(listening, self._accept)
-
-        self._retry = self._loop.call_later(RETRY_AFTER, again)
+        self.close()
+        self._retry = self._loop.call_later(RETRY_AFTER, self.open, listening)
