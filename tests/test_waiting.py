@@ -224,6 +224,9 @@ class Readers:
 
     waiting = 0
 
+    def __init__(self) -> None:
+        self.loop = asyncio.get_running_loop()
+
 
 def test_a_cancel_of_thousands_of_pending_goals_leaves_the_others_their_turns() -> None:
     count = 2_000
@@ -272,7 +275,7 @@ def test_who_begins_to_watch_while_much_is_told_hears_what_happens_from_then_on(
 def test_news_are_told_as_fast_as_they_are_read() -> None:
     async def scene() -> None:
         readers, told = Readers(), []
-        line = News(asyncio.get_running_loop(), cast("Any", readers))
+        line = News(cast("Any", readers))
 
         def tell(number: int) -> None:
             told.append(number)
@@ -299,7 +302,7 @@ def test_news_are_told_though_nobody_reads_and_that_is_waited_for_only_so_long(m
         waits = []
         later = loop.call_later
         loop.call_later = lambda *values: waits.append(values) or later(*values)  # type: ignore[method-assign, func-returns-value]
-        line = News(loop, cast("Any", readers))
+        line = News(cast("Any", readers))
 
         def tell(number: int) -> None:
             told.append(number)
@@ -317,7 +320,7 @@ def test_news_are_told_though_nobody_reads_and_that_is_waited_for_only_so_long(m
 def test_what_comes_of_news_is_told_with_them_and_what_fails_takes_no_other() -> None:
     async def scene() -> None:
         told: list[str] = []
-        line = News(asyncio.get_running_loop(), cast("Any", Readers()))
+        line = News(cast("Any", Readers()))
 
         def first() -> None:
             told.append("first")

@@ -73,9 +73,9 @@ def bug(what: str, error: Exception) -> None:
     line(f"a bug in {what}{place}: {shown(f'{type(error).__name__}: {error}')}")
 
 
-def ended(record: Record, seconds: float | None) -> None:
-    """Write the line of a goal that has ended."""
-    took = "" if seconds is None else f" after {seconds:.1f} s"
+def ended(record: Record, seconds: float) -> None:
+    """Write the line of a goal that has ended; `seconds`: since it began to be spoken, if it did."""
+    took = "" if record.started_at is None else f" after {seconds:.1f} s"
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:
         how += f" ({record.reason}{_by(record.by)})"

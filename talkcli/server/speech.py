@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.supervisor import Supervisor
-    from talkcli.goals.goal import By, JsonObject
+    from talkcli.goals.goal import By
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Scheduler
     from talkcli.server.call import Place
@@ -83,17 +83,18 @@ class Speech:
         self._loop = asyncio.get_running_loop()
         self.subscribers = Subscribers(self._loop, lambda: (each.connection for each in self.for_room))
         self.streams = Streams(self._loop)
-        self.news = News(self._loop, self.streams)
+        self.news = News(self.streams)
         #: whether it was told to end, and takes no goal any more
         self.closing = False
         self._timer: asyncio.TimerHandle | None = None
-        #: when the goals that were handed to the engine began, until their end is told: one, or for a moment two
-        self._started: dict[str, float] = {}
         #: requests that wait for a goal to be silent, until its end is told
         self._for_silence: dict[Record, Place] = {}
-        #: the goal that is known to be held and silent
+        #: the goal that was last known to be held and silent
         self.silent: Record | None = None
-        self._mailbox = Mailbox(self._loop, self._note, log.bug)
+        #: what the engine thread has said, and is still to be taken
+        self._reports: deque[Report] = deque()
+        #: whether the loop has been told so: to wake it for each costs as much as to take one
+        self._reports_due = False
         self._takes: dict[type[Report], Callable[[Any], None]] = {
             protocol.Ready: self._ready,
             protocol.StartFailed: self._start_failed,
@@ -223,15 +224,11 @@ class Speech:
     def _tell_changed(self, record: Record, state: State, at: float) -> None:
         self.subscribers.changed(record, state, at)
         if state.terminal:
-            began = self._started.pop(record.id, None)
-            log.ended(record, None if began is None else time.monotonic() - began)
-            if record is self.silent:
-                self.silent = None
+            log.ended(record, elapsed() - record.began)
             go_on(self._for_silence.pop(record, {}))
             self.look_finished()
 
     def _start(self, record: Record) -> None:
-        self._started[record.id] = time.monotonic()
         self._followed = self.scheduler.pending_count > 0
         chosen = for_engine(record.say, self.scheduler.settings)
         self.engine.say(protocol.Say(record.id, record.text or "", followed=self._followed, **chosen))
@@ -258,13 +255,31 @@ class Speech:
     # -- the engine's reports
 
     def report(self, report: Report) -> None:
-        """Take what the engine thread says; called in any thread."""
-        self._mailbox.post(report)
+        """Take what the engine thread says, in its order, and a few at a time; called in any thread.
 
-    def _note(self, report: Report) -> None:
-        take = self._takes.get(type(report))
-        if take:  # what else the process says is for the engine thread alone
-            take(report)
+        A sentence of many words must not keep clients waiting who ask for something meanwhile: words that come faster
+        than they can be told wait, and the clients have their turn in between.
+        """
+        self._reports.append(report)
+        if not self._reports_due:
+            self._reports_due = True
+            with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left who would want to know
+                self._loop.call_soon_threadsafe(self._take_reports)
+
+    def _take_reports(self) -> None:
+        # Before it looks: what is added after the last look finds it so, and tells the loop again.
+        self._reports_due = False
+        for _ in range(AT_ONCE):
+            if not self._reports:
+                return
+            report = self._reports.popleft()
+            try:
+                if take := self._takes.get(type(report)):  # what else the process says is for its thread alone
+                    take(report)
+            except Exception as error:  # noqa: BLE001 - what comes after it must not be lost
+                log.bug("a report of the engine", error)
+        self._reports_due = True
+        self._loop.call_soon(self._take_reports)
 
     def _voices_known(self, voices: protocol.Voices) -> None:
         self.voices = voices.voices
@@ -304,11 +319,10 @@ class Speech:
 
     def _thread_died(self, died: ThreadDied) -> None:
         """End: there is nothing left that could speak, and a supervisor will start another server."""
-        words = died.words
-        self._engine_fails(words)
-        self.lost(TalkError(words))
+        self._engine_fails(died.words)
+        self.lost(TalkError(died.words))
         if self.scheduler.active:
-            self.apply(self.scheduler.failed(self.scheduler.active.id, "engine_failed", words, None, self._now()))
+            self.apply(self.scheduler.failed(self.scheduler.active.id, "engine_failed", died.words, None, self._now()))
 
     def _ended(self, ended: protocol.Ended) -> None:
         active = self.scheduler.active
@@ -332,14 +346,7 @@ class Speech:
             return
         record = self.scheduler.heard(word.id, word.end)
         text = (record.text or "")[word.start : word.end]
-        event: JsonObject = {
-            "word": text,
-            "start": word.start,
-            "end": word.end,
-            "number": word.number,
-            "time": word.time,
-        }
-        self.news.tell([partial(self.subscribers.heard, word.id, event, time.time())])
+        self.news.tell([partial(self.subscribers.heard, word, text, time.time())])
 
     def _paused(self, paused: protocol.Paused) -> None:
         active = self.scheduler.active
@@ -359,46 +366,3 @@ class Speech:
         """Set `finished`, where everything has ended and that is told."""
         if self.closing and self.scheduler.active is None and self.news.told:
             self.finished.set()
-
-
-class Mailbox:
-    """The reports of one engine thread, on their way into the event loop's: in their order, and a few at a time.
-
-    It looks at none of them. A sentence of many words must not keep clients waiting who ask for something meanwhile:
-    words that come faster than they can be told stay here, and the clients have their turn in between.
-    """
-
-    def __init__(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        take: Callable[[Report], None],
-        failed: Callable[[str, Exception], None],
-    ) -> None:
-        """`take` is called with each, in the loop's thread; `failed`, where that raised."""
-        self._loop = loop
-        self._take = take
-        self._failed = failed
-        self._waiting: deque[Report] = deque()
-        #: whether the loop has been told that something waits: to wake it for each costs as much as to take one
-        self._due = False
-
-    def post(self, report: Report) -> None:
-        """Hand a report over; from any thread."""
-        self._waiting.append(report)
-        if not self._due:
-            self._due = True
-            with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left who would want to know
-                self._loop.call_soon_threadsafe(self._take_some)
-
-    def _take_some(self) -> None:
-        # Before it looks: what is added after the last look finds it so, and tells the loop again.
-        self._due = False
-        for _ in range(AT_ONCE):
-            if not self._waiting:
-                return
-            try:
-                self._take(self._waiting.popleft())
-            except Exception as error:  # noqa: BLE001 - what comes after it must not be lost
-                self._failed("a report of the engine", error)
-        self._due = True
-        self._loop.call_soon(self._take_some)

@@ -1,7 +1,7 @@
 """Who is told what: those who wait for a goal, those who watch all, and that the server is alive while they do.
 
 What there is to tell is told in its order, and as fast as they read where it is much: a cancel may end thousands of
-goals. It knows connections and goals, nothing of the engine; of requests only that one may wait until all is told.
+goals. It knows connections and goals, of the engine what a word is, and of requests that one may wait for the news.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Iterable
 
+    from talkcli.engine.protocol import Word
     from talkcli.goals.goal import By, JsonObject
     from talkcli.goals.record import Record
     from talkcli.server.call import Call
@@ -83,46 +84,43 @@ class Subscribers:
 
     def changed(self, record: Record, state: State, at: float) -> None:
         """Publish a goal's new state; with its last one, its result."""
-        self._count += 1
-        waiting = self._waiters.get(record.id, ())
-        if not (waiting or self._watchers):
-            return
-        event: JsonObject = {"event": "state", "id": record.id, "state": state.name, "n": self._count, "at": at}
-        self._tell_watchers(record, state, event)
-        if state.terminal and waiting:
+        event: JsonObject = {"event": "state", "id": record.id, "state": state.name, **self._counted(at)}
+        if self._watchers:
+            # Its first state, and its last, tell watchers all of it.
+            whole = {"goal": record.snapshot(state).to_json()} if state is State.PENDING or state.terminal else {}
+            _publish({**event, **whole}, self._watchers)
+        if not state.terminal:
+            _publish(event, self._waiters.get(record.id, ()))
+        elif record.id in self._waiters:
             self._send_result(record, encode(event))
-        elif waiting:
-            _publish(event, waiting)
 
-    def heard(self, goal_id: str, word: JsonObject, at: float) -> None:
-        """Publish that a word of a goal is being heard."""
-        self._count += 1
-        listening = dict(self._watchers)
-        listening.update((each, None) for each, feedback in self._waiters.get(goal_id, {}).items() if feedback)
-        if listening:
-            event = {"event": "word", "id": goal_id, **word, "n": self._count, "at": at}
-            _publish(event, listening, feedback=True)
+    def heard(self, word: Word, text: str, at: float) -> None:
+        """Publish that a word of a goal is being heard; `text`: as it stands there."""
+        event: JsonObject = {"event": "word", "id": word.id, "word": text, "start": word.start, "end": word.end}
+        event |= {"number": word.number, "time": word.time, **self._counted(at)}
+        _publish(event, self._listening([self._waiters.get(word.id, {})]), feedback=True)
 
     def paused(self, held: str | None, *, paused: bool, by: By, at: float) -> None:
         """Publish that speech is held, or goes on: `held` is the goal that was being spoken."""
-        self._count += 1
-        listening = dict(self._watchers)
-        for waiting in self._waiters.values():
-            listening.update((each, None) for each, feedback in waiting.items() if feedback)
-        event: JsonObject = {"event": "paused", "paused": paused, "id": held, "by": by.to_json()}
-        _publish({**event, "n": self._count, "at": at}, listening)
+        event: JsonObject = {"event": "paused", "paused": paused, "id": held, "by": by.to_json(), **self._counted(at)}
+        _publish(event, self._listening(self._waiters.values()))
 
     def keep_alive(self) -> None:
         """Tell those who wait for anything, from now on, that the server is alive."""
         if self._alive is None:
             self._alive = self._loop.call_later(ALIVE_EVERY, self._say_alive)
 
-    def _tell_watchers(self, record: Record, state: State, event: JsonObject) -> None:
-        if not self._watchers:
-            return
-        if state is State.PENDING or state.terminal:
-            event = {**event, "goal": record.snapshot(state).to_json()}  # its first state, and its last
-        _publish(event, self._watchers)
+    def _counted(self, at: float) -> JsonObject:
+        """Return what every event has that is of the world, not of one client."""
+        self._count += 1
+        return {"n": self._count, "at": at}
+
+    def _listening(self, waiting: Iterable[dict[Connection, bool]]) -> dict[Connection, None]:
+        """Return who hears of these goals' feedback: those of who waits for them that want it, and who watches all."""
+        listening = dict(self._watchers)
+        for each in waiting:
+            listening.update((connection, None) for connection, feedback in each.items() if feedback)
+        return listening
 
     def _send_result(self, record: Record, last: bytes) -> None:
         """Send a goal's last state and its result, in one piece: a thousand may wait for it."""
@@ -143,8 +141,9 @@ class Subscribers:
 
 
 def _publish(event: JsonObject, connections: Iterable[Connection], *, feedback: bool = False) -> None:
-    line = encode(event)
-    for connection in list(connections):
+    told = list(connections)
+    line = encode(event) if told else b""  # most words are heard by nobody
+    for connection in told:
         connection.publish(line, feedback=feedback)
 
 
@@ -155,8 +154,8 @@ class News:
     to read. It looks at nothing of what is told.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, streams: Streams) -> None:
-        self._loop = loop
+    def __init__(self, streams: Streams) -> None:
+        self._loop = streams.loop
         self._streams = streams
         self._line: deque[Callable[[], None]] = deque()
         self._telling = False

@@ -10,9 +10,12 @@ from talkcli.engine import protocol
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
 from talkcli.goals.scheduler import Scheduler
-from talkcli.server.speech import AT_ONCE, Mailbox, Speech
+from talkcli.server import log
+from talkcli.server.speech import AT_ONCE, Speech
 
 if TYPE_CHECKING:
+    import pytest
+
     from talkcli.goals.record import Record
     from talkcli.goals.states import State
 
@@ -40,14 +43,15 @@ def test_words_that_come_all_at_once_leave_the_clients_their_turns() -> None:
         loop = asyncio.get_running_loop()
         taken: list[object] = []
         wakes = []
-        mailbox = Mailbox(loop, taken.append, lambda *_: None)
+        served = Speech(Scheduler("4k7f", max_queue=1))
+        served._takes[protocol.Word] = taken.append
         call = loop.call_soon_threadsafe
         loop.call_soon_threadsafe = lambda *values: wakes.append(call(*values))  # type: ignore[assignment, method-assign]
         words = [protocol.Word("4k7f-1", 0, 1, number, 0.0) for number in range(COUNT)]
 
         def post_all() -> None:
             for each in words:
-                mailbox.post(each)
+                served.report(each)
 
         thread = threading.Thread(target=post_all)
         thread.start()
@@ -59,13 +63,13 @@ def test_words_that_come_all_at_once_leave_the_clients_their_turns() -> None:
             turns += 1
             assert len(taken) <= turns * AT_ONCE
         assert taken == words
-        mailbox.post(words[0])
+        served.report(words[0])
         assert len(wakes) == 2
 
     asyncio.run(play())
 
 
-def test_report_that_meets_a_bug_takes_no_other_with_it() -> None:
+def test_report_that_meets_a_bug_takes_no_other_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
     async def play() -> None:
         taken, failed = [], []
 
@@ -74,9 +78,11 @@ def test_report_that_meets_a_bug_takes_no_other_with_it() -> None:
             if len(taken) == 1:
                 raise ZeroDivisionError("a bug")
 
-        mailbox = Mailbox(asyncio.get_running_loop(), take, lambda what, error: failed.append((what, type(error))))  # type: ignore[arg-type]
+        monkeypatch.setattr(log, "bug", lambda what, error: failed.append((what, type(error))))
+        served = Speech(Scheduler("4k7f", max_queue=1))
+        served._takes[protocol.Alive] = take
         for number in range(3):
-            mailbox.post(protocol.Alive(f"4k7f-{number}"))
+            served.report(protocol.Alive(f"4k7f-{number}"))
         await asyncio.sleep(0)
         assert len(taken) == 3
         assert failed == [("a report of the engine", ZeroDivisionError)]
