@@ -1,7 +1,8 @@
 """The listening socket: who may serve at a path, and how its file comes and goes.
 
 A lock that is held for life decides who serves; only its holder removes a socket that an ended server left. Cleaners of
-temporary directories and people remove the file while it is served: it is looked after.
+temporary directories and people remove the file while it is served: then it is bound again. When to look is the
+server's.
 """
 
 from __future__ import annotations
@@ -12,26 +13,17 @@ import os
 import socket
 import stat
 import sys
-from typing import TYPE_CHECKING
 
 from talkcli import paths, peers
 from talkcli.client.connect import connect, hello
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
-from talkcli.server import log
-from talkcli.server.lock import Lock, identity, serves_already
-
-if TYPE_CHECKING:
-    import asyncio
-    from collections.abc import Callable
+from talkcli.server.lock import Lock, identity, refusing, serves_already
 
 #: Connections that may wait to be accepted; the system's own limit applies too (net.core.somaxconn).
 BACKLOG = 1024
 #: The first descriptor that systemd passes (SD_LISTEN_FDS_START).
 _FIRST_PASSED = 3
 _RESTART_SOCKET = "restart the socket's unit (systemctl restart talk.socket)"
-#: Seconds between two looks. Nobody reaches the server meanwhile, and 30 s is what is promised; it is two calls of
-#: lstat, so it costs a machine at rest nothing.
-LOOK_EVERY = 10.0
 #: What passes, so that the next look may well succeed: no room, no descriptor, a disk that is read-only for a while.
 _PASSING = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
@@ -156,6 +148,11 @@ def listen(named: str | None, mode: int) -> Listener | InheritedListener:
     return Listener(named, mode)
 
 
+def may_pass(error: AddressInUse) -> bool:
+    """Whether it can well be bound at another time."""
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _PASSING
+
+
 def _refuse_second_server(named: str | None) -> None:
     """Refuse where clients would find another server before or instead of this one."""
     try:
@@ -184,12 +181,8 @@ def _refuse_live_socket(path: str) -> None:
 
 def _check_directory(directory: str) -> None:
     """Make sure that nobody else can put a socket of theirs in this one's place."""
-    try:
+    with refusing(f"the socket's directory {directory} can't be made"), contextlib.suppress(FileExistsError):
         os.mkdir(directory, 0o700)
-    except FileExistsError:
-        pass
-    except OSError as error:
-        raise AddressInUse(f"the socket's directory {directory} can't be made: {error.strerror}") from error
     status = os.lstat(directory)
     if stat.S_ISLNK(status.st_mode):
         raise AddressInUse(f"the socket's directory {directory} is a symbolic link: name the directory itself")
@@ -220,12 +213,8 @@ def _refuse_other_file(path: str) -> None:
 
 def _bind(path: str, mode: int) -> socket.socket:
     _refuse_other_file(path)
-    try:
+    with refusing(f"the socket {path} of an earlier server can't be removed"), contextlib.suppress(FileNotFoundError):
         os.unlink(path)  # the lock is ours, so whoever bound it is gone
-    except FileNotFoundError:
-        pass
-    except OSError as error:
-        raise AddressInUse(f"the socket {path} of an earlier server can't be removed: {error.strerror}") from error
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listening.setblocking(False)
@@ -246,56 +235,3 @@ def _bind(path: str, mode: int) -> socket.socket:
         listening.close()
         raise AddressInUse(f"cannot listen at {path}: {error.strerror or error}") from error
     return listening
-
-
-class Upkeep:
-    """Looks after the file of a listener, from `begin` to `end`: when to look, and what follows."""
-
-    def __init__(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        listener: Listener | InheritedListener,
-        moved: Callable[[socket.socket | None], None],
-        lost: Callable[[AddressInUse], None],
-    ) -> None:
-        """`moved` is called with the former socket when the listener has bound again, `lost` when it can't."""
-        self._loop = loop
-        self._listener = listener
-        self._moved = moved
-        self._lost = lost
-        self._said = ""
-        self._timer: asyncio.TimerHandle | None = None
-
-    def begin(self) -> None:
-        """Look from now on."""
-        self._timer = self._loop.call_later(LOOK_EVERY, self._look)
-
-    def end(self) -> None:
-        """Look no more."""
-        if self._timer:
-            self._timer.cancel()
-            self._timer = None
-
-    def _look(self) -> None:
-        self.begin()
-        if self._listener.in_place():
-            self._said = ""
-            return
-        try:
-            former = self._listener.bind_again()
-        except AddressInUse as error:
-            if not self._listener.passed and not _passes(error):
-                self.end()
-                log.line(log.shown(f"ending: {error}"))
-                self._lost(error)
-            elif str(error) != self._said:
-                self._said = str(error)
-                log.line(log.shown(f"clients can't reach this server: {error}"))
-            return
-        self._said = ""
-        log.line(f"the socket's file or its lock was gone or another: bound again at {self._listener.path}")
-        self._moved(former)
-
-
-def _passes(error: AddressInUse) -> bool:
-    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _PASSING

@@ -12,8 +12,12 @@ import fcntl
 import os
 import stat
 import time
+from typing import TYPE_CHECKING
 
 from talkcli.errors import AddressInUse
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 #: Seconds in which the holder of the lock has written its process id.
 _NAMES_HOLDER = 1.0
@@ -59,6 +63,15 @@ class Lock:
         os.close(self._fd)
 
 
+@contextlib.contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """Raise AddressInUse, with the system's words, where it lets none of this be done."""
+    try:
+        yield
+    except OSError as error:
+        raise AddressInUse(f"{what}: {error.strerror or error}") from error
+
+
 def identity(path: str) -> tuple[int, int] | None:
     """Return what tells a file from another of its name; None if there is none, or it can't be seen."""
     try:
@@ -83,18 +96,14 @@ def _open(name: str) -> tuple[int, bool]:
     """Return the descriptor of the lock's file, and whether it was made now."""
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
-        try:
+        with refusing(f"the lock {name} can't be opened"):
             with contextlib.suppress(FileExistsError):
                 return os.open(name, flags | os.O_CREAT | os.O_EXCL, 0o600), True
-        except OSError as error:
-            raise AddressInUse(f"the lock {name} can't be opened: {error.strerror}") from error
-        try:
-            _refuse_other_file(name, os.lstat(name))  # before it is opened, which may do something to a device
-            fd = os.open(name, flags)
-        except FileNotFoundError:
-            continue  # it was removed meanwhile
-        except OSError as error:
-            raise AddressInUse(f"the lock {name} can't be opened: {error.strerror}") from error
+            try:
+                _refuse_other_file(name, os.lstat(name))  # before it is opened, which may do something to a device
+                fd = os.open(name, flags)
+            except FileNotFoundError:
+                continue  # it was removed meanwhile
         try:
             _refuse_other_file(name, os.fstat(fd))
         except AddressInUse:

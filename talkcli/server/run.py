@@ -1,4 +1,4 @@
-"""`talk serve`, from the lock to the last goodbye: who is connected to one server, what it says of itself, its end."""
+"""`talk serve`, from the lock to the last goodbye: one server, who is connected to it, and what it says of itself."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from talkcli import __version__, peers, resources
 from talkcli.engine import protocol
 from talkcli.engine.protocol import START_LIMIT
 from talkcli.engine.supervisor import Supervisor
-from talkcli.errors import EXIT_OK, EXIT_SIGNAL, TalkError
+from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
 from talkcli.frozen import frozen
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, Say, Set, as_shown
@@ -25,15 +25,13 @@ from talkcli.protocol import replies
 from talkcli.protocol.lines import encode
 from talkcli.server import log
 from talkcli.server.connection import Connection
-from talkcli.server.listener import InheritedListener, Listener, Upkeep, listen
+from talkcli.server.listener import InheritedListener, Listener, listen, may_pass
 from talkcli.server.requests import Requests
 from talkcli.server.speech import Speech
 from talkcli.server.stream import Acceptor, make_room
 from talkcli.server.systemd import Systemd
 
 if TYPE_CHECKING:
-    import socket
-
     from talkcli.goals.goal import JsonObject
 
 #: Clients at once. Each takes a descriptor of the 1,024 that a process usually has.
@@ -42,6 +40,9 @@ MAX_CLIENTS = 256
 MAX_QUEUE = 100
 #: Places at the door of a full server, for clients that want to know its status or to silence it.
 DOOR = 16
+#: Seconds between two looks whether clients find the socket. Nobody reaches the server meanwhile, and 30 s is what is
+#: promised; it is two calls of lstat, so it costs a machine at rest nothing.
+LOOK_EVERY = 10.0
 #: Seconds in which clients take their last answers before they are let go.
 _GOODBYE = 0.3
 #: Seconds in which the engine process must be gone before the server leaves it to the system.
@@ -113,6 +114,8 @@ class Server:
         #: why it must end at once: what it was told to do can't be done
         self._fatal: TalkError | None = None
         self._began = time.time(), time.monotonic()
+        #: why clients can't reach it, as was last said
+        self._unreachable = ""
         self._ended_by = [signal.SIGTERM]
         # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
         if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
@@ -123,7 +126,6 @@ class Server:
         settings, speech = self._settings, self.speech
         descriptors = make_room(settings.max_clients + DOOR)
         self._acceptor = Acceptor(self._loop, lambda each: Connection(self, speech.streams, each).begin(), descriptors)
-        upkeep = Upkeep(self._loop, self._listener, self._moved, self._end)
         self._loop.set_exception_handler(self._on_bug)
         for number in self._ended_by:
             self._loop.add_signal_handler(number, self._on_signal, number)
@@ -141,7 +143,7 @@ class Server:
             raise TalkError(f"the engine's thread cannot be started: {resources.limits()}") from error
         try:
             self._acceptor.open(self._listener.socket)
-            upkeep.begin()
+            self._next_look = self._loop.call_later(LOOK_EVERY, self._look_after_socket)
             if settings.goals.voice or settings.driver:
                 # Who asked for what can't be had is told so, and nothing else.
                 with contextlib.suppress(asyncio.TimeoutError):
@@ -153,7 +155,7 @@ class Server:
                 itself = Sender(os.getpid(), os.getuid(), "talk")
                 speech.apply(self._scheduler.submit(Say(settings.greeting), itself, speech.now()).effects)
             await speech.finished.wait()
-            upkeep.end()
+            self._next_look.cancel()
             self._acceptor.close()
             await self._say_goodbye()
         finally:
@@ -163,8 +165,26 @@ class Server:
         if self._fatal:
             raise self._fatal
 
-    def _moved(self, former: socket.socket | None) -> None:
-        """Take up connections where the listener is now; those that there are live on."""
+    def _look_after_socket(self) -> None:
+        """See whether clients find the socket, and bind it again where they don't; connections live on."""
+        self._next_look = self._loop.call_later(LOOK_EVERY, self._look_after_socket)
+        if self._listener.in_place():
+            self._unreachable = ""
+            return
+        try:
+            former = self._listener.bind_again()
+        except AddressInUse as error:
+            if not (self._listener.passed or may_pass(error)):
+                # Clients find another server, or none; a supervisor that starts this one again will hear why.
+                self._next_look.cancel()
+                log.line(log.shown(f"ending: {error}"))
+                self._end(error)
+            elif str(error) != self._unreachable:
+                self._unreachable = str(error)
+                log.line(log.shown(f"clients can't reach this server: {error}"))
+            return
+        self._unreachable = ""
+        log.line(f"the socket's file or its lock was gone or another: bound again at {self._listener.path}")
         self._acceptor.open(self._listener.socket)
         if former:
             former.close()

@@ -7,9 +7,9 @@ import sys
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
 
-from talkcli.server import listener
+from talkcli.server import run
 from tests.support import scripted_serve
 
 if __name__ == "__main__":
-    listener.LOOK_EVERY = 0.05
+    run.LOOK_EVERY = 0.05
     scripted_serve.main()

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.server import listener
+from talkcli.server.run import LOOK_EVERY
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
 from tests.support import processes
 from tests.support.connection import Wire
@@ -83,7 +83,7 @@ def move_directory(path: str) -> None:
 
 
 def test_it_is_looked_at_well_within_the_30_seconds_that_are_promised() -> None:
-    assert listener.LOOK_EVERY <= 15  # and a second look would find what the first, for a full disk, could not mend
+    assert LOOK_EVERY <= 15  # and a second look would find what the first, for a full disk, could not mend
 
 
 @pytest.mark.parametrize(
