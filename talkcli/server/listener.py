@@ -100,8 +100,7 @@ class InheritedListener:
         os.set_inheritable(fd, False)
         self.socket = socket.socket(fileno=fd)
         try:
-            _check_passed(self.socket)
-            self.path = self.socket.getsockname()
+            self.path = _path_of(self.socket)
             self._identity = identity(self.path)
             if self._identity is None:
                 raise AddressInUse(f"the passed socket's file {self.path} is gone: {_RESTART_SOCKET}")
@@ -124,8 +123,8 @@ class InheritedListener:
         self.socket.close()
 
 
-def _check_passed(passed: socket.socket) -> None:
-    """Refuse what isn't a listening Unix socket with a file: `talk serve` would fail at it in ways hard to read."""
+def _path_of(passed: socket.socket) -> str:
+    """Return the file of a listening Unix socket; refuse any other, at which `serve` would fail in ways hard to read."""
     if passed.family != socket.AF_UNIX:
         raise UsageError("the socket that was passed (LISTEN_FDS) is not a Unix socket: use ListenStream=/path")
     if passed.type != socket.SOCK_STREAM or not passed.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
@@ -133,6 +132,7 @@ def _check_passed(passed: socket.socket) -> None:
     name = passed.getsockname()
     if not isinstance(name, str) or not os.path.isabs(name):
         raise UsageError("the socket that was passed (LISTEN_FDS) has no file: use ListenStream=/path")
+    return name
 
 
 def listen(named: str | None, mode: int) -> Listener | InheritedListener:

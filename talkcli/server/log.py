@@ -31,6 +31,8 @@ _MAX_TEXT = 200
 #: Characters of a program's name or command line in the log.
 _MAX_COMMAND = 80
 
+#: What plays where a driver needs no player.
+_BY_ITSELF = "which plays by itself"
 #: Seconds between two lines of the same kind, of what may happen many times a second.
 _SELDOM = 60.0
 
@@ -79,15 +81,16 @@ def ended(record: Record, seconds: float) -> None:
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:
         how += f" ({record.reason}{_by(record.by)})"
-    text = shown(record.text or "")
-    line(f'{how}: "{text}" from {who(record.sender)}{_detail(record)}')
+    detail = f"; {shown(record.message)}" if record.state is State.ABORTED and record.message else ""
+    line(f'{how}: "{shown(record.text or "")}" from {who(record.sender)}{detail}')
 
 
 def ready(engine: Ready, for_player: Sequence[str]) -> None:
     """Write the line of an engine that is ready; `for_player`: the options that were given for a player."""
     version = f", {shown(engine.version)}" if engine.version else ""
-    words = f"engine ready: driver {engine.driver}{version}, {sound_of(engine)}"
-    if for_player and _plays_by_itself(engine):
+    sound = sound_of(engine)
+    words = f"engine ready: driver {engine.driver}{version}, {sound}"
+    if for_player and sound == _BY_ITSELF:
         words += f": {' and '.join(for_player)} {'has' if len(for_player) == 1 else 'have'} no effect"
     line(words)
 
@@ -96,15 +99,9 @@ def sound_of(engine: Ready) -> str:
     """Return what plays, for people."""
     if engine.player:
         return f"player {engine.player}"
-    return "which plays by itself" if _plays_by_itself(engine) else NO_PLAYER
-
-
-def _plays_by_itself(engine: Ready) -> bool:
-    if engine.player:
-        return False
     from talkcli.engine.start import is_own  # with half of the engine, for the few who need it
 
-    return not is_own(engine.driver)
+    return NO_PLAYER if is_own(engine.driver) else _BY_ITSELF
 
 
 def shown(words: str) -> str:
@@ -130,7 +127,3 @@ def _by(by: By | None) -> str:
     if by is None:
         return ""
     return f" by {by.goal}" if by.goal else f" by {who(by.client)}" if by.client else ""
-
-
-def _detail(record: Record) -> str:
-    return f"; {shown(record.message)}" if record.state is State.ABORTED and record.message else ""

@@ -261,19 +261,11 @@ class Requests:
         # that have ended, each is looked at when its turn comes to be sent.
         active = self._scheduler.active
         spoken = active.snapshot() if active else None
-        states = [record.state for record in records]
-
-        def goals() -> Iterator[JsonObject]:
-            for record, state in zip(records, states, strict=True):
-                goal = spoken if spoken and record is active else record.snapshot(state)
-                yield {"goal": goal.to_json()}
-
-        def results() -> Iterator[JsonObject]:
-            for record, state in zip(records, states, strict=True):
-                if state.terminal:  # the subscribers are told of the others
-                    yield {"event": "result", "goal": record.snapshot().to_json()}
-
-        call.answer(goals(), results(), count=len(records))
+        told = [(record, record.state) for record in records]
+        goals = (spoken if spoken and record is active else record.snapshot(state) for record, state in told)
+        ended = (record.snapshot() for record, state in told if state.terminal)  # subscribers are told of the others
+        results: Iterator[JsonObject] = ({"event": "result", "goal": each.to_json()} for each in ended)
+        call.answer(({"goal": each.to_json()} for each in goals), results, count=len(records))
 
     async def _cancel(self, call: Call, selection: Cancel) -> None:
         speech, by = self._speech, By(client=call.connection.sender)

@@ -103,7 +103,7 @@ class Server:
         )
         self.speech = Speech(self._scheduler, settings.for_player)
         self.speech.lost = self._end
-        self._systemd = Systemd(self._loop, os.environ, self.speech.words)
+        self._systemd = Systemd(self._loop, self.speech.words)
         self.speech.changed = self._systemd.changed
         self._requests = Requests(self.speech, self._describe)
         self.handle = self._requests.handle

@@ -325,12 +325,10 @@ class Speech:
             self.apply(self.scheduler.failed(self.scheduler.active.id, "engine_failed", died.words, None, self._now()))
 
     def _ended(self, ended: protocol.Ended) -> None:
+        now = self.now()
         active = self.scheduler.active
         if active is None or active.id != ended.id:
-            return  # it was given up before the engine came to its end
-        now = self.now()
-        if self.scheduler.active is not active:
-            return  # it was due just now
+            return  # it was given up before the engine came to its end, perhaps just now
         if ended.outcome == protocol.COMPLETED:
             effects = self.scheduler.completed(ended.id, ended.duration, now)
         elif ended.outcome == protocol.STOPPED and active.stop_since is not None:

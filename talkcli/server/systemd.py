@@ -14,7 +14,7 @@ from talkcli.server import log
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
 #: Seconds after a change until it is told, so that a burst of goals is one message.
 STATUS_AFTER = 0.5
@@ -27,15 +27,13 @@ BEATS = 2.5
 class Systemd:
     """The one that started this process, if it wants to be told. All calls are made in the event loop's thread."""
 
-    def __init__(
-        self, loop: asyncio.AbstractEventLoop, environment: Mapping[str, str], words: Callable[[], str]
-    ) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, words: Callable[[], str]) -> None:
         """`words` returns how the server is, in one line for people."""
         self._loop = loop
         self._words = words
-        self._address = _address(environment.get("NOTIFY_SOCKET", ""))
+        self._address = _address(os.environ.get("NOTIFY_SOCKET", ""))
         self._socket: socket.socket | None = None
-        self._beat = _beat(environment) if self._address else None
+        self._beat = _beat()
         #: what could not be sent yet; the newest of each kind
         self._unsent: dict[str, str] = {}
         self._status = ""
@@ -114,11 +112,11 @@ def _address(name: str) -> str:
     return name if os.path.isabs(name) else ""
 
 
-def _beat(environment: Mapping[str, str]) -> float | None:
+def _beat() -> float | None:
     """Return the seconds between two signs of life; None if nobody counts them."""
-    limit = environment.get("WATCHDOG_USEC", "")
+    limit, this = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
     if not (limit.isascii() and limit.isdecimal() and int(limit)):
         return None
-    if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
+    if os.environ.get("WATCHDOG_PID", this) != this:
         return None  # another process of this unit is watched
     return int(limit) / 1e6 / BEATS
