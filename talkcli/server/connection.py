@@ -48,8 +48,8 @@ READ_AHEAD = 64
 class Handler(Protocol):
     """What a connection needs of the server."""
 
-    def greeting(self) -> JsonObject:
-        """Return the first line for a client that is let in."""
+    #: the first line for a client that is let in
+    greeting: JsonObject
 
     def joined(self, connection: Connection) -> None:
         """Look who it is: admit a client, let it wait at the door, or close."""
@@ -98,7 +98,7 @@ class Connection(asyncio.Protocol):
     def admit(self) -> None:
         """Let the client in: greet it."""
         self.admitted = True
-        self._write(self._handler.greeting())
+        self._write(self._handler.greeting)
 
     # -- what the stream calls
 
@@ -118,7 +118,7 @@ class Connection(asyncio.Protocol):
             self._lines.extend(error.before)
             while self._may_go_on() and self._step():
                 pass  # they were asked for, and are answered
-            self.refuse(error.code, str(error))
+            self.part(replies.failure(None, error.code, str(error)))
             return
         if b"\n" in data:
             self._stop_line_limit()  # what follows the newline is another line
@@ -168,15 +168,15 @@ class Connection(asyncio.Protocol):
         self.stream.flush()
         return self.stream.closing
 
-    def refuse(self, code: str, words: str) -> None:
-        """Say why, and close."""
-        self._write(replies.failure(None, code, words))
+    def part(self, last: JsonObject) -> None:
+        """Say this, and close."""
+        self._write(last)
         self.stream.close()
 
     # -- inside
 
     def _limit(self, seconds: float, words: str) -> asyncio.TimerHandle:
-        return self._loop.call_later(seconds, self.refuse, "too_slow", words)
+        return self._loop.call_later(seconds, self.part, replies.failure(None, "too_slow", words))
 
     def _may_go_on(self) -> bool:
         """Whether the client can be told more, and takes it."""
@@ -275,8 +275,7 @@ class Connection(asyncio.Protocol):
         if not self.admitted:
             # Whose business is urgent comes in; a full server sends the others away.
             if not (isinstance(request, Status | Cancel) or (isinstance(request, Hello) and request.urgent)):
-                self._write(replies.busy_greeting())
-                self.stream.close()
+                self.part(replies.busy_greeting())
                 return
             self.admit()
         if isinstance(request, Hello):

@@ -64,8 +64,7 @@ class Listener:
         """
         path = paths.server_socket(self._named)
         _check_directory(os.path.dirname(path))
-        keeps_lock = self._lock.in_place(path)
-        lock = self._lock if keeps_lock else Lock(path)
+        lock = self._lock if self._lock.in_place(path) else Lock(path)
         former = None
         try:
             if identity(path) != self._identity:
@@ -74,10 +73,10 @@ class Listener:
                 former = self.socket
                 self.socket, self.path, self._identity = bound, path, identity(path)
         except BaseException:
-            if not keeps_lock:
+            if lock is not self._lock:
                 lock.undo()
             raise
-        if not keeps_lock:
+        if lock is not self._lock:
             self._lock.close()
             self._lock = lock
         return former
@@ -124,7 +123,7 @@ class InheritedListener:
 
 
 def _path_of(passed: socket.socket) -> str:
-    """Return the file of a listening Unix socket; refuse any other, at which `serve` would fail in ways hard to read."""
+    """Return the file of a listening Unix socket; UsageError for others, which fail later in ways hard to read."""
     if passed.family != socket.AF_UNIX:
         raise UsageError("the socket that was passed (LISTEN_FDS) is not a Unix socket: use ListenStream=/path")
     if passed.type != socket.SOCK_STREAM or not passed.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):

@@ -85,13 +85,14 @@ class Requests:
         call.begin(self._carry_out(call))
 
     def owes(self, connection: Connection) -> bool:
-        """Whether a request of this connection waits."""
-        return connection in self._calls
+        """Whether a client waits: for an answer, or for what it is to be told."""
+        return connection in self._calls or self._speech.subscribers.has(connection)
 
     def left(self, connection: Connection) -> None:
-        """Forget the requests of a client that is gone."""
+        """Forget the requests of a client that is gone, and what it was to be told."""
         for each in self._waiting(connection):
             each.drop()
+        self._speech.subscribers.left(connection)
 
     def shut_down(self) -> None:
         """End all goals, those that wait, too."""
@@ -292,7 +293,6 @@ class Requests:
 
     async def _pause(self, call: Call, _: Pause) -> None:
         speech = self._speech
-        speech.now()
         speech.pause(By(client=call.connection.sender))
         active = self._scheduler.active
         if active and active is not speech.silent and not await call.wait(speech.for_silence(active), PAUSE_LIMIT):

@@ -22,7 +22,6 @@ from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, Say, Set, as_shown
 from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol import replies
-from talkcli.protocol.lines import encode
 from talkcli.server import log
 from talkcli.server.connection import Connection
 from talkcli.server.listener import InheritedListener, Listener, listen, may_pass
@@ -106,7 +105,8 @@ class Server:
         self._systemd = Systemd(self._loop, self.speech.words)
         self.speech.changed = self._systemd.changed
         self._requests = Requests(self.speech, self._describe)
-        self.handle = self._requests.handle
+        self.handle, self.owes = self._requests.handle, self._requests.owes
+        self.greeting = replies.greeting(__version__, os.getpid(), self._scheduler.boot)
         self.connections: set[Connection] = set()
         #: set while there is no client
         self._deserted = asyncio.Event()
@@ -207,15 +207,7 @@ class Server:
             self.connections.add(connection)
             self._deserted.clear()
             return
-        connection.stream.write(encode(refusal))
-        connection.stream.close()
-
-    def greeting(self) -> JsonObject:
-        return replies.greeting(__version__, os.getpid(), self._scheduler.boot)
-
-    def owes(self, connection: Connection) -> bool:
-        """Whether a client waits for something."""
-        return self._requests.owes(connection) or self.speech.subscribers.has(connection)
+        connection.part(refusal)
 
     def left(self, connection: Connection) -> None:
         """Forget a client; its goals go on."""
@@ -227,7 +219,6 @@ class Server:
             if waiting and len(self.connections) - len(waiting) < self._settings.max_clients:
                 waiting[0].admit()
         self._requests.left(connection)
-        self.speech.subscribers.left(connection)
 
     # -- what it says of itself
 

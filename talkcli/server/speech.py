@@ -144,6 +144,7 @@ class Speech:
 
     def pause(self, by: By) -> None:
         """Hold what is being spoken, and start nothing."""
+        self.now()
         newly, effects, active = not self.scheduler.paused, self.scheduler.pause(), self.scheduler.active
         if newly:
             self._tell_paused(active if active and active.paused else None, by)

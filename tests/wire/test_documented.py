@@ -35,7 +35,7 @@ REASON_AT = {
     "_end": 2, "_close": 2, "failed": 1,
 }  # fmt: skip
 #: … and which is the code of an error on the wire.
-CODE_AT = {"BadRequest": 1, "RequestRefused": 1, "failure": 1, "refuse": 0, "call_later": 2}
+CODE_AT = {"BadRequest": 1, "RequestRefused": 1, "failure": 1, "refuse": 0}
 CODE = re.compile(r"[a-z]+(_[a-z]+)*")
 
 
