@@ -8,6 +8,7 @@ no goals.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from itertools import chain
 from types import coroutine
 from typing import TYPE_CHECKING
@@ -68,9 +69,10 @@ class Call:
             self._step(in_time)
 
     def move(self, place: Place) -> None:
-        """Have it wait elsewhere, for something else."""
+        """Have it wait there, and nowhere else."""
         self._leave()
-        self._enter(place)
+        self.place = place
+        place[self] = None
 
     def drop(self) -> None:
         """Forget it: its client is gone."""
@@ -78,15 +80,8 @@ class Call:
         self._steps.close()
 
     def _step(self, value: bool | None) -> None:
-        try:
-            place = self._steps.send(value)
-        except StopIteration:
-            return  # it has been answered
-        self._enter(place)
-
-    def _enter(self, place: Place) -> None:
-        self.place = place
-        place[self] = None
+        with contextlib.suppress(StopIteration):  # it has been answered
+            self.move(self._steps.send(value))
 
     def _leave(self) -> bool:
         """Leave the place where it waits, if it waits."""

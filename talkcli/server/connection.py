@@ -49,7 +49,7 @@ class Handler(Protocol):
     """What a connection needs of the server."""
 
     #: the first line for a client that is let in
-    greeting: JsonObject
+    greeting: bytes
 
     def joined(self, connection: Connection) -> None:
         """Look who it is: admit a client, let it wait at the door, or close."""
@@ -141,10 +141,10 @@ class Connection(asyncio.Protocol):
         """Send a reply, or what is encoded, after the lists that are on their way."""
         if self._half_closed:  # it may be the last that is owed. Not at once: another request must wait meanwhile
             self._ask_for_a_turn()
+        line = message if isinstance(message, bytes) else encode(message)
         if not self._outbox:
-            self._write(message)
+            self._write(line)
         elif len(self._outbox) < MAX_HELD:
-            line = message if isinstance(message, bytes) else encode(message)
             self._outbox.append(line)
             self.stream.hold(len(line))
         else:
@@ -170,7 +170,7 @@ class Connection(asyncio.Protocol):
 
     def part(self, last: JsonObject) -> None:
         """Say this, and close."""
-        self._write(last)
+        self._write(encode(last))
         self.stream.close()
 
     # -- inside
@@ -201,8 +201,8 @@ class Connection(asyncio.Protocol):
             self._line_limit.cancel()
             self._line_limit = None
 
-    def _write(self, message: JsonObject | bytes) -> None:
-        self.stream.write(message if isinstance(message, bytes) else encode(message))
+    def _write(self, line: bytes) -> None:
+        self.stream.write(line)
         if self.stream.size > HARD_OUTPUT:
             self.stream.abort()
 
@@ -248,7 +248,7 @@ class Connection(asyncio.Protocol):
             elif (message := next(first, None)) is None:
                 self._outbox.popleft()
             else:
-                self._write(message)
+                self._write(encode(message))
         elif self._newest:
             newest, self._newest = self._newest, b""
             self._write(newest)

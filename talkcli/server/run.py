@@ -22,6 +22,7 @@ from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, Say, Set, as_shown
 from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol import replies
+from talkcli.protocol.lines import encode
 from talkcli.server import log
 from talkcli.server.connection import Connection
 from talkcli.server.listener import InheritedListener, Listener, listen, may_pass
@@ -106,7 +107,7 @@ class Server:
         self.speech.changed = self._systemd.changed
         self._requests = Requests(self.speech, self._describe)
         self.handle, self.owes = self._requests.handle, self._requests.owes
-        self.greeting = replies.greeting(__version__, os.getpid(), self._scheduler.boot)
+        self.greeting = encode(replies.greeting(__version__, os.getpid(), self._scheduler.boot))
         self.connections: set[Connection] = set()
         #: set while there is no client
         self._deserted = asyncio.Event()
@@ -116,10 +117,9 @@ class Server:
         self._began = time.time(), time.monotonic()
         #: why clients can't reach it, as was last said
         self._unreachable = ""
-        self._ended_by = [signal.SIGTERM]
         # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
-        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-            self._ended_by.append(signal.SIGINT)
+        ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+        self._ended_by = [signal.SIGTERM] if ignored else [signal.SIGTERM, signal.SIGINT]
 
     async def run(self) -> None:
         """Serve until it is told to end."""
