@@ -49,7 +49,7 @@ class Subscribers:
         self._others = others
         #: events published so far: a watcher sees by a gap that feedback was dropped
         self._count = 0
-        #: by goal: those who wait for its end, and whether they want its feedback
+        #: by goal, until its end: those who wait for that, and whether they want its feedback
         self._waiters: dict[str, dict[Connection, bool]] = {}
         self._awaited: dict[Connection, set[str]] = {}
         self._watchers: dict[Connection, None] = {}
@@ -58,10 +58,9 @@ class Subscribers:
     def await_result(self, goal_id: str, connection: Connection, *, feedback: bool = False) -> None:
         """Tell this connection of the goal's states, of each word where it wants `feedback`, and at last its result."""
         waiting = self._waiters.setdefault(goal_id, {})
-        if connection not in waiting:
-            self._awaited.setdefault(connection, set()).add(goal_id)
-            self.keep_alive()
         waiting[connection] = waiting.get(connection, False) or feedback
+        self._awaited.setdefault(connection, set()).add(goal_id)
+        self.keep_alive()
 
     def has(self, connection: Connection) -> bool:
         """Whether this connection is to be told of a goal, or of everything."""
@@ -69,18 +68,14 @@ class Subscribers:
 
     def watch(self, connection: Connection) -> None:
         """Tell this connection of everything."""
-        if connection not in self._watchers:
-            self._watchers[connection] = None
-            self.keep_alive()
+        self._watchers[connection] = None
+        self.keep_alive()
 
     def left(self, connection: Connection) -> None:
         """Forget a connection that is gone."""
         self._watchers.pop(connection, None)
         for goal_id in self._awaited.pop(connection, ()):
-            waiting = self._waiters[goal_id]
-            del waiting[connection]
-            if not waiting:
-                del self._waiters[goal_id]
+            del self._waiters[goal_id][connection]
 
     def changed(self, record: Record, state: State, at: float) -> None:
         """Publish a goal's new state; with its last one, its result."""

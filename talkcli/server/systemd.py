@@ -96,10 +96,9 @@ class Systemd:
         data = "".join(f"{name}={value}\n" for name, value in self._unsent.items()).encode(errors="replace")
         try:
             self._socket.sendto(data, self._address)
-        except BlockingIOError:  # it has too much to read at this moment
-            self._later("retry", RETRY_AFTER, self._send)
         except OSError as error:
-            log.seldom("supervisor", f"the supervisor (NOTIFY_SOCKET) can't be told anything: {error.strerror}")
+            if not isinstance(error, BlockingIOError):  # else it has too much to read at this moment
+                log.seldom("supervisor", f"the supervisor (NOTIFY_SOCKET) can't be told anything: {error.strerror}")
             self._later("retry", RETRY_AFTER, self._send)
         else:
             self._unsent.clear()
