@@ -214,10 +214,9 @@ class Server:
         self.connections.discard(connection)
         if not self.connections:
             self._deserted.set()
-        if len(self.connections) >= self._settings.max_clients:  # then somebody may wait at the door for this place
-            waiting = [each for each in self.connections if not each.admitted]
-            if waiting and len(self.connections) - len(waiting) < self._settings.max_clients:
-                waiting[0].admit()
+        waiting = [each for each in self.connections if not each.admitted]
+        if waiting and len(self.connections) - len(waiting) < self._settings.max_clients:
+            waiting[0].admit()  # it was at the door, for this place
         self._requests.left(connection)
 
     # -- what it says of itself

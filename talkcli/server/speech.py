@@ -247,8 +247,7 @@ class Speech:
         deadline = self.scheduler.deadline()
         self._timer = None
         if deadline is not None:
-            rest = max(0.0, deadline - elapsed())
-            self._timer = self._loop.call_later(min(rest, LOOK_EVERY), self._tick)
+            self._timer = self._loop.call_later(min(deadline - elapsed(), LOOK_EVERY), self._tick)
 
     def _tick(self) -> None:
         self.apply(self.scheduler.tick(self._now()))
