@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import peers
 from talkcli.engine import protocol
-from talkcli.engine.players.holders import kill_holders
+from talkcli.engine.players.child import kill_holders
 from talkcli.quota import Quota
 from talkcli.splitter import LineSplitter
 

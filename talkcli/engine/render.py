@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from talkcli.client.connect import ready
 from talkcli.engine import protocol
 from talkcli.engine.once import Conversation, EngineFailed
-from talkcli.engine.players.wav_stream import WavStreamPlayer
+from talkcli.engine.players.wav import WavStreamPlayer
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
 from talkcli.goals.options import MAX_CHARACTERS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.engine.players.complaint import LONGEST_LINE, Complaint
+from talkcli.engine.players.program import LONGEST_LINE, Complaint
 
 
 def _complaint(text: str) -> str | None:

@@ -14,8 +14,7 @@ from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.players.null import NullPlayer
 from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.programs import commands, on_path
-from talkcli.engine.players.wav import WavPlayer
-from talkcli.engine.players.wav_stream import WavStreamPlayer
+from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
