@@ -15,7 +15,7 @@ from talkcli import errors
 from talkcli.cli import commands, completion, show
 from talkcli.cli.click_app import ClickCommand, talk
 from talkcli.cli.command import ALL_EXIT_CODES
-from talkcli.engine import devices
+from talkcli.engine.players import devices
 from talkcli.goals import states
 from tests.conformance.bareserve import TALK, environment, run
 from tests.support.surroundings import short_directory

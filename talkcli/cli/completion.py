@@ -263,7 +263,7 @@ def files(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
 
 def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
     """Return the players that talk knows by name."""
-    from talkcli.engine.players.programs import PLAYERS
+    from talkcli.engine.players import PLAYERS
 
     return _items([(name, each.about) for name, each in PLAYERS.items()], incomplete)
 

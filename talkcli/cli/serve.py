@@ -184,14 +184,14 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
     With a device and no player named it only looks at the names of files, so that the start is not kept waiting.
     """
-    from talkcli.engine.devices import nothing_sounds
+    from talkcli.engine.players.devices import nothing_sounds
 
     if player == "null" or player.startswith("file:"):
         return
     silent = nothing_sounds(os.environ)
     if not player and not silent:
         return
-    from talkcli.engine.players.programs import PACKAGES
+    from talkcli.engine.players import PACKAGES
     from talkcli.engine.start import is_own
 
     if not is_own(driver):
@@ -204,8 +204,8 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
 def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
+    from talkcli.engine.players import PLAYERS, commands, on_path
     from talkcli.engine.players.base import AudioFailed
-    from talkcli.engine.players.programs import PLAYERS, commands, on_path
 
     try:
         commands(player, None, 0, on_path, None)

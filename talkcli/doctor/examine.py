@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.doctor import machine, sentence, server, sound, voice
-from talkcli.engine.players.programs import PACKAGES
+from talkcli.engine.players import PACKAGES
 from talkcli.engine.start import is_own
 from talkcli.errors import TalkError
 from talkcli.frozen import replace

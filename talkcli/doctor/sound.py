@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor.machine import judge_access, judge_cards
 from talkcli.doctor.report import Finding, done, failed, some, warning
-from talkcli.engine.devices import sound_servers
-from talkcli.engine.players.programs import PACKAGES
+from talkcli.engine.players import PACKAGES
+from talkcli.engine.players.devices import sound_servers
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:

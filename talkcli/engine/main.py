@@ -69,7 +69,7 @@ def _configuration(channel: Channel) -> protocol.Configure | None:
 
 def _serve(channel: Channel, configure: protocol.Configure) -> None:
     from talkcli.engine.players.base import CannotEnd
-    from talkcli.engine.players.which import Players
+    from talkcli.engine.players.choice import Players
     from talkcli.engine.session import Session
     from talkcli.engine.start import CannotStart, start
 

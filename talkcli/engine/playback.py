@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from talkcli.engine.pause import Pause
     from talkcli.engine.players.base import Player, Wait
-    from talkcli.engine.players.which import Players
+    from talkcli.engine.players.choice import Players
 
 #: Seconds within which a player must take the first sound: a Bluetooth or USB device that sleeps needs one or two, a
 #: null sink that nobody records up to two.

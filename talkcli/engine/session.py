@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from talkcli.engine.channel import Channel
     from talkcli.engine.players.base import Interest
-    from talkcli.engine.players.which import Players
+    from talkcli.engine.players.choice import Players
     from talkcli.engine.protocol import Command
     from talkcli.engine.settings import Settings
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
-    from talkcli.engine.players.which import Players
+    from talkcli.engine.players.choice import Players
     from talkcli.engine.session import Session
     from talkcli.engine.synthesizers.base import Synthesizer
 

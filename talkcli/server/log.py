@@ -12,7 +12,7 @@ import time
 import traceback
 from typing import TYPE_CHECKING
 
-from talkcli.engine.players.programs import NO_PLAYER
+from talkcli.engine.players import NO_PLAYER
 from talkcli.goals.states import State
 from talkcli.quota import Quota
 from talkcli.terminal.text import printable

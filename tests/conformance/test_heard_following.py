@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from talkcli.engine.gap import MOST
+from talkcli.engine.players.choice import MOST
 from tests.conformance.hearing import HOME, LOW, heard, send
 from tests.support.compare import assert_heard, extent
 from tests.support.reference import RATE, render

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
+from talkcli.engine.players import Command
 from talkcli.engine.players.child import Child
 from talkcli.engine.players.program import ProgramPlayer
-from talkcli.engine.players.programs import Command
 from tests.engine.spawned import FAST, Spawned, children
 from tests.engine.test_player_faults import Player
 from tests.support.reference import render

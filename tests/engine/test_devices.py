@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine import devices
+from talkcli.engine.players import devices
 
 if TYPE_CHECKING:
     from pathlib import Path

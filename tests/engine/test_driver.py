@@ -14,7 +14,7 @@ from pyttsx3.engine import Engine
 from talkcli.engine.clock import Times
 from talkcli.engine.pause import Pause
 from talkcli.engine.players.base import AudioFailed
-from talkcli.engine.players.which import Players
+from talkcli.engine.players.choice import Players
 from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.engine.synthesizers.driver import register
 from tests.engine.test_synthesizer_contract import Scripted

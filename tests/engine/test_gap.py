@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.gap import LONGEST, MOST, REMEMBERED, Gap
+from talkcli.engine.players.choice import LONGEST, MOST, REMEMBERED, Gap
 from talkcli.engine.samples import QUIET, Samples
 from tests.engine.spawned import FAST, Spawned
 from tests.engine.test_player_faults import Player
@@ -21,7 +21,7 @@ TEXTS = ["battery low", "coming home", "please help"]
 #: Seconds that are left out where a test says so, and what that is in bytes: even a fast sentence ends in as much.
 LEFT_OUT = 0.02
 _BYTES = int(LEFT_OUT * RATE) * 2
-_SAYS_SO = f"from talkcli.engine.gap import Gap\nGap.allowance = lambda *_: {LEFT_OUT}"
+_SAYS_SO = f"from talkcli.engine.players.choice import Gap\nGap.allowance = lambda *_: {LEFT_OUT}"
 
 
 @pytest.fixture
@@ -159,7 +159,7 @@ def test_a_player_that_ends_too_early_is_seen_as_before(player: Player) -> None:
     """A sentence may not end sooner than so much before its whole length, what was left out of it included."""
     rate = 200  # at which the silence at the end is that long
     length = len(_sentences(rate)[0]) / 2 / RATE
-    before = "from talkcli.engine.gap import Gap\nGap.allowance = lambda *_: 0.2"
+    before = "from talkcli.engine.players.choice import Gap\nGap.allowance = lambda *_: 0.2"
     hurried = "import os\nwhile os.read(0, 65536): pass"  # it is over by what it gets, which is 0.2 s less
     with Spawned(player.command(hurried), before=before, limits={"EARLY_END": length - 0.2}) as engine:
         engine.until(protocol.Voices)

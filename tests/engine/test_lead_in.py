@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.players import which
+from talkcli.engine.players import choice
 from tests.engine.spawned import FAST, SOON, Spawned, children
 from tests.engine.test_player_faults import Player, player
 from tests.support import compare
@@ -74,7 +74,7 @@ def test_a_player_gets_it_once_and_it_does_not_count(player: Player) -> None:
 
 def test_a_device_that_was_idle_gets_it_again(player: Player) -> None:
     sentences = _bytes()
-    before = "from talkcli.engine.players import which\nwhich.IDLE_AFTER = 0.0"
+    before = "from talkcli.engine.players import choice\nchoice.IDLE_AFTER = 0.0"
     with Spawned(player.plays(), lead_in=LEAD_IN, before=before) as engine:
         engine.until(protocol.Voices)
         for number, text in enumerate(TEXTS):
@@ -83,7 +83,7 @@ def test_a_device_that_was_idle_gets_it_again(player: Player) -> None:
 
 
 def test_a_player_after_a_long_pause_gets_it_again(player: Player) -> None:
-    before = "from talkcli.engine.players import which\nwhich.IDLE_AFTER = 0.2"
+    before = "from talkcli.engine.players import choice\nchoice.IDLE_AFTER = 0.2"
     constants = {"RELEASE_AFTER": 0.1}
     with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=0.3) as engine:
         engine.until(protocol.Voices)
@@ -103,7 +103,7 @@ def test_a_player_after_a_long_pause_gets_it_again(player: Player) -> None:
 
 
 def test_a_sentence_that_goes_on_as_soon_as_the_device_was_let_go_of_gets_it_again(player: Player) -> None:
-    before, constants = "from talkcli.engine.players import which\nwhich.IDLE_AFTER = 0.3", {"RELEASE_AFTER": 0.3}
+    before, constants = "from talkcli.engine.players import choice\nchoice.IDLE_AFTER = 0.3", {"RELEASE_AFTER": 0.3}
     with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=SOON) as engine:
         engine.until(protocol.Voices)
         engine.say(TEXTS[0])
@@ -132,7 +132,7 @@ def test_a_sentence_s_own_comes_before_it_wherever_the_output_is(player: Player)
 
 def test_a_sentence_s_own_stands_for_the_server_s_and_0_is_none(player: Player) -> None:
     sentences = _bytes([*TEXTS, TEXTS[1]])
-    before = "from talkcli.engine.players import which\nwhich.IDLE_AFTER = 0.0"
+    before = "from talkcli.engine.players import choice\nchoice.IDLE_AFTER = 0.0"
     with Spawned(player.plays(), lead_in=LEAD_IN, before=before) as engine:
         engine.until(protocol.Voices)
         assert engine.spoken(TEXTS[0], "g1", lead_in=0).outcome == protocol.COMPLETED
@@ -146,7 +146,7 @@ def test_a_sentence_s_own_stands_for_the_server_s_and_0_is_none(player: Player) 
 def test_a_sentence_s_own_comes_again_after_a_pause_only_where_the_device_was_idle(
     player: Player, idle: float, again: int
 ) -> None:
-    before = f"from talkcli.engine.players import which\nwhich.IDLE_AFTER = {idle}"
+    before = f"from talkcli.engine.players import choice\nchoice.IDLE_AFTER = {idle}"
     with Spawned(
         player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": 0.1}, before=before, alive_every=0.3
     ) as engine:
@@ -257,11 +257,11 @@ def test_a_file_gets_none(tmp_path: Path) -> None:
 def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    found = which.Players("null", None, lead_in=0.4)
+    found = choice.Players("null", None, lead_in=0.4)
     assert found.lead_in() == 0.4
     found.let_go()
-    now += which.IDLE_AFTER - 0.01
+    now += choice.IDLE_AFTER - 0.01
     assert found.lead_in() == 0.0
     now += 0.02
     assert found.lead_in() == 0.4
-    assert which.Players("null", None).lead_in() == 0.0
+    assert choice.Players("null", None).lead_in() == 0.0

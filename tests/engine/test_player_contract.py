@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.engine.players import Command
 from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed
 from talkcli.engine.players.null import NullPlayer
 from talkcli.engine.players.program import ProgramPlayer
-from talkcli.engine.players.programs import Command
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
 from tests.engine.spawned import PATIENCE, children
 from tests.support.timing import assert_within, limits

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from talkcli.engine.players import PACKAGES, PLAYERS, commands
 from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.choice import Players
 from talkcli.engine.players.program import ProgramPlayer
-from talkcli.engine.players.programs import PACKAGES, PLAYERS, commands
-from talkcli.engine.players.which import Players
 
 
 def _names(player: str | None, there: set[str], last: str | None = None) -> list[str]:

@@ -35,7 +35,6 @@ PURE = [
     "quota",
     "splitter",
     "client.event_buffer",
-    "engine.gap",
     "engine.synthesizers.guard",
 ]
 IMPURE = {

@@ -21,8 +21,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from talkcli.engine.players import Command
     from talkcli.engine.players.base import Interest
-    from talkcli.engine.players.programs import Command
 
 #: Seconds that a player which closed its input is given to end and to say why, before it is killed.
 LAST_WORDS = 0.5

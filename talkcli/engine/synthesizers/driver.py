@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from talkcli.engine.clock import TimedWord, Times
     from talkcli.engine.pause import Pause
     from talkcli.engine.players.base import Wait
-    from talkcli.engine.players.which import Players
+    from talkcli.engine.players.choice import Players
     from talkcli.engine.synthesizers.base import Synthesizer
 
 #: Seconds between two steps of pyttsx3's own loop, which `talk` does not use.
