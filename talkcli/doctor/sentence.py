@@ -12,7 +12,7 @@ from talkcli.doctor.report import SENTENCE, Finding, done, failed
 from talkcli.doctor.sound import is_custom
 from talkcli.doctor.voice import INSTALL_LIBRARY, conversation, fault
 from talkcli.engine import protocol
-from talkcli.engine.once import EngineFailed
+from talkcli.engine.process import EngineFailed
 from talkcli.errors import TalkError
 from talkcli.frozen import frozen, replace
 from talkcli.goals.states import State

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor.report import Finding, done, failed, warning
 from talkcli.engine import protocol
-from talkcli.engine.once import Conversation, EngineFailed, EngineSilent
+from talkcli.engine.process import Conversation, EngineFailed, EngineSilent
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:

@@ -12,7 +12,10 @@ import signal
 import sys
 
 from talkcli.engine import protocol
-from talkcli.engine.channel import Channel
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from talkcli.engine.session import Channel
 
 #: Linux's: have this process killed when the thread that started it is gone. For what it starts, see `players.child`.
 _PR_SET_PDEATHSIG = 1
@@ -28,6 +31,8 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     # Who started the server may ignore it, and every player would seem to have ended well then: nothing to reap.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    from talkcli.engine.session import Channel
+
     channel = Channel()
     configure = _configuration(channel)
     # The server may have died before the kernel was asked to tell.

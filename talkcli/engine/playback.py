@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import time
 
-from talkcli.engine.clock import TimedWord, WordClock
-from talkcli.engine.pause import CLOCK_AHEAD, RELEASE_AFTER, SAID_AGAIN, SILENT_WITHIN
 from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
-from talkcli.engine.samples import Samples
-from talkcli.engine.stream import Stream
+from talkcli.engine.stream import Samples, Stream
+from talkcli.engine.words import TimedWord, WordClock
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.engine.pause import Pause
     from talkcli.engine.players.base import Player, Wait
     from talkcli.engine.players.choice import Players
 
@@ -46,6 +43,53 @@ BUSY_FOR, BUSY_PAUSE = 1.0, 0.05
 
 #: Seconds within which a player that was killed must be gone: it takes 1 ms, unless it hangs in a device's driver.
 GONE_WITHIN = 1.0
+
+
+#: Seconds within which a sentence that is to be held must be silent. A player has 42 to 98 ms of it to play; one that
+#: has more, or stands still, is ended instead and the sentence goes on with another.
+SILENT_WITHIN = 0.15
+
+#: Seconds by which the word clock may be ahead of what is heard: 4 to 8 ms were measured.
+CLOCK_AHEAD = 0.01
+
+#: Seconds that are said again where a player had to be ended before all it held was heard: the clock is no better than
+#: this, and nothing may be lost.
+SAID_AGAIN = 0.03
+
+#: Seconds of a pause after which the player is let go of: long enough for a question in between, after which the next
+#: sample is heard at once; a longer one must leave the device to other programs, and let it sleep.
+RELEASE_AFTER = 10.0
+
+
+class Pause:
+    """Whether the sentence in hand is to be held: the session asks, the playback obeys and says when it is silent.
+
+    pyttsx3 has no word for a pause, so this goes past it, to our own driver alone.
+    """
+
+    def __init__(self, on_silent: Callable[[int], None]) -> None:
+        """`on_silent` is called once in each pause, with its number, when the sentence is silent."""
+        #: whether the sentence is to be held now
+        self.asked = False
+        self._on_silent = on_silent
+        #: the pause that was asked for last, and the one that was confirmed last
+        self._number = self._confirmed = 0
+
+    def ask(self, number: int) -> None:
+        """Hold the sentence; `number` counts the pauses in it, from 1."""
+        self.asked = True
+        self._number = number
+
+    def release(self) -> None:
+        """Let the sentence go on, or a new one begin."""
+        self.asked = False
+        self._confirmed = 0
+
+    def confirm(self) -> None:
+        """Take note that the sentence is silent; may be called again and again."""
+        if self.asked and self._confirmed != self._number:
+            self._confirmed = self._number
+            self._on_silent(self._number)
 
 
 class Playback:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 from talkcli.client.connect import ready
 from talkcli.engine import protocol
-from talkcli.engine.once import Conversation, EngineFailed
 from talkcli.engine.players.wav import WavStreamPlayer
+from talkcli.engine.process import Conversation, EngineFailed
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
 from talkcli.goals.options import MAX_CHARACTERS

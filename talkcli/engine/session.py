@@ -9,6 +9,7 @@ raise, ignores blank text and turns errors into notifications.
 
 from __future__ import annotations
 
+import os
 import select
 import sys
 import time
@@ -16,22 +17,21 @@ import traceback
 from collections import deque
 
 from talkcli.engine import protocol
-from talkcli.engine.clock import Times
-from talkcli.engine.pause import Pause
+from talkcli.engine.playback import Pause
 from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.settings import SettingFailed
 from talkcli.engine.synthesizers.voices import list_voices
-from talkcli.engine.synthesizers.words import Words
+from talkcli.engine.words import Times, Words
+from talkcli.splitter import LineSplitter
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from typing import Any
 
-    from talkcli.engine.channel import Channel
     from talkcli.engine.players.base import Interest
     from talkcli.engine.players.choice import Players
-    from talkcli.engine.protocol import Command
+    from talkcli.engine.protocol import Command, Event
     from talkcli.engine.settings import Settings
 
 #: Seconds between two steps of a driver that is not ours while it has a goal in hand: it has no way to wake us.
@@ -42,6 +42,46 @@ STEP = 0.05
 #: whether it speaks, only that it should have ended by then.
 PATIENCE = 10.0
 WORDS_A_CHARACTER = 3
+
+
+#: Bytes read in one go; the longest command, escaped, takes a few of them.
+_AT_ONCE = 65536
+
+
+class Channel:
+    """The engine process's end of the socket to its server: commands come in, events go out, over one descriptor.
+
+    It blocks only where it is asked to. A server that is gone is no error here: `closed` says so, and the process ends.
+    """
+
+    def __init__(self, descriptor: int = 0) -> None:
+        self.descriptor = descriptor
+        #: True once the server is gone.
+        self.closed = False
+        #: monotonic time of the last event.
+        self.sent_at = time.monotonic()
+        self._lines = LineSplitter()
+
+    def send(self, event: Event) -> None:
+        """Send an event, waiting until the server takes it."""
+        data = memoryview(protocol.encode(event))
+        self.sent_at = time.monotonic()
+        try:
+            while data:
+                data = data[os.write(self.descriptor, data) :]
+        except (BrokenPipeError, ConnectionResetError):
+            self.closed = True
+
+    def receive(self) -> list[Command]:
+        """Read once, waiting if there is nothing, and return the commands that are complete."""
+        try:
+            data = os.read(self.descriptor, _AT_ONCE)
+        except ConnectionResetError:
+            data = b""
+        if not data:
+            self.closed = True
+            return []
+        return [protocol.decode_command(line) for line in self._lines.feed(data)]
 
 
 class InHand:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.engine.clock import TimedWord, WordClock
+from talkcli.engine.words import TimedWord, WordClock
 
 
 def test_the_clock_stands_until_it_is_started_and_is_held_back_by_the_player() -> None:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from pyttsx3.engine import Engine
 
-from talkcli.engine.clock import Times
-from talkcli.engine.pause import Pause
+from talkcli.engine.playback import Pause
 from talkcli.engine.players.base import AudioFailed
 from talkcli.engine.players.choice import Players
 from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.engine.synthesizers.driver import register
+from talkcli.engine.words import Times
 from tests.engine.test_synthesizer_contract import Scripted
 from tests.support.timing import assert_within, limits
 

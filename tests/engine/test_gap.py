@@ -9,7 +9,7 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.players.choice import LONGEST, MOST, REMEMBERED, Gap
-from talkcli.engine.samples import QUIET, Samples
+from talkcli.engine.stream import QUIET, Samples
 from tests.engine.spawned import FAST, Spawned
 from tests.engine.test_player_faults import Player
 from tests.support.reference import RATE, render
@@ -137,7 +137,7 @@ def test_it_counts_what_is_so_at_the_end_of_a_sentence(player: Player, followed:
 
 
 def test_no_sample_that_is_sound_is_left_out(player: Player) -> None:
-    louder_than_nothing = f"{_SAYS_SO}\nfrom talkcli.engine import samples\nsamples.QUIET = -1"
+    louder_than_nothing = f"{_SAYS_SO}\nfrom talkcli.engine import stream\nstream.QUIET = -1"
     with Spawned(player.plays(), before=louder_than_nothing) as engine:
         engine.until(protocol.Voices)
         engine.send(_say(TEXTS[0], "g0", followed=True))

@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.client.connect import Interrupted
-from talkcli.engine import once
+from talkcli.engine import process
 from talkcli.engine.process import engine_command
 from talkcli.engine.render import CannotWrite, RenderFailed, pieces, render
 from talkcli.errors import TalkError, UsageError
@@ -168,7 +168,7 @@ def test_what_a_link_points_to_is_replaced_and_the_link_stays(tmp_path: Path) ->
 def test_what_cannot_be_written_is_told_before_anything_is_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, words: str
 ) -> None:
-    monkeypatch.setattr(once, "EngineProcess", None)  # calling it would be a TypeError
+    monkeypatch.setattr(process, "EngineProcess", None)  # calling it would be a TypeError
     (tmp_path / "file").touch()
     with socket.socket(socket.AF_UNIX) as listening, monkeypatch.context() as there:
         there.chdir(tmp_path)
@@ -423,8 +423,8 @@ def test_an_engine_that_is_of_no_use_is_told_and_killed(
     monkeypatch.setattr(
         "talkcli.engine.process.engine_command", lambda: [interpreter, option, f"{path}\n{before}\nfrom {rest}"]
     )
-    monkeypatch.setattr(once, "START_LIMIT", 0.3 if reason == "engine_failed" else 10)
-    monkeypatch.setattr(once, "HANG_AFTER", 0.5)
+    monkeypatch.setattr(process, "START_LIMIT", 0.3 if reason == "engine_failed" else 10)
+    monkeypatch.setattr(process, "HANG_AFTER", 0.5)
     error = failed("yes", tmp_path / "x.wav")
     assert error.code == reason
     assert words in str(error)

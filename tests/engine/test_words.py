@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.engine.synthesizers.words import Words, letters
+from talkcli.engine.words import Words, letters
 from tests.support.reference import Sentence, render_with_words
 
 if TYPE_CHECKING:

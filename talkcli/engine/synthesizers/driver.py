@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import Any
 
-    from talkcli.engine.clock import TimedWord, Times
-    from talkcli.engine.pause import Pause
+    from talkcli.engine.playback import Pause
     from talkcli.engine.players.base import Wait
     from talkcli.engine.players.choice import Players
     from talkcli.engine.synthesizers.base import Synthesizer
+    from talkcli.engine.words import TimedWord, Times
 
 #: Seconds between two steps of pyttsx3's own loop, which `talk` does not use.
 _LOOP_STEP = 0.05

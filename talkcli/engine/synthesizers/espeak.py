@@ -14,7 +14,7 @@ from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import guard
 from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.engine.synthesizers.voices import VARIANT
-from talkcli.engine.synthesizers.words import letters
+from talkcli.engine.words import letters
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

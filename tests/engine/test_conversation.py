@@ -12,8 +12,8 @@ import pytest
 from talkcli.doctor import sentence, voice
 from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Engine, Setting
-from talkcli.engine import once, protocol
-from talkcli.engine.once import Conversation, EngineFailed
+from talkcli.engine import process, protocol
+from talkcli.engine.process import Conversation, EngineFailed
 from talkcli.goals.states import State
 from tests.support import scripted_engine
 
@@ -88,13 +88,13 @@ def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None
 
 @pytest.mark.usefixtures("scripted")
 def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(once, "HANG_AFTER", 0.4)
+    monkeypatch.setattr(process, "HANG_AFTER", 0.4)
     hung = Played(State.ABORTED, "engine_hung", "the engine process said nothing for 0.4 s")
     assert sentence.by_engine("hang", Setting(), 1.0, 20.0) == hung
     behaviour = tmp_path / "start"
     behaviour.write_text("hang")
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
-    monkeypatch.setattr(once, "START_LIMIT", 0.3)
+    monkeypatch.setattr(process, "START_LIMIT", 0.3)
     words = "the engine process said nothing for 0.3 s"
     assert voice.look(Setting()) == Engine(reason="engine_hung", words=words)
 
