@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 
-from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed, CannotEnd, Stopped
+from talkcli.engine.players.base import PIECE, SAMPLE, CannotEnd, CannotSpeak, Stopped
 from talkcli.engine.stream import Samples, Stream
 from talkcli.engine.words import TimedWord, WordClock
 
@@ -95,7 +95,7 @@ class Pause:
 class Playback:
     """One sentence on its way to the player: the `Output` of whoever makes it.
 
-    Every method may raise Stopped or AudioFailed, except the last two, which are for others than the synthesizer.
+    Every method may raise Stopped or CannotSpeak, except the last two, which are for others than the synthesizer.
     """
 
     def __init__(self, players: Players, wait: Wait, pause: Pause, on_word: Callable[[TimedWord], None]) -> None:
@@ -106,7 +106,7 @@ class Playback:
         self._rate = 0
         self._candidates: list[Callable[[], Player]] = []
         self._stream: Stream | None = None
-        self._first_error: AudioFailed | None = None
+        self._first_error: CannotSpeak | None = None
         self._clock = WordClock()
         #: all of them until the player is proven, then those that were not heard yet
         self._samples = Samples()
@@ -131,7 +131,7 @@ class Playback:
         if self._players.is_program and not self._pause.asked:
             try:
                 self._try(lambda _: True)
-            except AudioFailed:
+            except CannotSpeak:
                 self._candidates, self._first_error = [], None
 
     def word(self, start: int, length: int, position: float) -> None:
@@ -150,7 +150,7 @@ class Playback:
     def finish(self) -> float:
         """Play to the end and return the length in seconds. Returns only if all of it was heard."""
         if not self._samples.speaks:
-            raise AudioFailed("nothing_to_say", "nothing in the text can be spoken")
+            raise CannotSpeak("nothing_to_say", "nothing in the text can be spoken")
         self._complete = True
         self._try(self._drain)
         for word in self._clock.rest():
@@ -194,7 +194,7 @@ class Playback:
                     self._stream = self._open()
                 if step(self._stream):
                     return
-            except AudioFailed as error:
+            except CannotSpeak as error:
                 self._next_player(error)
 
     def _open(self) -> Stream:
@@ -206,7 +206,7 @@ class Playback:
         lead_in = self._players.lead_in(begins=self._begin == 0)
         return Stream(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
-    def _next_player(self, error: AudioFailed) -> None:
+    def _next_player(self, error: CannotSpeak) -> None:
         """Give up on this player; raises the first player's error if there is no other, or if sound was taken."""
         stream = self._stream
         if stream is not None and stream.player.real_time and self._pause.asked:
@@ -221,7 +221,7 @@ class Playback:
         if not self._candidates:
             self._wait((), time.monotonic() + BUSY_PAUSE)
 
-    def _is_busy(self, error: AudioFailed) -> bool:
+    def _is_busy(self, error: CannotSpeak) -> bool:
         """Whether the device is held by somebody else, and not for long yet."""
         if error.reason != "audio_device" or "busy" not in str(error).lower():
             return False
@@ -267,7 +267,7 @@ class Playback:
             due = stream.progress_at + limit if stream.player.real_time else None  # as long as a reader takes
             self._wait_for(stream, due)
             if due and time.monotonic() >= due and not self._pause.asked and not self._offer(stream):
-                raise AudioFailed("audio_stalled", f"{stream.player.name} took no sound for {limit:g} s")
+                raise CannotSpeak("audio_stalled", f"{stream.player.name} took no sound for {limit:g} s")
 
     def _drain(self, stream: Stream) -> bool:
         """Close the player's input and wait for its end; False if it was let go of before."""
@@ -284,11 +284,11 @@ class Playback:
                 self._go_back(stream)
                 return False  # with less than that left it has ended as soon as it could be held
             if now >= limit:
-                raise AudioFailed("audio_stalled", f"{player.name} did not end {DRAIN_WITHIN:g} s after the sound")
+                raise CannotSpeak("audio_stalled", f"{player.name} did not end {DRAIN_WITHIN:g} s after the sound")
             self._wait_for(stream, limit)
         missing = stream.missing(time.monotonic())
         if player.real_time and missing > EARLY_END - self._seconds(self._samples.end - self._sent):
-            raise AudioFailed("audio_lost", f"{player.name} ended {missing:.1f} s before the sound did")
+            raise CannotSpeak("audio_lost", f"{player.name} ended {missing:.1f} s before the sound did")
         return True
 
     def _offer(self, stream: Stream) -> int:
@@ -360,7 +360,7 @@ class Playback:
             self._pause.confirm()
             try:
                 fed = self._feed_silence(stream)
-            except AudioFailed:
+            except CannotSpeak:
                 return False  # a pause is no reason to end the sentence
             due = min(release_at, stream.progress_at + STALLED_AFTER)
             if time.monotonic() >= due:

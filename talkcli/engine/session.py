@@ -18,7 +18,7 @@ from collections import deque
 
 from talkcli.engine import protocol
 from talkcli.engine.playback import Pause
-from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.settings import SettingFailed
 from talkcli.engine.synthesizers.voices import list_voices
 from talkcli.engine.words import Times, Words
@@ -309,9 +309,9 @@ class Session:
         elif completed:
             duration = self.times.duration
             self._end(protocol.COMPLETED, duration=None if duration is None else round(duration, 6))
-        elif goal.stop_asked and not isinstance(goal.error, AudioFailed):
+        elif goal.stop_asked and not isinstance(goal.error, CannotSpeak):
             self._end(protocol.STOPPED)
-        elif isinstance(goal.error, AudioFailed):
+        elif isinstance(goal.error, CannotSpeak):
             self._end(protocol.FAILED, goal.error.reason, str(goal.error))
         else:
             _log(goal.error)

@@ -12,7 +12,7 @@ import pytest
 from pyttsx3.engine import Engine
 
 from talkcli.engine.playback import Pause
-from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.choice import Players
 from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.engine.synthesizers.driver import register
@@ -138,7 +138,7 @@ def test_an_error_is_told_before_the_end() -> None:
     assert error[0] == "error"
     assert error[1].keys() == FORM["error"]
     assert error[1]["name"] == "g1"
-    assert isinstance(error[1]["exception"], AudioFailed)
+    assert isinstance(error[1]["exception"], CannotSpeak)
     assert finished == ("finished-utterance", {"name": "g1", "completed": False})
     assert told.beside[-1][1] is None
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.players import Command
-from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed
+from talkcli.engine.players.base import PIECE, SAMPLE, CannotSpeak
 from talkcli.engine.players.null import NullPlayer
 from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
@@ -235,7 +235,7 @@ def test_it_has_a_name_and_says_whether_it_takes_time(case: Case, tmp_path: Path
 @those("refused")
 def test_one_that_cannot_be_opened_says_so(case: Case, tmp_path: Path) -> None:
     assert case.refused is not None
-    with pytest.raises(AudioFailed) as caught:
+    with pytest.raises(CannotSpeak) as caught:
         case.refused(tmp_path)
     assert caught.value.reason in {"no_player", "audio_device"}
     assert str(caught.value)
@@ -403,7 +403,7 @@ def test_one_that_is_lost_says_so_each_time_it_is_asked(case: Case, tmp_path: Pa
     assert case.lost is not None
     player = case.lost(tmp_path)
     for _ in range(2):
-        with pytest.raises(AudioFailed) as caught:
+        with pytest.raises(CannotSpeak) as caught:
             _play_for_ever(player)
         assert caught.value.reason in {"audio_device", "audio_lost"}
         assert str(caught.value)

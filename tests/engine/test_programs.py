@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from talkcli.engine.players import PACKAGES, PLAYERS, commands
-from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.choice import Players
 from talkcli.engine.players.program import ProgramPlayer
 
@@ -58,6 +58,6 @@ def test_a_command_line_is_split_without_a_shell() -> None:
 
 @pytest.mark.parametrize("player", ["pacat", "sox -", "", "  ", "'"])
 def test_a_player_that_is_not_there_is_an_error(player: str) -> None:
-    with pytest.raises(AudioFailed) as caught:
+    with pytest.raises(CannotSpeak) as caught:
         commands(player, None, 22050, lambda _: False, None)
     assert caught.value.reason == "no_player"

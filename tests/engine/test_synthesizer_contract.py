@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.players.base import SAMPLE, AudioFailed, Stopped
+from talkcli.engine.players.base import SAMPLE, CannotSpeak, Stopped
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.base import Sound, UnknownVoice
 from talkcli.engine.synthesizers.espeak import Espeak
@@ -274,7 +274,7 @@ def test_nothing_of_a_sentence_stays(synthesizer: Synthesizer) -> None:
 
 
 @limits()
-@pytest.mark.parametrize("fails", [Stopped(), AudioFailed("audio_lost", "unplugged")], ids=["stopped", "failed"])
+@pytest.mark.parametrize("fails", [Stopped(), CannotSpeak("audio_lost", "unplugged")], ids=["stopped", "failed"])
 @pytest.mark.parametrize(("at", "after"), [("begin", 0), ("word", 0), ("word", 3), ("write", 0), ("write", 5)])
 def test_what_the_output_raises_comes_out_at_once_and_it_is_left_alone(
     synthesizer: Synthesizer, fails: Exception, at: str, after: int

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.wav import WavPlayer
 from tests.engine.spawned import Spawned
 
@@ -99,7 +99,7 @@ def test_other_content_is_refused_and_left_alone(tmp_path: Path, make: object) -
     assert callable(make)
     make(path)
     before = path.read_bytes()
-    with pytest.raises(AudioFailed) as caught:
+    with pytest.raises(CannotSpeak) as caught:
         WavPlayer(str(path), 22050)
     assert caught.value.reason == "audio_device"
     assert str(path) in str(caught.value)
@@ -109,14 +109,14 @@ def test_other_content_is_refused_and_left_alone(tmp_path: Path, make: object) -
 def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path, tmp_path / "pipe", tmp_path / "missing" / "x.wav", "", "/dev/null"):
-        with pytest.raises(AudioFailed) as caught:
+        with pytest.raises(CannotSpeak) as caught:
             WavPlayer(str(path), 22050)
         assert caught.value.reason == "audio_device"
 
 
 def test_a_full_disk_is_an_error_and_no_descriptor_is_left() -> None:
     before = os.listdir("/proc/self/fd")
-    with pytest.raises(AudioFailed):
+    with pytest.raises(CannotSpeak):
         WavPlayer("/dev/full", 22050)
     assert os.listdir("/proc/self/fd") == before
 

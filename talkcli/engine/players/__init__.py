@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import struct
 
-from talkcli.engine.players.base import PIECE, SAMPLE, AudioFailed
+from talkcli.engine.players.base import PIECE, SAMPLE, CannotSpeak
 from talkcli.frozen import frozen
 
 TYPE_CHECKING = False
@@ -113,18 +113,18 @@ NO_PLAYER = f"no player found: install {', '.join(_OTHERS)} or {_LAST}"
 def commands(
     player: str | None, device: str | None, rate: int, found: Callable[[str], bool], last: str | None
 ) -> list[Command]:
-    """Return the players to try, best first; AudioFailed (no_player) if there is none.
+    """Return the players to try, best first; CannotSpeak (no_player) if there is none.
 
     `found` says whether a program can be run, `last` names the player that worked last time.
     """
     if player is None:
         names = sorted((name for name in PACKAGES if found(name)), key=lambda name: name != last)
         if not names:
-            raise AudioFailed("no_player", NO_PLAYER)
+            raise CannotSpeak("no_player", NO_PLAYER)
         return [_PROGRAMS[name](rate, device) for name in names]
     if player in PACKAGES:
         if not found(player):
-            raise AudioFailed("no_player", f'player "{player}" not found: install {PACKAGES[player]}')
+            raise CannotSpeak("no_player", f'player "{player}" not found: install {PACKAGES[player]}')
         return [_PROGRAMS[player](rate, device)]
     return [_custom(player, device, rate, found)]
 
@@ -145,10 +145,10 @@ def _custom(player: str, device: str | None, rate: int, found: Callable[[str], b
     try:
         parts = shlex.split(player)
     except ValueError as error:
-        raise AudioFailed("no_player", f"player command {player!r}: {str(error).lower()}") from error
+        raise CannotSpeak("no_player", f"player command {player!r}: {str(error).lower()}") from error
     if not parts:
-        raise AudioFailed("no_player", "player command is empty: name a program that reads samples")
+        raise CannotSpeak("no_player", "player command is empty: name a program that reads samples")
     argv = [part.replace("{rate}", str(rate)).replace("{device}", device or "default") for part in parts]
     if not found(argv[0]):
-        raise AudioFailed("no_player", f'player "{argv[0]}" not found')
+        raise CannotSpeak("no_player", f'player "{argv[0]}" not found')
     return Command(os.path.basename(argv[0]), tuple(argv))

@@ -24,7 +24,7 @@ PIECE = 0.02
 Interest = tuple[int, int]
 
 
-class AudioFailed(Exception):
+class CannotSpeak(Exception):
     """The sentence cannot be spoken (any further): `reason` is for programs, the text for people."""
 
     def __init__(self, reason: str, message: str) -> None:
@@ -43,7 +43,7 @@ class CannotEnd(Exception):
 class Player(Protocol):
     """Where the samples of one sentence go: opened for it, and never used again after it.
 
-    What opens a player raises AudioFailed (`no_player`, `audio_device`) where that is impossible, and leaves nothing
+    What opens a player raises CannotSpeak (`no_player`, `audio_device`) where that is impossible, and leaves nothing
     open then. From there on the playback alone calls it, in one thread: `offer` as long as there are samples, then
     `close` once, then `ended` until it is true; `consumed` and `proven` in between, at any time. `interests` and
     `wake_at` are asked right before each wait. A sentence may end at any point of this, by a stop or an error; last
@@ -52,7 +52,7 @@ class Player(Protocol):
     Nothing in a player blocks or waits: what would is done in another thread or process of its own, which wakes the
     playback by a descriptor. But for `kill`: it may take some milliseconds where silence is certain then. It plays
     what it took, all of it, in order and once, without silence of its own. A mistake of the world (a device that is
-    unplugged, a full disk) is AudioFailed; any other exception is a mistake of the player's.
+    unplugged, a full disk) is CannotSpeak; any other exception is a mistake of the player's.
     """
 
     #: the player's name, for people, and to find it again among those that worked. It never changes.
@@ -68,7 +68,7 @@ class Player(Protocol):
     def offer(self, data: memoryview) -> int:
         """Take what fits now and return its length, which may end within a sample; 0 if it is full.
 
-        `data` is never empty, no longer than a piece, and is not to be kept: it is overwritten afterwards. AudioFailed
+        `data` is never empty, no longer than a piece, and is not to be kept: it is overwritten afterwards. CannotSpeak
         if the player takes nothing any more, then and each time from then on.
         """
 
@@ -81,12 +81,12 @@ class Player(Protocol):
         """
 
     def close(self) -> None:
-        """Take note that no more samples follow: what was taken is played to its end. AudioFailed if that is lost."""
+        """Take note that no more samples follow: what was taken is played to its end. CannotSpeak if that is lost."""
 
     def ended(self) -> bool:
         """Return True when all was played and it ended well after `close`, False while it goes on.
 
-        AudioFailed in any other case, before `close` as well: one that knows itself lost says so here, without a sample
+        CannotSpeak in any other case, before `close` as well: one that knows itself lost says so here, without a sample
         to be offered.
         """
 

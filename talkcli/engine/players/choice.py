@@ -11,7 +11,7 @@ from collections import deque
 from functools import partial
 
 from talkcli.engine.players import commands, on_path
-from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.null import NullPlayer
 from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
@@ -112,7 +112,7 @@ class Players:
         return self._output is None and player not in _BUILT_IN and not player.startswith(_FILE)
 
     def candidates(self, rate: int) -> list[Callable[[], Player]]:
-        """Return what opens the players to try for a sentence, best first; AudioFailed if there is none."""
+        """Return what opens the players to try for a sentence, best first; CannotSpeak if there is none."""
         if self._output is not None:
             return [partial(self._stream, self._output, rate)]
         if self._player in _BUILT_IN:
@@ -155,7 +155,7 @@ class Players:
             return self._player
         try:
             return commands(None, None, 1, on_path, self._worked)[0].name
-        except AudioFailed:
+        except CannotSpeak:
             return None
 
     def _stream(self, output: int, rate: int) -> WavStreamPlayer:

@@ -13,7 +13,7 @@ import signal
 import struct
 import time
 
-from talkcli.engine.players.base import AudioFailed
+from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.child import Child, is_held
 from talkcli.splitter import LineSplitter
 
@@ -92,7 +92,7 @@ class ProgramPlayer:
     real_time = True
 
     def __init__(self, command: Command, inherited: Sequence[int] = ()) -> None:
-        """Start the player; AudioFailed (no_player) if that is impossible. It inherits the descriptors given."""
+        """Start the player; CannotSpeak (no_player) if that is impossible. It inherits the descriptors given."""
         self.name = command.name
         self.proven = False
         self._read_ahead = command.read_ahead
@@ -136,7 +136,7 @@ class ProgramPlayer:
         self._child.close_stdin()
 
     def ended(self) -> bool:
-        """Return True when the player ended well after `close`; AudioFailed if it ended in any other way."""
+        """Return True when the player ended well after `close`; CannotSpeak if it ended in any other way."""
         self._read_stderr()
         status = self._child.status()
         if status is None:
@@ -195,17 +195,17 @@ class ProgramPlayer:
         """Give up on a player that closed its input but does not end."""
         if self._broken_at is not None and time.monotonic() - self._broken_at >= LAST_WORDS:
             line = self._complaint.line()
-            raise AudioFailed("audio_lost", line or f"{self.name} closed its input before the sound was over")
+            raise CannotSpeak("audio_lost", line or f"{self.name} closed its input before the sound was over")
 
-    def _verdict(self, status: int) -> AudioFailed:
+    def _verdict(self, status: int) -> CannotSpeak:
         self.consumed()
         line = self._complaint.line()
         if status < 0:
-            return AudioFailed("audio_lost", f"{self.name} was killed by {_signal_name(-status)}")
+            return CannotSpeak("audio_lost", f"{self.name} was killed by {_signal_name(-status)}")
         if status == 0:
-            return AudioFailed("audio_lost", line or f"{self.name} ended before the sound did")
+            return CannotSpeak("audio_lost", line or f"{self.name} ended before the sound did")
         reason = "audio_lost" if self.proven else "audio_device"
-        return AudioFailed(reason, line or f"{self.name} exited with status {status}")
+        return CannotSpeak(reason, line or f"{self.name} exited with status {status}")
 
     def _read_stderr(self) -> None:
         if self._child.stderr is None:
@@ -225,7 +225,7 @@ def _start(command: Command, inherited: Sequence[int]) -> Child:
         return Child(command.argv, inherited)
     except OSError as error:
         text = error.strerror or str(error)
-        raise AudioFailed("no_player", f"{command.name} cannot be started: {text}") from error
+        raise CannotSpeak("no_player", f"{command.name} cannot be started: {text}") from error
 
 
 def _unread(pipe: int) -> int:

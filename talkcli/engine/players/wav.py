@@ -13,7 +13,7 @@ import select
 import stat
 import struct
 
-from talkcli.engine.players.base import SAMPLE, AudioFailed
+from talkcli.engine.players.base import SAMPLE, CannotSpeak
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class WavPlayer:
     proven = True
 
     def __init__(self, path: str, rate: int) -> None:
-        """Open or create the file; AudioFailed (audio_device) if it cannot take this sentence."""
+        """Open or create the file; CannotSpeak (audio_device) if it cannot take this sentence."""
         self.name = f"file:{path}"
         self._path = path
         self._rate = rate
@@ -43,7 +43,7 @@ class WavPlayer:
             self._start = _data_length(self._file, path, rate)
             os.ftruncate(self._file, _HEADER.size + self._start)
             self._write_header()
-        except (OSError, AudioFailed) as error:
+        except (OSError, CannotSpeak) as error:
             os.close(self._file)
             self._file = None
             raise _refused(path, error) from error
@@ -53,11 +53,11 @@ class WavPlayer:
         if self._file is None:
             return 0
         if self._start + self._taken + len(data) > _LONGEST:
-            raise AudioFailed("audio_lost", f"{self._path} is full: a WAV file holds 4 GiB")
+            raise CannotSpeak("audio_lost", f"{self._path} is full: a WAV file holds 4 GiB")
         try:
             taken = os.pwrite(self._file, data, _HEADER.size + self._start + self._taken)
         except OSError as error:
-            raise AudioFailed("audio_lost", f"{self._path}: {error.strerror}") from error
+            raise CannotSpeak("audio_lost", f"{self._path}: {error.strerror}") from error
         self._taken += taken
         return taken
 
@@ -76,7 +76,7 @@ class WavPlayer:
             finally:
                 os.close(file)  # where a quota or a file system of another machine tells that it is full
         except OSError as error:
-            raise AudioFailed("audio_lost", f"{self._path}: {error.strerror}") from error
+            raise CannotSpeak("audio_lost", f"{self._path}: {error.strerror}") from error
 
     def ended(self) -> bool:
         """Return True once it is closed."""
@@ -93,7 +93,7 @@ class WavPlayer:
     def kill(self) -> None:
         """Keep what was written so far as a valid file."""
         # The sentence has ended by a stop or by an error of its own, which is the one to report.
-        with contextlib.suppress(AudioFailed):
+        with contextlib.suppress(CannotSpeak):
             self.close()
 
     def gone(self) -> bool:
@@ -136,7 +136,7 @@ class WavStreamPlayer:
         except BlockingIOError:
             return 0
         except OSError as error:
-            raise AudioFailed("audio_lost", f"{self.name}: {error.strerror}") from error
+            raise CannotSpeak("audio_lost", f"{self.name}: {error.strerror}") from error
         header = min(written, len(self._header))
         self._header = self._header[header:]
         self._taken += written - header
@@ -174,20 +174,20 @@ class WavStreamPlayer:
 def _open(path: str) -> int:
     try:
         if not path:
-            raise AudioFailed("audio_device", "the player file: needs a path, as in file:speech.wav")
+            raise CannotSpeak("audio_device", "the player file: needs a path, as in file:speech.wav")
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o666)
     except OSError as error:
         raise _refused(path, error) from error
     if not stat.S_ISREG(os.fstat(file).st_mode):
         os.close(file)
-        raise AudioFailed("audio_device", f"{path} is no regular file")
+        raise CannotSpeak("audio_device", f"{path} is no regular file")
     return file
 
 
-def _refused(path: str, error: OSError | AudioFailed) -> AudioFailed:
-    if isinstance(error, AudioFailed):
+def _refused(path: str, error: OSError | CannotSpeak) -> CannotSpeak:
+    if isinstance(error, CannotSpeak):
         return error
-    return AudioFailed("audio_device", f"{path} cannot be written: {error.strerror}")
+    return CannotSpeak("audio_device", f"{path} cannot be written: {error.strerror}")
 
 
 def _header(rate: int, length: int) -> bytes:
@@ -205,7 +205,7 @@ def _endless_header(rate: int) -> bytes:
 
 
 def _data_length(file: int, path: str, rate: int) -> int:
-    """Return the length of the samples in the file, 0 for an empty one; AudioFailed if the file is not ours."""
+    """Return the length of the samples in the file, 0 for an empty one; CannotSpeak if the file is not ours."""
     size = os.fstat(file).st_size
     if size == 0:
         return 0
@@ -217,13 +217,13 @@ def _data_length(file: int, path: str, rate: int) -> int:
     if header != _header(found_rate, length):
         raise _foreign(path)
     if found_rate != rate:
-        raise AudioFailed(
+        raise CannotSpeak(
             "audio_device", f"{path} has {found_rate} samples a second, this voice {rate}: use another file"
         )
     if size < _HEADER.size + length:
-        raise AudioFailed("audio_device", f"{path} is shorter than its header says: use another file")
+        raise CannotSpeak("audio_device", f"{path} is shorter than its header says: use another file")
     return int(length)
 
 
-def _foreign(path: str) -> AudioFailed:
-    return AudioFailed("audio_device", f"{path} is no WAV file of talk's (16 bit, one channel): use another file")
+def _foreign(path: str) -> CannotSpeak:
+    return CannotSpeak("audio_device", f"{path} is no WAV file of talk's (16 bit, one channel): use another file")

@@ -38,7 +38,7 @@ class Output(Protocol):
     """Where one sentence goes; the playback is one.
 
     Each method may wait, for as long as a sentence is held, and may raise: Stopped when the sentence is to end,
-    AudioFailed when it can't be played. It was told everything then, and is told no more.
+    CannotSpeak when it can't be played. It was told everything then, and is told no more.
     """
 
     def begin(self, rate: int) -> None:
@@ -89,6 +89,6 @@ class Synthesizer(Protocol):
         words, and silence at most. Any string is a text: control characters and lone surrogates are silent.
 
         What the output raises comes out of here, at once, and the output is not called again. Of its own it raises
-        AudioFailed (`engine_failed`), no other. Nothing of a sentence stays, whichever way it ended: the next is what
+        CannotSpeak (`engine_failed`), no other. Nothing of a sentence stays, whichever way it ended: the next is what
         it would have been without it, but for what of the samples is noise.
         """

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 
-from talkcli.engine.players.base import SAMPLE, AudioFailed
+from talkcli.engine.players.base import SAMPLE, CannotSpeak
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import guard
 from talkcli.engine.synthesizers.base import UnknownVoice
@@ -83,7 +83,7 @@ class Espeak:
         if raised is not None:
             raise raised
         if status != espeak.EE_OK:
-            raise AudioFailed("engine_failed", f"espeak_Synth failed with {status}")
+            raise CannotSpeak("engine_failed", f"espeak_Synth failed with {status}")
 
     def _obey(self, sound: Sound) -> None:
         espeak = self._espeak
