@@ -192,7 +192,7 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
     if not player and not silent:
         return
     from talkcli.engine.players import PACKAGES
-    from talkcli.engine.start import is_own
+    from talkcli.engine.synthesizers import is_own
 
     if not is_own(driver):
         return  # it plays by itself, and the server says so

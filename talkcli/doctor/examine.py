@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor import machine, sentence, server, sound, voice
 from talkcli.engine.players import PACKAGES
-from talkcli.engine.start import is_own
+from talkcli.engine.synthesizers import is_own
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
 from talkcli.goals.states import State

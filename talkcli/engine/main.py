@@ -73,27 +73,22 @@ def _configuration(channel: Channel) -> protocol.Configure | None:
 
 
 def _serve(channel: Channel, configure: protocol.Configure) -> None:
+    from talkcli.engine.driver import CannotStart, start
     from talkcli.engine.players.base import CannotEnd
     from talkcli.engine.players.choice import Players
     from talkcli.engine.session import Session
-    from talkcli.engine.start import CannotStart, start
 
     players = Players(configure.player, configure.device, _inherited(), configure.lead_in / 1000, configure.output)
     session = Session(channel, players)
     try:
-        started = start(configure.driver, configure.voice, players, session)
+        channel.send(start(configure, session))
     except CannotStart as error:
-        channel.send(protocol.StartFailed(error.reason, str(error), error.lasting, error.usage))
+        channel.send(error.failed)
         return
-    session.open(started.engine, started.settings, started.pump)
-    own = started.pump is None
-    channel.send(protocol.Ready(started.driver, started.version, players.first() if own else None))
     try:
         session.run(configure.list_voices)
     except CannotEnd as error:  # the server sees that something is left, and speaks on with another process
         sys.stderr.write(f"{error}\n")
-    finally:
-        started.engine.endLoop()
 
 
 def _inherited() -> list[int]:

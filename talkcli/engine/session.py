@@ -2,9 +2,9 @@
 
 One thread. While a goal is spoken by `talk`'s own driver, the driver waits in `Session.wait`; a `Stop` that comes in
 there is carried out at once, by `engine.stop()`, which comes to the driver, its playback and the player; a `Pause` by
-the playback; what ties them together is `start`. Other drivers know no pause: there the sentence is stopped, and what
-is left of it is spoken as another. Nothing may leave a goal without its `Ended`: pyttsx3 swallows what its callbacks
-raise, ignores blank text and turns errors into notifications.
+the playback; what ties them together is `driver.start`. Other drivers know no pause: there the sentence is stopped, and
+what is left of it is spoken as another. Nothing may leave a goal without its `Ended`: pyttsx3 swallows what its
+callbacks raise, ignores blank text and turns errors into notifications.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from collections import deque
 from talkcli.engine import protocol
 from talkcli.engine.playback import Pause
 from talkcli.engine.players.base import CannotSpeak
-from talkcli.engine.settings import SettingFailed
 from talkcli.engine.synthesizers.voices import list_voices
-from talkcli.engine.words import Times, Words
+from talkcli.engine.words import Words
 from talkcli.splitter import LineSplitter
 
 TYPE_CHECKING = False
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from talkcli.engine.players.base import Interest
     from talkcli.engine.players.choice import Players
     from talkcli.engine.protocol import Command, Event
-    from talkcli.engine.settings import Settings
 
 #: Seconds between two steps of a driver that is not ours while it has a goal in hand: it has no way to wake us.
 STEP = 0.05
@@ -118,22 +116,29 @@ class Session:
 
     def __init__(self, channel: Channel, players: Players) -> None:
         self._channel = channel
-        self._players = players
+        #: what our own driver plays with
+        self.players = players
         self._backlog: deque[Command] = deque()
         self._leaving = False
         self._goal: InHand | None = None
         self._engine: Any = None
-        self._settings: Settings | None = None
+        self._apply: Callable[[protocol.Say], None] | None = None
         self._pump: Callable[[], None] | None = None
         #: for our own driver to obey, and what the session itself goes by with another
         self.pause = Pause(self._tell_paused)
-        #: what our own driver tells beside its notifications
-        self.times = Times()
+        #: what our own driver tells beside its notifications, which have no word for it, true as long as one is told:
+        #: the place in the audio, in seconds, of the word that begins; the seconds of the sentence that has ended, None
+        #: if not all of it was heard. None where another speaks, which doesn't know.
+        self.position: float | None = None
+        self.duration: float | None = None
 
-    def open(self, engine: Any, settings: Settings, pump: Callable[[], None] | None) -> None:
-        """Take the engine; `pump` is called about 20 times a second while a goal is spoken by a foreign driver."""
+    def open(self, engine: Any, apply: Callable[[protocol.Say], None], pump: Callable[[], None] | None) -> None:
+        """Take the engine, and what sets its properties for a goal or raises CannotSpeak.
+
+        `pump`: for a foreign driver, called about 20 times a second while it has a goal.
+        """
         self._engine = engine
-        self._settings = settings
+        self._apply = apply
         self._pump = pump
         engine.connect("started-word", _told(self._word))
         engine.connect("finished-utterance", _told(self._finished))
@@ -141,13 +146,16 @@ class Session:
 
     def run(self, voices: bool) -> None:
         """Carry out commands until the server leaves or says so; before that tell the voices, if they are wanted."""
-        if voices:
-            self._channel.send(protocol.Voices(self._voices()))
-        while not (self._leaving or self._channel.closed):
-            if self._backlog:
-                self._carry_out(self._backlog.popleft())
-            else:
-                self._backlog.extend(self._channel.receive())
+        try:
+            if voices:
+                self._channel.send(protocol.Voices(self._voices()))
+            while not (self._leaving or self._channel.closed):
+                if self._backlog:
+                    self._carry_out(self._backlog.popleft())
+                else:
+                    self._backlog.extend(self._channel.receive())
+        finally:
+            self._engine.endLoop()
 
     def wait(self, interests: Sequence[Interest], until: float | None) -> None:
         """Wait for one of the interests, a command or a monotonic time, and carry out what the server wants now."""
@@ -176,7 +184,7 @@ class Session:
             self._stop(command)
         elif isinstance(command, protocol.Followed):
             if goal is not None and goal.id == command.id:
-                self._players.gap.followed = command.followed
+                self.players.gap.followed = command.followed
         elif isinstance(command, protocol.Pause | protocol.Resume):
             if goal is not None and goal.id == command.id and not goal.stop_asked:
                 self._hold_or_go_on(goal, command)
@@ -225,10 +233,10 @@ class Session:
 
     def _say(self, say: protocol.Say) -> None:
         """Speak a goal to its end."""
-        assert self._settings is not None
+        assert self._apply is not None
         self._goal = goal = InHand(say, time.monotonic())
         self.pause.release()
-        self._players.begin(say.lead_in, say.followed)
+        self.players.begin(say.lead_in, say.followed)
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
         waiting, self._backlog = self._backlog, deque()
@@ -237,8 +245,8 @@ class Session:
         if self._leaving:
             self._silence()
         try:
-            self._settings.apply(say)
-        except SettingFailed as error:
+            self._apply(say)
+        except CannotSpeak as error:
             if self._goal is not None:
                 self._end(protocol.FAILED, error.reason, str(error))
         if self._goal is not None and self._pump is not None and say.lead_in:
@@ -293,7 +301,7 @@ class Session:
         found = goal.words.next(goal.offset + location if location >= 0 else location, length)
         if found is not None:
             goal.last_word, goal.progress_at = found.start, _since(0.0)
-            seconds = _since(goal.began) if self.times.word is None else self.times.word
+            seconds = _since(goal.began) if self.position is None else self.position
             self._channel.send(protocol.Word(goal.id, found.start, found.end, found.number, round(seconds, 3)))
 
     def _error(self, exception: Exception, **_: object) -> None:
@@ -307,8 +315,7 @@ class Session:
         if goal.interrupted and not (completed or goal.stop_asked or goal.error):
             goal.spoken, goal.silent_at = False, time.monotonic()
         elif completed:
-            duration = self.times.duration
-            self._end(protocol.COMPLETED, duration=None if duration is None else round(duration, 6))
+            self._end(protocol.COMPLETED, duration=None if self.duration is None else round(self.duration, 6))
         elif goal.stop_asked and not isinstance(goal.error, CannotSpeak):
             self._end(protocol.STOPPED)
         elif isinstance(goal.error, CannotSpeak):

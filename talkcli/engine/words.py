@@ -95,19 +95,6 @@ class TimedWord:
     position: float  # seconds into the audio
 
 
-class Times:
-    """What pyttsx3's notifications have no word for, for who gets one: it is true as long as he is told.
-
-    Our own driver sets it. None where another speaks, which doesn't know.
-    """
-
-    def __init__(self) -> None:
-        #: of the word that begins: its place in the audio, in seconds
-        self.word: float | None = None
-        #: of the sentence that has ended: the seconds of its audio, None if not all of it was heard
-        self.duration: float | None = None
-
-
 class WordClock:
     """Tells how much was heard, and which words have begun."""
 

@@ -13,6 +13,7 @@ import traceback
 from typing import TYPE_CHECKING
 
 from talkcli.engine.players import NO_PLAYER
+from talkcli.engine.synthesizers import is_own
 from talkcli.goals.states import State
 from talkcli.quota import Quota
 from talkcli.terminal.text import printable
@@ -99,8 +100,6 @@ def sound_of(engine: Ready) -> str:
     """Return what plays, for people."""
     if engine.player:
         return f"player {engine.player}"
-    from talkcli.engine.start import is_own  # with half of the engine, for the few who need it
-
     return NO_PLAYER if is_own(engine.driver) else _BY_ITSELF
 
 

@@ -1,4 +1,4 @@
-"""Our driver as pyttsx3 sees it, with pyttsx3's own engine: what it notifies, what its properties are, how it loops."""
+"""Our driver as pyttsx3 sees it, with pyttsx3's own engine: what it notifies, and what its properties are."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import re
 import select
 import time
 from array import array
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 from pyttsx3.engine import Engine
 
+from talkcli.engine.driver import register
 from talkcli.engine.playback import Pause
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.choice import Players
 from talkcli.engine.synthesizers.base import UnknownVoice
-from talkcli.engine.synthesizers.driver import register
-from talkcli.engine.words import Times
 from tests.engine.test_synthesizer_contract import Scripted
 from tests.support.timing import assert_within, limits
 
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from talkcli.engine.players.base import Interest
+    from talkcli.engine.session import Session
     from talkcli.engine.synthesizers.base import Output, Sound, Synthesizer
 
 #: What pyttsx3 documents: the keywords of each notification.
@@ -36,17 +36,22 @@ _RATE = 16000
 
 
 class Told:
-    """An engine of pyttsx3's with our driver, and all that it has notified, with the times that went beside it."""
+    """An engine of pyttsx3's with our driver, and all that it has notified, with the times that went beside it.
+
+    For the driver it is the session.
+    """
 
     def __init__(self, player: str = "null", synthesizer: Synthesizer | None = None) -> None:
         self.told: list[tuple[str, dict[str, Any]]] = []
-        self.times = Times()
+        self.position: float | None = None
+        self.duration: float | None = None
         self.beside: list[tuple[float | None, float | None]] = []
         #: what happens when a word is told, and in each wait
         self.at_word: Callable[[], None] = lambda: None
         self.at_wait: Callable[[], None] = lambda: None
-        made = synthesizer or Scripted()
-        register(_NAME, made, Players(player, None), self._wait, Pause(lambda _: None), self.times)
+        self.players = Players(player, None)
+        self.pause = Pause(lambda _: None)
+        register(_NAME, synthesizer or Scripted(), cast("Session", self))
         self.engine: Any = Engine(_NAME)
         for topic in FORM:
             self.engine.connect(topic, self._note(topic))
@@ -54,13 +59,13 @@ class Told:
     def _note(self, topic: str) -> Callable[..., None]:
         def note(**values: object) -> None:
             self.told.append((topic, values))
-            self.beside.append((self.times.word, self.times.duration))
+            self.beside.append((self.position, self.duration))
             if topic == "started-word":
                 self.at_word()
 
         return note
 
-    def _wait(self, interests: Sequence[Interest], until: float | None) -> None:
+    def wait(self, interests: Sequence[Interest], until: float | None) -> None:
         poll = select.poll()
         for descriptor, events in interests:
             poll.register(descriptor, events)
@@ -173,17 +178,6 @@ def test_what_cannot_be_set_is_an_error_and_changes_nothing(
     assert values.keys() == FORM["error"]
     assert type(values["exception"]) is kind
     assert [told.engine.getProperty(each) for each in ("voice", "rate")] == ["one", 200]
-
-
-def test_pyttsx3s_own_loop_speaks_all_that_was_said() -> None:
-    told = Told()
-    told.engine.say("a", "g1")
-    told.engine.say("b", "g2")
-    told.engine.runAndWait()
-    assert [values for topic, values in told.told if topic == "finished-utterance"] == [
-        {"name": "g1", "completed": True},
-        {"name": "g2", "completed": True},
-    ]
 
 
 class Halting(Scripted):

@@ -288,13 +288,13 @@ def test_no_library_at_all_says_what_to_install() -> None:
 
 def test_a_library_without_a_voice_of_its_own_says_which() -> None:
     before = """
-from talkcli.engine.synthesizers import library
-load = library.load
+from talkcli.engine.synthesizers import espeak
+load = espeak.load
 def without_english():
-    found = load()
-    found.espeak.SetVoiceByName = lambda _: found.espeak.EE_OK + 1
-    return found
-library.load = without_english
+    library, *more = load()
+    library.SetVoiceByName = lambda _: library.EE_OK + 1
+    return library, *more
+espeak.load = without_english
 """
     failed = _start_failure(before=before)
     assert failed.message == 'the driver "talk_espeak" cannot be started: UnknownVoice: en'

@@ -18,7 +18,6 @@ from talkcli.engine.players.base import SAMPLE, CannotSpeak, Stopped
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.base import Sound, UnknownVoice
 from talkcli.engine.synthesizers.espeak import Espeak
-from talkcli.engine.synthesizers.library import load
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -85,7 +84,7 @@ class Scripted:
 @cache
 def _espeak() -> Synthesizer:
     """Return the one that there is in a process: its library can be loaded once, and hangs where it is to end."""
-    return Espeak(load())
+    return Espeak()
 
 
 SYNTHESIZERS: dict[str, Callable[[], Synthesizer]] = {"espeak": _espeak, "scripted": Scripted}

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 SET_ALL = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
-from talkcli.engine.synthesizers.library import load
-espeak = load().espeak
+from talkcli.engine.synthesizers.espeak import load
+espeak, *_ = load()
 current = []
 for each in json.load(sys.stdin):
     status = espeak.SetVoiceByName(each.encode())

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 #: Which argument of a call is a goal's reason; the place of a keyword doesn't matter.
 REASON_AT = {
-    "CannotSpeak": 0, "SettingFailed": 0, "StartFailed": 0, "Ended": 2, "_lose_process": 1, "_recall": 1, "_stop": 1,
+    "CannotSpeak": 0, "StartFailed": 0, "Ended": 2, "_lose_process": 1, "_recall": 1, "_stop": 1,
     "_end": 2, "_close": 2, "failed": 1,
 }  # fmt: skip
 #: … and which is the code of an error on the wire.

@@ -1,18 +1,21 @@
-"""Libespeak-ng behind the interface of a synthesizer: its voices, its words, and the guard before it.
+"""Libespeak-ng behind the interface of a synthesizer: loaded, its voices, its words, and the guard before it.
 
 The library speaks in one call and calls back in the same thread, with some 50 ms of samples each time; an exception
-cannot pass through it, so it is kept until the library has returned. There is one of it in a process.
+cannot pass through it, so it is kept until the library has returned. There is one of it in a process. Linux only;
+elsewhere pyttsx3's own drivers find their libraries themselves.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import errno
 import os
 
 from talkcli.engine.players.base import SAMPLE, CannotSpeak
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import guard
-from talkcli.engine.synthesizers.base import UnknownVoice
+from talkcli.engine.synthesizers.base import NotInstalled, UnknownVoice
 from talkcli.engine.synthesizers.voices import VARIANT
 from talkcli.engine.words import letters
 
@@ -22,7 +25,15 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.synthesizers.base import Output, Sound
-    from talkcli.engine.synthesizers.library import Library
+
+_LIBRARY = "libespeak-ng.so.1"
+
+#: Milliseconds of sound that the library hands over at once. It rounds up to 49 at 22,050 Hz; more would only delay
+#: the first sound.
+_BUFFER_MS = 20
+
+#: Without this option the library calls exit() where its data is missing.
+_DONT_EXIT = 0x8000
 
 #: English: by its file, which saves the 4 to 40 ms in which the library reads all voices to find it by its language.
 _DEFAULTS = ("gmw/en", "en")
@@ -36,14 +47,84 @@ _VARIANTS, _MBROLA = b"variant", b"mbrola"
 _MBROLA_PLACES = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
 
 
+def load() -> tuple[Any, str, int]:
+    """Load the system's library where there is one, else the wheel's, and initialise it, once a process.
+
+    Return pyttsx3's binding of it, what it is for people, "eSpeak NG 1.51 (system)", and its samples per second until a
+    voice says otherwise. NotInstalled; OSError where it may be loaded later. It must run before anything imports
+    `pyttsx3.drivers._espeak`, which loads the library when it is imported.
+    """
+    origin, data = _preload()
+    from pyttsx3.drivers import _espeak
+
+    with _no_sound_server():
+        rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _BUFFER_MS, data, _DONT_EXIT)
+    if rate <= 0:
+        raise NotInstalled("there is no espeak-ng data: install espeak-ng-data, or pip install espeakng-loader")
+    version = (_espeak.Info(None) or b"").decode("utf-8", "replace").split(" ")[0]
+    return _espeak, f"eSpeak NG {version} ({origin})", rate
+
+
+@contextlib.contextmanager
+def _no_sound_server() -> Iterator[None]:
+    """Let no PulseAudio be found meanwhile.
+
+    The library connects to one whenever it is initialised, though it is never to play: 7 ms where one answers, and 30 s
+    where one hangs, in which the engine would be given up.
+    """
+    before = os.environ.get("PULSE_SERVER")
+    os.environ["PULSE_SERVER"] = "unix:/dev/null"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PULSE_SERVER"]
+        else:
+            os.environ["PULSE_SERVER"] = before
+
+
+def _preload() -> tuple[str, bytes | None]:
+    """Have the library in the process, so that the binding finds it; return its origin and its data's directory."""
+    try:
+        ctypes.CDLL(_LIBRARY)
+    except OSError as missing:
+        if _passes(missing):
+            raise
+        return _preload_wheel(missing)
+    return "system", None
+
+
+def _preload_wheel(missing: OSError) -> tuple[str, bytes]:
+    try:
+        import espeakng_loader
+
+        # Global, as the binding asks for the name that the system's library would have, and gets the one that is there.
+        ctypes.CDLL(espeakng_loader.get_library_path(), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError) as error:
+        if _passes(error):
+            raise
+        text = "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader"
+        raise NotInstalled(f"{text} ({missing})") from error
+    return "espeakng-loader", str(espeakng_loader.get_data_path()).encode()
+
+
+def _passes(error: Exception) -> bool:
+    """Tell whether a library that is there could not be loaded for want of memory or descriptors.
+
+    The loader has but words for it, which end in the system's.
+    """
+    return str(error).endswith(tuple(map(os.strerror, (errno.EMFILE, errno.ENFILE, errno.ENOMEM))))
+
+
 class Espeak:
     """The library as a synthesizer."""
 
-    def __init__(self, library: Library) -> None:
-        """Take the library that was loaded; UnknownVoice if it has no English."""
-        self.version: str | None = library.version
-        self._espeak = espeak = library.espeak
-        self._rate = library.rate
+    version: str | None
+
+    def __init__(self) -> None:
+        """Load the library, as `load`; UnknownVoice if it has no English."""
+        self._espeak, self.version, self._rate = load()
+        espeak = self._espeak
         #: what its parameters were last set to; they are left alone where they need not be set, so that the first
         #: sentence of a fresh process is what the library alone would make
         self._set = {espeak.RATE: 175, espeak.VOLUME: 100, espeak.PITCH: 50}

@@ -1,0 +1,271 @@
+"""pyttsx3's engine: its driver, a goal's settings as its properties, and our own driver in front of a synthesizer.
+
+It starts no goal. What is missing is an answer that says what to install, and no traceback.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import types
+
+from talkcli.engine.playback import Playback
+from talkcli.engine.players.base import CannotSpeak, Stopped
+from talkcli.engine.protocol import Ready, StartFailed
+from talkcli.engine.synthesizers import SYNTHESIZERS, is_own
+from talkcli.engine.synthesizers.base import NotInstalled, Sound, UnknownVoice
+from talkcli.engine.synthesizers.voices import find_voice, list_voices, unknown_voice
+from talkcli.frozen import fields, replace
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from typing import Any
+
+    from talkcli.engine.protocol import Configure, Say, Voice
+    from talkcli.engine.session import Session
+    from talkcli.engine.synthesizers.base import Synthesizer
+    from talkcli.engine.words import TimedWord
+
+#: The drivers of macOS that speak in Apple's run loop, which somebody has to run.
+_RUN_LOOP_DRIVERS = ("nsss", "avspeech")
+
+
+class CannotStart(Exception):
+    """The engine cannot start: the text names what to install or to change, `failed` is what the server is told."""
+
+    def __init__(self, message: str, reason: str = "engine_failed", **more: bool) -> None:
+        """`more`: as in `StartFailed`."""
+        super().__init__(message)
+        self.failed = StartFailed(reason, message, **more)
+
+
+def start(configure: Configure, session: Session) -> Ready:
+    """Build the engine, with its loop started, and hand it to the session; CannotStart."""
+    try:
+        import pyttsx3
+    except ModuleNotFoundError as error:
+        raise CannotStart(f"pyttsx3 is missing: pip install pyttsx3 ({error})") from error
+    own = is_own(configure.driver)
+    shown = configure.driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
+    name = f"talk_{shown}" if own else shown
+    version = _register_own(shown, name, session) if own else None
+    engine = _init(pyttsx3, name, named=configure.driver is not None)
+    settings = Settings(engine, name)
+    _start_loop(engine, name)
+    try:
+        settings.set_voice(configure.voice)
+    except CannotSpeak as error:
+        unknown = error.reason == "unknown_voice"
+        raise CannotStart(str(error), error.reason, lasting=unknown, usage=unknown) from error
+    session.open(engine, settings.apply, None if own else _pump(name))
+    return Ready(shown, version, session.players.first() if own else None)
+
+
+def _register_own(synthesizer: str, driver: str, session: Session) -> str | None:
+    """Make a synthesizer, and put a driver for it among pyttsx3's; return its version, for people."""
+    try:
+        made = SYNTHESIZERS[synthesizer]()
+    except NotInstalled as error:
+        raise CannotStart(str(error)) from error
+    except UnknownVoice as error:  # not even its own: a part of it is missing
+        raise CannotStart(_cannot_be_started(driver, error), lasting=False) from error
+    register(driver, made, session)
+    return made.version
+
+
+def register(name: str, synthesizer: Synthesizer, session: Session) -> None:
+    """Put a driver among pyttsx3's own, so that `pyttsx3.init(name)` finds it."""
+    module: Any = types.ModuleType(f"pyttsx3.drivers.{name}")
+    module.buildDriver = lambda proxy: Driver(proxy, synthesizer, session)
+    sys.modules[module.__name__] = module
+
+
+def _init(pyttsx3: Any, name: str, *, named: bool) -> Any:
+    """Return the engine of a driver; `named`: whether an option has named it."""
+    try:
+        return pyttsx3.init(name)
+    except ModuleNotFoundError as error:
+        if error.name == f"pyttsx3.drivers.{name}":
+            words = f'unknown driver "{name}": there are {", ".join(_driver_names(pyttsx3))}'
+            raise CannotStart(words, usage=named) from error
+        raise CannotStart(f'the driver "{name}" cannot be loaded: {error}', usage=named) from error
+    except Exception as error:
+        raise CannotStart(_cannot_be_started(name, error), lasting=False) from error
+
+
+def _cannot_be_started(driver: str, error: Exception) -> str:
+    return f'the driver "{driver}" cannot be started: {type(error).__name__}: {error}'
+
+
+def _driver_names(pyttsx3: Any) -> list[str]:
+    import pkgutil
+
+    folder = os.path.join(os.path.dirname(pyttsx3.__file__), "drivers")
+    found = {module.name for module in pkgutil.iter_modules([folder]) if not module.name.startswith("_")}
+    return sorted(found | SYNTHESIZERS.keys())
+
+
+def _start_loop(engine: Any, name: str) -> None:
+    """Start the loop and take its first step: some drivers cannot, and would hang at the first goal."""
+    try:
+        engine.startLoop(False)
+        engine.iterate()
+    except TypeError as error:
+        text = f'the driver "{name}" cannot be stepped (its iterate() is no generator)'
+        raise CannotStart(f"{text}: leave --driver out", usage=True) from error
+
+
+def _pump(name: str) -> Callable[[], None]:
+    if sys.platform != "darwin" or name not in _RUN_LOOP_DRIVERS:
+        return lambda: None
+    from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
+
+    def run_loop() -> None:
+        NSRunLoop.currentRunLoop().runUntilDate_(NSDate.dateWithTimeIntervalSinceNow_(0))
+
+    return run_loop
+
+
+class Settings:
+    """A goal's settings as properties of one engine, by what they were last set to.
+
+    A property is set only where it differs from what the driver has: a foreign driver may not know a property that
+    nobody asked for. A voice is always set by an id that the driver itself lists.
+    """
+
+    def __init__(self, engine: Any, driver: str) -> None:
+        self._engine = engine
+        self._driver = driver
+        self._set = fields(Sound())  # what pyttsx3's drivers set themselves
+        self._default_voice: Any = None
+        self._voices: tuple[Voice, ...] | None = None
+        self._voice: str | None = None
+        self._error: Exception | None = None
+        engine.connect("error", self._note)
+
+    def apply(self, say: Say) -> None:
+        """Set what the goal wants; CannotSpeak if that cannot be had."""
+        self.set_voice(say.voice)
+        for name, value in (("rate", say.rate), ("volume", say.volume), ("pitch", say.pitch)):
+            if self._set.get(name) != value:
+                self._put(name, value, f"{name} to {value}")
+                self._set[name] = value
+
+    def set_voice(self, wanted: str | None) -> None:
+        """Set the voice; None is the one that the driver started with. CannotSpeak if there is no such voice."""
+        if wanted == self._voice:
+            return
+        if self._voice is None:
+            self._default_voice = self._engine.getProperty("voice")
+        self._put("voice", self._default_voice if wanted is None else self._driver_id(wanted), f"the voice {wanted}")
+        self._voice = wanted
+
+    def _driver_id(self, wanted: str) -> str:
+        if self._voices is None:  # once: it takes some milliseconds, and they don't change while a process lives
+            self._voices = list_voices(self._engine)
+        found = find_voice(wanted, self._voices)
+        if found is None:
+            raise CannotSpeak("unknown_voice", unknown_voice(wanted, self._voices))
+        return found.id
+
+    def _put(self, name: str, value: Any, shown: str) -> None:
+        """Set a property; what goes wrong pyttsx3 reports by a notification, not by an exception."""
+        self._error = None
+        self._engine.setProperty(name, value)
+        error, self._error = self._error, None
+        if isinstance(error, UnknownVoice):
+            text = f"the voice {value} is listed, but it cannot be loaded: {error}"
+            raise CannotSpeak("unknown_voice", text) from error
+        if error is not None:
+            why = str(error.args[0] if error.args else error) or type(error).__name__
+            raise CannotSpeak("bad_option", f"the driver {self._driver} cannot set {shown}: {why}") from error
+
+    def _note(self, exception: Exception, **_: object) -> None:
+        self._error = exception
+
+
+class Driver:
+    """Our driver; its methods are those that pyttsx3's DriverProxy calls for an engine whose loop is another's.
+
+    What it speaks is played, stopped, held, and told word by word. It speaks inside `iterate()`; the synthesizer writes
+    to the playback in the same thread, and that waits for the player. It must not let an exception out: pyttsx3 would
+    lose the sentence without a word.
+
+    Its notifications are pyttsx3's, keyword for keyword; what else there is to be told stands in the session. More than
+    pyttsx3 asks for: the property "pitch" (0 to 100).
+    """
+
+    def __init__(self, proxy: Any, synthesizer: Synthesizer, session: Session) -> None:
+        self._proxy = proxy
+        self._synthesizer = synthesizer
+        self._session = session
+        self._sound = Sound()
+        self._text: str | None = None
+        self._playback: Playback | None = None
+
+    def iterate(self) -> Iterator[None]:
+        """Speak what was said since the last step, to its end."""
+        while True:
+            if self._text is None:
+                self._proxy.setBusy(False)  # pyttsx3 starts busy; this hands over what waits, by a call of `say`
+            if self._text is None:
+                yield
+                continue
+            text, self._text = self._text, None
+            self._speak(text)
+
+    def say(self, text: str) -> None:
+        """Take a sentence; the next step of `iterate` speaks it."""
+        self._proxy.setBusy(True)
+        self._text = text
+
+    def stop(self) -> None:
+        """Be silent now."""
+        self._text = None
+        if self._playback is not None:
+            self._playback.stop()
+
+    #: Called when the proxy goes away.
+    destroy = stop
+
+    def getProperty(self, name: str) -> Any:  # noqa: N802 - pyttsx3's name
+        """Return a property; KeyError if it is unknown."""
+        if name == "voices":
+            from pyttsx3.voice import Voice
+
+            found = self._synthesizer.voices()
+            return [Voice(each.id, each.name, [each.language] if each.language else []) for each in found]
+        return self._synthesizer.voice if name == "voice" else fields(self._sound)[name]
+
+    def setProperty(self, name: str, value: Any) -> None:  # noqa: N802 - pyttsx3's name
+        """Set a property; KeyError if it is unknown, UnknownVoice."""
+        if name == "voice":
+            self._synthesizer.load(str(value))
+        else:
+            kind = type(fields(self._sound)[name])
+            self._sound = replace(self._sound, **{name: kind(value)})
+
+    def _speak(self, text: str) -> None:
+        """Speak the text, with exactly one finished-utterance at its end."""
+        session = self._session
+        self._proxy.notify("started-utterance")
+        self._playback = playback = Playback(session.players, session.wait, session.pause, self._word_heard)
+        failure: Exception | None = None
+        session.duration = None
+        try:
+            self._synthesizer.speak(text, self._sound, playback)
+            session.duration = playback.finish()
+        except Stopped:
+            pass
+        except Exception as error:  # noqa: BLE001 - whatever it is, pyttsx3 would swallow it: it is told instead
+            failure = error
+        playback.silence()
+        self._playback = None
+        if failure is not None:
+            self._proxy.notify("error", exception=failure)
+        self._proxy.notify("finished-utterance", completed=session.duration is not None)
+
+    def _word_heard(self, word: TimedWord) -> None:
+        self._session.position = word.position
+        self._proxy.notify("started-word", location=word.location, length=word.length)
