@@ -10,7 +10,7 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.players.base import CannotSpeak
-from talkcli.engine.players.wav import WavPlayer
+from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
 from tests.engine.spawned import Spawned
 
 if TYPE_CHECKING:
@@ -93,7 +93,13 @@ def _other_rate(path: Path) -> None:
     _write(path, b"one ", 16000)
 
 
-@pytest.mark.parametrize("make", [_stereo, _with_a_chunk_behind, _cut_short, _text, _other_rate])
+def _of_unknown_length(path: Path) -> None:
+    """What `say -o -` writes."""
+    with path.open("wb") as file:
+        WavStreamPlayer(file.fileno(), 22050, first=True).offer(memoryview(b"one "))
+
+
+@pytest.mark.parametrize("make", [_of_unknown_length, _stereo, _with_a_chunk_behind, _cut_short, _text, _other_rate])
 def test_other_content_is_refused_and_left_alone(tmp_path: Path, make: object) -> None:
     path = tmp_path / "x.wav"
     assert callable(make)

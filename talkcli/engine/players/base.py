@@ -76,8 +76,8 @@ class Player(Protocol):
         """Return how much of what `offer` took has left for the device; the rest waits, and could still be lost.
 
         It never shrinks, is never more than was taken, and comes to all of it by the time that `ended` is true; after
-        `close` it may count what the player has still to take. The
-        word clock starts where it begins to grow, and is held back by it.
+        `close` it may count what the player has still to take. The word clock starts where it begins to grow, and is
+        held back by it.
         """
 
     def close(self) -> None:
@@ -107,6 +107,44 @@ class Player(Protocol):
 
         Asked after `kill` alone, every 20 ms; after a second the whole engine process is given up.
         """
+
+
+class BuiltIn:
+    """What the players that are no programs have in common: what they took is gone at once, and so are they."""
+
+    proven = True
+
+    def __init__(self) -> None:
+        self._taken = 0
+        self._closed = False
+
+    def consumed(self) -> int:
+        """Return what was taken."""
+        return self._taken
+
+    def close(self) -> None:
+        """Take note that the sound ends here."""
+        self._closed = True
+
+    def ended(self) -> bool:
+        """Return True once it is closed."""
+        return self._closed
+
+    def interests(self) -> Sequence[Interest]:
+        """Return nothing."""
+        return ()
+
+    def wake_at(self) -> float | None:
+        """Return "at once"."""
+        return 0.0
+
+    def kill(self) -> None:
+        """Take no more: there is nothing to silence."""
+        self._closed = True
+
+    def gone(self) -> bool:
+        """Return True: nothing is ever left."""
+        return True
 
 
 #: Waits for one of the interests or a monotonic time, whatever comes first, and may return early. What the server sends

@@ -7,31 +7,27 @@ from __future__ import annotations
 
 import time
 
-from talkcli.engine.players.base import SAMPLE
+from talkcli.engine.players.base import SAMPLE, BuiltIn
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.engine.players.base import Interest
-
 #: Seconds of sound that it takes ahead of its clock, as much as a real player's buffer holds.
 AHEAD = 0.06
 
 
-class NullPlayer:
+class NullPlayer(BuiltIn):
     """Takes samples at the pace of the clock."""
 
     name = "null"
     real_time = True
-    proven = True
 
     def __init__(self, rate: int, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
         self._bytes_per_second = rate * SAMPLE
         self._clock = clock
         self._started: float | None = None
-        self._taken = 0
-        self._closed = False
 
     def offer(self, data: memoryview) -> int:
         """Take all of it if there is room, else nothing."""
@@ -44,21 +40,9 @@ class NullPlayer:
         self._taken += len(data)
         return len(data)
 
-    def consumed(self) -> int:
-        """Return what was taken."""
-        return self._taken
-
-    def close(self) -> None:
-        """Take note that the sound ends here."""
-        self._closed = True
-
     def ended(self) -> bool:
         """Return True when the last sample would have been heard."""
         return self._closed and (self._started is None or self._clock() >= self._heard_at())
-
-    def interests(self) -> list[Interest]:
-        """Return nothing: only time counts."""
-        return []
 
     def wake_at(self) -> float | None:
         """Return when the next samples fit, or when the sound ends."""
@@ -66,13 +50,6 @@ class NullPlayer:
             return self._clock()
         # A third of what it holds fits then: no more wake-ups than a real player causes.
         return self._heard_at() if self._closed else self._heard_at() - AHEAD * 2 / 3
-
-    def kill(self) -> None:
-        """End: there is nothing to silence."""
-
-    def gone(self) -> bool:
-        """Return True: nothing is ever left."""
-        return True
 
     def _heard_at(self) -> float:
         return (self._started or 0.0) + self._taken / self._bytes_per_second
