@@ -184,14 +184,14 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
     With a device and no player named it only looks at the names of files, so that the start is not kept waiting.
     """
+    from talkcli.engine.players import PACKAGES, is_silent
     from talkcli.engine.players.devices import nothing_sounds
 
-    if player == "null" or player.startswith("file:"):
+    if is_silent(player):
         return
     silent = nothing_sounds(os.environ)
     if not player and not silent:
         return
-    from talkcli.engine.players import PACKAGES
     from talkcli.engine.synthesizers import is_own
 
     if not is_own(driver):

@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.doctor import machine, sentence, server, sound, voice
-from talkcli.engine.players import PACKAGES
+from talkcli.engine.players import PACKAGES, is_silent
 from talkcli.engine.synthesizers import is_own
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
@@ -96,7 +96,7 @@ class Examination:
         cards, found = machine.cards(here), sound.sound_server(env, here)
         self._hangs = found.hangs
         yield from sound.judge(players, devices, cards, found, here, running=running)
-        if not sound.is_silent(wanted):
+        if not is_silent(wanted):
             default = device is None and used in PACKAGES
             yield from sound.judge_levels(sound.levels(env, found, cards), default=default)
 
@@ -122,14 +122,14 @@ class Examination:
             behind = sentence.AS_OWNER.format(machine.owner(f"/proc/{self._process}"))
         if played.reason == "audio_stalled" and not (self._hangs or custom):
             played = replace(played, suspended=sound.suspended(env))
-        silent = self._silent or sound.is_silent(wanted)
+        silent = self._silent or is_silent(wanted)
         return sentence.judge(played, silent=silent, behind=behind, hangs=self._hangs, device=self._told("device"))
 
     def _setting_of_server(self, process: int, env: Mapping[str, str]) -> voice.Setting:
         """Return what the server speaks with, for a process that does as it does, without a sound."""
         player = self._told("player")
-        if sound.is_silent(player):
-            player = sound.SILENT  # a file would get a sentence more, perhaps in the middle of one of the server's
+        if is_silent(player):
+            player = "null"  # a file would get a sentence more, perhaps in the middle of one of the server's
         elif player in PACKAGES and not machine.names_a_player(process, env):
             player = None  # that one is the first that the server tries, and not the only one
         return voice.Setting(

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor.machine import judge_access, judge_cards
 from talkcli.doctor.report import Finding, done, failed, some, warning
-from talkcli.engine.players import PACKAGES
+from talkcli.engine.players import PACKAGES, is_silent
 from talkcli.engine.players.devices import sound_servers
 from talkcli.frozen import frozen
 
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
     from talkcli.doctor.machine import Cards, Session
 
-#: Players that need no device.
-SILENT = "null"
-FILE = "file:"
 #: What ALSA lists besides devices: converters, and ways that nobody takes by default.
 _NO_DEVICES = frozenset(
     {"null", "lavrate", "samplerate", "speexrate", "jack", "oss", "speex", "upmix", "vdownmix", "usbstream"}
@@ -166,11 +163,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 def _read(descriptor: int) -> str:
     return os.pread(descriptor, _MOST, 0).decode("utf-8", "replace")
-
-
-def is_silent(player: str | None) -> bool:
-    """Tell whether a player makes no sound by its nature."""
-    return player is not None and (player == SILENT or player.startswith(FILE))
 
 
 def is_custom(player: str | None) -> bool:

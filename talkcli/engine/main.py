@@ -78,8 +78,7 @@ def _serve(channel: Channel, configure: protocol.Configure) -> None:
     from talkcli.engine.players.choice import Players
     from talkcli.engine.session import Session
 
-    players = Players(configure.player, configure.device, _inherited(), configure.lead_in / 1000, configure.output)
-    session = Session(channel, players)
+    session = Session(channel, Players(configure, _inherited()))
     try:
         channel.send(start(configure, session))
     except CannotStart as error:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import signal
 import socket
 import subprocess
 import sys
@@ -26,7 +25,7 @@ from typing import TYPE_CHECKING
 from talkcli import peers
 from talkcli.client.connect import ready
 from talkcli.engine import protocol
-from talkcli.engine.players.child import kill_holders
+from talkcli.engine.players.child import close, kill, kill_holders, open_pipes, processes, signal_name
 from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
 from talkcli.quota import Quota
 from talkcli.splitter import LineSplitter
@@ -84,14 +83,11 @@ class EngineProcess:
         environment = {name: value for name, value in (env or os.environ).items() if name not in _NOT_INHERITED}
         with contextlib.ExitStack() as kept, contextlib.ExitStack() as handed_over:
             self.socket, theirs = socket.socketpair()
-            kept.callback(self.socket.close)
-            handed_over.callback(theirs.close)
-            self.liveness, liveness = os.pipe()
-            kept.callback(os.close, self.liveness)
-            handed_over.callback(os.close, liveness)
-            self.stderr, stderr = os.pipe()
-            kept.callback(os.close, self.stderr)
-            handed_over.callback(os.close, stderr)
+            kept.enter_context(self.socket)
+            handed_over.enter_context(theirs)
+            (self.liveness, liveness), (self.stderr, stderr) = open_pipes(2)
+            kept.callback(close, self.liveness, self.stderr)
+            handed_over.callback(close, liveness, stderr)
             os.set_blocking(self.stderr, False)
             self.socket.setblocking(False)
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
@@ -157,11 +153,10 @@ class EngineProcess:
         the pipe that it holds.
         """
         if self._process.returncode is None:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            for pid in _session(self._process.pid):
-                with contextlib.suppress(ProcessLookupError, PermissionError):
-                    os.kill(pid, signal.SIGKILL)
+            kill([-self.pid])
+            # A player leads a group of its own; it dies with the engine process, but a pipeline that it has started
+            # would not.
+            kill(pid for pid in processes() if peers.stat_of(pid)[3:4] == [b"%d" % self.pid])
             kill_holders(self.liveness)
 
     def last_words(self) -> str:
@@ -177,7 +172,7 @@ class EngineProcess:
             return "it closed its connection"
         self.read_stderr()
         lines = [line.strip() for line in self._stderr_tail.decode(errors="replace").splitlines() if line.strip()]
-        how = f"it was killed by {_signal_name(-status)}" if status < 0 else f"it exited with status {status}"
+        how = f"it was killed by {signal_name(-status)}" if status < 0 else f"it exited with status {status}"
         return f"{how} ({lines[-1]})" if lines else how
 
     def _await_exit(self) -> None:
@@ -199,27 +194,7 @@ class EngineProcess:
             self._process.wait(_LAST_BREATH)
         with self._sending:
             self.socket.close()
-        os.close(self.liveness)
-        os.close(self.stderr)
-
-
-def _session(leader: int) -> list[int]:
-    """Return the processes of a session, where there is a /proc to tell them and a descriptor to read it with.
-
-    A player leads a group of its own; it dies with the engine process, but a pipeline that it has started would not.
-    """
-    try:
-        pids = [int(name) for name in os.listdir("/proc") if name.isdigit()]
-    except OSError:
-        return []
-    return [pid for pid in pids if peers.stat_of(pid)[3:4] == [b"%d" % leader]]
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
+        close(self.liveness, self.stderr)
 
 
 class Murmur:
@@ -334,12 +309,11 @@ class Conversation:
         return HANG_AFTER if self._process.ready else START_LIMIT
 
     def _keep_limits(self) -> None:
-        now = time.monotonic()
+        now, limit = time.monotonic(), self._limit()
         if now >= self._deadline:
             raise TimeoutError
-        if now < self._heard_at + self._limit():
+        if now < self._heard_at + limit:
             return
-        if not self._process.ready:
-            words = f"the engine was not ready after {START_LIMIT:g} s"
-            raise EngineSilent("engine_failed", words, START_LIMIT)
-        raise EngineSilent("engine_hung", f"the engine gave no sign of life for {HANG_AFTER:g} s", HANG_AFTER)
+        if self._process.ready:
+            raise EngineSilent("engine_hung", f"the engine gave no sign of life for {limit:g} s", limit)
+        raise EngineSilent("engine_failed", f"the engine was not ready after {limit:g} s", limit)

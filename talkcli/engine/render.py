@@ -88,13 +88,15 @@ def render(
     if path not in STANDARD_OUTPUT and not _is_stream(path):
         target = _target(path)
         with _beside(target, path) as hidden:
-            seconds = _speak_into(_to_file(driver, hidden), hidden, path, says, deadline, ends)
+            configure = protocol.Configure(os.getpid(), driver, f"file:{hidden}", None, None, list_voices=False)
+            seconds = _speak_into(Conversation(configure, deadline=deadline, interrupt=ends), hidden, path, says)
             _put_in_place(hidden, target, path)
         return seconds
     with _stream(path, deadline, ends) as output:
         configure = protocol.Configure(os.getpid(), driver, None, None, None, list_voices=False, output=output)
         try:
-            return _speak_into(configure, WavStreamPlayer.name, _named(path), says, deadline, ends)
+            conversation = Conversation(configure, deadline=deadline, interrupt=ends)
+            return _speak_into(conversation, WavStreamPlayer.name, _named(path), says)
         except CannotWrite as error:
             if path in STANDARD_OUTPUT and ready({output: 0}, 0.0):
                 raise BrokenPipeError(errno.EPIPE, "the reader of standard output is gone") from error
@@ -206,7 +208,7 @@ def _beside(target: str, path: str) -> Iterator[str]:
 def _create(hidden: str, path: str) -> None:
     """Make the file, so that its mode is what the umask makes of it and nobody else's file is written to."""
     try:
-        os.close(os.open(hidden, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
+        open(hidden, "xb").close()
     except OSError as error:
         directory = os.path.dirname(hidden)
         if not os.path.isdir(directory):
@@ -216,11 +218,8 @@ def _create(hidden: str, path: str) -> None:
 
 def _put_in_place(hidden: str, target: str, path: str) -> None:
     try:
-        file = os.open(hidden, os.O_RDONLY | os.O_CLOEXEC)
-        try:
+        with open(hidden, "rb") as file:
             os.fsync(file)  # some file systems tell only here that the disk is full, and a power cut must not empty it
-        finally:
-            os.close(file)
         os.replace(hidden, target)
     except OSError as error:
         raise _unwritable(path, error) from error
@@ -230,23 +229,12 @@ def _unwritable(path: str, error: OSError) -> CannotWrite:
     return CannotWrite(path, f"cannot be written: {error.strerror}")
 
 
-def _to_file(driver: str | None, file: str) -> protocol.Configure:
-    return protocol.Configure(os.getpid(), driver, f"file:{file}", None, None, list_voices=False)
-
-
-def _speak_into(
-    configure: protocol.Configure,
-    name: str,
-    path: str,
-    says: Iterator[protocol.Say],
-    deadline: float | None,
-    interrupt: Mapping[int, int] | None,
-) -> float:
+def _speak_into(conversation: Conversation, name: str, path: str, says: Iterator[protocol.Say]) -> float:
     """Speak all pieces, and return the seconds of audio. What the engine calls `name` is `path` to the user."""
     seconds = 0.0
     silent = None
     try:
-        with Conversation(configure, deadline=deadline, interrupt=interrupt) as engine:
+        with conversation as engine:
             for ended in _endings(engine, says):
                 if ended.outcome == protocol.COMPLETED and ended.duration is not None:
                     seconds += ended.duration

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 from pyttsx3.engine import Engine
 
+from talkcli.engine import protocol
 from talkcli.engine.driver import register
 from talkcli.engine.playback import Pause
 from talkcli.engine.players.base import CannotSpeak
@@ -49,7 +50,7 @@ class Told:
         #: what happens when a word is told, and in each wait
         self.at_word: Callable[[], None] = lambda: None
         self.at_wait: Callable[[], None] = lambda: None
-        self.players = Players(player, None)
+        self.players = Players(protocol.Configure(0, None, player, None, None))
         self.pause = Pause(lambda _: None)
         register(_NAME, synthesizer or Scripted(), cast("Session", self))
         self.engine: Any = Engine(_NAME)

@@ -257,11 +257,11 @@ def test_a_file_gets_none(tmp_path: Path) -> None:
 def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    found = choice.Players("null", None, lead_in=0.4)
+    found = choice.Players(protocol.Configure(0, None, "null", None, None, lead_in=400))
     assert found.lead_in() == 0.4
     found.let_go()
     now += choice.IDLE_AFTER - 0.01
     assert found.lead_in() == 0.0
     now += 0.02
     assert found.lead_in() == 0.4
-    assert choice.Players("null", None).lead_in() == 0.0
+    assert choice.Players(protocol.Configure(0, None, "null", None, None)).lead_in() == 0.0

@@ -277,6 +277,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 JUDGING = ["machine", "voice", "sound", "server", "sentence", "report"]
 #: What the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
+    "talkcli.engine.players",
     "talkcli.goals.options",
     "talkcli.goals.states",
     "talkcli.terminal.goals",

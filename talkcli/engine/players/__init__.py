@@ -19,6 +19,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from talkcli.engine.players.base import Player
+
 #: Milliseconds of sound that a player may hold. What it holds is heard late and is lost in a stall; with less than
 #: three periods of 20 ms a busy machine makes gaps.
 BUFFER_MS = 60
@@ -54,10 +56,10 @@ class Known:
     about: str
     #: the package of Debian's that the program comes in
     package: str = ""
-    #: what the program takes for a device, for people
-    devices: str = ""
     #: makes the program's command, of the samples per second and a device; None for a player that is no program
     command: Callable[[int, str | None], Command] | None = None
+    #: … and opens that one, of the same
+    opens: Callable[[int, str | None], Player] | None = None
 
 
 def _aplay(rate: int, device: str | None) -> Command:
@@ -93,21 +95,34 @@ def _au_header(rate: int) -> bytes:
     return b"dns." + struct.pack("<5I", 24, endless, pcm16, rate, 1)
 
 
+def _null(rate: int, _: str | None) -> Player:
+    from talkcli.engine.players.null import NullPlayer
+
+    return NullPlayer(rate)
+
+
 #: The players that `talk` knows by name. The programs among them are tried in this order where none is named: `aplay`
 #: first, as it opens the device before it reads, so that a failure is known before a sample is lost, and as it is there
 #: on a robot without a desktop.
 PLAYERS = {
-    "aplay": Known("ALSA", "alsa-utils", "one that 'aplay -L' lists, such as plughw:1,0", _aplay),
-    "pacat": Known("PulseAudio", "pulseaudio-utils", "one of 'pactl list short sinks'", _pacat),
-    "pw-cat": Known("PipeWire", "pipewire-bin", "the name of a node, as in 'pw-cli ls Node'", _pw_cat),
-    "null": Known("silent, in real time"),
+    "aplay": Known("ALSA", "alsa-utils", _aplay),
+    "pacat": Known("PulseAudio", "pulseaudio-utils", _pacat),
+    "pw-cat": Known("PipeWire", "pipewire-bin", _pw_cat),
+    "null": Known("silent, in real time", opens=_null),
 }
+#: How the player begins that is a file; its path follows.
+FILE = "file:"
 _PROGRAMS = {name: each.command for name, each in PLAYERS.items() if each.command is not None}
 #: The programs among them, and the package each comes in.
 PACKAGES = {name: PLAYERS[name].package for name in _PROGRAMS}
 *_OTHERS, _LAST = [f"{package} ({name})" for name, package in PACKAGES.items()]
 #: What is said where none of them is there.
 NO_PLAYER = f"no player found: install {', '.join(_OTHERS)} or {_LAST}"
+
+
+def is_silent(player: str | None) -> bool:
+    """Tell whether a player makes no sound by its nature, so that it needs no device."""
+    return player is not None and (player == "null" or player.startswith(FILE))
 
 
 def commands(

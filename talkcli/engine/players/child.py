@@ -27,7 +27,7 @@ import signal
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
 #: Bytes that the pipe can hold, where the system lets us choose: one page. A pipe of one page is what makes poll say
 #: "writable" only when the player has taken everything.
@@ -45,7 +45,7 @@ class Child:
 
     def __init__(self, argv: tuple[str, ...], inherited: Sequence[int] = ()) -> None:
         """Start it; OSError if that is impossible. It inherits the descriptors given."""
-        (stdin, our_stdin), (our_stderr, stderr), (tied, leash) = _open_pipes(3)
+        (stdin, our_stdin), (our_stderr, stderr), (tied, leash) = open_pipes(3)
         try:
             os.set_blocking(our_stdin, False)
             os.set_blocking(our_stderr, False)
@@ -54,10 +54,10 @@ class Child:
             self.pid = _spawn(argv, stdin, stderr, [tied, *inherited])
             _tie(tied, self.pid)
         except BaseException:
-            _close(our_stdin, our_stderr, leash)
+            close(our_stdin, our_stderr, leash)
             raise
         finally:
-            _close(stdin, stderr, tied)
+            close(stdin, stderr, tied)
         #: the ends of its standard input and of its standard error, None once they are closed; neither blocks
         self.stdin: int | None = our_stdin
         self.stderr: int | None = our_stderr
@@ -87,8 +87,7 @@ class Child:
     def kill(self) -> None:
         """Kill it and what it has started."""
         if self._status is None:  # not reaped yet, so its group can't be another's
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.pid, signal.SIGKILL)
+            kill([-self.pid])
 
     def await_end(self, seconds: float) -> None:
         """Wait on the spot for its end, where the system tells of it."""
@@ -100,13 +99,13 @@ class Child:
     def close_stdin(self) -> None:
         """Have its input end."""
         if self.stdin is not None:
-            _close(self.stdin)
+            close(self.stdin)
             self.stdin = None
 
     def close_stderr(self) -> None:
         """Hear its errors no more."""
         if self.stderr is not None:
-            _close(self.stderr)
+            close(self.stderr)
             self.stderr = None
 
     def release(self) -> None:
@@ -114,20 +113,20 @@ class Child:
         self.close_stdin()
         self.close_stderr()
         if self.exit is not None:
-            _close(self.exit)
+            close(self.exit)
             self.exit = None
         if self._leash is not None:
-            _close(self._leash)
+            close(self._leash)
             self._leash = None
 
 
-def _open_pipes(count: int) -> list[tuple[int, int]]:
+def open_pipes(count: int) -> list[tuple[int, int]]:
     """Open all of these pipes, or none; the ends are reading, writing."""
     with contextlib.ExitStack() as opened:
         pipes = []
         for _ in range(count):
             pipes.append(os.pipe())
-            opened.callback(_close, *pipes[-1])
+            opened.callback(close, *pipes[-1])
         opened.pop_all()
     return pipes
 
@@ -168,7 +167,8 @@ def _exit_descriptor(pid: int) -> int | None:
         return None
 
 
-def _close(*descriptors: int) -> None:
+def close(*descriptors: int) -> None:
+    """Close all of these."""
     for each in descriptors:
         os.close(each)
 
@@ -185,21 +185,25 @@ def kill_holders(pipe: int) -> bool:
 
     Return whether any of them was killed: others can't be, or can't be found.
     """
-    killed = False
     if not is_held(pipe, _MOMENT):
-        return killed
-    for pid in _holders(f"pipe:[{os.fstat(pipe).st_ino}]"):
+        return False
+    link, own = f"pipe:[{os.fstat(pipe).st_ino}]", os.getpid()
+    return kill(pid for pid in processes() if pid != own and link in _links(f"/proc/{pid}/fd"))
+
+
+def kill(pids: Iterable[int]) -> bool:
+    """Kill processes, a group by its negative number; return whether any of them was there and could be killed."""
+    killed = False
+    for pid in pids:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.kill(pid, signal.SIGKILL)
             killed = True
     return killed
 
 
-def _holders(link: str) -> Iterator[int]:
-    own = str(os.getpid())
-    for name in _names("/proc"):
-        if name.isdigit() and name != own and link in _links(f"/proc/{name}/fd"):
-            yield int(name)
+def processes() -> list[int]:
+    """Return all processes, where there is a /proc to tell them and a descriptor to read it with."""
+    return [int(name) for name in _names("/proc") if name.isdigit()]
 
 
 def _links(folder: str) -> Iterator[str]:
@@ -213,3 +217,11 @@ def _names(folder: str) -> list[str]:
         return os.listdir(folder)
     except OSError:  # another user's, or gone; or there is none
         return []
+
+
+def signal_name(number: int) -> str:
+    """Return what a signal is called, for people."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

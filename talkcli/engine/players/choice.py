@@ -10,9 +10,8 @@ import time
 from collections import deque
 from functools import partial
 
-from talkcli.engine.players import commands, on_path
+from talkcli.engine.players import FILE, PLAYERS, commands, on_path
 from talkcli.engine.players.base import CannotSpeak
-from talkcli.engine.players.null import NullPlayer
 from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
 
@@ -21,10 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from talkcli.engine.players.base import Player
-
-#: The players that are no programs, by their names in the table: what opens one, for samples per second and a device.
-_BUILT_IN: dict[str, Callable[[int, str | None], Player]] = {"null": lambda rate, _: NullPlayer(rate)}
-_FILE = "file:"
+    from talkcli.engine.protocol import Configure
 
 #: Seconds after which a device that was let go of counts as idle, and gets the lead-in again: the power saving of sound
 #: cards (snd_hda_intel) begins after 1 s where it is on, sound servers suspend a device after 5 s. Silence counts as
@@ -78,53 +74,37 @@ class Gap:
 
 
 class Players:
-    """The player setting of one engine process."""
+    """Where the sound of one engine process goes, as it was told at its start."""
 
-    def __init__(
-        self,
-        player: str | None,
-        device: str | None,
-        inherited: Sequence[int] = (),
-        lead_in: float = 0.0,
-        output: int | None = None,
-    ) -> None:
-        """`inherited` are descriptors that every player program gets, `lead_in` seconds for a device that slept.
-
-        `output`: a descriptor that gets a WAV file of all sentences, instead of any player.
-        """
-        self._player = player
-        self._device = device
+    def __init__(self, configure: Configure, inherited: Sequence[int] = ()) -> None:
+        """`inherited`: descriptors that every player program gets."""
+        self._configure = configure
         self._inherited = inherited
-        self._lead_in = lead_in
-        self._output = output
+        #: opens the player that is no program, for samples per second; None where programs play
+        self._built_in = self._opens()
         self._streaming = False
         #: what lies between two sentences
         self.gap = Gap()
-        #: seconds of silence that the sentence in hand brings along; None for what it was told at the start
-        self._own_lead_in: float | None = None
+        #: milliseconds of silence that the sentence in hand brings along; None for what it was told at the start
+        self._own_lead_in: int | None = None
         self._worked: str | None = None
         self._used_at: float | None = None
 
     @property
     def is_program(self) -> bool:
         """Whether what plays is a program, which takes a while to start."""
-        player = self._player or ""
-        return self._output is None and player not in _BUILT_IN and not player.startswith(_FILE)
+        return self._built_in is None
 
     def candidates(self, rate: int) -> list[Callable[[], Player]]:
         """Return what opens the players to try for a sentence, best first; CannotSpeak if there is none."""
-        if self._output is not None:
-            return [partial(self._stream, self._output, rate)]
-        if self._player in _BUILT_IN:
-            return [partial(_BUILT_IN[self._player], rate, self._device)]
-        if self._player is not None and self._player.startswith(_FILE):
-            return [partial(WavPlayer, self._player[len(_FILE) :], rate)]
-        found = commands(self._player, self._device, rate, on_path, self._worked)
+        if self._built_in is not None:
+            return [partial(self._built_in, rate)]
+        found = commands(self._configure.player, self._configure.device, rate, on_path, self._worked)
         return [partial(ProgramPlayer, command, self._inherited) for command in found]
 
     def begin(self, lead_in: int | None, followed: bool) -> None:
         """Take note of a new sentence: milliseconds of a lead-in of its own, and whether a goal waits behind it."""
-        self._own_lead_in = None if lead_in is None else lead_in / 1000
+        self._own_lead_in = lead_in
         self.gap.followed = followed
 
     def worked(self, name: str) -> None:
@@ -143,20 +123,28 @@ class Players:
         """
         idle = self._used_at is None or time.monotonic() - self._used_at >= IDLE_AFTER
         own = self._own_lead_in
-        if own is None:
-            return self._lead_in if idle else 0.0
-        return own if begins or idle else 0.0
+        wanted, due = (self._configure.lead_in, idle) if own is None else (own, begins or idle)
+        return wanted / 1000 if due else 0.0
 
     def first(self) -> str | None:
         """Return the name of what is tried first, for people; None if nothing is found."""
-        if self._output is not None:
+        if self._configure.output is not None:
             return WavStreamPlayer.name
-        if self._player is not None:
-            return self._player
+        if self._configure.player is not None:
+            return self._configure.player
         try:
-            return commands(None, None, 1, on_path, self._worked)[0].name
+            return commands(None, None, 1, on_path, None)[0].name
         except CannotSpeak:
             return None
+
+    def _opens(self) -> Callable[[int], Player] | None:
+        player, device, output = self._configure.player or "", self._configure.device, self._configure.output
+        if output is not None:
+            return partial(self._stream, output)
+        if player.startswith(FILE):
+            return partial(WavPlayer, player.removeprefix(FILE))
+        opens = PLAYERS[player].opens if player in PLAYERS else None
+        return opens and (lambda rate: opens(rate, device))
 
     def _stream(self, output: int, rate: int) -> WavStreamPlayer:
         first, self._streaming = not self._streaming, True

@@ -6,15 +6,16 @@ moment to be reaped. Of what it says on standard error the line is kept that nam
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import select
-import signal
 import struct
+import termios
 import time
 
 from talkcli.engine.players.base import CannotSpeak
-from talkcli.engine.players.child import Child, is_held
+from talkcli.engine.players.child import Child, is_held, signal_name
 from talkcli.splitter import LineSplitter
 
 TYPE_CHECKING = False
@@ -95,10 +96,13 @@ class ProgramPlayer:
         """Start the player; CannotSpeak (no_player) if that is impossible. It inherits the descriptors given."""
         self.name = command.name
         self.proven = False
-        self._read_ahead = command.read_ahead
-        self._at_start = command.at_start
+        self._command = command
         self._complaint = Complaint()
-        self._child = _start(command, inherited)
+        try:
+            self._child = Child(command.argv, inherited)
+        except OSError as error:
+            text = error.strerror or str(error)
+            raise CannotSpeak("no_player", f"{self.name} cannot be started: {text}") from error
         self._overhead = len(command.preamble)
         self._written = 0
         self._consumed = 0
@@ -117,7 +121,7 @@ class ProgramPlayer:
         if waiting == 0 or not is_held(self._child.stdin):
             return self._write(data)
         # But a player that has taken nothing yet is to find what it needs to begin.
-        room = self._at_start - waiting if waiting == self._written else 0
+        room = self._command.at_start - waiting if waiting == self._written else 0
         return self._write(data[:room]) if room > 0 else 0
 
     def consumed(self) -> int:
@@ -126,7 +130,7 @@ class ProgramPlayer:
             self._consumed = max(self._consumed, self._written - _unread(self._child.stdin) - self._overhead)
         elif self._closed:
             self._consumed = self._written - self._overhead
-        if self._consumed > self._read_ahead:
+        if self._consumed > self._command.read_ahead:
             self.proven = True
         return self._consumed
 
@@ -201,7 +205,7 @@ class ProgramPlayer:
         self.consumed()
         line = self._complaint.line()
         if status < 0:
-            return CannotSpeak("audio_lost", f"{self.name} was killed by {_signal_name(-status)}")
+            return CannotSpeak("audio_lost", f"{self.name} was killed by {signal_name(-status)}")
         if status == 0:
             return CannotSpeak("audio_lost", line or f"{self.name} ended before the sound did")
         reason = "audio_lost" if self.proven else "audio_device"
@@ -220,27 +224,9 @@ class ProgramPlayer:
             self._child.close_stderr()
 
 
-def _start(command: Command, inherited: Sequence[int]) -> Child:
-    try:
-        return Child(command.argv, inherited)
-    except OSError as error:
-        text = error.strerror or str(error)
-        raise CannotSpeak("no_player", f"{command.name} cannot be started: {text}") from error
-
-
 def _unread(pipe: int) -> int:
     """Return how many bytes wait in the pipe; 0 where the system does not tell."""
-    import fcntl
-    import termios
-
     try:
         return int(struct.unpack("i", fcntl.ioctl(pipe, termios.FIONREAD, b"\0\0\0\0"))[0])
     except OSError:
         return 0
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
