@@ -17,7 +17,7 @@ from talkcli.frozen import fields, frozen
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from typing import Any, ClassVar
+    from typing import Any
 
 #: Seconds between two messages of an engine process that has a goal in hand. Far below `HANG_AFTER`, so that one
 #: late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
@@ -51,7 +51,6 @@ FAILED = "failed"  # ended by an error: `reason` and `message` say which
 class Configure:
     """What an engine process is told at its start."""
 
-    kind: ClassVar[str] = "configure"
     #: process id of the server: a process whose parent is another one has been orphaned already, and ends.
     server: int
     #: name of a pyttsx3 driver, or None for the one that fits this system (`talk`'s own on Linux).
@@ -74,7 +73,6 @@ class Configure:
 class Say:
     """Speak `text`. Settings are absolute; None leaves the driver's default."""
 
-    kind: ClassVar[str] = "say"
     id: str
     text: str
     rate: int  # words per minute, 80 to 450
@@ -89,7 +87,6 @@ class Say:
 class Stop:
     """Be silent now. A stop for a goal that is not being spoken is ignored: it ended before the stop arrived."""
 
-    kind: ClassVar[str] = "stop"
     id: str
 
 
@@ -97,7 +94,6 @@ class Stop:
 class Pause:
     """Hold the sentence where it is; `Paused` comes when it is silent. Ignored where the goal isn't being spoken."""
 
-    kind: ClassVar[str] = "pause"
     id: str
     number: int  # of the pause in the goal, from 1
 
@@ -106,7 +102,6 @@ class Pause:
 class Resume:
     """Go on where the sentence was held. Ignored where it is not held."""
 
-    kind: ClassVar[str] = "resume"
     id: str
 
 
@@ -114,7 +109,6 @@ class Resume:
 class Followed:
     """Another goal waits behind the one that is being spoken, or no longer does."""
 
-    kind: ClassVar[str] = "followed"
     id: str
     followed: bool
 
@@ -123,7 +117,6 @@ class Followed:
 class Quit:
     """End the process; the sentence being spoken, if any, is stopped first."""
 
-    kind: ClassVar[str] = "quit"
 
 
 @frozen
@@ -139,7 +132,6 @@ class Voice:
 class Ready:
     """The engine is initialised and takes a `Say`."""
 
-    kind: ClassVar[str] = "ready"
     driver: str
     version: str | None  # of the synthesiser, for people: "eSpeak NG 1.51 (system)"
     player: str | None  # what will be tried first, for people
@@ -149,7 +141,6 @@ class Ready:
 class StartFailed:
     """The engine cannot start; the process ends after this."""
 
-    kind: ClassVar[str] = "start_failed"
     reason: str  # "engine_failed" or "unknown_voice"
     message: str  # names what is missing and what to install
     lasting: bool = True  # whether the next start will fail for it, too, if nobody changes something
@@ -160,7 +151,6 @@ class StartFailed:
 class Voices:
     """All voices of the driver; sent once, right after `Ready`, where `Configure` asks for it."""
 
-    kind: ClassVar[str] = "voices"
     voices: tuple[Voice, ...]
 
 
@@ -168,7 +158,6 @@ class Voices:
 class Started:
     """The `Say` was taken in hand."""
 
-    kind: ClassVar[str] = "started"
     id: str
 
 
@@ -176,7 +165,6 @@ class Started:
 class Alive:
     """A sign of life from a process that has a goal in hand, at most `ALIVE_EVERY` seconds after the last message."""
 
-    kind: ClassVar[str] = "alive"
     id: str
 
 
@@ -184,7 +172,6 @@ class Alive:
 class Word:
     """A word begins to be heard, now, by the playback clock."""
 
-    kind: ClassVar[str] = "word"
     id: str
     start: int  # character offset in the text
     end: int  # offset after the word's last character
@@ -196,7 +183,6 @@ class Word:
 class Paused:
     """The sentence is held and silent, until `Resume` or `Stop`."""
 
-    kind: ClassVar[str] = "paused"
     id: str
     number: int  # of the pause that it answers
 
@@ -205,7 +191,6 @@ class Paused:
 class Ended:
     """The `Say` is over, and it is silent: the player is reaped, or its stream is closed."""
 
-    kind: ClassVar[str] = "ended"
     id: str
     outcome: str  # COMPLETED, STOPPED or FAILED
     reason: str | None = None  # of FAILED: audio_device, audio_lost, audio_stalled, no_player, nothing_to_say, …
@@ -218,8 +203,9 @@ Event = Ready | StartFailed | Voices | Started | Alive | Word | Paused | Ended
 #: The events that belong to a goal, by its `id`.
 OF_A_GOAL = (Started, Alive, Word, Paused, Ended)
 
-_COMMANDS = {each.kind: each for each in (Configure, Say, Stop, Pause, Resume, Followed, Quit)}
-_EVENTS = {each.kind: each for each in (Ready, StartFailed, Started, Alive, Word, Paused, Ended)}
+# In a line a message is called as its class is.
+_COMMANDS = {each.__name__: each for each in (Configure, Say, Stop, Pause, Resume, Followed, Quit)}
+_EVENTS = {each.__name__: each for each in (Ready, StartFailed, Voices, Started, Alive, Word, Paused, Ended)}
 
 # Made once: `json.dumps` makes another for each line that isn't written in its own way, and `json.loads` guesses at the
 # encoding of each; together that is a third of what the two ends of this socket do for a line.
@@ -229,7 +215,7 @@ _DECODER = json.JSONDecoder()
 
 def encode(message: Command | Event) -> bytes:
     """Return the message as a line."""
-    return _ENCODER.encode({"kind": message.kind, **fields(message)}).encode() + b"\n"
+    return _ENCODER.encode({"kind": type(message).__name__, **fields(message)}).encode() + b"\n"
 
 
 def decode_command(line: bytes) -> Command:
@@ -241,10 +227,10 @@ def decode_command(line: bytes) -> Command:
 def decode_event(line: bytes) -> Event:
     """Return the event in a line; ValueError, TypeError or KeyError if there is none."""
     fields = _fields(line)
-    kind = fields.pop("kind")
-    if kind == Voices.kind:
-        return Voices(tuple(Voice(**each) for each in fields["voices"]))
-    return _EVENTS[kind](**fields)
+    event = _EVENTS[fields.pop("kind")]
+    if event is Voices:
+        fields["voices"] = tuple(Voice(**each) for each in fields["voices"])
+    return event(**fields)
 
 
 def _fields(line: bytes) -> dict[str, Any]:

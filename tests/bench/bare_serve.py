@@ -41,7 +41,7 @@ class Engine:
 
     def say(self, goal_id: str) -> None:
         """Hand a goal to the process."""
-        self._socket.send(json.dumps({"kind": "say", "id": goal_id, "text": "length=0 words=0"}).encode() + b"\n")
+        self._socket.send(json.dumps({"kind": "Say", "id": goal_id, "text": "length=0 words=0"}).encode() + b"\n")
 
     def _run(self) -> None:
         while data := self._socket.recv(65536):

@@ -133,7 +133,7 @@ def test_row_44_a_goal_that_nobody_stopped_cannot_have_been_stopped(talk: Talk) 
 
 
 def test_row_44_an_engine_that_says_what_is_no_message_takes_nothing_along(talk: Talk) -> None:
-    lines = ("no-json", "[]", "{}", '{"kind":"sing"}', '{"kind":"word","id":7}', "\x01", '{"kind":"ended"}')
+    lines = ("no-json", "[]", "{}", '{"kind":"sing"}', '{"kind":"Word","id":7}', "\x01", '{"kind":"Ended"}')
     with talk.connect() as wire:
         for line in lines:
             goal_id = wire.request("say", text=f"started raw={line} ended=completed", wait=True)["goal"]["id"]
