@@ -6,8 +6,7 @@ one of his own, in a conversation.
 What makes "silent" provable is one pipe that nobody writes to: the engine process and its player inherit the writing
 end, so its reading end shows end of file exactly when both are gone, however they went.
 
-What the process writes to standard error comes out of here as whole lines, and no more of them than a log can take: a
-driver of somebody else's may write a line for each word, for months.
+What the process writes to standard error comes out of here as whole lines; the last one is a crash's own words.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ from talkcli.client.connect import ready
 from talkcli.engine import protocol
 from talkcli.engine.players.child import close, kill, kill_holders, open_pipes, processes, signal_name
 from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
-from talkcli.quota import Quota
 from talkcli.splitter import LineSplitter
 
 if TYPE_CHECKING:
@@ -37,13 +35,9 @@ if TYPE_CHECKING:
 _NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
 #: Bytes that may wait to be read by the process: the longest text, escaped, fits several times.
 _SEND_BUFFER = 512 * 1024
-#: Bytes of standard error kept: its last line goes into the message of a crash.
-_STDERR_KEPT = 4096
 #: Seconds a process that closed its connection is given to end by itself, so that its own exit status is seen.
 _LAST_BREATH = 0.2
-#: Lines of standard error that are passed on in a while, and the seconds of that: a whole traceback, and no flood.
-LINES, WHILE = 20, 60.0
-#: Bytes of such a line that are kept, of one that never ends as well.
+#: Bytes of a line of standard error that are kept, of one that never ends as well.
 LONGEST = 1000
 
 
@@ -62,11 +56,11 @@ class EngineProcess:
     def __init__(
         self,
         configure: protocol.Configure,
-        on_stderr: Callable[[bytes], None] = lambda _: None,
+        on_line: Callable[[str], None] = lambda _: None,
         env: Mapping[str, str] | None = None,
         command: list[str] | None = None,
     ) -> None:
-        """`on_stderr` is called with what is read of its standard error, empty at the end.
+        """`on_line` is called with each line that is read of its standard error.
 
         `env`: if not this process's; `command`: its command line, if not `engine_command`'s.
         """
@@ -78,8 +72,9 @@ class EngineProcess:
         # Held for a send that doesn't wait: the descriptor must not be closed, and be another's, in the middle of one.
         self._sending = threading.Lock()
         self._lines = LineSplitter()
-        self._stderr_tail = b""
-        self._on_stderr = on_stderr
+        self._stderr_lines = LineSplitter(LONGEST)
+        self._last_line = ""
+        self._on_line = on_line
         environment = {name: value for name, value in (env or os.environ).items() if name not in _NOT_INHERITED}
         with contextlib.ExitStack() as kept, contextlib.ExitStack() as handed_over:
             self.socket, theirs = socket.socketpair()
@@ -137,14 +132,20 @@ class EngineProcess:
                 return
 
     def read_stderr(self) -> bool:
-        """Keep the end of what the process wrote to standard error; False once that is closed."""
+        """Read what the process wrote to standard error; False once that is closed."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
             return True
-        self._stderr_tail = (self._stderr_tail + data)[-_STDERR_KEPT:]
-        self._on_stderr(data)
+        self._complain(data or b"\n")
         return bool(data)
+
+    def _complain(self, data: bytes) -> None:
+        for line in self._stderr_lines.feed(data):
+            words = line.decode(errors="replace").rstrip()
+            if words:
+                self._last_line = words.lstrip()
+                self._on_line(words)
 
     def kill(self) -> None:
         """Kill the process, its player, and what that has started.
@@ -171,9 +172,9 @@ class EngineProcess:
         except subprocess.TimeoutExpired:
             return "it closed its connection"
         self.read_stderr()
-        lines = [line.strip() for line in self._stderr_tail.decode(errors="replace").splitlines() if line.strip()]
+        self._complain(b"\n")  # that was its last
         how = f"it was killed by {signal_name(-status)}" if status < 0 else f"it exited with status {status}"
-        return f"{how} ({lines[-1]})" if lines else how
+        return f"{how} ({self._last_line})" if self._last_line else how
 
     def _await_exit(self) -> None:
         """Let the process end by itself, so that its own exit status is seen; it stays to be reaped."""
@@ -195,26 +196,6 @@ class EngineProcess:
         with self._sending:
             self.socket.close()
         close(self.liveness, self.stderr)
-
-
-class Murmur:
-    """Lines from standard error, of one engine process after the other."""
-
-    def __init__(self) -> None:
-        self._lines = LineSplitter(LONGEST)
-        self._quota = Quota(LINES, WHILE)
-
-    def take(self, data: bytes, now: float) -> list[str]:
-        """Take what was written, and return the lines to pass on; no data means that the process wrote its last."""
-        passed = []
-        for line in self._lines.feed(data or b"\n"):
-            left_out = self._quota.take(now) if line.strip() else None
-            if left_out is None:
-                continue
-            if left_out:
-                passed.append(f"({left_out} lines were left out)")
-            passed.append(line.decode(errors="replace").rstrip())
-        return passed
 
 
 class EngineFailed(Exception):

@@ -118,7 +118,6 @@ class Quit:
     """End the process; the sentence being spoken, if any, is stopped first."""
 
 
-
 @frozen
 class Voice:
     """One voice of the driver's."""

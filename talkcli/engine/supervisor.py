@@ -14,15 +14,20 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.inbox import NEVER, Inbox
-from talkcli.engine.process import EngineProcess, Murmur
+from talkcli.engine.process import EngineProcess
 from talkcli.engine.protocol import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
 from talkcli.frozen import frozen, replace
+from talkcli.quota import Quota
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 #: Seconds before the next start, by the number of processes in a row that died before they were of use.
 BACK_OFF = (0.0, 0.1, 0.5, 2.0, 10.0)
+
+#: Lines of the process's standard error that are passed on in a while, and the seconds of that: a whole traceback, and
+#: no flood, as a driver of somebody else's may write a line for each word, for months.
+LINES, WHILE = 20, 60.0
 
 #: A ready process that dies sooner than this, with no goal in hand, was of no use.
 SHORT_LIFE = 1.0
@@ -79,10 +84,6 @@ class Restarts:
         #: since when there has been no ready process
         self._missing_since = now
 
-    def ready(self) -> None:
-        """Take note that a process is ready."""
-        self.error = None
-
     def died(self, now: float, *, age: float, had_goal: bool) -> None:
         """Plan the start after a process that had been ready; one that died over a goal costs no wait."""
         self._missing_since = now
@@ -138,11 +139,6 @@ class Handed:
         """Whether a process has it."""
         return self.heard_at is not None
 
-    @property
-    def ending(self) -> bool:
-        """Whether it was told to stop, or has lost its process."""
-        return self.stop_at is not None or self.verdict is not None
-
 
 class Supervisor:
     """Owns the engine process. `post` is called in its thread: with what the process says, an `Ended` for each goal."""
@@ -162,7 +158,7 @@ class Supervisor:
         self._goal: Handed | None = None
         #: the killed ones that are not known to be gone
         self._dying: list[EngineProcess] = []
-        self._murmur = Murmur()
+        self._complaints = Quota(LINES, WHILE)
         self._closing = False
 
     # -- called from other threads
@@ -285,6 +281,10 @@ class Supervisor:
 
     # -- goals
 
+    def _in_hand(self, goal_id: str) -> Handed | None:
+        """Return the goal if it has not ended meanwhile."""
+        return self._goal if self._goal and self._goal.id == goal_id else None
+
     def _take(self, say: protocol.Say, sent: EngineProcess | None = None, at: float = 0.0) -> None:
         """Take a goal in hand, one that was sent to a process already, or is to be: where that one is lost since."""
         self._goal = Handed(say)
@@ -298,8 +298,9 @@ class Supervisor:
     def _not_taken(self, goal_id: str, process: EngineProcess) -> None:
         """Let a goal wait for the next process: this one doesn't have it."""
         if process is self._process:
-            if self._goal and self._goal.id == goal_id:
-                self._goal.heard_at = None
+            goal = self._in_hand(goal_id)
+            if goal:
+                goal.heard_at = None
             self._refused(process)
 
     def _refused(self, process: EngineProcess) -> None:
@@ -320,13 +321,14 @@ class Supervisor:
             self._refused(self._process)
 
     def _tell_followed(self, goal_id: str, followed: bool) -> None:
-        if self._process and self._goal and self._goal.id == goal_id and self._goal.spoken:
+        goal = self._in_hand(goal_id)
+        if self._process and goal and goal.spoken:
             # No command: an engine that has no room for it at this moment is not hung for that, and little is lost.
             self._process.send(protocol.Followed(goal_id, followed))
 
     def _hold(self, goal_id: str, pause: int | None) -> None:
-        goal = self._goal
-        if goal is None or goal.id != goal_id or goal.ending or goal.pause is pause is None:
+        goal = self._in_hand(goal_id)
+        if goal is None or goal.stop_at is not None or goal.verdict or goal.pause is pause is None:
             return  # it ended, or is about to, while this was on its way
         goal.pause = pause
         goal.pause_at = time.monotonic() if goal.spoken and pause is not None else None
@@ -338,8 +340,8 @@ class Supervisor:
             self._hand_over()
 
     def _begin_stop(self, goal_id: str) -> None:
-        goal = self._goal
-        if goal is None or goal.id != goal_id or goal.stop_at is not None:
+        goal = self._in_hand(goal_id)
+        if goal is None or goal.stop_at is not None:
             return  # it ended while the stop was on its way
         if goal.verdict:
             goal.verdict = protocol.Ended(goal_id, protocol.STOPPED)
@@ -350,9 +352,10 @@ class Supervisor:
             self._process.send(protocol.Stop(goal_id))
 
     def _abandon(self, goal_id: str) -> None:
-        if self._goal and self._goal.id == goal_id:
-            spoken, self._goal = self._goal.spoken, None
-            if spoken:
+        goal = self._in_hand(goal_id)
+        if goal:
+            self._goal = None
+            if goal.spoken:
                 self._lose_process("the engine could not be silenced", "not_silent")
         self._open = self._process if self._process and self._process.ready else None
 
@@ -365,7 +368,7 @@ class Supervisor:
     def _start(self) -> None:
         self._started_at = time.monotonic()
         try:
-            process = EngineProcess(self._configure, self._murmured)
+            process = EngineProcess(self._configure, self._complain)
         except OSError as error:
             words = f"the engine process cannot be started: {error.strerror or error}"
             self._post(EngineDied(words))
@@ -389,8 +392,11 @@ class Supervisor:
         self._open = None
         self._lose_process(f"the engine crashed: {process.last_words()}", "engine_crashed")
 
-    def _murmured(self, data: bytes) -> None:
-        for words in self._murmur.take(data, time.monotonic()):
+    def _complain(self, words: str) -> None:
+        left_out = self._complaints.take(time.monotonic())
+        if left_out:
+            self._post(EngineSaid(f"({left_out} lines were left out)"))
+        if left_out is not None:
             self._post(EngineSaid(words))
 
     def _note(self, process: EngineProcess, event: protocol.Event) -> None:
@@ -411,7 +417,7 @@ class Supervisor:
             return
         if isinstance(event, protocol.Ready):
             process.ready = True
-            self._restarts.ready()
+            self._restarts.error = None
             self._open = process
         elif isinstance(event, protocol.StartFailed):
             process.failed = event

@@ -11,8 +11,7 @@ import pytest
 
 import talkcli
 from talkcli.engine import protocol, supervisor
-from talkcli.engine.process import LINES
-from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid
+from talkcli.engine.supervisor import LINES, EngineDied, EngineMissing, EngineSaid
 from tests.engine.threads import Thread, start
 
 if TYPE_CHECKING:

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-import itertools
 import os
+import select
 import selectors
 import socket
+import sys
+import time
 from typing import TYPE_CHECKING, cast
 
 import pytest
 
+from talkcli.client.connect import ready
 from talkcli.engine import protocol
-from talkcli.engine.process import LINES, LONGEST, WHILE, Murmur
+from talkcli.engine.process import LONGEST, EngineProcess
 from talkcli.engine.protocol import SILENCE_LIMIT
-from talkcli.engine.supervisor import BACK_OFF, PATIENCE, SHORT_LIFE, Handed, Restarts, Supervisor
+from talkcli.engine.supervisor import (
+    BACK_OFF,
+    LINES,
+    PATIENCE,
+    SHORT_LIFE,
+    WHILE,
+    EngineSaid,
+    Handed,
+    Restarts,
+    Supervisor,
+)
 
 if TYPE_CHECKING:
-    from talkcli.engine.process import EngineProcess
     from talkcli.engine.supervisor import Report
 
 
@@ -53,7 +65,7 @@ def test_what_is_known_to_stay_is_an_error_until_the_next_start_says_otherwise()
     restarts = Restarts(100.0)
     assert not restarts.failed(100.0, 100.0, LACKING)
     assert restarts.error == LACKING
-    restarts.ready()
+    restarts.error = None
     assert restarts.error is None
     restarts.died(200.0, age=SHORT_LIFE * 2, had_goal=False)
     restarts.failed(200.0, 200.0, LACKING)
@@ -66,35 +78,49 @@ def test_a_start_costs_a_goal_only_where_it_began_long_after_there_was_a_process
     assert not restarts.failed(100.0 + PATIENCE + 5, 100.0 + PATIENCE - 0.1, None)
     assert restarts.failed(100.0 + PATIENCE, 100.0 + PATIENCE, None)
     assert restarts.failed(100.0 + PATIENCE + 10, 100.0 + PATIENCE + 10, None)
-    restarts.ready()
+    restarts.error = None
     restarts.died(300.0, age=SHORT_LIFE * 2, had_goal=False)
     assert not restarts.failed(300.0, 300.0, None)
     assert restarts.failed(300.0 + PATIENCE, 300.0 + PATIENCE, None)
     assert restarts.error is None
 
 
-def test_lines_are_passed_on_when_they_are_whole() -> None:
-    murmur = Murmur()
-    assert murmur.take(b"one\ntw", 0.0) == ["one"]
-    assert murmur.take(b"o\n\n  \nthr\xffee", 0.0) == ["two"]
-    assert murmur.take(b"", 0.0) == ["thr\ufffdee"]
-    assert murmur.take(b"", 0.0) == []
+def _complaining(script: str) -> tuple[list[str], str]:
+    """Return the lines that a process passes on which writes to standard error, and its last words."""
+    lines: list[str] = []
+    configure = protocol.Configure(os.getpid(), None, None, None, None)
+    process = EngineProcess(configure, lines.append, command=[sys.executable, "-c", f"import os\n{script}"])
+    while process.stderr in ready({process.stderr: select.POLLIN}, 20.0) and process.read_stderr():
+        pass
+    words = process.last_words()
+    process.close()
+    return lines, words
+
+
+def test_lines_are_passed_on_when_they_are_whole_and_the_last_is_a_crashs_own() -> None:
+    lines, words = _complaining("for each in (b'one\\ntw', b'o\\n\\n  \\n thr\\xffee'): os.write(2, each)")
+    assert lines == ["one", "two", " thr\ufffdee"]
+    assert words == "it exited with status 0 (thr\ufffdee)"
 
 
 def test_a_line_that_never_ends_is_not_kept() -> None:
-    murmur = Murmur()
-    for _ in range(100):
-        assert murmur.take(b"x" * 65536, 0.0) == []
-    assert murmur.take(b"\n", 0.0) == ["x" * LONGEST]
+    assert _complaining("for _ in range(100): os.write(2, b'x' * 65536)")[0] == ["x" * LONGEST]
 
 
-def test_what_is_too_much_is_counted_and_told_with_the_next_lines() -> None:
-    murmur = Murmur()
-    passed = list(itertools.chain.from_iterable(murmur.take(b"x\n" * 10, second) for second in range(10)))
-    assert passed == ["x"] * LINES
-    assert murmur.take(b"y\n", WHILE - 0.1) == []
-    assert murmur.take(b"z\n", WHILE) == [f"({100 + 1 - LINES} lines were left out)", "z"]
-    assert murmur.take(b"z\n", 2 * WHILE) == ["z"]
+def test_what_is_too_much_is_counted_and_told_with_the_next_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    passed: list[Report] = []
+    engine, now = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), passed.append), 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    for number in range(100):
+        now = 1000.0 + number / 10
+        engine._complain("x")
+    assert passed == [EngineSaid("x")] * LINES
+    for later in (WHILE - 0.1, WHILE, 2 * WHILE):
+        now = 1000.0 + later
+        engine._complain(f"{later}")
+    told = [f"({100 + 1 - LINES} lines were left out)", f"{WHILE}", f"{2 * WHILE}"]
+    assert passed[LINES:] == [EngineSaid(each) for each in told]
+    engine._inbox.close()
 
 
 class Undying:
