@@ -136,16 +136,13 @@ def by_engine(text: str, setting: Setting, volume: float, limit: float) -> Playe
     """Play a sentence by an engine process, in at most `limit` seconds, and return how that went."""
     try:
         with conversation(setting, limit) as engine:
-            player = setting.player
-            for event in engine.events():
-                if isinstance(event, protocol.Ready):
-                    player = event.player
-                    rate = _RATE if volume else _SILENT_RATE
-                    engine.say(protocol.Say("doctor", text, rate, volume, setting.voice, 50))
-                elif isinstance(event, protocol.Ended):
-                    if event.outcome == protocol.COMPLETED:
-                        return Played(State.SUCCEEDED, duration=event.duration, player=player)
-                    return Played(State.ABORTED, event.reason, event.message or event.outcome, player=player)
+            player = engine.until(protocol.Ready).player
+            rate = _RATE if volume else _SILENT_RATE
+            engine.say(protocol.Say("doctor", text, rate, volume, setting.voice, 50))
+            ended = engine.until(protocol.Ended)
+            if ended.outcome == protocol.COMPLETED:
+                return Played(State.SUCCEEDED, duration=ended.duration, player=player)
+            return Played(State.ABORTED, ended.reason, ended.message or ended.outcome, player=player)
     except EngineFailed as error:
         return Played(State.ABORTED, *fault(error))
     except TimeoutError:

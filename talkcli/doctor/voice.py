@@ -72,11 +72,9 @@ def look(setting: Setting) -> Engine:
     found = Engine()
     try:
         with conversation(setting) as engine:
-            for event in engine.events():
-                if isinstance(event, protocol.Ready):
-                    found = Engine(event.driver, event.version)
-                elif isinstance(event, protocol.Voices):
-                    return Engine(found.driver, found.synthesizer, len(event.voices))
+            ready = engine.until(protocol.Ready)
+            found = Engine(ready.driver, ready.version)
+            return Engine(ready.driver, ready.version, len(engine.until(protocol.Voices).voices))
     except EngineFailed as error:
         if found.driver is None or error.reason == "engine_crashed":
             reason, words = fault(error)

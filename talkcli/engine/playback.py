@@ -156,8 +156,9 @@ class Playback:
         for word in self._clock.rest():
             self._on_word(word)
         if self._stream is not None:
-            self._players.worked(self._stream.player.name)
-            self._players.gap.ended(self._stream.player.name, self._stream.over_at(time.monotonic()))
+            name, now = self._stream.player.name, time.monotonic()
+            self._players.worked(name)
+            self._players.gap.ended(name, now + self._stream.unheard(self._stream.written, now))
         return self._seconds(self._sent)
 
     def stop(self) -> None:
@@ -292,8 +293,10 @@ class Playback:
         return True
 
     def _offer(self, stream: Stream) -> int:
-        if stream.leading_in:
-            return stream.lead_in()
+        if stream.lead_in:
+            taken = stream.offer_silence(self._seconds(self._begin), stream.lead_in)
+            stream.lead_in -= taken
+            return taken
         with self._samples.part(self._sent, min(self._audible_end(stream), self._sent + stream.piece)) as part:
             taken = stream.offer(part)
         self._sent += taken
@@ -316,7 +319,7 @@ class Playback:
             return
         if stream.taken and not self._began:
             self._began = True
-            self._players.gap.began(player.name, stream.began_at(now))
+            self._players.gap.began(player.name, now - self._clock.elapsed(now))
         self._samples.forget(self._unheard() if player.real_time else self._sent)
         for word in self._clock.due(now) if player.real_time else self._clock.rest():
             self._on_word(word)

@@ -30,6 +30,9 @@ from talkcli.splitter import LineSplitter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+    from typing import TypeVar
+
+    _E = TypeVar("_E", bound=protocol.Event)
 
 #: Variables of the server's own supervisor, which its children must not answer to.
 _NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
@@ -245,6 +248,8 @@ class Conversation:
         except OSError as error:
             raise EngineFailed("engine_failed", f"the engine process cannot be started: {error}") from error
         self._heard_at = time.monotonic()
+        #: what the process says, without an end; raises as `until`
+        self.events = self._listen()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -261,8 +266,11 @@ class Conversation:
                 pass  # where it is dead, it is known how it died
             raise EngineFailed("engine_hung", "the engine takes no commands")
 
-    def events(self) -> Iterator[protocol.Event]:
-        """Give what the process says, without an end; EngineFailed, TimeoutError past the deadline, Interrupted."""
+    def until(self, kind: type[_E]) -> _E:
+        """Return the next of such events; EngineFailed, TimeoutError past the deadline, Interrupted."""
+        return next(event for event in self.events if isinstance(event, kind))
+
+    def _listen(self) -> Iterator[protocol.Event]:
         process = self._process
         watched = {process.socket.fileno(): select.POLLIN, process.stderr: select.POLLIN}
         while True:

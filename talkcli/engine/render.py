@@ -235,7 +235,12 @@ def _speak_into(conversation: Conversation, name: str, path: str, says: Iterator
     silent = None
     try:
         with conversation as engine:
-            for ended in _endings(engine, says):
+            began = engine.until(protocol.Ready)
+            if began.player is None:
+                raise UsageError(f'the driver "{began.driver}" cannot write a file: leave --driver out, on Linux')
+            for say in says:
+                engine.say(say)
+                ended = engine.until(protocol.Ended)
                 if ended.outcome == protocol.COMPLETED and ended.duration is not None:
                     seconds += ended.duration
                 elif ended.reason == "nothing_to_say":  # a piece of a long text may be rows of dots
@@ -250,22 +255,6 @@ def _speak_into(conversation: Conversation, name: str, path: str, says: Iterator
     if silent and not seconds:
         raise _failure(silent, name, path)
     return seconds
-
-
-def _endings(engine: Conversation, says: Iterator[protocol.Say]) -> Iterator[protocol.Ended]:
-    """Have one piece spoken after the other, and give how each ended."""
-    for event in engine.events():
-        if isinstance(event, protocol.Ready):
-            if event.player is None:
-                raise UsageError(f'the driver "{event.driver}" cannot write a file: leave --driver out, on Linux')
-        elif isinstance(event, protocol.Ended):
-            yield event
-        else:
-            continue
-        say = next(says, None)
-        if say is None:
-            return
-        engine.say(say)
 
 
 def _failure(ended: protocol.Ended, name: str, path: str) -> RenderFailed:

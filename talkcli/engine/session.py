@@ -87,10 +87,8 @@ class InHand:
 
     def __init__(self, say: protocol.Say, now: float) -> None:
         self.id = say.id
-        self.text = say.text
+        self.say = say
         self.words = Words(say.text)
-        #: words per minute
-        self.rate = say.rate
         #: when it began, without the time for which it was held
         self.began = now
         #: when the driver got it, or said a word of it
@@ -150,10 +148,14 @@ class Session:
             if voices:
                 self._channel.send(protocol.Voices(self._voices()))
             while not (self._leaving or self._channel.closed):
-                if self._backlog:
-                    self._carry_out(self._backlog.popleft())
-                else:
+                if not self._backlog:
                     self._backlog.extend(self._channel.receive())
+                    continue
+                command = self._backlog.popleft()
+                if isinstance(command, protocol.Say):
+                    self._say(command)
+                # What else comes out of a goal came too late; a second Configure has nothing to change.
+                self._leaving = self._leaving or isinstance(command, protocol.Quit)
         finally:
             self._engine.endLoop()
 
@@ -180,17 +182,17 @@ class Session:
 
     def _carry_out_now(self, command: Command) -> None:
         goal = self._goal
-        if isinstance(command, protocol.Stop):
-            self._stop(command)
-        elif isinstance(command, protocol.Followed):
-            if goal is not None and goal.id == command.id:
-                self.players.gap.followed = command.followed
-        elif isinstance(command, protocol.Pause | protocol.Resume):
-            if goal is not None and goal.id == command.id and not goal.stop_asked:
-                self._hold_or_go_on(goal, command)
-        else:
+        if not isinstance(command, protocol.Stop | protocol.Followed | protocol.Pause | protocol.Resume):
             self._leaving = self._leaving or isinstance(command, protocol.Quit)
             self._backlog.append(command)
+        elif goal is None or goal.id != command.id:
+            return  # it ended before this arrived
+        elif isinstance(command, protocol.Stop):
+            self._silence()
+        elif isinstance(command, protocol.Followed):
+            self.players.gap.followed = command.followed
+        elif not goal.stop_asked:
+            self._hold_or_go_on(goal, command)
 
     def _hold_or_go_on(self, goal: InHand, command: protocol.Pause | protocol.Resume) -> None:
         if isinstance(command, protocol.Resume):
@@ -205,17 +207,6 @@ class Session:
         if self._goal is not None and not self._goal.stop_asked:
             self._channel.send(protocol.Paused(self._goal.id, number))
 
-    def _stop(self, command: protocol.Stop) -> None:
-        if self._goal is not None and self._goal.id == command.id:
-            self._silence()
-            return
-        for waiting in self._backlog:
-            if isinstance(waiting, protocol.Say) and waiting.id == command.id:
-                self._backlog.remove(waiting)
-                self._channel.send(protocol.Started(waiting.id))
-                self._channel.send(protocol.Ended(waiting.id, protocol.STOPPED))
-                return
-
     def _silence(self) -> None:
         if self._goal is not None and not self._goal.stop_asked:
             self._goal.stop_asked = True
@@ -223,13 +214,6 @@ class Session:
                 self._engine.stop()
             else:  # held, or not begun: the driver has nothing that it could end
                 self._end(protocol.STOPPED)
-
-    def _carry_out(self, command: Command) -> None:
-        if isinstance(command, protocol.Say):
-            self._say(command)
-        elif isinstance(command, protocol.Quit):
-            self._leaving = True
-        # What else comes out of a goal came too late; a second Configure has nothing to change.
 
     def _say(self, say: protocol.Say) -> None:
         """Speak a goal to its end."""
@@ -269,7 +253,7 @@ class Session:
         goal.offset = goal.last_word
         goal.spoken, goal.interrupted, goal.silent_at = True, False, None
         goal.progress_at = time.monotonic()
-        if self._engine.say(goal.text[goal.offset :], goal.id) is not None:
+        if self._engine.say(goal.say.text[goal.offset :], goal.id) is not None:
             self._end(protocol.FAILED, "nothing_to_say", "nothing in the text can be spoken")
 
     def _step(self) -> None:
@@ -322,7 +306,11 @@ class Session:
             self._end(protocol.FAILED, goal.error.reason, str(goal.error))
         else:
             _log(goal.error)
-            text = "the driver did not complete the sentence" if goal.error is None else _describe(goal.error)
+            text = (
+                f"{type(goal.error).__name__}: {goal.error}"
+                if goal.error
+                else "the driver did not complete the sentence"
+            )
             self._end(protocol.FAILED, "engine_failed", text)
 
     def _end(
@@ -344,7 +332,7 @@ class Session:
         """
         if self._pump is None or not goal.spoken:
             return False
-        rest = (len(goal.text) - goal.last_word) * WORDS_A_CHARACTER * 60 / goal.rate
+        rest = (len(goal.say.text) - goal.last_word) * WORDS_A_CHARACTER * 60 / goal.say.rate
         lost = time.monotonic() > goal.progress_at + PATIENCE + rest
         if lost and not goal.given_up:
             goal.given_up = True
@@ -379,10 +367,6 @@ def _told(callback: Callable[..., None]) -> Callable[..., None]:
 
 def _since(began: float) -> float:
     return time.monotonic() - began
-
-
-def _describe(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
 
 
 def _log(error: Exception | None) -> None:

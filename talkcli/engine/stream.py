@@ -93,31 +93,28 @@ class Stream:
         self._zeros = bytes(self.piece)
         self._clock = clock
         self._first_write = 0.0
-        self._begin = begin
-        self._lead_in = int(lead_in * rate) * SAMPLE if player.real_time else 0
+        #: bytes of silence that are to be written before the first sample
+        self.lead_in = int(lead_in * rate) * SAMPLE if player.real_time else 0
         clock.begin(begin)
-
-    @property
-    def leading_in(self) -> bool:
-        """Whether there is silence to be written before the first sample."""
-        return self._lead_in > 0
-
-    def lead_in(self) -> int:
-        """Offer a piece of that silence; return the bytes that were taken."""
-        taken = self._offer_silence(self._begin, self._lead_in)
-        self._lead_in -= taken
-        return taken
 
     def offer(self, samples: memoryview) -> int:
         """Offer samples, no more than a piece; return the bytes that were taken."""
         taken = self.player.offer(samples)
         if taken:
-            self._wrote(taken)
+            now = time.monotonic()
+            if self.written == 0:
+                self._first_write = now
+                self._clock.start(now)
+            self.written += taken
+            self.progress_at = now
         return taken
 
-    def offer_silence(self, position: float) -> int:
-        """Offer a piece of silence before that position of the audio; return the bytes that were taken."""
-        return self._offer_silence(position, self.piece)
+    def offer_silence(self, position: float, most: int | None = None) -> int:
+        """Offer a piece of silence before that position of the audio, no more than `most`; return the bytes taken."""
+        taken = self.offer(memoryview(self._zeros)[:most])
+        if taken:
+            self._clock.insert(position, self._seconds(taken))
+        return taken
 
     def tick(self, now: float, last: bool) -> None:
         """Bring the clock up to date; `last` says that nothing more waits to be written."""
@@ -143,32 +140,9 @@ class Stream:
         """Return by how many seconds it would be too early for the stream to be over."""
         return self._first_write + self._seconds(self.written) - now
 
-    def began_at(self, now: float) -> float:
-        """Return when its stream began to be heard, or would have if the clock were exact."""
-        return now - self._clock.elapsed(now)
-
-    def over_at(self, now: float) -> float:
-        """Return when all that was written is heard, or was."""
-        return now + self.unheard(self.written, now)
-
     def interests(self, full: bool) -> list[Interest]:
         """Return what to poll for; where nothing is to be written, not for room to write."""
         return [each for each in self.player.interests() if not (full and each[1] == select.POLLOUT)]
-
-    def _offer_silence(self, position: float, length: int) -> int:
-        taken = self.player.offer(memoryview(self._zeros)[:length])
-        if taken:
-            self._wrote(taken)
-            self._clock.insert(position, self._seconds(taken))
-        return taken
-
-    def _wrote(self, length: int) -> None:
-        now = time.monotonic()
-        if self.written == 0:
-            self._first_write = now
-            self._clock.start(now)
-        self.written += length
-        self.progress_at = now
 
     def _seconds(self, length: int) -> float:
         return length / (self._rate * SAMPLE)

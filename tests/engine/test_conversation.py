@@ -37,7 +37,7 @@ def conversation(texts: list[str]) -> list[protocol.Ended]:
     ended = []
     waiting = iter(texts)
     with Conversation(CONFIGURE) as engine:
-        for event in engine.events():
+        for event in engine.events:
             if isinstance(event, protocol.Ended):
                 ended.append(event)
             if isinstance(event, protocol.Ready | protocol.Ended):
@@ -62,7 +62,7 @@ def test_texts_are_spoken_in_their_order_and_the_process_is_gone_then() -> None:
 @pytest.mark.usefixtures("scripted")
 def test_who_says_something_to_a_process_that_has_died_hears_how() -> None:
     with Conversation(CONFIGURE) as engine:
-        events = engine.events()
+        events = engine.events
         assert isinstance(next(events), protocol.Ready)
         os.kill(engine._process.pid, 9)
         os.waitid(os.P_PID, engine._process.pid, os.WEXITED | os.WNOWAIT)
@@ -75,7 +75,7 @@ def test_who_says_something_to_a_process_that_has_died_hears_how() -> None:
 def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None:
     with Conversation(CONFIGURE, deadline=time.monotonic() + 0.7) as engine:
         heard: list[protocol.Event] = []
-        events = engine.events()
+        events = engine.events
         assert isinstance(next(events), protocol.Ready)
         engine.say(say(1, "never-ends"))
         with pytest.raises(TimeoutError):
