@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor.report import Finding, done, failed, warning
 from talkcli.engine import protocol
-from talkcli.engine.process import Conversation, EngineFailed, EngineSilent
+from talkcli.engine.process import Conversation, EngineFailed
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ def conversation(setting: Setting, limit: float = math.inf) -> Conversation:
 
 def fault(error: EngineFailed) -> tuple[str, str]:
     """Return why an engine process failed, for programs and in words; whether it was ready yet makes no difference."""
-    if isinstance(error, EngineSilent):
-        return "engine_hung", f"the engine process said nothing for {error.seconds:g} s"
+    if error.silent is not None:
+        return "engine_hung", f"the engine process said nothing for {error.silent:g} s"
     return error.reason, str(error)
 
 

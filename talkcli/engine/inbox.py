@@ -68,15 +68,12 @@ class Inbox:
         self._sleeps_until = 0.0
         if ready:
             self._dozes_until = time.monotonic() + self._doze
-        for place, key in enumerate(ready):
-            if key.fd == self._descriptor:
-                del ready[place]
-                os.read(self._descriptor, 4096)
-                # Before it looks at what waits: what comes after that finds it so, and wakes the thread again.
-                self._woken = False
-                break
+        if any(key.fd == self._descriptor for key in ready):
+            os.read(self._descriptor, 4096)
+            # Before it looks at what waits: what comes after that finds it so, and wakes the thread again.
+            self._woken = False
         self.run()
-        return ready
+        return [key for key in ready if key.fd != self._descriptor]
 
     def run(self) -> None:
         """Do what waits."""

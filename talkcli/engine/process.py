@@ -202,19 +202,15 @@ class EngineProcess:
 
 
 class EngineFailed(Exception):
-    """The engine process failed: `reason` is for programs, as a goal has it. For `engine_crashed` the text says how."""
+    """The engine process failed: `reason` is for programs, as a goal has it. For `engine_crashed` the text says how.
 
-    def __init__(self, reason: str, words: str) -> None:
+    `silent`: for how many seconds it has said nothing, where that is why.
+    """
+
+    def __init__(self, reason: str, words: str, silent: float | None = None) -> None:
         super().__init__(words)
         self.reason = reason
-
-
-class EngineSilent(EngineFailed):
-    """The engine process has said nothing for `seconds`."""
-
-    def __init__(self, reason: str, words: str, seconds: float) -> None:
-        super().__init__(reason, words)
-        self.seconds = seconds
+        self.silent = silent
 
 
 class Conversation:
@@ -304,5 +300,5 @@ class Conversation:
         if now < self._heard_at + limit:
             return
         if self._process.ready:
-            raise EngineSilent("engine_hung", f"the engine gave no sign of life for {limit:g} s", limit)
-        raise EngineSilent("engine_failed", f"the engine was not ready after {limit:g} s", limit)
+            raise EngineFailed("engine_hung", f"the engine gave no sign of life for {limit:g} s", limit)
+        raise EngineFailed("engine_failed", f"the engine was not ready after {limit:g} s", limit)

@@ -197,23 +197,18 @@ def _beside(target: str, path: str) -> Iterator[str]:
     # Its length doesn't depend on the target's, whose name may be as long as a name can be.
     hidden = os.path.join(os.path.dirname(target), f".talk-{os.urandom(8).hex()}.wav")
     try:
-        _create(hidden, path)
+        try:  # with the mode that the umask makes of it, and nobody else's file is written to
+            open(hidden, "xb").close()
+        except OSError as error:
+            directory = os.path.dirname(hidden)
+            if not os.path.isdir(directory):
+                raise CannotWrite(path, f"cannot be written: there is no directory {directory}") from error
+            raise _unwritable(path, error) from error
         yield hidden
     finally:
         # Renamed by now, or never made; where it cannot be removed, why is in the error that brought us here.
         with contextlib.suppress(OSError):
             os.unlink(hidden)
-
-
-def _create(hidden: str, path: str) -> None:
-    """Make the file, so that its mode is what the umask makes of it and nobody else's file is written to."""
-    try:
-        open(hidden, "xb").close()
-    except OSError as error:
-        directory = os.path.dirname(hidden)
-        if not os.path.isdir(directory):
-            raise CannotWrite(path, f"cannot be written: there is no directory {directory}") from error
-        raise _unwritable(path, error) from error
 
 
 def _put_in_place(hidden: str, target: str, path: str) -> None:

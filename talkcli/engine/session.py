@@ -305,12 +305,10 @@ class Session:
         elif isinstance(goal.error, CannotSpeak):
             self._end(protocol.FAILED, goal.error.reason, str(goal.error))
         else:
-            _log(goal.error)
-            text = (
-                f"{type(goal.error).__name__}: {goal.error}"
-                if goal.error
-                else "the driver did not complete the sentence"
-            )
+            text = "the driver did not complete the sentence"
+            if goal.error is not None:
+                traceback.print_exception(goal.error)  # for the server's log
+                text = f"{type(goal.error).__name__}: {goal.error}"
             self._end(protocol.FAILED, "engine_failed", text)
 
     def _end(
@@ -347,8 +345,8 @@ class Session:
     def _voices(self) -> tuple[protocol.Voice, ...]:
         try:
             return list_voices(self._engine)
-        except Exception as error:  # noqa: BLE001 - any driver's; a voice can be spoken with without the list
-            _log(error)
+        except Exception:  # noqa: BLE001 - any driver's; a voice can be spoken with without the list
+            traceback.print_exc()
             return ()
 
 
@@ -367,9 +365,3 @@ def _told(callback: Callable[..., None]) -> Callable[..., None]:
 
 def _since(began: float) -> float:
     return time.monotonic() - began
-
-
-def _log(error: Exception | None) -> None:
-    """Leave a trace for the server's log."""
-    if error is not None:
-        traceback.print_exception(type(error), error, error.__traceback__, file=sys.stderr)

@@ -40,8 +40,7 @@ class Samples:
         self.speaks = False
         #: bytes that were forgotten
         self.begin = 0
-        #: the end, and the most that was asked about, for which `_quiet` was found
-        self._looked_at = (0, 0)
+        #: bytes at the end that are silence, forgotten ones included
         self._quiet = 0
 
     @property
@@ -53,6 +52,9 @@ class Samples:
         """Add samples at the end."""
         self._kept += samples
         self.speaks = self.speaks or samples.count(0) != len(samples)
+        last = reversed(array("h", samples))
+        loud = next((number for number, each in enumerate(last) if abs(each) > QUIET), None)
+        self._quiet = self._quiet + len(samples) if loud is None else loud * SAMPLE
 
     def part(self, begin: int, end: int) -> memoryview:
         """Return the samples between two places. It must be released before more are added or forgotten."""
@@ -65,15 +67,7 @@ class Samples:
 
     def quiet_end(self, most: int) -> int:
         """Return how many bytes at the end are silence, counting no more than `most`."""
-        if self._looked_at != (self.end, most):
-            self._looked_at = (self.end, most)
-            self._quiet = self._count_quiet(most)
-        return self._quiet
-
-    def _count_quiet(self, most: int) -> int:
-        last = array("h", bytes(self._kept[max(0, len(self._kept) - most) :]))
-        loud = next((number for number, each in enumerate(reversed(last)) if abs(each) > QUIET), len(last))
-        return loud * SAMPLE
+        return min(self._quiet, most, len(self._kept))
 
 
 class Stream:

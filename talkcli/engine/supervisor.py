@@ -316,10 +316,6 @@ class Supervisor:
             if not process.send(goal.say):
                 self._not_taken(goal.id, process)
 
-    def _tell(self, command: protocol.Command) -> None:
-        if self._process and not self._process.send(command):
-            self._refused(self._process)
-
     def _tell_followed(self, goal_id: str, followed: bool) -> None:
         goal = self._in_hand(goal_id)
         if self._process and goal and goal.spoken:
@@ -333,7 +329,9 @@ class Supervisor:
         goal.pause = pause
         goal.pause_at = time.monotonic() if goal.spoken and pause is not None else None
         if goal.spoken:
-            self._tell(protocol.Resume(goal_id) if pause is None else protocol.Pause(goal_id, pause))
+            command = protocol.Resume(goal_id) if pause is None else protocol.Pause(goal_id, pause)
+            if self._process and not self._process.send(command):
+                self._refused(self._process)
         elif pause is not None:
             self._post(protocol.Paused(goal_id, pause))  # it waits for a process, and now for `resume` as well
         else:

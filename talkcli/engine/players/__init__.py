@@ -147,11 +147,8 @@ def commands(
 def on_path(program: str) -> bool:
     """Return whether the program can be run; a name without a slash is looked for on the PATH."""
     places = [""] if os.sep in program else os.get_exec_path()
-    return any(_runnable(os.path.join(place, program)) for place in places)
-
-
-def _runnable(path: str) -> bool:
-    return os.path.isfile(path) and os.access(path, os.X_OK)
+    paths = [os.path.join(place, program) for place in places]
+    return any(os.path.isfile(each) and os.access(each, os.X_OK) for each in paths)
 
 
 def _custom(player: str, device: str | None, rate: int, found: Callable[[str], bool]) -> Command:

@@ -112,12 +112,8 @@ class Child:
         """Close all that is open, once it is reaped; may be called again."""
         self.close_stdin()
         self.close_stderr()
-        if self.exit is not None:
-            close(self.exit)
-            self.exit = None
-        if self._leash is not None:
-            close(self._leash)
-            self._leash = None
+        close(*(each for each in (self.exit, self._leash) if each is not None))
+        self.exit = self._leash = None
 
 
 def open_pipes(count: int) -> list[tuple[int, int]]:

@@ -153,14 +153,10 @@ class ProgramPlayer:
 
     def interests(self) -> list[Interest]:
         """Return the pipe, where there is something to write, the player's standard error, and its end."""
-        child, wanted = self._child, []
-        if child.stdin is not None and self._broken_at is None:
-            wanted.append((child.stdin, select.POLLOUT))
-        if child.stderr is not None:
-            wanted.append((child.stderr, select.POLLIN))
-        if child.exit is not None:
-            wanted.append((child.exit, select.POLLIN))
-        return wanted
+        child = self._child
+        stdin = child.stdin if self._broken_at is None else None
+        wanted = ((stdin, select.POLLOUT), (child.stderr, select.POLLIN), (child.exit, select.POLLIN))
+        return [(descriptor, events) for descriptor, events in wanted if descriptor is not None]
 
     def wake_at(self) -> float | None:
         """Return when to look at the player again."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import itertools
 import os
 
 from talkcli.engine.players.base import SAMPLE, CannotSpeak
@@ -77,9 +78,8 @@ def _no_sound_server() -> Iterator[None]:
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["PULSE_SERVER"]
-        else:
+        del os.environ["PULSE_SERVER"]
+        if before is not None:
             os.environ["PULSE_SERVER"] = before
 
 
@@ -87,14 +87,11 @@ def _preload() -> tuple[str, bytes | None]:
     """Have the library in the process, so that the binding finds it; return its origin and its data's directory."""
     try:
         ctypes.CDLL(_LIBRARY)
-    except OSError as missing:
-        if _passes(missing):
+        return "system", None
+    except OSError as error:
+        if _passes(error):
             raise
-        return _preload_wheel(missing)
-    return "system", None
-
-
-def _preload_wheel(missing: OSError) -> tuple[str, bytes]:
+        missing = error
     try:
         import espeakng_loader
 
@@ -186,7 +183,7 @@ class Espeak:
         return 0
 
     def _hand_on(self, output: Output, samples: Any, count: int, events: Any) -> None:
-        for event in _until_end(events):
+        for event in itertools.takewhile(lambda each: each.type, events):
             if event.type == _EVENT_SAMPLERATE:
                 if event.id.number != self._rate:
                     self._rate = event.id.number
@@ -198,13 +195,6 @@ class Espeak:
                     output.word(start, length, event.sample / self._rate)
         if samples and count > 0:
             output.write(ctypes.string_at(samples, count * SAMPLE))
-
-
-def _until_end(events: Any) -> Iterator[Any]:
-    index = 0
-    while events[index].type:
-        yield events[index]
-        index += 1
 
 
 def _variants(espeak: Any) -> list[Voice]:

@@ -211,15 +211,14 @@ def _without_leading_hyphens(text: str) -> str:
     The library marks no beginning of that word, and looks for it before the first phoneme of its list: in Vietnamese,
     Danish, Hindi and others what it finds there kills it. Nor does it report the word.
     """
-    result: list[str] | None = None
-    for found in _HYPHEN.finditer(text):
+
+    def blanked(found: re.Match[str]) -> str:
         at = start = found.start()
         while start and not text[start - 1].isalnum():
             start -= 1
-        if start == 0 or _ends_clause(text, start, at):
-            result = result or list(text)
-            result[at] = " "
-    return "".join(result) if result else text
+        return " " if start == 0 or _ends_clause(text, start, at) else "-"
+
+    return _HYPHEN.sub(blanked, text)
 
 
 def _without_endless_words(text: str) -> str:

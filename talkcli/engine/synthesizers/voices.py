@@ -11,7 +11,7 @@ from talkcli.engine.protocol import Voice
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Sequence
     from typing import Any
 
 #: A variant changes how any of espeak's voices sounds. It is listed by what is written behind the voice's name, and
@@ -68,25 +68,17 @@ def unknown_voice(wanted: str, voices: tuple[Voice, ...]) -> str:
     return f'unknown voice "{shown}": {hint}"talk voices" lists them'
 
 
-def _parted(voices: Iterable[Voice]) -> tuple[list[Voice], list[Voice]]:
+def _parted(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
     """Return the voices that speak by themselves, and the variants."""
-    plain: list[Voice] = []
-    variants: list[Voice] = []
-    for voice in voices:
-        (variants if voice.id.startswith(VARIANT) else plain).append(voice)
-    return plain, variants
+    plain = [each for each in voices if not each.id.startswith(VARIANT)]
+    return plain, [each for each in voices if each.id.startswith(VARIANT)]
 
 
 def _named(wanted: str, voices: list[Voice]) -> Voice | None:
     word = wanted.casefold()
-    if not word:
-        return None
-    named = [[each.casefold() for each in _words(voice)] for voice in voices]
-    for place in range(4):
-        for voice, words in zip(voices, named, strict=True):
-            if words[place] == word:
-                return voice
-    return None
+    called = [(place, each.casefold(), voice) for voice in voices for place, each in enumerate(_words(voice)) if each]
+    found = [(place, voice) for place, each, voice in called if each == word]
+    return min(found, key=lambda each: each[0], default=(0, None))[1]
 
 
 def _words(voice: Voice) -> tuple[str, str, str, str]:
@@ -140,8 +132,5 @@ def _in_english(wanted: str, voices: list[Voice]) -> list[str]:
 
 
 def _voice(found: Any) -> Voice:
-    languages = found.languages or []
-    language = languages[0] if languages else None
-    if isinstance(language, bytes):  # older drivers: a priority byte, then the language
-        language = language[1:].decode("utf-8", "replace")
+    language = str(found.languages[0]) if found.languages else None
     return Voice(id=str(found.id), language=language or None, name=str(found.name or found.id))
