@@ -204,11 +204,11 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
 def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
-    from talkcli.engine.players import PLAYERS, commands, on_path
+    from talkcli.engine.players import PLAYERS, commands
     from talkcli.engine.players.base import CannotSpeak
 
     try:
-        commands(player, None, 0, on_path, None)
+        commands(player, None, 0)
     except CannotSpeak as error:
         near = nearest(player, PLAYERS.keys() - {player})
         hint = f"did you mean '{near}'? " if near else ""

@@ -84,7 +84,9 @@ def look(setting: Setting) -> Engine:
 
 def conversation(setting: Setting, limit: float = math.inf) -> Conversation:
     """Return what talks to an engine process of these settings, for at most `limit` seconds."""
-    configure = protocol.Configure(os.getpid(), setting.driver, setting.player, setting.device, setting.voice)
+    configure = protocol.Configure(
+        os.getpid(), setting.driver, setting.player, setting.device, setting.voice, list_voices=True
+    )
     deadline = time.monotonic() + limit
     return Conversation(configure, env=setting.env, deadline=deadline, interrupt=setting.interrupt)
 

@@ -250,7 +250,7 @@ class Driver:
         """Speak the text, with exactly one finished-utterance at its end."""
         session = self._session
         self._proxy.notify("started-utterance")
-        self._playback = playback = Playback(session.players, session.wait, session.pause, self._word_heard)
+        self._playback = playback = Playback(session, self._word_heard)
         failure: Exception | None = None
         session.duration = None
         try:

@@ -1,11 +1,12 @@
 """The playback of one sentence: feeds a player, holds it where it is asked to, and judges whether all of it was heard.
 
-It waits only through the function it is given, which lets a stop and a pause come in. It knows nothing of synthesis and
-nothing of processes: a player says what it takes, this says what that means.
+It waits only in the session, which lets a stop and a pause come in, and which it tells when it is silent. It knows
+nothing of synthesis and nothing of processes: a player says what it takes, this says what that means.
 """
 
 from __future__ import annotations
 
+import select
 import time
 
 from talkcli.engine.players.base import PIECE, SAMPLE, CannotEnd, CannotSpeak, Stopped
@@ -16,8 +17,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.engine.players.base import Player, Wait
-    from talkcli.engine.players.choice import Players
+    from talkcli.engine.players.base import Player
+    from talkcli.engine.session import Session
 
 #: Seconds within which a player must take the first sound: a Bluetooth or USB device that sleeps needs one or two, a
 #: null sink that nobody records up to two.
@@ -61,47 +62,16 @@ SAID_AGAIN = 0.03
 RELEASE_AFTER = 10.0
 
 
-class Pause:
-    """Whether the sentence in hand is to be held: the session asks, the playback obeys and says when it is silent.
-
-    pyttsx3 has no word for a pause, so this goes past it, to our own driver alone.
-    """
-
-    def __init__(self, on_silent: Callable[[int], None]) -> None:
-        """`on_silent` is called once in each pause, with its number, when the sentence is silent."""
-        #: whether the sentence is to be held now
-        self.asked = False
-        self._on_silent = on_silent
-        #: the pause that was asked for last, and the one that was confirmed last
-        self._number = self._confirmed = 0
-
-    def ask(self, number: int) -> None:
-        """Hold the sentence; `number` counts the pauses in it, from 1."""
-        self.asked = True
-        self._number = number
-
-    def release(self) -> None:
-        """Let the sentence go on, or a new one begin."""
-        self.asked = False
-        self._confirmed = 0
-
-    def confirm(self) -> None:
-        """Take note that the sentence is silent; may be called again and again."""
-        if self.asked and self._confirmed != self._number:
-            self._confirmed = self._number
-            self._on_silent(self._number)
-
-
 class Playback:
     """One sentence on its way to the player: the `Output` of whoever makes it.
 
     Every method may raise Stopped or CannotSpeak, except the last two, which are for others than the synthesizer.
     """
 
-    def __init__(self, players: Players, wait: Wait, pause: Pause, on_word: Callable[[TimedWord], None]) -> None:
-        self._players = players
-        self._wait = wait
-        self._pause = pause
+    def __init__(self, session: Session, on_word: Callable[[TimedWord], None]) -> None:
+        self._session = session
+        self._players = session.players
+        self._wait = session.wait
         self._on_word = on_word
         self._rate = 0
         self._candidates: list[Callable[[], Player]] = []
@@ -128,7 +98,7 @@ class Playback:
         if self._stream is not None and rate != self._rate:
             self._let_go(0)  # it was started for another
         self._rate = rate
-        if self._players.is_program and not self._pause.asked:
+        if self._players.is_program and not self._session.held:
             try:
                 self._try(lambda _: True)
             except CannotSpeak:
@@ -157,7 +127,7 @@ class Playback:
             self._on_word(word)
         if self._stream is not None:
             name, now = self._stream.player.name, time.monotonic()
-            self._players.worked(name)
+            self._players.worked = name
             self._players.gap.ended(name, now + self._stream.unheard(self._stream.written, now))
         return self._seconds(self._sent)
 
@@ -210,7 +180,7 @@ class Playback:
     def _next_player(self, error: CannotSpeak) -> None:
         """Give up on this player; raises the first player's error if there is no other, or if sound was taken."""
         stream = self._stream
-        if stream is not None and stream.player.real_time and self._pause.asked:
+        if stream is not None and stream.player.real_time and self._session.held:
             self._go_back(stream)  # what is held is spoken by another later, and fails then if there is none
             return
         first = self._first_error or error
@@ -238,7 +208,7 @@ class Playback:
         """End the player of a sentence that is held; any of them may go on with it."""
         stream, self._begin, self._sent = self._stream, begin, begin
         if stream is not None and stream.player.proven:
-            self._players.worked(stream.player.name)  # tried first again
+            self._players.worked = stream.player.name  # tried first again
         self._candidates = []
         self._first_error = None
         self._leave()
@@ -255,7 +225,7 @@ class Playback:
         if stream.written == 0:
             stream.progress_at = time.monotonic()  # what it was not given it could not take
         while True:
-            if self._pause.asked and not self._stay_silent(stream):
+            if self._session.held and not self._stay_silent(stream):
                 return False
             if self._sent == self._audible_end(stream):
                 self._tick(stream)  # what comes next may be long in coming
@@ -267,7 +237,7 @@ class Playback:
             limit = FIRST_WITHIN if stream.taken == 0 else STALLED_AFTER
             due = stream.progress_at + limit if stream.player.real_time else None  # as long as a reader takes
             self._wait_for(stream, due)
-            if due and time.monotonic() >= due and not self._pause.asked and not self._offer(stream):
+            if due and time.monotonic() >= due and not self._session.held and not self._offer(stream):
                 raise CannotSpeak("audio_stalled", f"{stream.player.name} took no sound for {limit:g} s")
 
     def _drain(self, stream: Stream) -> bool:
@@ -281,7 +251,7 @@ class Playback:
         while not player.ended():
             self._tick(stream)
             now = time.monotonic()
-            if self._pause.asked and stream.ahead(now) > SILENT_WITHIN:
+            if self._session.held and stream.ahead(now) > SILENT_WITHIN:
                 self._go_back(stream)
                 return False  # with less than that left it has ended as soon as it could be held
             if now >= limit:
@@ -313,7 +283,7 @@ class Playback:
         """Bring the clock up to date, report the words that are heard, forget the samples that were heard."""
         now = time.monotonic()
         last = self._complete and self._sent == self._audible_end(stream)
-        stream.tick(now, last=last and not self._pause.asked)
+        stream.tick(now, last=last and not self._session.held)
         player = stream.player
         if not player.proven:
             return
@@ -333,7 +303,7 @@ class Playback:
             return True
         if not self._fall_silent(stream):
             return False
-        if self._pause.asked and not self._stay_open(stream):
+        if self._session.held and not self._stay_open(stream):
             self._let_go(self._sent)  # what it held was heard
             return False
         stream.progress_at = time.monotonic()
@@ -345,7 +315,7 @@ class Playback:
         mark, now = stream.written, time.monotonic()
         limit = now + SILENT_WITHIN
         hopeless = stream.taken == 0 or stream.unheard(mark, now) > SILENT_WITHIN
-        while self._pause.asked and (left := stream.unheard(mark, now) + CLOCK_AHEAD) > 0:
+        while self._session.held and (left := stream.unheard(mark, now) + CLOCK_AHEAD) > 0:
             if hopeless or now >= limit:
                 self._go_back(stream)
                 return False
@@ -359,8 +329,8 @@ class Playback:
         """Keep the player that holds nothing but silence; False if it failed, or must be let go of, before the end."""
         self._silent_at = time.monotonic()
         release_at = self._silent_at + RELEASE_AFTER
-        while self._pause.asked:
-            self._pause.confirm()
+        while self._session.held:
+            self._session.confirm()
             try:
                 fed = self._feed_silence(stream)
             except CannotSpeak:
@@ -381,12 +351,12 @@ class Playback:
         return taken
 
     def _full(self, stream: Stream) -> bool:
-        return self._pause.asked and stream.ahead(time.monotonic()) >= SILENT_WITHIN
+        return bool(self._session.held) and stream.ahead(time.monotonic()) >= SILENT_WITHIN
 
     def _await_resume(self) -> None:
         """Wait, without a player, while the sentence is held."""
-        while self._pause.asked:
-            self._pause.confirm()
+        while self._session.held:
+            self._session.confirm()
             self._wait((), None)
             self._check_stopped()
 
@@ -398,7 +368,9 @@ class Playback:
             moments[1] = now + PIECE
         if stream.taken < stream.written:  # a player that takes a part of what waits wakes nobody
             moments.append(now + LOOK_EVERY)
-        self._wait(stream.interests(full), min((moment for moment in moments if moment is not None), default=None))
+        # Where nothing is to be written, not for room to write.
+        interests = [each for each in player.interests() if not (full and each[1] == select.POLLOUT)]
+        self._wait(interests, min((moment for moment in moments if moment is not None), default=None))
         self._check_stopped()
 
     def _check_stopped(self) -> None:

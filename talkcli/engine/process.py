@@ -226,7 +226,7 @@ class Conversation:
         configure: protocol.Configure,
         *,
         env: Mapping[str, str] | None = None,
-        deadline: float | None = None,
+        deadline: float = float("inf"),
         interrupt: Mapping[int, int] | None = None,
     ) -> None:
         """`env`: the process's environment, if not this one's; `deadline`: the monotonic time by which all is over.
@@ -235,7 +235,7 @@ class Conversation:
         """
         self._configure = configure
         self._env = env
-        self._deadline = float("inf") if deadline is None else deadline
+        self._deadline = deadline
         self._interrupt = interrupt
 
     def __enter__(self) -> Conversation:

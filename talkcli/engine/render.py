@@ -79,7 +79,7 @@ def render(
     descriptor that ends it with `Interrupted` as soon as it is readable. RenderFailed; BrokenPipeError where whoever
     reads standard output is gone; UsageError for a driver that writes no file, or for a terminal.
     """
-    deadline = None if timeout is None else time.monotonic() + timeout
+    deadline = time.monotonic() + (float("inf") if timeout is None else timeout)
     ends = None if interrupt is None else {interrupt: select.POLLIN}
     fault = texts.fault(text, None)
     if fault is not None:
@@ -132,7 +132,7 @@ def _is_stream(path: str) -> bool:
 
 
 @contextlib.contextmanager
-def _stream(path: str, deadline: float | None, interrupt: Mapping[int, int] | None) -> Iterator[int]:
+def _stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
     """Give a descriptor of standard output, a named pipe or a device, open for writing."""
     output = os.dup(1) if path in STANDARD_OUTPUT else _open_stream(path, deadline, interrupt)
     try:
@@ -146,7 +146,7 @@ def _stream(path: str, deadline: float | None, interrupt: Mapping[int, int] | No
         os.close(output)
 
 
-def _open_stream(path: str, deadline: float | None, interrupt: Mapping[int, int] | None) -> int:
+def _open_stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
     """Open a device, or a named pipe once somebody reads it."""
     while True:
         try:
@@ -154,7 +154,7 @@ def _open_stream(path: str, deadline: float | None, interrupt: Mapping[int, int]
         except OSError as error:
             if error.errno != errno.ENXIO or not stat.S_ISFIFO(os.stat(path).st_mode):
                 raise _unwritable(path, error) from error
-        left = _READER_LOOK if deadline is None else min(_READER_LOOK, deadline - time.monotonic())
+        left = min(_READER_LOOK, deadline - time.monotonic())
         if left <= 0:
             raise TimeoutError(f"nobody has opened {path} to read it within the time")
         ready({}, left, interrupt)

@@ -17,7 +17,6 @@ import traceback
 from collections import deque
 
 from talkcli.engine import protocol
-from talkcli.engine.playback import Pause
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.synthesizers.voices import list_voices
 from talkcli.engine.words import Words
@@ -52,8 +51,10 @@ class Channel:
     It blocks only where it is asked to. A server that is gone is no error here: `closed` says so, and the process ends.
     """
 
-    def __init__(self, descriptor: int = 0) -> None:
-        self.descriptor = descriptor
+    #: standard input
+    descriptor = 0
+
+    def __init__(self) -> None:
         #: True once the server is gone.
         self.closed = False
         #: monotonic time of the last event.
@@ -120,10 +121,12 @@ class Session:
         self._leaving = False
         self._goal: InHand | None = None
         self._engine: Any = None
-        self._apply: Callable[[protocol.Say], None] | None = None
+        self._apply: Any = None
         self._pump: Callable[[], None] | None = None
-        #: for our own driver to obey, and what the session itself goes by with another
-        self.pause = Pause(self._tell_paused)
+        #: the number of the pause for which the sentence in hand is to be held, 0 for none: for the playback to obey,
+        #: as pyttsx3 has no word for a pause; with a driver that is not ours the session itself goes by it
+        self.held = 0
+        self._confirmed = 0
         #: what our own driver tells beside its notifications, which have no word for it, true as long as one is told:
         #: the place in the audio, in seconds, of the word that begins; the seconds of the sentence that has ended, None
         #: if not all of it was heard. None where another speaks, which doesn't know.
@@ -146,7 +149,12 @@ class Session:
         """Carry out commands until the server leaves or says so; before that tell the voices, if they are wanted."""
         try:
             if voices:
-                self._channel.send(protocol.Voices(self._voices()))
+                try:
+                    found = list_voices(self._engine)
+                except Exception:  # noqa: BLE001 - any driver's; a voice can be spoken with without the list
+                    traceback.print_exc()
+                    found = ()
+                self._channel.send(protocol.Voices(found))
             while not (self._leaving or self._channel.closed):
                 if not self._backlog:
                     self._backlog.extend(self._channel.receive())
@@ -160,7 +168,10 @@ class Session:
             self._engine.endLoop()
 
     def wait(self, interests: Sequence[Interest], until: float | None) -> None:
-        """Wait for one of the interests, a command or a monotonic time, and carry out what the server wants now."""
+        """Wait for one of the interests, a command or a monotonic time, whatever comes first; it may return early.
+
+        What the server wants now is carried out inside: a sentence can be stopped when this returns.
+        """
         poll = select.poll()
         if not self._channel.closed:
             poll.register(self._channel.descriptor, select.POLLIN)
@@ -170,17 +181,16 @@ class Session:
         timeout = max(0.0, min(moments) - time.monotonic()) * 1000 if moments else None
         ready = [descriptor for descriptor, _ in poll.poll(timeout)]
         if self._channel.descriptor in ready:
-            self._take_commands()
-        self._tell_alive()
-
-    def _take_commands(self) -> None:
-        """Read what came during a goal; what concerns it is carried out, the rest has to wait."""
-        for command in self._channel.receive():
-            self._carry_out_now(command)
-        if self._leaving or self._channel.closed:
-            self._silence()
+            for command in self._channel.receive():
+                self._carry_out_now(command)
+            if self._leaving or self._channel.closed:
+                self._silence()
+        due = self._alive_due()
+        if self._goal is not None and due is not None and time.monotonic() >= due:
+            self._channel.send(protocol.Alive(self._goal.id))
 
     def _carry_out_now(self, command: Command) -> None:
+        """Carry out what concerns the goal in hand; the rest has to wait."""
         goal = self._goal
         if not isinstance(command, protocol.Stop | protocol.Followed | protocol.Pause | protocol.Resume):
             self._leaving = self._leaving or isinstance(command, protocol.Quit)
@@ -196,16 +206,18 @@ class Session:
 
     def _hold_or_go_on(self, goal: InHand, command: protocol.Pause | protocol.Resume) -> None:
         if isinstance(command, protocol.Resume):
-            self.pause.release()
+            self.held = 0
             return
-        self.pause.ask(command.number)
+        self.held = command.number
         if self._pump is not None and goal.spoken and not goal.interrupted:
             goal.interrupted = True
             self._engine.stop()
 
-    def _tell_paused(self, number: int) -> None:
-        if self._goal is not None and not self._goal.stop_asked:
-            self._channel.send(protocol.Paused(self._goal.id, number))
+    def confirm(self) -> None:
+        """Take note that the sentence that is to be held is silent; may be called again and again."""
+        if self._goal is not None and not self._goal.stop_asked and self._confirmed != self.held:
+            self._confirmed = self.held
+            self._channel.send(protocol.Paused(self._goal.id, self.held))
 
     def _silence(self) -> None:
         if self._goal is not None and not self._goal.stop_asked:
@@ -217,9 +229,8 @@ class Session:
 
     def _say(self, say: protocol.Say) -> None:
         """Speak a goal to its end."""
-        assert self._apply is not None
         self._goal = goal = InHand(say, time.monotonic())
-        self.pause.release()
+        self.held = self._confirmed = 0
         self.players.begin(say.lead_in, say.followed)
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
@@ -244,12 +255,12 @@ class Session:
         if goal.spoken:
             self._step()
             return
-        if self._pump is not None and self.pause.asked:
-            self.pause.confirm()
+        if self._pump is not None and self.held:
+            self.confirm()
             self.wait((), None)
             return
         if goal.silent_at is not None:
-            goal.began += _since(goal.silent_at)
+            goal.began += time.monotonic() - goal.silent_at
         goal.offset = goal.last_word
         goal.spoken, goal.interrupted, goal.silent_at = True, False, None
         goal.progress_at = time.monotonic()
@@ -259,23 +270,18 @@ class Session:
     def _step(self) -> None:
         """Let the driver go on. Ours speaks to the end in one step, others are asked again and again."""
         self._engine.iterate()
-        if self._goal is None:
+        goal = self._goal
+        if goal is None:
             return
         if self._pump is None:
             self._end(protocol.FAILED, "engine_failed", "the driver lost the sentence")
-            return
-        if self._goal.error is not None:
-            self._give_up(self._goal.id)
-            return
-        self.wait((), time.monotonic() + STEP)
-        self._pump()
-
-    def _give_up(self, goal: str) -> None:
-        """End a goal whose driver failed: one that raises in `say` never tells that it is finished."""
-        self._engine.stop()
-        if self._goal is not None:
+        elif goal.error is not None:  # one that raises in `say` never tells that it is finished
+            self._engine.stop()
             self._engine.proxy.setBusy(False)  # else pyttsx3 would keep the next sentence to itself
-            self._finished(goal, completed=False)
+            self._finished(goal.id, completed=False)
+        else:
+            self.wait((), time.monotonic() + STEP)
+            self._pump()
 
     def _word(self, location: int, length: int, **_: object) -> None:
         """Report a word. Other drivers give the word as the notification's name, so that says nothing."""
@@ -284,8 +290,8 @@ class Session:
             return
         found = goal.words.next(goal.offset + location if location >= 0 else location, length)
         if found is not None:
-            goal.last_word, goal.progress_at = found.start, _since(0.0)
-            seconds = _since(goal.began) if self.position is None else self.position
+            goal.last_word, goal.progress_at = found.start, time.monotonic()
+            seconds = goal.progress_at - goal.began if self.position is None else self.position
             self._channel.send(protocol.Word(goal.id, found.start, found.end, found.number, round(seconds, 3)))
 
     def _error(self, exception: Exception, **_: object) -> None:
@@ -337,18 +343,6 @@ class Session:
             sys.stderr.write(f"the driver did not end what takes less than {PATIENCE + rest:.0f} s\n")
         return lost
 
-    def _tell_alive(self) -> None:
-        due = self._alive_due()
-        if due is not None and self._goal is not None and time.monotonic() >= due:
-            self._channel.send(protocol.Alive(self._goal.id))
-
-    def _voices(self) -> tuple[protocol.Voice, ...]:
-        try:
-            return list_voices(self._engine)
-        except Exception:  # noqa: BLE001 - any driver's; a voice can be spoken with without the list
-            traceback.print_exc()
-            return ()
-
 
 def _told(callback: Callable[..., None]) -> Callable[..., None]:
     """Return the callback with its errors printed: pyttsx3 drops them."""
@@ -361,7 +355,3 @@ def _told(callback: Callable[..., None]) -> Callable[..., None]:
             raise
 
     return call
-
-
-def _since(began: float) -> float:
-    return time.monotonic() - began

@@ -6,7 +6,6 @@ what the samples are: which come next, and what a failure means, is the playback
 
 from __future__ import annotations
 
-import select
 import time
 from array import array
 
@@ -14,7 +13,7 @@ from talkcli.engine.players.base import PIECE, SAMPLE
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from talkcli.engine.players.base import Interest, Player
+    from talkcli.engine.players.base import Player
     from talkcli.engine.words import WordClock
 
 #: Seconds of sound that a player holds at least between taking and playing it: of the 60 ms it is asked for, aplay was
@@ -133,10 +132,6 @@ class Stream:
     def missing(self, now: float) -> float:
         """Return by how many seconds it would be too early for the stream to be over."""
         return self._first_write + self._seconds(self.written) - now
-
-    def interests(self, full: bool) -> list[Interest]:
-        """Return what to poll for; where nothing is to be written, not for room to write."""
-        return [each for each in self.player.interests() if not (full and each[1] == select.POLLOUT)]
 
     def _seconds(self, length: int) -> float:
         return length / (self._rate * SAMPLE)

@@ -145,7 +145,8 @@ class Supervisor:
 
     def __init__(self, configure: protocol.Configure, post: Callable[[Report], None]) -> None:
         # Held, not inherited from: a Thread has private names of its own, and others in each version of Python.
-        self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
+        #: to be started, and with it the first engine process; joined after `close`
+        self.thread = threading.Thread(target=self._run, name="engine", daemon=True)
         self._configure = configure
         self._post = post
         self._inbox = Inbox(doze=HANG_AFTER)
@@ -162,14 +163,6 @@ class Supervisor:
         self._closing = False
 
     # -- called from other threads
-
-    def start(self) -> None:
-        """Start the thread, and with it the first engine process."""
-        self._thread.start()
-
-    def join(self, timeout: float) -> None:
-        """Wait for the thread to end, at most `timeout` seconds."""
-        self._thread.join(timeout)
 
     def say(self, goal: protocol.Say) -> None:
         """Hand in a goal; the one before must have ended or been given up. Only one thread may call this.

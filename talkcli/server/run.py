@@ -138,7 +138,7 @@ class Server:
             speech.report,
         )
         try:
-            speech.engine.start()
+            speech.engine.thread.start()
         except RuntimeError as error:  # all that Python says of a thread that it can't have
             raise TalkError(f"the engine's thread cannot be started: {resources.limits()}") from error
         try:
@@ -160,7 +160,7 @@ class Server:
             await self._say_goodbye()
         finally:
             speech.engine.close()
-            speech.engine.join(_ENGINE_GOODBYE)
+            speech.engine.thread.join(_ENGINE_GOODBYE)
             self._systemd.close()
         if self._fatal:
             raise self._fatal

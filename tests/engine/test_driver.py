@@ -13,7 +13,6 @@ from pyttsx3.engine import Engine
 
 from talkcli.engine import protocol
 from talkcli.engine.driver import register
-from talkcli.engine.playback import Pause
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.choice import Players
 from talkcli.engine.synthesizers.base import UnknownVoice
@@ -51,7 +50,7 @@ class Told:
         self.at_word: Callable[[], None] = lambda: None
         self.at_wait: Callable[[], None] = lambda: None
         self.players = Players(protocol.Configure(0, None, player, None, None))
-        self.pause = Pause(lambda _: None)
+        self.held = 0
         register(_NAME, synthesizer or Scripted(), cast("Session", self))
         self.engine: Any = Engine(_NAME)
         for topic in FORM:

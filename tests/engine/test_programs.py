@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
-from talkcli.engine import protocol
+from talkcli.engine import players, protocol
 from talkcli.engine.players import PACKAGES, PLAYERS, commands
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.choice import Players
 from talkcli.engine.players.program import ProgramPlayer
 
+#: Sets which programs can be run.
+There = Callable[[set[str]], None]
 
-def _names(player: str | None, there: set[str], last: str | None = None) -> list[str]:
-    return [command.name for command in commands(player, None, 22050, there.__contains__, last)]
+
+@pytest.fixture
+def there(monkeypatch: pytest.MonkeyPatch) -> There:
+    return lambda found: monkeypatch.setattr(players, "on_path", found.__contains__)
 
 
-def test_what_is_there_is_tried_and_what_worked_comes_first() -> None:
-    there = {"aplay", "pw-cat", "pacat"}
-    assert _names(None, there) == ["aplay", "pacat", "pw-cat"]
-    assert _names(None, there, "pw-cat") == ["pw-cat", "aplay", "pacat"]
-    assert _names(None, {"pacat"}) == ["pacat"]
-    assert _names("pacat", there, "aplay") == ["pacat"]
+def _names(player: str | None, last: str | None = None) -> list[str]:
+    return [command.name for command in commands(player, None, 22050, last)]
+
+
+def test_what_is_there_is_tried_and_what_worked_comes_first(there: There) -> None:
+    there({"aplay", "pw-cat", "pacat"})
+    assert _names(None) == ["aplay", "pacat", "pw-cat"]
+    assert _names(None, "pw-cat") == ["pw-cat", "aplay", "pacat"]
+    assert _names("pacat", "aplay") == ["pacat"]
+    there({"pacat"})
+    assert _names(None) == ["pacat"]
 
 
 @pytest.mark.parametrize(
     ("player", "expected"),
     [("aplay", ["-D", "usb"]), ("pacat", ["-d", "usb"]), ("pw-cat", ["--target=usb", "-"])],
 )
-def test_the_device_is_given_in_the_players_own_words(player: str, expected: list[str]) -> None:
-    (command,) = commands(player, "usb", 16000, lambda _: True, None)
+def test_the_device_is_given_in_the_players_own_words(there: There, player: str, expected: list[str]) -> None:
+    there({player})
+    (command,) = commands(player, "usb", 16000)
     assert list(command.argv[-len(expected) :]) == expected
     assert "16000" in " ".join(command.argv) or b"\x80\x3e\x00\x00" in command.preamble
 
@@ -43,14 +55,16 @@ def test_a_player_with_a_name_that_is_no_program_is_built_in() -> None:
         assert player.gone()
 
 
-def test_a_command_line_is_split_without_a_shell() -> None:
-    (command,) = commands("/opt/my player -r{rate} '{device} x' $HOME", None, 22050, lambda _: True, None)
+def test_a_command_line_is_split_without_a_shell(there: There) -> None:
+    there({"/opt/my"})
+    (command,) = commands("/opt/my player -r{rate} '{device} x' $HOME", None, 22050)
     assert command.argv == ("/opt/my", "player", "-r22050", "default x", "$HOME")
     assert command.name == "my"
 
 
 @pytest.mark.parametrize("player", ["pacat", "sox -", "", "  ", "'"])
-def test_a_player_that_is_not_there_is_an_error(player: str) -> None:
+def test_a_player_that_is_not_there_is_an_error(there: There, player: str) -> None:
+    there(set())
     with pytest.raises(CannotSpeak) as caught:
-        commands(player, None, 22050, lambda _: False, None)
+        commands(player, None, 22050)
     assert caught.value.reason == "no_player"

@@ -32,7 +32,7 @@ class Thread:
         self.seen: list[Report] = []
         self._posted: queue.Queue[Report] = queue.Queue()
         self.engine = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), self._posted.put)
-        self.engine.start()
+        self.engine.thread.start()
 
     def say(self, text: str, goal: str = "g1") -> None:
         self.engine.say(protocol.Say(goal, text, 200, 1.0, None, 50))
@@ -52,7 +52,7 @@ class Thread:
 
     def close(self) -> None:
         self.engine.close()
-        self.engine.join(PATIENCE)
+        self.engine.thread.join(PATIENCE)
 
 
 @pytest.fixture

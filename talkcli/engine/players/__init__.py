@@ -1,7 +1,7 @@
 """What takes the samples of a sentence: programs at the end of a pipe, files, silence; here the names they go by.
 
 The table has the players that have a name, and the command lines of those that are programs. Who wants to know what
-players there are imports this alone: what is on the PATH comes in as a function, nothing is started or opened here.
+players there are imports this alone: nothing is started or opened here.
 `base` has what each of them does and may raise; `choice` chooses one for each sentence; `devices` tells whether there
 is anything to play to. A player that is no program is a module here, and each goes through
 `tests/engine/test_player_contract.py`. The package may import the ground.
@@ -125,23 +125,18 @@ def is_silent(player: str | None) -> bool:
     return player is not None and (player == "null" or player.startswith(FILE))
 
 
-def commands(
-    player: str | None, device: str | None, rate: int, found: Callable[[str], bool], last: str | None
-) -> list[Command]:
-    """Return the players to try, best first; CannotSpeak (no_player) if there is none.
-
-    `found` says whether a program can be run, `last` names the player that worked last time.
-    """
+def commands(player: str | None, device: str | None, rate: int, last: str | None = None) -> list[Command]:
+    """Return the players to try, best first, `last` the one that worked last; CannotSpeak (no_player) for none."""
     if player is None:
-        names = sorted((name for name in PACKAGES if found(name)), key=lambda name: name != last)
+        names = sorted((name for name in PACKAGES if on_path(name)), key=lambda name: name != last)
         if not names:
             raise CannotSpeak("no_player", NO_PLAYER)
         return [_PROGRAMS[name](rate, device) for name in names]
     if player in PACKAGES:
-        if not found(player):
+        if not on_path(player):
             raise CannotSpeak("no_player", f'player "{player}" not found: install {PACKAGES[player]}')
         return [_PROGRAMS[player](rate, device)]
-    return [_custom(player, device, rate, found)]
+    return [_custom(player, device, rate)]
 
 
 def on_path(program: str) -> bool:
@@ -151,7 +146,7 @@ def on_path(program: str) -> bool:
     return any(os.path.isfile(each) and os.access(each, os.X_OK) for each in paths)
 
 
-def _custom(player: str, device: str | None, rate: int, found: Callable[[str], bool]) -> Command:
+def _custom(player: str, device: str | None, rate: int) -> Command:
     import shlex
 
     try:
@@ -161,6 +156,6 @@ def _custom(player: str, device: str | None, rate: int, found: Callable[[str], b
     if not parts:
         raise CannotSpeak("no_player", "player command is empty: name a program that reads samples")
     argv = [part.replace("{rate}", str(rate)).replace("{device}", device or "default") for part in parts]
-    if not found(argv[0]):
+    if not on_path(argv[0]):
         raise CannotSpeak("no_player", f'player "{argv[0]}" not found')
     return Command(os.path.basename(argv[0]), tuple(argv))

@@ -6,10 +6,9 @@ Samples are signed 16 bit, little-endian, one channel; lengths are in bytes. Not
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from typing import Protocol
 else:
     Protocol = object
@@ -145,8 +144,3 @@ class BuiltIn:
     def gone(self) -> bool:
         """Return True: nothing is ever left."""
         return True
-
-
-#: Waits for one of the interests or a monotonic time, whatever comes first, and may return early. What the server sends
-#: meanwhile is carried out inside: a sentence can be stopped when this returns.
-Wait = Callable[[Sequence[Interest], "float | None"], None]

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from functools import partial
 
-from talkcli.engine.players import FILE, PLAYERS, commands, on_path
+from talkcli.engine.players import FILE, PLAYERS, commands
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
@@ -82,34 +82,28 @@ class Players:
         self._inherited = inherited
         #: opens the player that is no program, for samples per second; None where programs play
         self._built_in = self._opens()
+        #: whether what plays is a program, which takes a while to start
+        self.is_program = self._built_in is None
         self._streaming = False
         #: what lies between two sentences
         self.gap = Gap()
         #: milliseconds of silence that the sentence in hand brings along; None for what it was told at the start
         self._own_lead_in: int | None = None
-        self._worked: str | None = None
+        #: the name of the player by which a sentence was played whole, the last time
+        self.worked: str | None = None
         self._used_at: float | None = None
-
-    @property
-    def is_program(self) -> bool:
-        """Whether what plays is a program, which takes a while to start."""
-        return self._built_in is None
 
     def candidates(self, rate: int) -> list[Callable[[], Player]]:
         """Return what opens the players to try for a sentence, best first; CannotSpeak if there is none."""
         if self._built_in is not None:
             return [partial(self._built_in, rate)]
-        found = commands(self._configure.player, self._configure.device, rate, on_path, self._worked)
+        found = commands(self._configure.player, self._configure.device, rate, self.worked)
         return [partial(ProgramPlayer, command, self._inherited) for command in found]
 
     def begin(self, lead_in: int | None, followed: bool) -> None:
         """Take note of a new sentence: milliseconds of a lead-in of its own, and whether a goal waits behind it."""
         self._own_lead_in = lead_in
         self.gap.followed = followed
-
-    def worked(self, name: str) -> None:
-        """Take note that a sentence was played whole by the player of this name."""
-        self._worked = name
 
     def let_go(self, silent_at: float | None = None) -> None:
         """Take note that a device was closed; `silent_at`: since when it had played nothing but silence."""
@@ -133,7 +127,7 @@ class Players:
         if self._configure.player is not None:
             return self._configure.player
         try:
-            return commands(None, None, 1, on_path, None)[0].name
+            return commands(None, None, 1)[0].name
         except CannotSpeak:
             return None
 

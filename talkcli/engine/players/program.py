@@ -83,8 +83,7 @@ class Complaint:
         line = re.sub(_PLACE, r"\g<program>: ", line)
         if self._named is None and re.search(_ERROR, line, re.IGNORECASE):
             self._named = line
-        if self._first is None:
-            self._first = line
+        self._first = self._first or line
 
 
 class ProgramPlayer:
