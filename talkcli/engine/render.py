@@ -86,12 +86,9 @@ def render(
         raise RenderFailed(*fault)
     says = (protocol.Say(f"{n}", each, rate, volume, voice, pitch) for n, each in enumerate(pieces(text), 1))
     if path not in STANDARD_OUTPUT and not _is_stream(path):
-        target = _target(path)
-        with _beside(target, path) as hidden:
+        with _replacing(path) as hidden:
             configure = protocol.Configure(os.getpid(), driver, f"file:{hidden}", None, None, list_voices=False)
-            seconds = _speak_into(Conversation(configure, deadline=deadline, interrupt=ends), hidden, path, says)
-            _put_in_place(hidden, target, path)
-        return seconds
+            return _speak_into(Conversation(configure, deadline=deadline, interrupt=ends), hidden, path, says)
     with _stream(path, deadline, ends) as output:
         configure = protocol.Configure(os.getpid(), driver, None, None, None, list_voices=False, output=output)
         try:
@@ -192,8 +189,9 @@ def _is_our_output(found: os.stat_result) -> bool:
 
 
 @contextlib.contextmanager
-def _beside(target: str, path: str) -> Iterator[str]:
-    """Give a new file, hidden, in the target's directory; it is removed at the end if it is still there."""
+def _replacing(path: str) -> Iterator[str]:
+    """Give a new file, hidden, in the directory of the one to rename over; at a good end it is that one, else gone."""
+    target = _target(path)
     # Its length doesn't depend on the target's, whose name may be as long as a name can be.
     hidden = os.path.join(os.path.dirname(target), f".talk-{os.urandom(8).hex()}.wav")
     try:
@@ -205,19 +203,16 @@ def _beside(target: str, path: str) -> Iterator[str]:
                 raise CannotWrite(path, f"cannot be written: there is no directory {directory}") from error
             raise _unwritable(path, error) from error
         yield hidden
+        try:
+            with open(hidden, "rb") as file:
+                os.fsync(file)  # a power cut must not empty it; and some file systems tell only here of a full disk
+            os.replace(hidden, target)
+        except OSError as error:
+            raise _unwritable(path, error) from error
     finally:
         # Renamed by now, or never made; where it cannot be removed, why is in the error that brought us here.
         with contextlib.suppress(OSError):
             os.unlink(hidden)
-
-
-def _put_in_place(hidden: str, target: str, path: str) -> None:
-    try:
-        with open(hidden, "rb") as file:
-            os.fsync(file)  # some file systems tell only here that the disk is full, and a power cut must not empty it
-        os.replace(hidden, target)
-    except OSError as error:
-        raise _unwritable(path, error) from error
 
 
 def _unwritable(path: str, error: OSError) -> CannotWrite:

@@ -290,9 +290,10 @@ class Session:
             return
         found = goal.words.next(goal.offset + location if location >= 0 else location, length)
         if found is not None:
-            goal.last_word, goal.progress_at = found.start, time.monotonic()
+            start, end, number = found
+            goal.last_word, goal.progress_at = start, time.monotonic()
             seconds = goal.progress_at - goal.began if self.position is None else self.position
-            self._channel.send(protocol.Word(goal.id, found.start, found.end, found.number, round(seconds, 3)))
+            self._channel.send(protocol.Word(goal.id, start, end, number, round(seconds, 3)))
 
     def _error(self, exception: Exception, **_: object) -> None:
         if self._goal is not None and self._goal.error is None:

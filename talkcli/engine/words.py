@@ -22,15 +22,6 @@ _NUMBER_GOES_ON = re.compile(r"\d+(?:[.,]\d+)*")
 _STOPS = ".,;:!?…"
 
 
-@frozen
-class FoundWord:
-    """A word of the text."""
-
-    start: int  # character offset
-    end: int  # offset after its last character
-    number: int  # in the sentence, from 1
-
-
 def letters(text: str, start: int) -> int:
     """Return how many letters and digits, with their accents, stand there in a row.
 
@@ -57,8 +48,11 @@ class Words:
         self._end = 0
         self._number = 0
 
-    def next(self, location: int, length: int) -> FoundWord | None:
-        """Return the word reported there, None if nothing new is there."""
+    def next(self, location: int, length: int) -> tuple[int, int, int] | None:
+        """Return where the word that is reported there begins and ends, and its number in the sentence, from 1.
+
+        None if nothing new is there.
+        """
         if location < self._end:
             return None
         piece = self._text[location : location + max(length, 0)]
@@ -72,7 +66,7 @@ class Words:
             return None
         self._end = self._whole(start, start + len(parts[0]))
         self._number += 1
-        return FoundWord(start, self._end, self._number)
+        return start, self._end, self._number
 
     def _whole(self, start: int, end: int) -> int:
         """Return where a word ends of which this was reported."""

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 def reported(text: str, places: Iterable[tuple[int, int]]) -> list[str]:
     words = Words(text)
     found = [each for each in (words.next(start, length) for start, length in places) if each is not None]
-    assert [each.number for each in found] == list(range(1, len(found) + 1))
-    assert all(first.end <= second.start for first, second in itertools.pairwise(found))
-    return [text[each.start : each.end] for each in found]
+    assert [number for _, _, number in found] == list(range(1, len(found) + 1))
+    assert all(end <= start for (_, end, _), (start, _, _) in itertools.pairwise(found))
+    return [text[start:end] for start, end, _ in found]
 
 
 def spoken(text: str, voice: str = "gmw/en") -> list[str]:
@@ -81,25 +81,23 @@ def test_whatever_is_reported_words_go_forward_within_the_text(text: str, places
     for location, length in places:
         found = words.next(location, length)
         if found is not None:
-            assert end <= found.start < found.end <= len(text)
-            word = text[found.start : found.end]
-            assert word.split() == [word]
-            end = found.end
+            before, (start, end, _) = end, found
+            assert before <= start < end <= len(text)
+            assert text[start:end].split() == [text[start:end]]
 
 
 def test_words_only_move_forward() -> None:
     words = Words("this one é 日本 😀 ! battery")
     reported = [(0, 4), (0, 4), (5, 0), (9, 1), (-1, 0), (11, 2), (11, 2), (3, 2), (13, 1), (14, 1), (16, 11), (18, 7)]
     found = [words.next(*place) for place in reported]
-    assert [(word.start, word.end) for word in found if word] == [
-        (0, 4),
-        (9, 10),
-        (11, 13),
-        (14, 15),
-        (16, 17),
-        (18, 25),
+    assert [word for word in found if word] == [
+        (0, 4, 1),
+        (9, 10, 2),
+        (11, 13, 3),
+        (14, 15, 4),
+        (16, 17, 5),
+        (18, 25, 6),
     ]
-    assert [word.number for word in found if word] == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_word_beyond_the_text_is_none() -> None:
