@@ -201,17 +201,13 @@ class Session:
             self._silence()
         elif isinstance(command, protocol.Followed):
             self.players.gap.followed = command.followed
-        elif not goal.stop_asked:
-            self._hold_or_go_on(goal, command)
-
-    def _hold_or_go_on(self, goal: InHand, command: protocol.Pause | protocol.Resume) -> None:
-        if isinstance(command, protocol.Resume):
+        elif isinstance(command, protocol.Resume):
             self.held = 0
-            return
-        self.held = command.number
-        if self._pump is not None and goal.spoken and not goal.interrupted:
-            goal.interrupted = True
-            self._engine.stop()
+        elif not goal.stop_asked:
+            self.held = command.number
+            if self._pump is not None and goal.spoken and not goal.interrupted:
+                goal.interrupted = True
+                self._engine.stop()
 
     def confirm(self) -> None:
         """Take note that the sentence that is to be held is silent; may be called again and again."""

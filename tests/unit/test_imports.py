@@ -36,6 +36,7 @@ PURE = [
     "splitter",
     "client.event_buffer",
     "engine.synthesizers.guard",
+    "engine.words",
 ]
 IMPURE = {
     *("asyncio", "threading", "_thread", "socket", "_socket", "select", "selectors", "signal", "time", "datetime"),

@@ -143,7 +143,9 @@ class ProgramPlayer:
         self._read_stderr()
         status = self._child.status()
         if status is None:
-            self._check_broken()
+            if self._broken_at is not None and time.monotonic() - self._broken_at >= LAST_WORDS:
+                line = self._complaint.line()
+                raise CannotSpeak("audio_lost", line or f"{self.name} closed its input before the sound was over")
             return False
         self._read_stderr()
         if status == 0 and self._closed:
@@ -189,12 +191,6 @@ class ProgramPlayer:
             return 0
         self._written += written
         return written
-
-    def _check_broken(self) -> None:
-        """Give up on a player that closed its input but does not end."""
-        if self._broken_at is not None and time.monotonic() - self._broken_at >= LAST_WORDS:
-            line = self._complaint.line()
-            raise CannotSpeak("audio_lost", line or f"{self.name} closed its input before the sound was over")
 
     def _verdict(self, status: int) -> CannotSpeak:
         self.consumed()
