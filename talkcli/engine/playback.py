@@ -45,7 +45,6 @@ BUSY_FOR, BUSY_PAUSE = 1.0, 0.05
 #: Seconds within which a player that was killed must be gone: it takes 1 ms, unless it hangs in a device's driver.
 GONE_WITHIN = 1.0
 
-
 #: Seconds within which a sentence that is to be held must be silent. A player has 42 to 98 ms of it to play; one that
 #: has more, or stands still, is ended instead and the sentence goes on with another.
 SILENT_WITHIN = 0.15

@@ -40,7 +40,6 @@ STEP = 0.05
 PATIENCE = 10.0
 WORDS_A_CHARACTER = 3
 
-
 #: Bytes read in one go; the longest command, escaped, takes a few of them.
 _AT_ONCE = 65536
 

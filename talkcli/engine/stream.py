@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 #: seen to hold 42 to 78, pacat 25 to 60.
 PLAYER_HOLDS = 0.02
 
-
 #: A sample no louder than this, of 32,768, is silence: it is 66 dB below the loudest. libespeak-ng adds 235 to 275 ms
 #: of zeros behind a sentence; with a voice that has an echo ("f3") the last 100 ms or so are silence.
 QUIET = 16

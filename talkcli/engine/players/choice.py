@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 #: idle: loudspeakers that switch themselves off do so by what they hear.
 IDLE_AFTER = 1.0
 
-
 #: Changes by which the next is judged, by their median: one that was late, on a busy machine, changes nothing.
 REMEMBERED = 5
 
