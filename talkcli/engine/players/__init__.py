@@ -4,7 +4,7 @@ The table has the players that have a name, and the command lines of those that 
 players there are imports this alone: nothing is started or opened here.
 `base` has what each of them does and may raise; `choice` chooses one for each sentence; `devices` tells whether there
 is anything to play to. A player that is no program is a module here, and each goes through
-`tests/engine/test_player_contract.py`. The package may import the ground.
+`tests/engine/test_player_contract.py`. The package may import the ground, and the protocol for its types.
 """
 
 from __future__ import annotations
