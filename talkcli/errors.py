@@ -2,7 +2,7 @@
 
 Rules for this file: no imports of other modules of `talk`; a class is added where a program has to tell a case from
 another, with a code that is never used again for anything else. Texts are lower-case and name the thing and the next
-step. The exit codes are the table of the README.
+step. The exit codes are the table of the README. `limits` ends the sentence of one that comes of too little memory.
 """
 
 from __future__ import annotations
@@ -128,3 +128,18 @@ BY_CODE: dict[str, type[RequestRefused]] = {
 def refusal(code: str, message: str) -> RequestRefused:
     """Return the error that a server's error reply stands for."""
     return BY_CODE.get(code, RequestRefused)(message, code)
+
+
+def limits() -> str:
+    """Return what this process is limited to in memory, or where else to look: the end of an error's sentence."""
+    import resource  # no start pays for it
+
+    # What each limit is of, and where it is set: in a shell, in a systemd unit.
+    for number, what, where in (
+        (resource.RLIMIT_DATA, "bytes of memory", "ulimit -d, LimitDATA="),
+        (resource.RLIMIT_AS, "bytes of address space", "ulimit -v, LimitAS="),
+    ):
+        allowed = resource.getrlimit(number)[0]
+        if allowed != resource.RLIM_INFINITY:
+            return f"it is limited to {allowed:,} {what} ({where})"
+    return "see 'free', 'ulimit -u', and MemoryMax= and TasksMax= of its unit"

@@ -12,7 +12,7 @@ import sys
 import time
 
 from talkcli import __version__
-from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, TalkError
+from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, TalkError, limits
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -80,9 +80,7 @@ def ended(command: Callable[[], object], options: Common) -> int:
     except KeyboardInterrupt:
         return EXIT_SIGINT
     except MemoryError:
-        from talkcli import resources
-
-        note(f"there is not enough memory for talk: {resources.limits()}")
+        note(f"there is not enough memory for talk: {limits()}")
         return EXIT_ERROR
     except Exception as error:
         given_up = give_up_failed(error)

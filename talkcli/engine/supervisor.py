@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.inbox import NEVER, Inbox
-from talkcli.engine.process import EngineProcess
+from talkcli.engine.process import EngineProcess, Quota
 from talkcli.engine.protocol import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
 from talkcli.frozen import frozen, replace
-from talkcli.quota import Quota
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,9 +13,9 @@ import traceback
 from typing import TYPE_CHECKING
 
 from talkcli.engine.players import NO_PLAYER
+from talkcli.engine.process import Quota
 from talkcli.engine.synthesizers import is_own
 from talkcli.goals.states import State
-from talkcli.quota import Quota
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:

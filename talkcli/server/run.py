@@ -12,11 +12,11 @@ import string
 import time
 from typing import TYPE_CHECKING
 
-from talkcli import __version__, peers, resources
+from talkcli import __version__, peers
 from talkcli.engine import protocol
 from talkcli.engine.protocol import START_LIMIT
 from talkcli.engine.supervisor import Supervisor
-from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError
+from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, limits
 from talkcli.frozen import frozen
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, Say, Set, as_shown
@@ -140,7 +140,7 @@ class Server:
         try:
             speech.engine.thread.start()
         except RuntimeError as error:  # all that Python says of a thread that it can't have
-            raise TalkError(f"the engine's thread cannot be started: {resources.limits()}") from error
+            raise TalkError(f"the engine's thread cannot be started: {limits()}") from error
         try:
             self._acceptor.open(self._listener.socket)
             self._next_look = self._loop.call_later(LOOK_EVERY, self._look_after_socket)

@@ -25,14 +25,13 @@ PACKAGE = Path(talkcli.__file__).parent
 #: Each layer may import those before it, and itself; nothing imports one behind it.
 LAYERS = ["ground", "goals", "protocol", "terminal", "client", "engine", "server", "doctor", "cli"]
 #: The files of the ground, which lie flat and import nothing of the others but each other.
-GROUND = {"errors", "frozen", "paths", "peers", "quota", "resources", "splitter"}
+GROUND = {"errors", "frozen", "paths", "peers", "splitter"}
 #: What lies flat besides: the package's face and its command, which hand on what others have.
 FACE = {"", "__main__"}
 #: What is pure besides all of `goals` and `protocol`.
 PURE = [
     "errors",
     "frozen",
-    "quota",
     "splitter",
     "client.event_buffer",
     "engine.synthesizers.guard",
