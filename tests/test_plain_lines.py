@@ -21,8 +21,7 @@ from talkcli.client.connect import GREETING
 from talkcli.goals.option import FLAG
 from talkcli.goals.options import Cancel, Say
 from talkcli.protocol import replies
-from talkcli.protocol.encoder import write_request
-from talkcli.protocol.lines import encode
+from talkcli.protocol.lines import encode, write_request
 from talkcli.protocol.requests import Hello, Pause, Resume, Status
 
 if TYPE_CHECKING:

@@ -170,7 +170,7 @@ def first(plain: Plain) -> tuple[JsonObject, JsonObject] | None:
 
 
 def _request(command: str, given: dict[str, Any]) -> JsonObject | None:
-    from talkcli.protocol.encoder import write_request
+    from talkcli.protocol.lines import write_request
 
     if command == "say":
         say = _say(given)

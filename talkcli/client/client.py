@@ -21,9 +21,8 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.option import MAX_ID, MAX_IDS, MAX_LOG
 from talkcli.goals.options import Cancel, Say, Set, bad_key, bad_option
 from talkcli.goals.states import State
-from talkcli.protocol.encoder import request_line, write_request
 from talkcli.protocol.events import Snapshot
-from talkcli.protocol.lines import MAX_LINE
+from talkcli.protocol.lines import MAX_LINE, request_line, write_request
 from talkcli.protocol.replies import Canceled, ServerStatus, goal_in, goals
 from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from talkcli.errors import AccessDenied, TalkError
     from talkcli.goals.goal import JsonObject
-    from talkcli.splitter import LineSplitter
+    from talkcli.protocol.lines import LineSplitter
 
 #: How a server of this protocol begins its greeting, as `protocol.lines` writes it; a test compares the two.
 GREETING = b'{"talk": 1, "version": '
@@ -133,7 +133,7 @@ def ask(begun: Begun, hello: JsonObject, request: JsonObject, before: Callable[[
     None where the connection broke before: nothing was sent that could have an effect. `before`: called before the
     request is sent, which is not done where the server greets otherwise, or not at once.
     """
-    from talkcli.protocol.encoder import request_line
+    from talkcli.protocol.lines import request_line
 
     connected, line = begun.socket, request_line({"seq": FIRST, **request})
     assert connected
@@ -256,7 +256,7 @@ def _greet(
     begun: Begun, connected: _socket.socket, hello: JsonObject, patience: float, interrupt: Mapping[int, int] | None
 ) -> Line:
     """Greet, unless that has been done, and be greeted; where that fails the connection is closed."""
-    from talkcli.splitter import LineSplitter
+    from talkcli.protocol.lines import LineSplitter
 
     splitter = LineSplitter()
     try:
@@ -283,7 +283,7 @@ def _greet(
 
 
 def _say(connected: _socket.socket, hello: JsonObject) -> None:
-    from talkcli.protocol.encoder import request_line
+    from talkcli.protocol.lines import request_line
 
     try:
         connected.send(request_line(hello))

@@ -23,9 +23,8 @@ from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Say
 from talkcli.goals.states import State
 from talkcli.protocol import events
-from talkcli.protocol.encoder import request_line, write_request
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
-from talkcli.protocol.lines import decode
+from talkcli.protocol.lines import decode, request_line, write_request
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

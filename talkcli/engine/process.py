@@ -26,7 +26,7 @@ from talkcli.client.connect import ready
 from talkcli.engine import protocol
 from talkcli.engine.players.child import close, kill, kill_holders, open_pipes, processes, signal_name
 from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
-from talkcli.splitter import LineSplitter
+from talkcli.protocol.lines import LineSplitter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

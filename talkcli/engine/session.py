@@ -20,7 +20,7 @@ from talkcli.engine import protocol
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.synthesizers.voices import list_voices
 from talkcli.engine.words import Words
-from talkcli.splitter import LineSplitter
+from talkcli.protocol.lines import LineSplitter
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

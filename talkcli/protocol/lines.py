@@ -1,20 +1,19 @@
 """Lines: one JSON object each, UTF-8. No I/O: bytes go in, objects come out, and back.
 
 Rules for this file: it knows lines and their limits, never what a request means. Anything that comes from outside ends
-as an object or as a BadRequest, whatever bytes they were.
+as an object or as a BadRequest, whatever bytes they were. The engine process and its players cut lines, too, and a
+client writes its first request before anything else is there: `json` and the errors are imported by who needs them.
 """
 
 from __future__ import annotations
 
-import json
-import math
+import sys
 
-from talkcli.errors import BadRequest, LineTooLong
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.splitter import Cut, LineSplitter
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
+    from talkcli.protocol.requests import Request
 
 #: Bytes of one request line, its newline included: the longest text (40,000 bytes of UTF-8) fits with room for quotes,
 #: and so do 10,000 characters that are all escaped as \uXXXX.
@@ -24,18 +23,135 @@ MAX_LINE = 64 * 1024
 MAX_DIGITS = 20
 
 
-def encode(message: JsonObject) -> bytes:
-    """Return the object as a line. Text goes as UTF-8; only what UTF-8 cannot hold (a lone surrogate) is escaped."""
+class Cut(bytes):
+    """The beginning of a line that was longer than what is kept of one."""
+
+    #: bytes that the whole line had
+    size: int
+
+
+class LineSplitter:
+    """Takes bytes as they come and gives lines; holds no more than the first `most` bytes of one."""
+
+    __slots__ = ("_begun", "_most", "size")
+
+    def __init__(self, most: int = sys.maxsize) -> None:
+        self._most = most
+        self._begun = bytearray()
+        #: bytes of the line that has begun and not ended, those that are not kept among them
+        self.size = 0
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Return the lines that are complete now, without their newlines; those that are too long are `Cut`."""
+        *lines, begun = data.split(b"\n")
+        for place, line in enumerate(lines):
+            if self.size or len(line) > self._most:
+                self._add(line)
+                lines[place] = self.end()
+        self._add(begun)
+        return lines
+
+    def end(self) -> bytes:
+        """Return the line that has begun and not ended, as if it ended here; empty if there is none."""
+        line = bytes(self._begun)
+        if self.size > self._most:
+            line = Cut(line)
+            line.size = self.size
+        self._begun.clear()
+        self.size = 0
+        return line
+
+    def _add(self, data: bytes) -> None:
+        self.size += len(data)
+        self._begun += data[: self._most - len(self._begun)]
+
+
+class RequestSplitter(LineSplitter):
+    """Cuts what comes from a client into lines, none of them past a limit; a server is trusted."""
+
+    __slots__ = ("_limit",)
+
+    def __init__(self, limit: int = MAX_LINE) -> None:
+        """`limit`: bytes of a line, its newline included."""
+        super().__init__(limit - 1)
+        self._limit = limit
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Return the lines that are complete now, without their newlines; LineTooLong, with those before it, past the
+        limit.
+
+        After that error the stream cannot be followed any further: the connection has to be closed.
+        """
+        from talkcli.errors import LineTooLong
+
+        lines = super().feed(data)
+        for place, line in enumerate(lines):
+            if isinstance(line, Cut):
+                raise LineTooLong(self._limit, lines[:place])
+        if self.size >= self._limit:
+            raise LineTooLong(self._limit, lines)
+        return lines
+
+
+def write_request(request: Request) -> JsonObject:
+    """Return a request as the object that goes over the wire; fields at their defaults are left out."""
+    message: JsonObject = {"request": request.kind}
+    for option in request.options:
+        value = getattr(request, option.name)
+        if value != option.default or option.name == "text":
+            message[option.name] = list(value) if isinstance(value, tuple) else value
+    return message
+
+
+def request_line(message: JsonObject) -> bytes:
+    """Return what `encode` does, without `json` where the values are plain."""
     try:
-        return _ENCODER.encode(message).encode() + b"\n"
+        shown = ", ".join(f'"{name}": {_plain(value)}' for name, value in message.items())
+        return f"{{{shown}}}\n".encode()
+    except (TypeError, UnicodeEncodeError):
+        return encode(message)
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, str):
+        return _quoted(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        return int.__repr__(value)
+    if isinstance(value, float) and _finite(value):
+        return float.__repr__(value)
+    if isinstance(value, list):
+        return f"[{', '.join(map(_plain, value))}]"
+    raise TypeError
+
+
+def _quoted(text: str) -> str:
+    if text.isprintable() and '"' not in text and "\\" not in text:
+        return f'"{text}"'
+    from _json import encode_basestring  # a library of its own, whose loading most texts need not wait for
+
+    return encode_basestring(text)
+
+
+def encode(message: JsonObject) -> bytes:
+    """Return the object as a line; ValueError or TypeError where it is no JSON.
+
+    Text goes as UTF-8; only what UTF-8 cannot hold (a lone surrogate) is escaped.
+    """
+    json = _json()
+    try:
+        return json.encode(message).encode() + b"\n"
     except UnicodeEncodeError:
-        return _ASCII_ENCODER.encode(message).encode() + b"\n"
+        return json.escape(message).encode() + b"\n"
 
 
 def decode(line: bytes) -> JsonObject:
     """Return the object in a line; BadRequest, whose code says why, where there is none."""
+    from talkcli.errors import BadRequest
+
     try:
-        value = _DECODER.decode(line.decode())
+        value = _json().decode(line.decode())
     except UnicodeDecodeError as error:
         raise BadRequest(f"a line is UTF-8, but byte {error.start} of this one is not", "bad_encoding") from None
     except RecursionError:
@@ -45,6 +161,34 @@ def decode(line: bytes) -> JsonObject:
     if not isinstance(value, dict):
         raise BadRequest(f"a line is one JSON object, not {type(value).__name__}", "bad_json")
     return value
+
+
+class _Json:
+    """The ways into JSON and back, as strict as they can be.
+
+    `json.dumps` and `json.loads` make new ones for each line that isn't written or read in their own way, which takes
+    half as long as an event's line itself.
+    """
+
+    def __init__(self) -> None:
+        import json
+
+        self.encode = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
+        self.escape = json.JSONEncoder(allow_nan=False).encode
+        self.decode = json.JSONDecoder(
+            object_pairs_hook=_no_duplicates, parse_constant=_no_constant, parse_int=_short_integer, parse_float=_number
+        ).decode
+
+
+_made: _Json | None = None
+
+
+def _json() -> _Json:
+    """Return them, made when the first line needs them."""
+    global _made  # noqa: PLW0603
+    if _made is None:
+        _made = _Json()
+    return _made
 
 
 def _no_duplicates(pairs: list[tuple[str, object]]) -> JsonObject:
@@ -64,42 +208,13 @@ def _short_integer(digits: str) -> int:
     return int(digits)
 
 
-def _finite(digits: str) -> float:
+def _number(digits: str) -> float:
     number = float(digits)
-    if not math.isfinite(number):
+    if not _finite(number):
         raise ValueError("a number past every float")
     return number
 
 
-# Made once: `json.dumps` and `json.loads` make a new one for each line that isn't written or read in their own way,
-# which takes half as long as an event's line itself.
-_ENCODER = json.JSONEncoder(ensure_ascii=False, allow_nan=False)
-_ASCII_ENCODER = json.JSONEncoder(allow_nan=False)
-_DECODER = json.JSONDecoder(
-    object_pairs_hook=_no_duplicates, parse_constant=_no_constant, parse_int=_short_integer, parse_float=_finite
-)
-
-
-class RequestSplitter(LineSplitter):
-    """Cuts what comes from a client into lines, none of them past a limit; a server is trusted."""
-
-    __slots__ = ("_limit",)
-
-    def __init__(self, limit: int = MAX_LINE) -> None:
-        """`limit`: bytes of a line, its newline included."""
-        super().__init__(limit - 1)
-        self._limit = limit
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that are complete now, without their newlines; LineTooLong, with those before it, past the
-        limit.
-
-        After that error the stream cannot be followed any further: the connection has to be closed.
-        """
-        lines = super().feed(data)
-        for place, line in enumerate(lines):
-            if isinstance(line, Cut):
-                raise LineTooLong(self._limit, lines[:place])
-        if self.size >= self._limit:
-            raise LineTooLong(self._limit, lines)
-        return lines
+def _finite(number: float) -> bool:
+    """Whether it is neither NaN nor infinite."""
+    return number - number == 0

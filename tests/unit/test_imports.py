@@ -25,14 +25,13 @@ PACKAGE = Path(talkcli.__file__).parent
 #: Each layer may import those before it, and itself; nothing imports one behind it.
 LAYERS = ["ground", "goals", "protocol", "terminal", "client", "engine", "server", "doctor", "cli"]
 #: The files of the ground, which lie flat and import nothing of the others but each other.
-GROUND = {"errors", "frozen", "paths", "peers", "splitter"}
+GROUND = {"errors", "frozen", "paths", "peers"}
 #: What lies flat besides: the package's face and its command, which hand on what others have.
 FACE = {"", "__main__"}
 #: What is pure besides all of `goals` and `protocol`.
 PURE = [
     "errors",
     "frozen",
-    "splitter",
     "client.event_buffer",
     "engine.synthesizers.guard",
     "engine.words",
@@ -260,7 +259,7 @@ COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", 
         ("import talkcli.client.client", [*HEAVY, *COSTLY]),
         ("from talkcli import Client", [*HEAVY, *COSTLY]),
         ("import talkcli.cli, talkcli.cli.plain", [*HEAVY, *COSTLY, "json", "re", "enum", "signal"]),
-        ("import talkcli.protocol.encoder", [*HEAVY, *COSTLY, "_json", "json", "re", "enum", "signal"]),
+        ("import talkcli.protocol.lines", [*HEAVY, *COSTLY, "_json", "json", "re", "enum", "signal"]),
         ("import talkcli.cli.ask, talkcli.cli.say, talkcli.cli.wait", [*HEAVY, *COSTLY]),
         ("import talkcli.terminal.goals, talkcli.terminal.transcript, talkcli.cli.show, talkcli.cli.command", HEAVY),
     ],

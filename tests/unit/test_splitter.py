@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from talkcli.splitter import Cut, LineSplitter
+from talkcli.protocol.lines import Cut, LineSplitter
 
 MOST = 8
 

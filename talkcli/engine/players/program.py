@@ -16,7 +16,7 @@ import time
 
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.child import Child, is_held, signal_name
-from talkcli.splitter import LineSplitter
+from talkcli.protocol.lines import LineSplitter
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
