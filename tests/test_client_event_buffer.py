@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from talkcli import Client
-from talkcli.client.event_buffer import MAX_FEEDBACK, MAX_STATES
+from talkcli.client.following import MAX_FEEDBACK, MAX_STATES
 from talkcli.errors import Lost, UnknownGoal
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, Result, Snapshot, StateChanged, WordHeard

@@ -11,7 +11,7 @@ import pytest
 
 import talkcli
 from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard
-from talkcli.client.event_buffer import MAX_FEEDBACK, MAX_STATES, EventBuffer
+from talkcli.client.following import MAX_FEEDBACK, MAX_STATES, EventBuffer
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.protocol import events

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import Client, State
-from talkcli.client.connection import Followed
-from talkcli.client.following import merged
-from talkcli.client.goal import GoalHandle
+from talkcli.client.following import Followed
+from talkcli.client.goal import GoalHandle, merged
 from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say

@@ -136,7 +136,7 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback:
 
 def _show(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, shown: Feedback) -> None:
     """Show what happens to the goals until all have ended."""
-    from talkcli.client.following import merged
+    from talkcli.client.goal import merged
 
     try:
         shown.begin([each.goal for each in goals])

@@ -13,7 +13,7 @@ It imports neither click nor asyncio nor pyttsx3, starts no thread, and may be u
 from __future__ import annotations
 
 from talkcli.client.connection import SILENCE_LIMIT, SocketConnection
-from talkcli.client.event_buffer import MAX_STATES, EventBuffer
+from talkcli.client.following import MAX_STATES, EventBuffer
 from talkcli.client.goal import GoalHandle
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING

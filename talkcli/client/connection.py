@@ -17,24 +17,19 @@ from collections.abc import Callable
 
 from talkcli import paths, peers
 from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, hello, ready, sender
+from talkcli.client.following import Followed
 from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, UsageError, refusal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Say
-from talkcli.goals.states import State
-from talkcli.protocol import events
-from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.protocol.lines import decode, request_line, write_request
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Protocol
-    from weakref import WeakSet
 
     from talkcli.client.connect import Begun
-    from talkcli.client.event_buffer import EventBuffer
     from talkcli.goals.goal import JsonObject
-    from talkcli.protocol.events import Event
     from talkcli.protocol.requests import Request
 else:
     Protocol = object
@@ -44,49 +39,6 @@ SILENCE_LIMIT = 15.0
 
 
 OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
-
-
-class Followed:
-    """Who is told what of the events that come in: of one goal, of all speech, of everything. Used under one lock."""
-
-    def __init__(self) -> None:
-        self._goals: dict[str, list[Callable[[Event], None]]] = {}
-        self._watches: WeakSet[EventBuffer] | None = None
-
-    def add(self, goal_id: str, hear: Callable[[Event], None]) -> None:
-        """Tell of a goal, and of speech that is held or goes on, until the goal's Result, which is the last."""
-        self._goals.setdefault(goal_id, []).append(hear)
-
-    def watch(self, buffer: EventBuffer) -> None:
-        """Put everything that happens into this buffer, as long as somebody holds it."""
-        from weakref import WeakSet  # few watch, and all would wait for the import
-
-        # A watch ends when nobody holds its iterator any more.
-        self._watches = WeakSet() if self._watches is None else self._watches
-        self._watches.add(buffer)
-
-    def hear(self, message: JsonObject) -> None:
-        """Hand on an event; ValueError where it is none."""
-        event = events.from_json(message)
-        if isinstance(event, Result):
-            for hear in self._goals.pop(event.goal.id, ()):
-                hear(event)
-        elif isinstance(event, StateChanged | WordHeard | PausedChanged):
-            if isinstance(event, PausedChanged):
-                hearing = [hear for each in self._goals.values() for hear in each]
-            else:
-                hearing = self._goals.get(event.id, [])
-            for hear in hearing:
-                hear(event)
-            # Of the goals that are waited for the states come twice: with the whole goal to those who watch.
-            if not isinstance(event, StateChanged) or event.goal or not _tells_all(event.state):
-                for buffer in self._watches or ():
-                    buffer.add(event)
-
-
-def _tells_all(state: State) -> bool:
-    """Whether those who watch are told the whole goal with this state."""
-    return state is State.PENDING or state.terminal
 
 
 class Connection(Protocol):

@@ -1,82 +1,109 @@
-"""What happens to several goals, as one stream in the server's order. `GoalHandle.events` is that of a single goal.
+"""Who is told what of the events that come in, and what waits for who takes them late: bounded, in its order.
 
-It waits, as a handle does, on their connection; it prints nothing and cancels nothing.
+No I/O, no locks of its own: whoever uses it holds the connection's.
 """
 
 from __future__ import annotations
 
-import time
+from collections import deque
 
-from talkcli.client.connection import SILENCE_LIMIT
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.states import State
+from talkcli.protocol import events
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable
+    from weakref import WeakSet
 
-    from talkcli.client.goal import GoalHandle
+    from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
 
-
-def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Iterate over what happens to these goals of one connection, each event with its goal, until all have ended.
-
-    Each goal's last is its Result. That speech is held, which all of them hear, comes once. TimeoutError where they
-    have not all ended `timeout` seconds after the first step; where the server goes away, the rest are LOST.
-    """
-    end = None if timeout is None else time.monotonic() + timeout
-    stream = _Stream(handles)
-    late = False
-    while stream.going:
-        connection = stream.going[0]._connection
-        if late:  # what had arrived by the deadline counts, nothing after it
-            with connection.changed:
-                found = stream.arrived()
-        else:
-            found = connection.wait_until(stream.arrived, lambda: end, SILENCE_LIMIT)
-            late = end is not None and time.monotonic() >= end
-        if not found:
-            for each in stream.going:
-                each._give_up(timeout)
-            with connection.changed:
-                stream.arrived()
-        yield from stream.take()
+#: Words and pauses kept for whoever takes them late, the newest: the longest text, 10,000 characters, has no more
+#: words, so that those of one goal are all there after its end.
+MAX_FEEDBACK = 5_000
+#: States kept for whoever watches all goals, and doesn't take them while others read on the same connection: those of
+#: some 3,000 goals. None is dropped: past this, watching ends.
+MAX_STATES = 10_000
 
 
-class _Stream:
-    """Events taken from the handles and not yet handed out."""
+class EventBuffer:
+    """What waits for one reader. Its users hold a lock of theirs."""
 
-    def __init__(self, handles: Sequence[GoalHandle]) -> None:
-        #: goals whose Result was not found yet, each once, whoever named it twice
-        self.going = list({each.id: each for each in handles}.values())
-        #: the number of the last event, by the goal's id: its Result follows that
-        self._last = dict.fromkeys((each.id for each in self.going), 0)
-        self._found: list[tuple[int, GoalHandle, Event]] = []
-        self._paused_at: int | None = None
+    __slots__ = ("__weakref__", "_count", "_feedback", "_last", "_states", "overrun")
 
-    def arrived(self) -> bool:
-        """Take what has come for all of them, and tell whether there is something; under the connection's lock."""
-        for handle in self.going:
-            while (event := handle._buffer.take()) is not None:
-                self._add(handle, event)
-            if handle.state.terminal:
-                self._found.append((self._last[handle.id], handle, Result(handle.goal)))
-        self.going = [each for each in self.going if not each.state.terminal]
-        return bool(self._found)
+    def __init__(self) -> None:
+        # Each with its number in the order of arrival; two queues, so that the oldest feedback is dropped in no time.
+        self._states: deque[tuple[int, Event]] = deque()
+        self._feedback: deque[tuple[int, Event]] = deque(maxlen=MAX_FEEDBACK)
+        self._count = 0
+        self._last: int | None = None
+        #: whether a state came that there was no room for: nothing that came after it is here
+        self.overrun = False
 
-    def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Return what was found, in the server's order."""
-        # A stable sort: a Result has the number of its goal's last event, and was found after that.
-        found = sorted(self._found, key=lambda each: each[0])
-        self._found = []
-        return [(handle, event) for _, handle, event in found]
-
-    def _add(self, handle: GoalHandle, event: Event) -> None:
-        number = event.n if isinstance(event, StateChanged | WordHeard | PausedChanged) else None
-        if isinstance(event, PausedChanged):
-            if number is not None and number == self._paused_at:
+    def add(self, event: Event) -> None:
+        """Keep an event. One that comes twice, to a connection that waits for a goal and watches all, is kept once."""
+        if isinstance(event, StateChanged | WordHeard | PausedChanged):
+            if event.n is not None and event.n == self._last:
                 return
-            self._paused_at = number
-        if number is not None:
-            self._last[handle.id] = number
-        self._found.append((self._last[handle.id], handle, event))
+            self._last = event.n
+        if self.overrun:
+            return
+        self._count += 1
+        if isinstance(event, WordHeard | PausedChanged):
+            self._feedback.append((self._count, event))
+        elif len(self._states) < MAX_STATES:
+            self._states.append((self._count, event))
+        else:
+            self.overrun = True
+
+    def take(self) -> Event | None:
+        """Take the oldest event; None if there is none."""
+        if not (self._states or self._feedback):
+            return None
+        if not self._feedback or (self._states and self._states[0][0] < self._feedback[0][0]):
+            return self._states.popleft()[1]
+        return self._feedback.popleft()[1]
+
+
+class Followed:
+    """Who is told what of the events that come in: of one goal, of all speech, of everything. Used under one lock."""
+
+    def __init__(self) -> None:
+        self._goals: dict[str, list[Callable[[Event], None]]] = {}
+        self._watches: WeakSet[EventBuffer] | None = None
+
+    def add(self, goal_id: str, hear: Callable[[Event], None]) -> None:
+        """Tell of a goal, and of speech that is held or goes on, until the goal's Result, which is the last."""
+        self._goals.setdefault(goal_id, []).append(hear)
+
+    def watch(self, buffer: EventBuffer) -> None:
+        """Put everything that happens into this buffer, as long as somebody holds it."""
+        from weakref import WeakSet  # few watch, and all would wait for the import
+
+        # A watch ends when nobody holds its iterator any more.
+        self._watches = WeakSet() if self._watches is None else self._watches
+        self._watches.add(buffer)
+
+    def hear(self, message: JsonObject) -> None:
+        """Hand on an event; ValueError where it is none."""
+        event = events.from_json(message)
+        if isinstance(event, Result):
+            for hear in self._goals.pop(event.goal.id, ()):
+                hear(event)
+        elif isinstance(event, StateChanged | WordHeard | PausedChanged):
+            if isinstance(event, PausedChanged):
+                hearing = [hear for each in self._goals.values() for hear in each]
+            else:
+                hearing = self._goals.get(event.id, [])
+            for hear in hearing:
+                hear(event)
+            # Of the goals that are waited for the states come twice: with the whole goal to those who watch.
+            if not isinstance(event, StateChanged) or event.goal or not _tells_all(event.state):
+                for buffer in self._watches or ():
+                    buffer.add(event)
+
+
+def _tells_all(state: State) -> bool:
+    """Whether those who watch are told the whole goal with this state."""
+    return state is State.PENDING or state.terminal

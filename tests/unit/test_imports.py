@@ -32,7 +32,7 @@ FACE = {"", "__main__"}
 PURE = [
     "errors",
     "frozen",
-    "client.event_buffer",
+    "client.following",
     "engine.synthesizers.guard",
     "engine.words",
 ]
