@@ -318,7 +318,7 @@ def test_poll_tells_that_the_goal_is_lost_where_the_server_says_nothing_any_more
     client: Client, scripted: Talk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     handle = client.say("never-ends words=1")
-    monkeypatch.setattr("talkcli.client.goal.SILENCE_LIMIT", 0.3)
+    monkeypatch.setattr("talkcli.client.connection.SILENCE_LIMIT", 0.3)
     scripted.freeze()
     began = time.monotonic()
     assert told(polled(handle))[-1] is Result

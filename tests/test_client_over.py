@@ -63,12 +63,11 @@ class Scripted:
         self,
         done: Callable[[], bool],
         deadline: Callable[[], float | None],
-        silence: float | None = None,
         *,
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        del deadline, silence, since, interruptible  # nothing takes time here
+        del deadline, since, interruptible  # nothing takes time here
         with self.changed:
             while not done():
                 if not self.coming:

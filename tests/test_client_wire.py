@@ -82,7 +82,7 @@ def test_server_that_says_nothing_at_all_is_given_up(monkeypatch: pytest.MonkeyP
 
 
 def test_watch_goes_on_as_long_as_the_server_is_alive(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("talkcli.client.client.SILENCE_LIMIT", 0.4)
+    monkeypatch.setattr("talkcli.client.connection.SILENCE_LIMIT", 0.4)
 
     def play(peer: Peer) -> None:
         peer.reply("watch", **OVERVIEW)

@@ -12,7 +12,7 @@ It imports neither click nor asyncio nor pyttsx3, starts no thread, and may be u
 
 from __future__ import annotations
 
-from talkcli.client.connection import SILENCE_LIMIT, SocketConnection
+from talkcli.client.connection import SocketConnection, taken
 from talkcli.client.following import MAX_STATES, EventBuffer
 from talkcli.client.goal import GoalHandle
 from talkcli.errors import Lost, UnknownGoal, UsageError
@@ -308,19 +308,12 @@ class Client:
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        event: Event | None = None
-
-        def arrived() -> bool:
-            nonlocal event
-            event = buffer.take()
-            return event is not None or buffer.overrun
-
-        while self._connection.wait_until(arrived, lambda: None, SILENCE_LIMIT):
-            if event is None:
-                raise Lost(
-                    f"more than {MAX_STATES} events waited and none was taken: watch again, and take them faster"
-                )
+        for event in taken(self._connection, lambda: buffer.take() or buffer.overrun, None):
+            if isinstance(event, bool):
+                break
             yield event
+        if buffer.overrun:
+            raise Lost(f"more than {MAX_STATES} events waited and none was taken: watch again, and take them faster")
         raise Lost(f"nothing more is heard of the server at {self.path}: {self._connection.ended}")
 
 

@@ -25,12 +25,14 @@ from talkcli.goals.options import Say
 from talkcli.protocol.lines import decode, request_line, write_request
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from typing import Protocol
+    from collections.abc import Iterator, Mapping
+    from typing import Protocol, TypeVar
 
     from talkcli.client.connect import Begun
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
+
+    _T = TypeVar("_T")
 else:
     Protocol = object
 
@@ -91,7 +93,6 @@ class Connection(Protocol):
         self,
         done: Callable[[], bool],
         deadline: Callable[[], float | None],
-        silence: float | None = None,
         *,
         since: float | None = None,
         interruptible: bool = True,
@@ -99,9 +100,8 @@ class Connection(Protocol):
         """Read until `done()`, and return True; False at the deadline (monotonic), or once the connection ended.
 
         `done` is called under `changed`, and no more once it was true; what has arrived by the deadline counts.
-        `silence`: seconds without a word from the server after which the connection counts as ended, counted from this
-        call on, or from `since` (monotonic). What interrupts the connection's waits does so here, with Interrupted,
-        unless it is not `interruptible`.
+        A server that says nothing for SILENCE_LIMIT, counted from this call on, or from `since` (monotonic), counts as
+        gone. What interrupts the connection's waits does so here, with Interrupted, unless it is not `interruptible`.
         """
 
     def close(self) -> None:
@@ -109,6 +109,30 @@ class Connection(Protocol):
 
         In a forked child it closes the child's copy alone.
         """
+
+
+def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
+    """Yield what `take` finds, called under `changed`, again and again as it comes.
+
+    What is empty is yielded where nothing has come by `end` (monotonic), or can come any more. What had arrived by then
+    counts, nothing after it: a goal may go on for ever.
+    """
+    found: _T
+
+    def arrived() -> bool:
+        nonlocal found
+        found = take()
+        return bool(found)
+
+    late = False
+    while True:
+        if late:
+            with connection.changed:
+                arrived()
+        else:
+            connection.wait_until(arrived, lambda: end)
+            late = end is not None and time.monotonic() >= end
+        yield found
 
 
 def _refusal(reply: JsonObject, items: list[JsonObject]) -> RequestRefused:
@@ -217,7 +241,6 @@ class SocketConnection:
             self.wait_until(
                 lambda: exchange.reply is not None,
                 lambda: None if slow else exchange.touched + self._patience,
-                SILENCE_LIMIT if slow else None,
                 interruptible=interruptible,
             )
         finally:
@@ -241,7 +264,6 @@ class SocketConnection:
         self,
         done: Callable[[], bool],
         deadline: Callable[[], float | None],
-        silence: float | None = None,
         *,
         since: float | None = None,
         interruptible: bool = True,
@@ -256,17 +278,16 @@ class SocketConnection:
                     return False
                 now = time.monotonic()
                 limit = deadline()
-                quiet = None if silence is None else max(began, self._heard) + silence
-                if last and quiet is not None and now >= quiet and (limit is None or quiet < limit):
-                    self.ended = f"it has said nothing for {silence:g} s"
+                quiet = max(began, self._heard) + SILENCE_LIMIT
+                rest = (quiet if limit is None else min(limit, quiet)) - now
+                if last and rest <= 0:
+                    if limit is None or quiet < limit:
+                        self.ended = f"it has said nothing for {SILENCE_LIMIT:g} s"
                     return False
-                if last and limit is not None and now >= limit:
-                    return False
-                rest = min((each - now for each in (limit, quiet) if each is not None), default=None)
                 # What has arrived by the deadline counts: one more look, that doesn't wait.
-                last = rest is not None and rest <= 0
+                last = rest <= 0
                 if self._reading:
-                    self.changed.wait(None if rest is None else min(max(0.0, rest), threading.TIMEOUT_MAX))
+                    self.changed.wait(max(0.0, rest))
                     continue
                 self._reading = True
             try:

@@ -57,9 +57,12 @@ class EventBuffer:
         else:
             self.overrun = True
 
+    def __len__(self) -> int:
+        return len(self._states) + len(self._feedback)
+
     def take(self) -> Event | None:
         """Take the oldest event; None if there is none."""
-        if not (self._states or self._feedback):
+        if not self:
             return None
         if not self._feedback or (self._states and self._states[0][0] < self._feedback[0][0]):
             return self._states.popleft()[1]

@@ -1,4 +1,4 @@
-"""A goal that was sent, or is followed: its state, its events as they come, its end; and those of several as one stream.
+"""A goal that was sent, or is followed: its state, its events as they come, its end. Of several, one stream of them.
 
 It needs a connection, and knows no client. It reads nothing by itself: whoever waits on the connection reads for all,
 and what is for this goal comes to `_hear`. Whatever changes a handle does so under the connection's lock, and never
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 
-from talkcli.client.connection import SILENCE_LIMIT
+from talkcli.client.connection import taken
 from talkcli.client.following import EventBuffer
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
@@ -71,7 +71,7 @@ class GoalHandle:
         """
         end = _end(timeout)
         self._follow(feedback=False)
-        if not self._connection.wait_until(lambda: self.state.terminal, lambda: end, SILENCE_LIMIT):
+        if not self._connection.wait_until(lambda: self.state.terminal, lambda: end):
             self._give_up(timeout)
         return self.goal
 
@@ -103,20 +103,15 @@ class GoalHandle:
         For a loop that must not: it reads what the server has said meanwhile, so it has to be called again and again.
         UsageError for a goal that was sent with `follow=False`, of which nothing comes until `wait` or `events` asks.
         """
-        event: Event | None = None
-
-        def arrived() -> bool:
-            nonlocal event
-            event = self._buffer.take()
-            return event is not None or self.state.terminal
-
         if not (self._followed or self.state.terminal):
             raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
         now, since = time.monotonic(), self._followed_at
-        if not self._connection.wait_until(arrived, lambda: now, SILENCE_LIMIT, since=since, interruptible=False):
+        if not self._connection.wait_until(self._has_next, lambda: now, since=since, interruptible=False):
             self._lose()
-        if event is None and self.state.terminal and not self._told:
-            event = self._result()
+        with self._connection.changed:
+            event = self._next()
+            if isinstance(event, Result):
+                event, self._told = None if self._told else event, True
         return event
 
     def request_cancel(self) -> None:
@@ -168,31 +163,22 @@ class GoalHandle:
                 self.goal = goal
 
     def _events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
-        event: Event | None = None
-
-        def arrived() -> bool:
-            nonlocal event
-            event = self._buffer.take()
-            return event is not None or self.state.terminal
-
-        late = False
-        while True:
-            if late:  # what had arrived by the deadline counts, nothing after it: the goal may go on for ever
-                with self._connection.changed:
-                    found = arrived()
-            else:
-                found = self._connection.wait_until(arrived, lambda: end, SILENCE_LIMIT)
-                late = end is not None and time.monotonic() >= end
-            if not found:
-                self._give_up(timeout)
+        for event in taken(self._connection, self._next, end):
             if event is None:
-                yield self._result()
+                self._give_up(timeout)
+            elif isinstance(event, Result):
+                self._told = True
+                yield event
                 return
-            yield event
+            else:
+                yield event
 
-    def _result(self) -> Result:
-        self._told = True
-        return Result(self.goal)
+    def _has_next(self) -> bool:
+        return self.state.terminal or bool(self._buffer)
+
+    def _next(self) -> Event | None:
+        """Take the next event, the Result where there is no other; under the connection's lock."""
+        return self._buffer.take() or (Result(self.goal) if self.state.terminal else None)
 
     def _follow(self, *, feedback: bool) -> None:
         """Have this connection told of the goal, if it isn't yet."""
@@ -225,62 +211,45 @@ def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Itera
     Each goal's last is its Result. That speech is held, which all of them hear, comes once. TimeoutError where they
     have not all ended `timeout` seconds after the first step; where the server goes away, the rest are LOST.
     """
-    end = None if timeout is None else time.monotonic() + timeout
     stream = _Stream(handles)
-    late = False
-    while stream.going:
-        connection = stream.going[0]._connection
-        if late:  # what had arrived by the deadline counts, nothing after it
-            with connection.changed:
-                found = stream.arrived()
-        else:
-            found = connection.wait_until(stream.arrived, lambda: end, SILENCE_LIMIT)
-            late = end is not None and time.monotonic() >= end
+    if not handles:
+        return
+    for found in taken(handles[0]._connection, stream.take, _end(timeout)):
         if not found:
             for each in stream.going:
                 each._give_up(timeout)
-            with connection.changed:
-                stream.arrived()
-        yield from stream.take()
+        yield from found
+        if not stream.going:
+            return
 
 
 class _Stream:
-    """Events taken from the handles and not yet handed out."""
+    """The events of some goals, as they come."""
 
     def __init__(self, handles: Sequence[GoalHandle]) -> None:
         #: goals whose Result was not found yet, each once, whoever named it twice
         self.going = list({each.id: each for each in handles}.values())
         #: the number of the last event, by the goal's id: its Result follows that
         self._last = dict.fromkeys((each.id for each in self.going), 0)
-        self._found: list[tuple[int, GoalHandle, Event]] = []
         self._paused_at: int | None = None
 
-    def arrived(self) -> bool:
-        """Take what has come for all of them, and tell whether there is something; under the connection's lock."""
-        for handle in self.going:
-            while (event := handle._buffer.take()) is not None:
-                self._add(handle, event)
-            if handle.state.terminal:
-                self._found.append((self._last[handle.id], handle, Result(handle.goal)))
-        self.going = [each for each in self.going if not each.state.terminal]
-        return bool(self._found)
-
     def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Return what was found, in the server's order."""
+        """Take what has come for all of them, in the server's order; under the connection's lock."""
+        found = []
+        for handle in self.going:
+            event: Event | None = None
+            while not isinstance(event, Result) and (event := handle._next()):
+                number = getattr(event, "n", None)
+                if isinstance(event, PausedChanged) and number is not None:
+                    if number == self._paused_at:
+                        continue
+                    self._paused_at = number
+                if number is not None:
+                    self._last[handle.id] = number
+                found.append((self._last[handle.id], handle, event))
+        self.going = [each for each in self.going if not each.state.terminal]
         # A stable sort: a Result has the number of its goal's last event, and was found after that.
-        found = sorted(self._found, key=lambda each: each[0])
-        self._found = []
-        return [(handle, event) for _, handle, event in found]
-
-    def _add(self, handle: GoalHandle, event: Event) -> None:
-        number = event.n if isinstance(event, StateChanged | WordHeard | PausedChanged) else None
-        if isinstance(event, PausedChanged):
-            if number is not None and number == self._paused_at:
-                return
-            self._paused_at = number
-        if number is not None:
-            self._last[handle.id] = number
-        self._found.append((self._last[handle.id], handle, event))
+        return [(handle, event) for _, handle, event in sorted(found, key=lambda each: each[0])]
 
 
 def _end(timeout: float | None) -> float | None:
