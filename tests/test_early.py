@@ -261,6 +261,7 @@ def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(ear
             stack.callback(listening.shutdown, socket.SHUT_RDWR)
         line = connect(None, hello(None, urgent=False), begun=begun())
         assert (line.path, line.sent) == (second, b"")
+        assert line.socket
         line.socket.close()
         os.unlink(second)
         with pytest.raises(AccessDenied, match=f"(?s)tried:\n  {first}: the server refuses: not you\n"):

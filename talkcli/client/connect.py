@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from talkcli.errors import AccessDenied, TalkError
     from talkcli.goals.goal import JsonObject
-    from talkcli.protocol.lines import LineSplitter
 
 #: How a server of this protocol begins its greeting, as `protocol.lines` writes it; a test compares the two.
 GREETING = b'{"talk": 1, "version": '
@@ -61,32 +60,18 @@ class Begun:
     failures: tuple[tuple[str, Exception], ...] = ()
     #: whether `hello` was said
     greeted: bool = False
-    #: what the server has said: less than its greeting, or more
+    #: what the server has said that nobody has read: less than its greeting, or more
     received: bytes = b""
     #: what was sent of the first request
     sent: bytes = b""
+    #: once its greeting is read, the server's boot id, the first half of its goals' ids, and its process
+    boot: str = ""
+    pid: int | None = None
 
     @property
     def full(self) -> bool:
         """Whether the last place has a server that takes up no connection at this moment."""
         return self.socket is None and bool(self.failures) and isinstance(self.failures[-1][1], BlockingIOError)
-
-
-@frozen
-class Line:
-    """A connection to a server that has greeted, and what was read of it beyond the greeting."""
-
-    socket: _socket.socket
-    path: str
-    #: the server's boot id: the first half of its goals' ids
-    boot: str
-    #: the server's process id
-    pid: int | None
-    splitter: LineSplitter
-    #: lines that came with the greeting
-    lines: list[bytes]
-    #: what was sent of the first request already
-    sent: bytes
 
 
 def reach(named: str | None, failures: tuple[tuple[str, Exception], ...] = ()) -> Begun:
@@ -199,8 +184,8 @@ def connect(
     patience: float = ANSWER_LIMIT,
     interrupt: Mapping[int, int] | None = None,
     begun: Begun | None = None,
-) -> Line:
-    """Return a connection to the first server that answers.
+) -> Begun:
+    """Return a connection to the first server that answers, with its greeting read.
 
     `named`: the only socket to try, or None for the list; `hello`: what is said to it; `patience`: seconds in which the
     server must greet; `interrupt`: what ends it with Interrupted, as in `ready`; `begun`: how far it has come already.
@@ -254,51 +239,45 @@ def ready(watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[
 
 def _greet(
     begun: Begun, connected: _socket.socket, hello: JsonObject, patience: float, interrupt: Mapping[int, int] | None
-) -> Line:
+) -> Begun:
     """Greet, unless that has been done, and be greeted; where that fails the connection is closed."""
-    from talkcli.protocol.lines import LineSplitter
+    from talkcli.protocol.lines import request_line
 
-    splitter = LineSplitter()
+    end = time.monotonic() + patience
+    received = begun.received
     try:
-        lines = splitter.feed(begun.received)
         if not begun.greeted:
-            _say(connected, hello)
-        end = time.monotonic() + patience
-        while not lines:
-            lines = splitter.feed(_heard(connected, begun.path, end, interrupt))
-        greeting = _checked(lines.pop(0), begun.path)
+            try:
+                connected.send(request_line(hello))
+            except (BrokenPipeError, ConnectionResetError):
+                pass  # it has hung up already, but it may have said why
+        while b"\n" not in received:
+            received += _heard(connected, begun.path, end, interrupt)
+        line, _, received = received.partition(b"\n")
+        greeting = _checked(line, begun.path)
     except BaseException:
         connected.close()
         raise
     boot, pid = greeting.get("boot"), greeting.get("pid")
-    return Line(
-        connected,
-        begun.path,
-        boot if isinstance(boot, str) else "",
-        pid if isinstance(pid, int) else None,
-        splitter,
-        lines,
-        begun.sent,
+    return replace(
+        begun,
+        received=received,
+        boot=boot if isinstance(boot, str) else "",
+        pid=pid if isinstance(pid, int) else None,
     )
-
-
-def _say(connected: _socket.socket, hello: JsonObject) -> None:
-    from talkcli.protocol.lines import request_line
-
-    try:
-        connected.send(request_line(hello))
-    except (BrokenPipeError, ConnectionResetError):
-        pass  # it has hung up already, but it may have said why
 
 
 def _heard(connected: _socket.socket, path: str, end: float, interrupt: Mapping[int, int] | None) -> bytes:
     """Return what a server says that has not greeted yet; `end`: until when it may take for that."""
     from select import POLLIN
 
+    from talkcli import peers
     from talkcli.errors import ServerUnavailable
 
     if not ready({connected.fileno(): POLLIN}, end - time.monotonic(), interrupt):
-        raise ServerUnavailable(f"the server at {path} does not answer; {_next_step(connected)}")
+        pid, _ = peers.credentials(connected)
+        hint = f"look at process {pid}, and restart it if it hangs"
+        raise ServerUnavailable(f"the server at {path} does not answer; {hint}")
     try:
         data = connected.recv(65536)
     except ConnectionResetError:
@@ -329,17 +308,9 @@ def _checked(line: bytes, path: str) -> JsonObject:
     return greeting
 
 
-def _next_step(connected: _socket.socket) -> str:
-    from talkcli import peers
-
-    pid, _ = peers.credentials(connected)
-    return f"look at process {pid}, and restart it if it hangs"
-
-
 def _nobody(begun: Begun, named: str | None) -> TalkError:
     """Return the error that says what was tried."""
     from talkcli.errors import AccessDenied, ServerUnavailable
-    from talkcli.paths import DIRECTORY, FORBIDDEN
 
     if begun.full:
         path = begun.failures[-1][0]
@@ -351,9 +322,9 @@ def _nobody(begun: Begun, named: str | None) -> TalkError:
         words = str(error)
         if isinstance(error, OSError):
             words = found = paths.found_at(path, error)
-            if found == DIRECTORY:
+            if found == paths.DIRECTORY:
                 words += f": name the one in it, {_inside(path)}"
-        denied = denied or isinstance(error, AccessDenied) or found == FORBIDDEN
+        denied = denied or isinstance(error, AccessDenied) or found == paths.FORBIDDEN
         tried += f"  {path}: {words}\n"
     step = _named_step(named, found, denied=denied) if named else f"{_LET_IN}\n{_OWN}" if denied else _START
     hint = paths.sudo_hint()
@@ -368,17 +339,16 @@ def _named_step(named: str, found: str, *, denied: bool) -> str:
     """Return what to do next where the only place was one that the user named."""
     import shlex  # it loads `re`
 
-    from talkcli.paths import DIRECTORY, FILE
     from talkcli.terminal.text import printable
 
     by_variable = named == os.environ.get("TALK_SOCKET")
-    place = shlex.quote(printable(_inside(named) if found == DIRECTORY else named))
+    place = shlex.quote(printable(_inside(named) if found == paths.DIRECTORY else named))
     if denied:
         step = _LET_IN if by_variable else f"{_LET_IN}\n{_OWN}"
-    elif found == FILE:
+    elif found == paths.FILE:
         step = "name a socket" if by_variable else "name a socket, or leave out --socket"
     elif by_variable:
-        step = f"set TALK_SOCKET to {place}" if found == DIRECTORY else _START
+        step = f"set TALK_SOCKET to {place}" if found == paths.DIRECTORY else _START
     else:
         step = f"{_START} --socket {place}"
     return f"{step}\nor unset TALK_SOCKET, which names this place: no other was tried" if by_variable else step

@@ -22,7 +22,7 @@ from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, 
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Say
-from talkcli.protocol.lines import decode, request_line, write_request
+from talkcli.protocol.lines import LineSplitter, decode, request_line, write_request
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -185,13 +185,14 @@ class SocketConnection:
         name = sender(name)
         if name and len(name) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
-        greeting = hello(name, urgent=urgent)
-        line = connect(paths.named_socket(socket), greeting, patience, self._interrupt, begun)
-        self.path, self.boot, self.pid = line.path, line.boot, line.pid
-        self._socket, self._splitter = line.socket, line.splitter
-        self._lines = deque(line.lines)
+        said = hello(name, urgent=urgent)
+        begun = connect(paths.named_socket(socket), said, patience, self._interrupt, begun)
+        assert begun.socket
+        self._socket, self.path, self.boot, self.pid = begun.socket, begun.path, begun.boot, begun.pid
+        self._splitter = LineSplitter()
+        self._lines = deque(self._splitter.feed(begun.received))
         # The beginning of the first line to be sent, if that was sent before there was this connection.
-        self._sent_early = line.sent
+        self._sent_early = begun.sent
         self._process = os.getpid()
         self._patience = patience
         self._exchanges: dict[int, _Exchange] = {}
@@ -299,7 +300,7 @@ class SocketConnection:
                         self._socket.close()
                     self.changed.notify_all()
 
-    def _read(self, timeout: float | None, interruptible: bool) -> None:
+    def _read(self, timeout: float, interruptible: bool) -> None:
         """Read what there is, or wait for it, and hand it out."""
         if not self._lines and not self._fill(timeout, interruptible):
             return
@@ -312,7 +313,7 @@ class SocketConnection:
                 self.ended = self.ended or f"it sent what is no message: {error}"
                 return
 
-    def _fill(self, timeout: float | None, interruptible: bool) -> bool:
+    def _fill(self, timeout: float, interruptible: bool) -> bool:
         try:
             watched = {self._socket.fileno(): select.POLLIN}
             if not ready(watched, timeout, self._interrupt if interruptible else None):

@@ -160,6 +160,7 @@ def _refuse_second_server(named: str | None) -> None:
         return  # nobody there who would answer our clients
     except TalkError as error:
         raise AddressInUse(f"a server is there already: {error}") from error
+    assert found.socket
     here, _ = peers.credentials(found.socket)  # behind a socket that ssh forwards it is a process of another machine's
     found.socket.close()
     raise serves_already(found.pid, found.path, here=here == found.pid)
