@@ -19,11 +19,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from talkcli.goals.goal import By
-    from talkcli.goals.options import Say
-    from talkcli.goals.queue import Queue
     from talkcli.goals.record import Record
 
-_Name = TypeVar("_Name", str, bytes)
+_Name = TypeVar("_Name")
+_Fact = TypeVar("_Fact")
 
 #: Results kept: a robot that speaks ten times a minute has more than an hour and a half to ask.
 MAX_ENDED = 1_000
@@ -97,26 +96,13 @@ class Said:
         """Remember a goal of which something was heard."""
         began = (record.began, record.id)
         if record.key is not None:
-            _keep(self._by_key, record.key, began)
-        _keep(self._by_text, _digest(record.text or ""), began)
+            _keep(self._by_key, record.key, began, MAX_SAID)
+        _keep(self._by_text, _digest(record.text or ""), began, MAX_SAID)
 
     def within(self, seconds: float, key: str | None, text: str, now: float) -> str | None:
         """Return the id of the last goal of this key, or without one of this text, if it began since."""
         last = self._by_text.get(_digest(text)) if key is None else self._by_key.get(key)
         return last[1] if last is not None and now - last[0] < seconds else None
-
-
-def throttling(say: Say, active: Record | None, queue: Queue, said: Said, now: float) -> tuple[str, str] | None:
-    """Return the id of the goal because of which this one is not to be spoken, and what is so with it; or None."""
-    if say.throttle is None:
-        return None
-    if active and (active.text == say.text if say.key is None else active.key == say.key):
-        return active.id, "is being said"
-    waiting = queue.with_text(say.text) if say.key is None else None
-    if waiting:
-        return waiting.id, "is waiting already"
-    last = said.within(say.throttle, say.key, say.text, now)
-    return None if last is None else (last, f"was said less than {say.throttle:g} s ago")
 
 
 class EarlyCancels:
@@ -127,10 +113,7 @@ class EarlyCancels:
 
     def note(self, goal_id: str, by: By, now: float) -> None:
         """Remember the cancel of an id."""
-        self._until.pop(goal_id, None)
-        self._until[goal_id] = (now + EARLY_CANCEL, by)
-        if len(self._until) > MAX_EARLY_CANCELS:
-            self._until.popitem(last=False)
+        _keep(self._until, goal_id, (now + EARLY_CANCEL, by), MAX_EARLY_CANCELS)
 
     def find(self, goal_id: str | None, now: float) -> By | None:
         """Return who cancelled this id."""
@@ -140,10 +123,11 @@ class EarlyCancels:
         return by if now < until else None
 
 
-def _keep(names: OrderedDict[_Name, tuple[float, str]], name: _Name, began: tuple[float, str]) -> None:
-    names[name] = began
+def _keep(names: OrderedDict[_Name, _Fact], name: _Name, fact: _Fact, most: int) -> None:
+    """Remember something of a name as the latest; the oldest gives way."""
+    names[name] = fact
     names.move_to_end(name)
-    if len(names) > MAX_SAID:
+    if len(names) > most:
         names.popitem(last=False)
 
 

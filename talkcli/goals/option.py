@@ -27,6 +27,9 @@ MAX_NAME = 64
 MAX_DATA = 1024
 #: Goals that one request for the log asks for: as many as are kept.
 MAX_LOG = 1_200
+_DIGITS = frozenset("0123456789")
+_LETTERS = frozenset("abcdefghijklmnopqrstuvwxyz")
+_OF_AN_ID = _DIGITS | _LETTERS | frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ._:/-")
 #: sys.float_info.max: NaN is no number of seconds, nor is an integer that is past every float.
 _LARGEST = 1.7976931348623157e308
 
@@ -48,6 +51,18 @@ class Kind:
 
 def _bad_id(value: str) -> str | None:
     return None if 0 < len(value) <= MAX_ID else f"must be an id of 1 to {MAX_ID} characters"
+
+
+def is_clients_id(goal_id: str) -> bool:
+    """Whether this is an id as a client may choose it: no server ever gives one of this form."""
+    if not (0 < len(goal_id) <= MAX_ID and _OF_AN_ID.issuperset(goal_id)) or goal_id[0] == "-":
+        return False
+    boot, dash, number = goal_id.partition("-")
+    if not dash:
+        return not _DIGITS.issuperset(goal_id)
+    # A boot id and a number. Digits first and third: so nobody names a goal (`goal-1`, `2024-12`).
+    servers = len(boot) == 4 and _DIGITS.issuperset(boot[::2]) and _LETTERS.issuperset(boot[1::2])
+    return not (servers and number and _DIGITS.issuperset(number))
 
 
 def _bad_ids(value: list[object]) -> str | None:

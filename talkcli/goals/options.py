@@ -26,9 +26,11 @@ from talkcli.goals.option import (
     WORD,
     Option,
     Setting,
+    is_clients_id,
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from typing import Any, ClassVar
 
     from talkcli.goals.goal import JsonObject
@@ -44,12 +46,11 @@ MAX_PRIORITY = 1_000_000
 MAX_KEY = 64
 #: Milliseconds of silence before a sentence: no output needs longer to wake.
 MAX_LEAD_IN = 5000
+#: Categories of characters that make no sound by themselves: separators, controls, format characters such as the
+#: zero-width space, and code points that are not assigned or private.
+_SILENT = frozenset({"Zs", "Zl", "Zp", "Cc", "Cf", "Cn", "Co"})
 #: What stands for the driver's own voice, where a voice is named.
 DEFAULT_VOICE = "default"
-
-_DIGITS = frozenset("0123456789")
-_LETTERS = frozenset("abcdefghijklmnopqrstuvwxyz")
-_OF_AN_ID = _DIGITS | _LETTERS | frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ._:/-")
 
 
 def _bad_priority(value: int) -> str | None:
@@ -72,18 +73,6 @@ def _foreign_id(value: str) -> str | None:
         f"the id {value[:MAX_ID]!a} is not one that a sender may choose: 1 to {MAX_ID} of A-Z a-z 0-9 . _ : / -, "
         "no '-' in front, not digits alone, and not of the form of a server's own, 4k7f-12"
     )
-
-
-def is_clients_id(goal_id: str) -> bool:
-    """Whether this is an id as a client may choose it: no server ever gives one of this form."""
-    if not (0 < len(goal_id) <= MAX_ID and _OF_AN_ID.issuperset(goal_id)) or goal_id[0] == "-":
-        return False
-    boot, dash, number = goal_id.partition("-")
-    if not dash:
-        return not _DIGITS.issuperset(goal_id)
-    # A boot id and a number. Digits first and third: so nobody names a goal (`goal-1`, `2024-12`).
-    servers = len(boot) == 4 and _DIGITS.issuperset(boot[::2]) and _LETTERS.issuperset(boot[1::2])
-    return not (servers and number and _DIGITS.issuperset(number))
 
 
 def _unknown_format(value: str) -> str | None:
@@ -341,11 +330,6 @@ class Say:
     data: JsonObject | None = None
     format: str = "text"
 
-    @property
-    def shown(self) -> dict[str, Any]:
-        """What a goal shows of it, by the options' names."""
-        return {name: getattr(self, name) for name in SHOWN}
-
 
 @frozen
 class Set:
@@ -399,16 +383,26 @@ class Cancel:
         ),
     )
     ids: tuple[str, ...] | None = None
-    #: the goal being spoken
     current: bool = False
-    #: this goal and all accepted before it
     before: str | None = None
-    #: goals with this key, pending or active
     key: str | None = None
 
     @property
     def everything(self) -> bool:
         return self.ids is None and not self.current and self.before is None and self.key is None
+
+    def of_waiting(self, goals: Sequence[Say]) -> list[int]:
+        """Return which of these goals it selects, which wait for being accepted: their places in their order.
+
+        `before` selects them only where it names one of them, by its sender's id.
+        """
+        ids = set(self.ids or ())
+        last = max((place for place, say in enumerate(goals) if say.id == self.before is not None), default=-1)
+        return [
+            place
+            for place, say in enumerate(goals)
+            if self.everything or say.id in ids or place <= last or say.key == self.key is not None
+        ]
 
 
 #: The options whose values may be refused: a scheduler asks of each goal.
@@ -426,6 +420,30 @@ def bad_option(asked: Say | Set) -> str | None:
         value = getattr(asked, option.name)
         if value is not None and value != option.default and (words := option.refusal(value)):
             return words
+    return None
+
+
+def bad_text(text: str, max_characters: int | None = MAX_CHARACTERS) -> tuple[str, str] | None:
+    """Return the reason and the words for people why this text can't be a goal, or None if it can.
+
+    Whether a synthesiser finds something to say in it, only the engine can tell. `max_characters`: None for one that is
+    no goal, and may have any length.
+    """
+    import unicodedata  # no start pays for it
+
+    if max_characters is not None and len(text) > max_characters:
+        return "text_too_long", f"the text has {len(text):,} characters, the longest allowed is {max_characters:,}"
+    try:
+        size = len(text.encode())
+    except UnicodeEncodeError as error:
+        words = f"character {error.start + 1} of the text is half of a surrogate pair: it is not valid UTF-8"
+        return "invalid_text", words
+    if max_characters is not None and size > MAX_BYTES:
+        return "text_too_long", f"the text has {size:,} bytes, the longest allowed is {MAX_BYTES:,}"
+    if "\0" in text:
+        return "invalid_text", f"character {text.index(chr(0)) + 1} of the text is NUL"
+    if all(unicodedata.category(each) in _SILENT for each in text):
+        return "invalid_text", "the text is empty" if not text.strip() else "the text has nothing that can be seen"
     return None
 
 

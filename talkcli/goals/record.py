@@ -5,10 +5,12 @@ Slots and no dictionary: a queue of ten thousand goals has to stay small.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal
+from talkcli.goals.options import SHOWN
 from talkcli.goals.states import State, follow
 
 if TYPE_CHECKING:
@@ -16,71 +18,49 @@ if TYPE_CHECKING:
     from talkcli.goals.options import Say
 
 
+@dataclass(slots=True, eq=False)
 class Record:
     """One goal, from its acceptance to its end."""
 
-    __slots__ = (
-        "began",
-        "by",
-        "duration",
-        "ended_at",
-        "expires_at",
-        "holds",
-        "id",
-        "message",
-        "number",
-        "paused",
-        "preempt",
-        "queued_at",
-        "reason",
-        "say",
-        "sender",
-        "spoken_end",
-        "started_at",
-        "state",
-        "stop_since",
-        "text",
-        "text_bytes",
-        "text_hash",
-        "turn",
-    )
+    id: str
+    #: order of acceptance
+    number: int
+    #: what its sender asked for, with the server's own time to live where it brought none
+    say: Say
+    sender: Sender
+    queued_at: float
+    preempt: bool = False
+    #: the monotonic time by which it must have begun
+    expires_at: float | None = None
+    #: its text; None once that is dropped
+    text: str | None = field(init=False)
+    #: stands for the text once that is dropped
+    text_hash: int = 0
+    #: what the text takes in the history
+    text_bytes: int = field(init=False)
+    state: State = State.PENDING
+    #: its place among the pending goals of its priority; the queue's business alone
+    turn: int = 0
+    reason: str | None = None
+    by: By | None = None
+    message: str | None = None
+    #: offset after the last word that was heard
+    spoken_end: int = 0
+    #: held in the middle of being spoken
+    paused: bool = False
+    #: how often that was asked for
+    holds: int = 0
+    #: monotonic time at which it was handed to the engine
+    began: float = 0.0
+    started_at: float | None = None
+    ended_at: float | None = None
+    duration: float | None = None
+    #: monotonic time of the first stop
+    stop_since: float | None = None
 
-    def __init__(self, goal_id: str, number: int, say: Say, sender: Sender, queued_at: float) -> None:
-        self.id = goal_id
-        #: order of acceptance
-        self.number = number
-        #: what its sender asked for, with the server's own time to live where it brought none
-        self.say = say
-        #: its text; None once that is dropped
-        self.text: str | None = say.text
-        #: stands for the text once that is dropped
-        self.text_hash = 0
-        #: what the text takes in the history
-        self.text_bytes = len(say.text.encode(errors="surrogatepass"))
-        self.sender = sender
-        self.queued_at = queued_at
-        self.state = State.PENDING
-        self.preempt = False
-        #: the monotonic time by which it must have begun
-        self.expires_at: float | None = None
-        #: its place among the pending goals of its priority; the queue's business alone
-        self.turn = 0
-        self.reason: str | None = None
-        self.by: By | None = None
-        self.message: str | None = None
-        #: offset after the last word that was heard
-        self.spoken_end = 0
-        #: held in the middle of being spoken
-        self.paused = False
-        #: how often that was asked for
-        self.holds = 0
-        #: monotonic time at which it was handed to the engine
-        self.began = 0.0
-        self.started_at: float | None = None
-        self.ended_at: float | None = None
-        self.duration: float | None = None
-        #: monotonic time of the first stop
-        self.stop_since: float | None = None
+    def __post_init__(self) -> None:
+        self.text = self.say.text
+        self.text_bytes = len(self.text.encode(errors="surrogatepass"))
 
     @property
     def priority(self) -> int:
@@ -95,11 +75,6 @@ class Record:
     def become(self, state: State) -> None:
         """Change the state as the table allows, or raise IllegalTransition and change nothing."""
         self.state = follow(self.state, state)
-
-    def hold(self) -> None:
-        """Be held, once more."""
-        self.paused = True
-        self.holds += 1
 
     def drop_text(self) -> None:
         """Forget the text, to make room; the result stays."""
@@ -132,5 +107,5 @@ class Record:
             started_at=started_at,
             ended_at=None if accepted else self.ended_at,
             duration=None if accepted else self.duration,
-            **self.say.shown,
+            **{name: getattr(self.say, name) for name in SHOWN},
         )

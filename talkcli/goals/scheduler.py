@@ -9,44 +9,109 @@ speech is paused, or while there is no engine; a goal ends once; the order in wh
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from talkcli.frozen import replace
-from talkcli.goals import text as texts
-from talkcli.goals.effects import Cancelled, Changed, GiveUp, Hold, Resume, Start, Stop, Submitted
+from talkcli.frozen import frozen, replace
 from talkcli.goals.goal import By
-from talkcli.goals.history import EarlyCancels, History, Said, throttling
-from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option, is_clients_id
+from talkcli.goals.history import EarlyCancels, History, Said
+from talkcli.goals.option import is_clients_id
+from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option, bad_text
 from talkcli.goals.queue import Queue
 from talkcli.goals.record import Record
-from talkcli.goals.selection import making_way, select
 from talkcli.goals.states import IllegalTransition, State
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from talkcli.goals.effects import Effect, Now
     from talkcli.goals.goal import Sender
     from talkcli.goals.options import Cancel, Say, Set
 
 #: Seconds after a stop in which silence must be confirmed: `cancel` is answered within 2 s whatever happens.
 SILENCE_LIMIT = 1.9
 
-SUCCEEDED_MESSAGE = "Talk completed successfully"
-PREEMPTED_MESSAGE = "Talk preempted"
+
+@frozen
+class Now:
+    """One moment on both clocks, in seconds: monotonic, for limits, and since 1970 UTC, to be shown.
+
+    The monotonic one counts the time in which the machine was suspended: what was true before is not news after it.
+    """
+
+    monotonic: float
+    wall: float
+
+
+@frozen
+class Changed:
+    """A goal is in a new state; to be published."""
+
+    record: Record
+    state: State
+
+
+@frozen
+class Start:
+    """The engine shall speak this goal."""
+
+    record: Record
+
+
+@frozen
+class Stop:
+    """The engine shall stop this goal; the answer is `ended`."""
+
+    record: Record
+
+
+@frozen
+class GiveUp:
+    """The engine didn't become silent in time: it must be replaced before it may be given another goal."""
+
+    record: Record
+
+
+@frozen
+class Hold:
+    """The engine shall be silent and go on with this goal at `Resume`."""
+
+    record: Record
+
+
+@frozen
+class Resume:
+    """The engine shall go on with the goal that it holds."""
+
+    record: Record
+
+
+Effect = Changed | Start | Stop | GiveUp | Hold | Resume
+
+
+@frozen
+class Submitted:
+    """What became of a goal that was sent: its record, or that of the first goal of its id, to which it is attached."""
+
+    record: Record
+    effects: list[Effect]
+    attached: bool = False
+
+
+@dataclass(slots=True)
+class Cancelled:
+    """What a cancel did: goals that ended at once, the one being stopped, those that had ended, ids nobody knows."""
+
+    recalled: list[Record] = field(default_factory=list)
+    stopping: Record | None = None
+    ended: list[Record] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    effects: list[Effect] = field(default_factory=list)
 
 
 class Scheduler:
     """Goals of one server. `boot` makes their ids: four characters a server start."""
 
-    def __init__(
-        self,
-        boot: str,
-        *,
-        max_queue: int,
-        max_text: int = MAX_CHARACTERS,
-        settings: Set = INITIAL,
-    ) -> None:
+    def __init__(self, boot: str, *, max_queue: int, max_text: int = MAX_CHARACTERS, settings: Set = INITIAL) -> None:
         self.boot = boot
         #: what holds for goals that don't say; all of them are given
         self.settings = settings
@@ -79,10 +144,6 @@ class Scheduler:
     def find(self, goal_id: str) -> Record | None:
         """Return a goal that is active, pending, or still remembered."""
         return self._by_id.get(goal_id) or self.history.find(goal_id)
-
-    def with_key(self, key: str | None) -> list[Record]:
-        """Return the goals with this key that have not ended."""
-        return [each for each in (self.active, self._queue.with_key(key)) if each and each.key == key is not None]
 
     def lacks_room(self, say: Say, now: Now, fault: tuple[str, str] | None = None) -> bool:
         """Whether this goal would be REJECTED only because the queue is full; `fault` as in `submit`."""
@@ -141,7 +202,7 @@ class Scheduler:
         """
         done = Cancelled()
         by = By(client=sender)
-        chosen = select(selection, self, done, waiting)
+        chosen = self._select(selection, done, waiting)
         for goal_id in filter(is_clients_id, done.unknown):
             self._early.note(goal_id, by, now.monotonic)
         for record in chosen:
@@ -170,7 +231,8 @@ class Scheduler:
         self.paused = True
         if self.active is None or self.active.state is not State.ACTIVE:
             return []
-        self.active.hold()
+        self.active.paused = True
+        self.active.holds += 1
         return [Hold(self.active)]
 
     def resume(self, now: Now) -> list[Effect]:
@@ -178,10 +240,8 @@ class Scheduler:
         if not self.paused:
             return []
         self.paused = False
-        if self.active is None:
-            return self._start_next(now)
-        if not self.active.paused:
-            return []  # it is being stopped
+        if not (self.active and self.active.paused):
+            return self._start_next(now)  # nothing where one is being stopped
         self.active.paused = False
         return [Resume(self.active)]
 
@@ -198,14 +258,10 @@ class Scheduler:
 
     def engine_missing(self, words: str, now: Now) -> list[Effect]:
         """End the goal whose turn it is: an engine was waited for long enough, and once more none came."""
-        if self.active or self.paused or self.has_engine:
+        if self.has_engine:
             return []
-        effects = self._expire(now)
-        record = self._queue.first()
-        if record is None:
-            return effects
-        effects.append(self._activate(record, now))
-        return effects + self.failed(record.id, "engine_failed", words, None, now)
+        record, effects = self._activate_next(now)
+        return effects + self.failed(record.id, "engine_failed", words, None, now) if record else effects
 
     def heard(self, goal_id: str, end: int) -> Record:
         """Note that the word that ends at this offset of the text is being heard."""
@@ -219,7 +275,7 @@ class Scheduler:
         record.duration = duration
         record.spoken_end = len(record.text or "")
         # A stop that came too late ended nothing: its reason goes.
-        return self._end(record, State.SUCCEEDED, None, SUCCEEDED_MESSAGE, None, now)
+        return self._end(record, State.SUCCEEDED, None, "Talk completed successfully", None, now)
 
     def failed(self, goal_id: str, reason: str, words: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal: engine or audio failed.
@@ -235,60 +291,104 @@ class Scheduler:
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
         """End the active goal, which was told to stop: it is silent."""
         record = self._spoken(goal_id)
-        return self._end(record, State.PREEMPTED, record.reason, PREEMPTED_MESSAGE, record.by, now)
+        return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     # -- time
 
     def deadline(self) -> float | None:
         """Return the monotonic time at which `tick` has something to do."""
-        due = (self._silence_deadline(), self._queue.next_expiry(), self._unbegun_deadline())
+        due = (self._active_deadline(), self._queue.next_expiry())
         return min((each for each in due if each is not None), default=None)
 
     def tick(self, now: Now) -> list[Effect]:
         """Do what is due: recall goals whose time is over; abort one that was stopped and isn't silent in time."""
         effects: list[Effect] = []
-        deadline = self._silence_deadline()
-        if self.active is not None and deadline is not None and now.monotonic >= deadline:
-            record = self.active
-            words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
-            effects = [GiveUp(record), *self._end(record, State.ABORTED, "not_silent", words, record.by, now)]
-        deadline = self._unbegun_deadline()
-        if self.active is not None and deadline is not None and now.monotonic >= deadline:
-            effects += self._stop(self.active, "expired", None, now)
+        record, deadline = self.active, self._active_deadline()
+        if record is not None and deadline is not None and now.monotonic >= deadline:
+            if record.stop_since is None:
+                effects = self._stop(record, "expired", None, now)
+            else:
+                words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
+                effects = [GiveUp(record), *self._end(record, State.ABORTED, "not_silent", words, record.by, now)]
         return effects + self._expire(now)
 
     # -- inside
+
+    def _select(self, selection: Cancel, done: Cancelled, waiting: Collection[str | None]) -> list[Record]:
+        """Return the selected goals that have not ended; note in `done` what else was named."""
+        chosen = self.unfinished() if selection.everything else []
+        for goal_id in dict.fromkeys(selection.ids or ()):
+            record = self.find(goal_id)
+            if record and record.state.terminal:
+                done.ended.append(record)
+            elif record:
+                chosen.append(record)
+            elif goal_id not in waiting:
+                done.unknown.append(goal_id)
+        if self.active and (selection.current or self.active.key == selection.key is not None):
+            chosen.append(self.active)
+        if pending := self._queue.with_key(selection.key):
+            chosen.append(pending)
+        if selection.before is not None:
+            last = self.find(selection.before)
+            if last or selection.before in waiting:
+                chosen += [each for each in self.unfinished() if last is None or each.number <= last.number]
+            else:
+                done.unknown.append(selection.before)
+        once = {each.number: each for each in chosen}.values()
+        # The active one last: another must not start, even for the length of this step, and be stopped again.
+        return sorted(once, key=lambda each: (each is self.active, each.number))
 
     def _record(self, say: Say, sender: Sender, now: Now) -> Record:
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
         if ttl != say.ttl:
             say = replace(say, ttl=ttl)
-        record = Record(f"{self.boot}-{self._count}", self._count, say, sender, now.wall)
-        record.preempt = self._preempts(say)
-        record.expires_at = None if ttl is None else now.monotonic + ttl
-        return record
+        expires_at = None if ttl is None else now.monotonic + ttl
+        return Record(f"{self.boot}-{self._count}", self._count, say, sender, now.wall, self._preempts(say), expires_at)
 
     def _refuse(self, say: Say, fault: tuple[str, str] | None, first: Record | None) -> tuple[str, str] | None:
         """Return reason and words why a goal can't be had, whatever else is being said."""
         if self._closing:
             return "shutdown", "the server is being stopped"
-        words = bad_option(say)
-        if words:
+        if words := bad_option(say):
             return "bad_option", words
         if first is not None:
             return "id_conflict", f"the id {say.id} is that of another text already"
-        return texts.fault(say.text, self.max_text) or fault
+        return bad_text(say.text, self.max_text) or fault
 
     def _throttle(self, say: Say, record: Record, now: Now) -> tuple[str, str] | None:
-        found = throttling(say, self.active, self._queue, self._said, now.monotonic)
-        if found is None:
+        """Return reason and words where the same is being said, waits, or was said just now; note which goal it is."""
+        if say.throttle is None:
             return None
-        record.by = By(goal=found[0])
-        return "throttled", f"the same {found[1]}"
+        active = self.active
+        waiting = self._queue.with_text(say.text) if say.key is None else None
+        if active and (active.text == say.text if say.key is None else active.key == say.key):
+            first, words = active.id, "is being said"
+        elif waiting:
+            first, words = waiting.id, "is waiting already"
+        else:
+            last = self._said.within(say.throttle, say.key, say.text, now.monotonic)
+            if last is None:
+                return None
+            first, words = last, f"was said less than {say.throttle:g} s ago"
+        record.by = By(goal=first)
+        return "throttled", f"the same {words}"
 
     def _way(self, say: Say) -> list[tuple[Record, str]] | None:
+        """Return the pending goals that this one recalls, and the reason; None if it has no room even so."""
+        replaced = self._queue.with_key(say.key)
+        preempted: list[Record] = []
+        if say.flush:
+            preempted = self._queue.up_to(say.priority)
+        elif self._preempts(say):
+            preempted = self._queue.preempting_up_to(say.priority)
+        way = [(replaced, "replaced")] if replaced else []
+        way += [(each, "preempted") for each in preempted if each is not replaced]
         # There never are more goals in the queue than may be: one that will be recalled makes room enough.
-        return making_way(say, self._queue, self.max_queue, preempts=self._preempts(say))
+        if way or len(self._queue) < self.max_queue:
+            return way
+        displaced = self._queue.giving_way_to(say.priority)
+        return [(displaced, "displaced")] if displaced else None
 
     def _preempts(self, say: Say) -> bool:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
@@ -318,33 +418,37 @@ class Scheduler:
             effects += self._recall(record, "expired", words, None, now)
         return effects
 
-    def _silence_deadline(self) -> float | None:
-        if self.active is None or self.active.stop_since is None:
-            return None
-        return self.active.stop_since + SILENCE_LIMIT
+    def _active_deadline(self) -> float | None:
+        """Return by when the active goal must be silent, if it was stopped, or else when it expires.
 
-    def _unbegun_deadline(self) -> float | None:
-        """Return when the active goal expires: one whose engine was lost before it was heard may have to begin anew."""
+        It does so only where its engine was lost before it was heard, and it may have to begin anew.
+        """
         goal = self.active
-        if goal is None or self.has_engine or goal.state is not State.ACTIVE or goal.spoken_end:
+        if goal is None:
             return None
-        return goal.expires_at
+        if goal.stop_since is not None:
+            return goal.stop_since + SILENCE_LIMIT
+        return None if self.has_engine or goal.spoken_end else goal.expires_at
 
     def _start_next(self, now: Now) -> list[Effect]:
-        if self.active or self.paused or not self.has_engine:
+        if not self.has_engine:
             return []
+        record, effects = self._activate_next(now)
+        return [*effects, Start(record)] if record else effects
+
+    def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
+        """Make the goal whose turn it is the active one, if there is one and nothing speaks against it."""
+        if self.active or self.paused:
+            return None, []
         effects = self._expire(now)
         record = self._queue.first()
-        if record is None:
-            return effects
-        return [*effects, self._activate(record, now), Start(record)]
-
-    def _activate(self, record: Record, now: Now) -> Changed:
-        record.become(State.ACTIVE)
-        self._queue.remove(record)
-        record.started_at, record.began = now.wall, now.monotonic
-        self.active = record
-        return Changed(record, State.ACTIVE)
+        if record:
+            record.become(State.ACTIVE)
+            self._queue.remove(record)
+            record.started_at, record.began = now.wall, now.monotonic
+            self.active = record
+            effects.append(Changed(record, State.ACTIVE))
+        return record, effects
 
     def _recall(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
         self._queue.remove(record)
@@ -352,7 +456,7 @@ class Scheduler:
 
     def _recalled(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
         record.become(State.RECALLING)
-        return self._close(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
+        return self._end(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
 
     def _stop(self, record: Record, reason: str, by: By | None, now: Now) -> list[Effect]:
         if record.state is State.PREEMPTING:
@@ -370,19 +474,15 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: str | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        effects = self._close(record, state, reason, message, by, now)
-        self.active = None
-        return effects + self._start_next(now)
-
-    def _close(
-        self, record: Record, state: State, reason: str | None, message: str, by: By | None, now: Now
-    ) -> list[Effect]:
+        """End a goal for ever, and start the next if it was the active one."""
         record.become(state)
         record.reason, record.message, record.by = reason, message, by
-        record.ended_at = now.wall
-        record.paused = False
+        record.ended_at, record.paused = now.wall, False
         if record.spoken_end and state is not State.ABORTED:
             self._said.note(record)
         self._by_id.pop(record.id)
         self.history.add(record)
-        return [Changed(record, state)]
+        if record is not self.active:
+            return [Changed(record, state)]
+        self.active = None
+        return [Changed(record, state), *self._start_next(now)]

@@ -16,7 +16,6 @@ from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals.goal import By
 from talkcli.goals.options import Cancel, Say, Set, as_shown, bad_option, given
-from talkcli.goals.selection import select_waiting
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
@@ -197,7 +196,7 @@ class Requests:
         """Return the selected goals of those that wait."""
         waiting = (*self._canceled, *self._speech.for_room, *self._speech.for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
-        selected = select_waiting(selection, [say for _, say in goals])
+        selected = selection.of_waiting([say for _, say in goals])
         # Who has hung up has taken its request back, and is about to be forgotten.
         return [goals[place][0] for place in selected if not goals[place][0].connection.has_hung_up()]
 

@@ -18,8 +18,8 @@ from talkcli.engine import protocol
 from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
-from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start
 from talkcli.goals.options import DEFAULT_VOICE, for_engine
+from talkcli.goals.scheduler import Changed, Effect, GiveUp, Hold, Now, Resume, Start
 from talkcli.goals.states import State
 from talkcli.server import log
 from talkcli.server.call import go_on

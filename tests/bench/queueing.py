@@ -10,10 +10,9 @@ import time
 from itertools import count, islice
 from typing import TYPE_CHECKING
 
-from talkcli.goals.effects import Now
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Cancel, Say
-from talkcli.goals.scheduler import Scheduler
+from talkcli.goals.scheduler import Now, Scheduler
 from talkcli.protocol import replies
 from talkcli.protocol.lines import encode
 from tests.bench.installed import serve

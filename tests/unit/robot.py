@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import replace
-from talkcli.goals.effects import Cancelled, Changed, Effect, Now, Submitted
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import INITIAL, Cancel, Say
-from talkcli.goals.scheduler import Scheduler
+from talkcli.goals.scheduler import Cancelled, Changed, Effect, Now, Scheduler, Submitted
 
 if TYPE_CHECKING:
     from talkcli.goals.record import Record

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.frozen import replace
-from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Now, Resume, Start, Stop
 from talkcli.goals.options import INITIAL, Cancel, Say
-from talkcli.goals.scheduler import Scheduler
+from talkcli.goals.scheduler import Changed, Effect, GiveUp, Hold, Now, Resume, Scheduler, Start, Stop
 from talkcli.goals.states import IllegalTransition, State
 from tests.unit.random_goals import BOOT, MAX_TEXT
 from tests.unit.slow_goal import ENDS, Selection, Wish
@@ -25,9 +24,9 @@ from tests.unit.witness import Witness
 if TYPE_CHECKING:
     from typing import Any
 
-    from talkcli.goals.effects import Submitted
     from talkcli.goals.goal import By, Goal, Sender
     from talkcli.goals.record import Record
+    from talkcli.goals.scheduler import Submitted
 
 ORDERS: dict[type[Effect], str] = {Start: "start", Stop: "stop", GiveUp: "give up", Hold: "hold", Resume: "resume"}
 

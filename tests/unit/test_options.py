@@ -19,7 +19,7 @@ from talkcli.cli.command import MODE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.engine import protocol
 from talkcli.frozen import fields, replace
-from talkcli.goals.option import INTEGER, NUMBER, Option
+from talkcli.goals.option import INTEGER, NUMBER, Option, is_clients_id
 from talkcli.goals.options import (
     DEFAULT_VOICE,
     FOR_ENGINE,
@@ -35,7 +35,6 @@ from talkcli.goals.options import (
     bad_option,
     for_engine,
     given,
-    is_clients_id,
     told,
 )
 from talkcli.protocol.requests import KINDS

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.goals.effects import Cancelled, Changed, Now
 from talkcli.goals.goal import By
 from talkcli.goals.options import Say
+from talkcli.goals.scheduler import Cancelled, Changed, Now
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending, numbers
 

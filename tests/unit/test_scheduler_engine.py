@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.goals.effects import GiveUp, Now, Start, Stop
 from talkcli.goals.goal import By
 from talkcli.goals.options import Say
-from talkcli.goals.scheduler import SILENCE_LIMIT
+from talkcli.goals.scheduler import SILENCE_LIMIT, GiveUp, Now, Start, Stop
 from talkcli.goals.states import IllegalTransition, State
 from tests.unit.robot import DOOR, Robot, ending
 

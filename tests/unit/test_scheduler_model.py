@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, precondition, rule
 
-from talkcli.goals.effects import Now
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
+from talkcli.goals.scheduler import Now
 from tests.unit.random_goals import BAD_SAYS, BOOT, OPTIONS, OWN_IDS, TEXTS, says_with
 from tests.unit.side_by_side import SideBySide
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from talkcli.frozen import replace
-from talkcli.goals.effects import Changed
 from talkcli.goals.goal import By
 from talkcli.goals.options import Cancel, Say
-from talkcli.goals.selection import select_waiting
+from talkcli.goals.scheduler import Changed
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending
 
@@ -262,4 +261,4 @@ def test_a_goal_cancelled_while_it_waited_for_room_is_recalled_and_stops_nothing
 )
 def test_which_of_those_that_wait_for_room_a_cancel_selects(selection: Cancel, chosen: list[int]) -> None:
     waiting = [Say("1", key="k"), Say("2", id="b", key="k"), Say("3", id="c"), Say("4")]
-    assert select_waiting(selection, waiting) == chosen
+    assert selection.of_waiting(waiting) == chosen

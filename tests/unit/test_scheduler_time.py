@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 
 from talkcli.frozen import replace
-from talkcli.goals.effects import Hold, Now, Resume
 from talkcli.goals.goal import By
 from talkcli.goals.options import Say
-from talkcli.goals.scheduler import SILENCE_LIMIT
+from talkcli.goals.scheduler import SILENCE_LIMIT, Hold, Now, Resume
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending
 

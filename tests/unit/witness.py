@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
-from talkcli.goals.effects import Changed, Effect, GiveUp, Hold, Resume, Start, Stop
+from talkcli.goals.scheduler import Changed, Effect, GiveUp, Hold, Resume, Start, Stop
 from tests.unit.slow_goal import ENDS, FIRST, TABLE
 
 if TYPE_CHECKING:
