@@ -7,16 +7,16 @@ know; requests, where that would drop what somebody asked for, are in `options` 
 
 from __future__ import annotations
 
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.states import State
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from typing import TypeVar
-
-    _T = TypeVar("_T")
+    from collections.abc import Callable
+    from typing import Any
 
 JsonObject = dict[str, object]
+#: The keys with which a goal's object begins; the others are its fields, in their order.
+_FIRST = dict.fromkeys(("id", "state", "status", "reason", "by", "message"))
 
 
 @frozen
@@ -33,18 +33,11 @@ class Sender:
     name: str | None = None
 
     def to_json(self) -> JsonObject:
-        return {"pid": self.pid, "uid": self.uid, "command": self.command, "parent": self.parent, "name": self.name}
+        return fields(self)
 
     @classmethod
     def from_json(cls, value: object) -> Sender:
-        fields = value if isinstance(value, dict) else {}
-        return cls(
-            _maybe(fields, "pid", int),
-            _maybe(fields, "uid", int),
-            _maybe(fields, "command", str),
-            _maybe(fields, "parent", str),
-            _maybe(fields, "name", str),
-        )
+        return cls(**known(cls, value if isinstance(value, dict) else {}))
 
 
 @frozen
@@ -61,10 +54,7 @@ class By:
 
     @classmethod
     def from_json(cls, value: object) -> By | None:
-        if not isinstance(value, dict):
-            return None
-        client = value.get("client")
-        return cls(_maybe(value, "goal", str), None if client is None else Sender.from_json(client))
+        return cls(**known(cls, value)) if isinstance(value, dict) else None
 
 
 @frozen
@@ -97,63 +87,52 @@ class Goal:
     duration: float | None = None
 
     def to_json(self) -> JsonObject:
-        return {
-            "id": self.id,
+        told = {
             "state": self.state.name,
             "status": int(self.state),
-            "reason": self.reason,
             "by": None if self.by is None else self.by.to_json(),
-            "message": self.message,
-            "text": self.text,
-            "format": self.format,
-            "spoken": self.spoken,
-            "priority": self.priority,
-            "key": self.key,
-            "ttl": self.ttl,
-            "data": self.data,
             "client": None if self.client is None else self.client.to_json(),
-            "paused": self.paused,
-            "queued_at": self.queued_at,
-            "started_at": self.started_at,
-            "ended_at": self.ended_at,
-            "duration": self.duration,
         }
+        return {**_FIRST, **fields(self), **told}
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
         """Return the goal in a server's message; ValueError where it is none. Fields not known here are ignored."""
         if not isinstance(value, dict):
             raise ValueError("a goal is a JSON object")
-        goal_id, state, data = value.get("id"), value.get("state"), value.get("data")
-        if not isinstance(goal_id, str) or not isinstance(state, str) or state not in State.__members__:
+        found = known(cls, value)
+        if "id" not in found or "state" not in found:
             raise ValueError("a goal has an id and a state")
-        return cls(
-            id=goal_id,
-            state=State[state],
-            text=_maybe(value, "text", str),
-            reason=_maybe(value, "reason", str),
-            by=By.from_json(value.get("by")),
-            message=_maybe(value, "message", str),
-            format=_maybe(value, "format", str) or "text",
-            spoken=_maybe(value, "spoken", str),
-            priority=_maybe(value, "priority", int) or 0,
-            key=_maybe(value, "key", str),
-            ttl=_seconds(value, "ttl"),
-            data=data if isinstance(data, dict) else None,
-            client=None if value.get("client") is None else Sender.from_json(value["client"]),
-            paused=_maybe(value, "paused", bool) or False,
-            queued_at=_seconds(value, "queued_at"),
-            started_at=_seconds(value, "started_at"),
-            ended_at=_seconds(value, "ended_at"),
-            duration=_seconds(value, "duration"),
-        )
+        return cls(**found)
 
 
-def _maybe(fields: Mapping[str, object], name: str, kind: type[_T]) -> _T | None:
-    value = fields.get(name)
-    return value if isinstance(value, kind) else None
+def known(cls: type, message: JsonObject) -> dict[str, Any]:
+    """Return what an object has of the fields of a value, each as the value has it; none that is of another kind."""
+    found = {}
+    for name, annotation in cls.__annotations__.items():
+        value = message.get(name)
+        if value is not None and (read := _READ[annotation.partition(" ")[0]](value)) is not None:
+            found[name] = read
+    return found
 
 
-def _seconds(fields: Mapping[str, object], name: str) -> float | None:
-    value = fields.get(name)
+def _of(kind: type) -> Callable[[object], object]:
+    return lambda value: value if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)) else None
+
+
+def _seconds(value: object) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+#: What reads a field, by its annotation; None for what is of another kind.
+_READ: dict[str, Callable[[object], object]] = {
+    "str": _of(str),
+    "int": _of(int),
+    "float": _seconds,
+    "bool": _of(bool),
+    "JsonObject": _of(dict),
+    "State": lambda value: State.__members__.get(value) if isinstance(value, str) else None,
+    "By": By.from_json,
+    "Sender": Sender.from_json,
+    "Goal": Goal.from_json,
+}

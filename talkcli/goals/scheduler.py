@@ -1,7 +1,8 @@
 """The scheduler: which goal is spoken, which waits, and how each ends.
 
 Pure: a request, an engine event or the time goes in, effects come out; no thread, socket or clock inside. A method
-either does all of its step or raises and has changed nothing. Effects are to be carried out in their order.
+either does all of its step or raises and has changed nothing. Effects are to be carried out in the order in which they
+come: those for the engine in theirs, and the news for clients, `Changed`, in theirs.
 
 What holds after every step: at most one goal is ACTIVE or PREEMPTING, and none starts before that one has ended, while
 speech is paused, or while there is no engine; a goal ends once; the order in which goals wait is the queue's.

@@ -7,18 +7,13 @@ or given another meaning; a reader ignores what it doesn't know.
 
 from __future__ import annotations
 
-from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.goal import By, Goal
-from talkcli.goals.states import State
+from talkcli.frozen import TYPE_CHECKING, fields, frozen
+from talkcli.goals.goal import By, Goal, known
 from talkcli.protocol.replies import ServerStatus
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import TypeVar
-
     from talkcli.goals.goal import JsonObject
-
-    _T = TypeVar("_T")
+    from talkcli.goals.states import State
 
 
 @frozen
@@ -35,22 +30,9 @@ class StateChanged:
     goal: Goal | None = None
 
     def to_json(self) -> JsonObject:
-        message: JsonObject = {"event": "state", "id": self.id, "state": self.state.name, "n": self.n, "at": self.at}
+        message = {**_counted("state", self), "state": self.state.name}
+        del message["goal"]
         return message if self.goal is None else {**message, "goal": self.goal.to_json()}
-
-    @classmethod
-    def from_json(cls, message: JsonObject) -> StateChanged:
-        """Return the event in a message; ValueError where it is none."""
-        name, goal = _field(message, "state", str), message.get("goal")
-        if name not in State.__members__:
-            raise ValueError(f"no goal can be {name!a}")
-        return cls(
-            _field(message, "id", str),
-            State[name],
-            _maybe(message, "at", float),
-            _maybe(message, "n", int),
-            None if goal is None else Goal.from_json(goal),
-        )
 
 
 @frozen
@@ -72,31 +54,7 @@ class WordHeard:
     n: int | None = None
 
     def to_json(self) -> JsonObject:
-        return {
-            "event": "word",
-            "id": self.id,
-            "word": self.word,
-            "start": self.start,
-            "end": self.end,
-            "number": self.number,
-            "time": self.time,
-            "n": self.n,
-            "at": self.at,
-        }
-
-    @classmethod
-    def from_json(cls, message: JsonObject) -> WordHeard:
-        """Return the event in a message; ValueError where it is none."""
-        return cls(
-            _field(message, "id", str),
-            _field(message, "word", str),
-            _field(message, "start", int),
-            _field(message, "end", int),
-            _field(message, "number", int),
-            _field(message, "time", float),
-            _maybe(message, "at", float),
-            _maybe(message, "n", int),
-        )
+        return _counted("word", self)
 
 
 @frozen
@@ -114,19 +72,7 @@ class PausedChanged:
     n: int | None = None
 
     def to_json(self) -> JsonObject:
-        by = None if self.by is None else self.by.to_json()
-        return {"event": "paused", "paused": self.paused, "id": self.id, "by": by, "n": self.n, "at": self.at}
-
-    @classmethod
-    def from_json(cls, message: JsonObject) -> PausedChanged:
-        """Return the event in a message; ValueError where it is none."""
-        return cls(
-            _field(message, "paused", bool),
-            _maybe(message, "id", str),
-            By.from_json(message.get("by")),
-            _maybe(message, "at", float),
-            _maybe(message, "n", int),
-        )
+        return {**_counted("paused", self), "by": None if self.by is None else self.by.to_json()}
 
 
 @frozen
@@ -138,11 +84,6 @@ class Result:
     def to_json(self) -> JsonObject:
         return {"event": "result", "goal": self.goal.to_json()}
 
-    @classmethod
-    def from_json(cls, message: JsonObject) -> Result:
-        """Return the event in a message; ValueError where it is none."""
-        return cls(Goal.from_json(message.get("goal")))
-
 
 @frozen
 class Snapshot:
@@ -153,38 +94,35 @@ class Snapshot:
     def to_json(self) -> JsonObject:
         return {"event": "snapshot", **self.status.to_json()}
 
-    @classmethod
-    def from_json(cls, message: JsonObject) -> Snapshot:
-        """Return the snapshot in a message; ValueError where one of its goals is none."""
-        return cls(ServerStatus.from_json(message))
-
 
 Event = StateChanged | WordHeard | PausedChanged | Result | Snapshot
 
-_READERS: dict[str, Callable[[JsonObject], Event]] = {
-    "state": StateChanged.from_json,
-    "word": WordHeard.from_json,
-    "paused": PausedChanged.from_json,
-    "result": Result.from_json,
-    "snapshot": Snapshot.from_json,
+_KINDS: dict[str, type[StateChanged | WordHeard | PausedChanged | Result]] = {
+    "state": StateChanged,
+    "word": WordHeard,
+    "paused": PausedChanged,
+    "result": Result,
 }
 
 
 def from_json(message: JsonObject) -> Event | None:
     """Return the event in a message; None for a kind that is not known here; ValueError where its fields are wrong."""
-    read = _READERS.get(str(message.get("event")))
-    return None if read is None else read(message)
+    kind = str(message.get("event"))
+    if kind == "snapshot":
+        return Snapshot(ServerStatus.from_json(message))
+    event = _KINDS.get(kind)
+    if event is None:
+        return None
+    found = known(event, message)
+    for name, annotation in event.__annotations__.items():
+        value = message.get(name)
+        if name not in found and (value is not None or not annotation.endswith(" | None")):
+            raise ValueError(f"the {name!r} of a {kind!a} event is {value!a}")
+    return event(**found)
 
 
-def _maybe(message: JsonObject, name: str, kind: type[_T]) -> _T | None:
-    """Return a field; None where it is null, or not there."""
-    return None if message.get(name) is None else _field(message, name, kind)
-
-
-def _field(message: JsonObject, name: str, kind: type[_T]) -> _T:
-    value = message.get(name)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)  # a JSON number without a fraction
-    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"the {name!r} of a {message.get('event')!a} event is {value!a}")
-    return value
+def _counted(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
+    """Return an event as an object: the kind first, the server's count and the time last."""
+    own = fields(event)
+    at, n = own.pop("at"), own.pop("n")
+    return {"event": kind, **own, "n": n, "at": at}

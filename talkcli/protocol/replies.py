@@ -11,7 +11,7 @@ from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator
 
     from talkcli.goals.goal import JsonObject
 
@@ -41,24 +41,19 @@ class ServerStatus:
     @classmethod
     def from_json(cls, message: JsonObject) -> ServerStatus:
         """Return the status in an object; ValueError where one of its goals is none."""
-        lists = [each if isinstance(each, list) else [] for each in (message.get("pending"), message.get("recent"))]
-        return cls._read(message, *lists)
+        server, pending, recent = message.get("server"), message.get("pending"), message.get("recent")
+        return cls(
+            server if isinstance(server, dict) else {},
+            goal_in(message, "active"),
+            tuple(map(Goal.from_json, pending)) if isinstance(pending, list) else (),
+            tuple(map(Goal.from_json, recent)) if isinstance(recent, list) else (),
+        )
 
     @classmethod
     def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
         """Return what a reply and the lines of its list say."""
-        lists = [[each[name] for each in items if name in each] for name in ("pending", "recent")]
-        return cls._read(reply, *lists)
-
-    @classmethod
-    def _read(cls, fields: JsonObject, pending: Iterable[object], recent: Iterable[object]) -> ServerStatus:
-        server = fields.get("server")
-        return cls(
-            server if isinstance(server, dict) else {},
-            goal_in(fields, "active"),
-            tuple(Goal.from_json(each) for each in pending),
-            tuple(Goal.from_json(each) for each in recent),
-        )
+        lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
+        return cls.from_json({**reply, **lists})
 
 
 @frozen

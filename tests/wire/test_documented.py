@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 #: Which argument of a call is a goal's reason; the place of a keyword doesn't matter.
 REASON_AT = {
     "CannotSpeak": 0, "StartFailed": 0, "Ended": 2, "_lose_process": 1, "_recall": 1, "_stop": 1,
-    "_end": 2, "_close": 2, "failed": 1,
+    "_end": 2, "failed": 1,
 }  # fmt: skip
 #: … and which is the code of an error on the wire.
 CODE_AT = {"BadRequest": 1, "RequestRefused": 1, "failure": 1, "refuse": 0}
@@ -91,9 +91,9 @@ def reasons() -> set[str]:
         if isinstance(node, ast.Tuple) and len(node.elts) == 2:
             first, second = node.elts
             for_people = isinstance(second, ast.JoinedStr | ast.Call) or " " in str(getattr(second, "value", ""))
-            if name in {"scheduler.py", "text.py", "speech.py"} and for_people:
+            if name in {"scheduler.py", "options.py", "speech.py"} and for_people:
                 found |= constants(first)
-            if name in {"scheduler.py", "selection.py"} and isinstance(first, ast.Name):
+            if name == "scheduler.py" and isinstance(first, ast.Name):
                 found |= constants(second)
     return found
 
