@@ -46,12 +46,8 @@ def __getattr__(name: str) -> object:
         from talkcli.protocol import events
 
         return getattr(events, name)
-    if name == "Goal":
-        from talkcli.goals.goal import Goal
+    if name in {"Goal", "State"}:
+        from talkcli.goals import goal
 
-        return Goal
-    if name == "State":
-        from talkcli.goals.states import State
-
-        return State
+        return getattr(goal, name)
     raise AttributeError(f"module 'talkcli' has no attribute {name!r}")

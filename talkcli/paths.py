@@ -14,9 +14,8 @@ import sys
 
 #: The name of the socket in its directory.
 SOCKET = "talk.sock"
-#: The directory of a server for the whole machine: what systemd makes for `RuntimeDirectory=talk`.
-SYSTEM_DIRECTORY = "/run/talk"
-SYSTEM_SOCKET = f"{SYSTEM_DIRECTORY}/{SOCKET}"
+#: That of a server for the whole machine, in the directory that systemd makes for `RuntimeDirectory=talk`.
+SYSTEM_SOCKET = f"/run/talk/{SOCKET}"
 
 #: What there may be at a place where a client reaches nobody.
 ABSENT = "not there"
@@ -81,12 +80,12 @@ def sudo_hint() -> str | None:
 
 def server_socket(named: str | None) -> str:
     """Return where a server listens, with its directory made; AddressInUse where that directory is not safe."""
+    from talkcli.errors import AddressInUse
+
     if named:
         try:
             return os.path.abspath(named)
         except FileNotFoundError as error:
-            from talkcli.errors import AddressInUse
-
             words = f"the working directory is gone, and the socket {named} would be in it: name its whole path"
             raise AddressInUse(words) from error
     given = os.environ.get("RUNTIME_DIRECTORY")
@@ -102,6 +101,4 @@ def server_socket(named: str | None) -> str:
         try:
             return str(platformdirs.PlatformDirs("talk", appauthor=False).place_runtime_file(SOCKET))
         except OSError as error:
-            from talkcli.errors import AddressInUse
-
             raise AddressInUse(f"no directory for the socket: {error}; name a socket with --socket PATH") from error

@@ -28,7 +28,6 @@ from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, 
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
-    from types import TracebackType
 
     from talkcli.client.connection import Connection
     from talkcli.goals.goal import JsonObject
@@ -81,9 +80,7 @@ class Client:
     def __enter__(self) -> Client:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def say(

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from talkcli import paths, peers
 from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, hello, ready, sender
 from talkcli.client.following import Followed
-from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, TalkError, UsageError, refusal
+from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, UsageError, refusal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Say
@@ -247,19 +247,17 @@ class SocketConnection:
         finally:
             del self._exchanges[number]
         if exchange.reply is None:
-            raise self._no_reply(request)
+            why = self.ended or f"it did not reply within {self._patience:g} s"
+            words = f"{request.kind} was sent to the server at {self.path}, but {why}"
+            if isinstance(request, Say):  # it alone can still have an effect that the sender does not know of
+                raise Lost(f"{words}; it may still be spoken")
+            raise ServerUnavailable(words)
         if exchange.reply.get("ok") is not True:
             raise _refusal(exchange.reply, exchange.items)
         return exchange.reply, exchange.items
 
     def post(self, request: Request) -> None:
         self._send(request_line({"seq": next(self._numbers), **write_request(request)}))
-
-    def _no_reply(self, request: Request) -> TalkError:
-        why = self.ended or f"it did not reply within {self._patience:g} s"
-        words = f"{request.kind} was sent to the server at {self.path}, but {why}"
-        # Only a goal can still have an effect that the sender does not know of.
-        return Lost(f"{words}; it may still be spoken") if isinstance(request, Say) else ServerUnavailable(words)
 
     def wait_until(
         self,

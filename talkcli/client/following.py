@@ -43,10 +43,10 @@ class EventBuffer:
 
     def add(self, event: Event) -> None:
         """Keep an event. One that comes twice, to a connection that waits for a goal and watches all, is kept once."""
-        if isinstance(event, StateChanged | WordHeard | PausedChanged):
-            if event.n is not None and event.n == self._last:
-                return
-            self._last = event.n
+        number = getattr(event, "n", None)
+        if number is not None and number == self._last:
+            return
+        self._last = number
         if self.overrun:
             return
         self._count += 1
@@ -101,12 +101,8 @@ class Followed:
                 hearing = self._goals.get(event.id, [])
             for hear in hearing:
                 hear(event)
-            # Of the goals that are waited for the states come twice: with the whole goal to those who watch.
-            if not isinstance(event, StateChanged) or event.goal or not _tells_all(event.state):
-                for buffer in self._watches or ():
-                    buffer.add(event)
-
-
-def _tells_all(state: State) -> bool:
-    """Whether those who watch are told the whole goal with this state."""
-    return state is State.PENDING or state.terminal
+            state = event.state if isinstance(event, StateChanged) and not event.goal else None
+            if state is State.PENDING or (state and state.terminal):
+                return  # it comes twice: with the whole goal to those who watch
+            for buffer in self._watches or ():
+                buffer.add(event)

@@ -2,7 +2,8 @@
 
 Made from them: the fields of `say` and `set` on the wire and their checks, what the library refuses, the options of the
 commands and how they are read, what a server's settings are called, the documents' tables. `Say` and `Client.say` name
-them again, for type checkers and readers; tests hold both to the rows. How two options go together is `bad_option`.
+them again, for type checkers and readers; tests hold both to the rows, which say what each means, and its unit. How two
+options go together is `bad_option`.
 
 Rules for this file: a client imports it before it sends anything, so it imports nothing heavy. A row may be added,
 never renamed or given another meaning. The first sentence of a request's docstring is its meaning in the wire's table.
@@ -301,31 +302,20 @@ class Say:
     kind: ClassVar[str] = "say"
     options: ClassVar[tuple[Option, ...]] = OPTIONS
     text: str
-    #: send this connection the goal's states, and its result
     wait: bool = False
-    #: … and each word as it is heard; implies `wait`
     feedback: bool = False
-    #: where the queue is full, answer when there is room, instead of REJECTED, queue_full
     patient: bool = False
-    #: stop what is being spoken and go first; None leaves it to the server's default
     preempt: bool | None = None
-    #: as `preempt`, and recall everything pending of the same or a lower priority
     flush: bool = False
-    #: higher goes first
     priority: int = 0
-    #: seconds from acceptance in which it must begin; 0 for no limit, None leaves it to the server's default
     ttl: float | None = None
-    #: replaces the pending goal with the same key
     key: str | None = None
-    #: seconds in which no other goal of this key, or else of this text, may have begun to be spoken
     throttle: float | None = None
-    #: the sender's own id; the same id again attaches to the first goal
     id: str | None = None
-    rate: int | None = None  # words per minute
-    volume: float | None = None  # 0 to 1
-    voice: str | None = None  # id, name or language
-    pitch: int | None = None  # 0 to 100
-    #: milliseconds of silence before it, whatever the output did; None leaves it to the server, where that was idle
+    rate: int | None = None
+    volume: float | None = None
+    voice: str | None = None
+    pitch: int | None = None
     lead_in: int | None = None
     data: JsonObject | None = None
     format: str = "text"
@@ -458,15 +448,15 @@ def for_engine(say: Say, settings: Set) -> dict[str, Any]:
     for name in FOR_ENGINE:
         own = getattr(say, name)
         found[name] = getattr(settings, name, None) if own is None else own
-    return without_none(found)
+    return _without_none(found)
 
 
 def as_shown(settings: Set) -> JsonObject:
     """Return settings as everybody is told of them: None where there is none."""
-    return without_none(fields(settings))
+    return _without_none(fields(settings))
 
 
-def without_none(values: dict[str, Any]) -> dict[str, Any]:
+def _without_none(values: dict[str, Any]) -> dict[str, Any]:
     """Return values by the options' names, with None for what stands for none: the default voice, a ttl of 0."""
     nones = {each.name: each.setting.none for each in SETTINGS if each.setting}
     return {name: None if value == nones.get(name) else value for name, value in values.items()}

@@ -69,12 +69,10 @@ class LineSplitter:
 class RequestSplitter(LineSplitter):
     """Cuts what comes from a client into lines, none of them past a limit; a server is trusted."""
 
-    __slots__ = ("_limit",)
+    __slots__ = ()
 
-    def __init__(self, limit: int = MAX_LINE) -> None:
-        """`limit`: bytes of a line, its newline included."""
-        super().__init__(limit - 1)
-        self._limit = limit
+    def __init__(self) -> None:
+        super().__init__(MAX_LINE - 1)
 
     def feed(self, data: bytes) -> list[bytes]:
         """Return the lines that are complete now, without their newlines; LineTooLong, with those before it, past the
@@ -87,9 +85,9 @@ class RequestSplitter(LineSplitter):
         lines = super().feed(data)
         for place, line in enumerate(lines):
             if isinstance(line, Cut):
-                raise LineTooLong(self._limit, lines[:place])
-        if self.size >= self._limit:
-            raise LineTooLong(self._limit, lines)
+                raise LineTooLong(MAX_LINE, lines[:place])
+        if self.size >= MAX_LINE:
+            raise LineTooLong(MAX_LINE, lines)
         return lines
 
 

@@ -46,7 +46,6 @@ class Hello:
         ),
     )
     name: str | None = None
-    #: only `status` and `cancel` will follow: a full server keeps some places for these
     urgent: bool = False
 
 
@@ -59,9 +58,7 @@ class Wait:
         Option("ids", IDS, "null: all that are active or pending now", form=f"of to {MAX_IDS:,} ids", absent="all"),
         Option("feedback", FLAG, "each word as it is heard, too", default=False),
     )
-    #: None for all that are active or pending now
     ids: tuple[str, ...] | None = None
-    #: each word as it is heard, too
     feedback: bool = False
 
 
