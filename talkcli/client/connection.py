@@ -215,13 +215,12 @@ class SocketConnection:
         return peers.credentials(self._socket)[0]
 
     def close(self) -> None:
+        self.ended = self.ended or "the connection was closed"
         if os.getpid() != self._process:
             # To shut it down would cut the parent's; and a thread of the parent's may have held the lock at the fork.
-            self.ended = self.ended or "the connection was closed"
             self._socket.close()
             return
         with self.changed:
-            self.ended = self.ended or "the connection was closed"
             self._closing = True
             self._shut(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
             if not self._reading:  # else it would poll a descriptor that may be another file's by now
@@ -300,8 +299,8 @@ class SocketConnection:
 
     def _read(self, timeout: float, interruptible: bool) -> None:
         """Read what there is, or wait for it, and hand it out."""
-        if not self._lines and not self._fill(timeout, interruptible):
-            return
+        if not self._lines:
+            self._fill(timeout, interruptible)
         while self._lines:
             try:
                 message = decode(self._lines.popleft())
@@ -311,14 +310,14 @@ class SocketConnection:
                 self.ended = self.ended or f"it sent what is no message: {error}"
                 return
 
-    def _fill(self, timeout: float, interruptible: bool) -> bool:
+    def _fill(self, timeout: float, interruptible: bool) -> None:
         try:
             watched = {self._socket.fileno(): select.POLLIN}
             if not ready(watched, timeout, self._interrupt if interruptible else None):
-                return False
+                return
             data = self._socket.recv(262144)
         except BlockingIOError:
-            return False
+            return
         except ConnectionResetError:  # it left without having read all that was sent
             data = b""
         except (OSError, ValueError) as error:  # ValueError: another thread closed it meanwhile
@@ -326,10 +325,9 @@ class SocketConnection:
             self.ended = self.ended or f"the connection broke: {error}"
         if not data:
             self.ended = self.ended or self._told or "the server went away"
-            return False
+            return
         self._heard = time.monotonic()
         self._lines.extend(self._splitter.feed(data))
-        return bool(self._lines)
 
     def _dispatch(self, message: JsonObject) -> None:
         if "event" in message:
