@@ -5,6 +5,7 @@ No I/O, no locks of its own: whoever uses it holds the connection's.
 
 from __future__ import annotations
 
+from _weakrefset import WeakSet  # as `threading` has it: the rest of `weakref` takes longer to import
 from collections import deque
 
 from talkcli.frozen import TYPE_CHECKING
@@ -14,7 +15,6 @@ from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHea
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from weakref import WeakSet
 
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
@@ -74,7 +74,8 @@ class Followed:
 
     def __init__(self) -> None:
         self._goals: dict[str, list[Callable[[Event], None]]] = {}
-        self._watches: WeakSet[EventBuffer] | None = None
+        #: a watch ends when nobody holds its iterator any more
+        self._watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, goal_id: str, hear: Callable[[Event], None]) -> None:
         """Tell of a goal, and of speech that is held or goes on, until the goal's Result, which is the last."""
@@ -82,10 +83,6 @@ class Followed:
 
     def watch(self, buffer: EventBuffer) -> None:
         """Put everything that happens into this buffer, as long as somebody holds it."""
-        from weakref import WeakSet  # few watch, and all would wait for the import
-
-        # A watch ends when nobody holds its iterator any more.
-        self._watches = WeakSet() if self._watches is None else self._watches
         self._watches.add(buffer)
 
     def hear(self, message: JsonObject) -> None:
@@ -104,5 +101,5 @@ class Followed:
             state = event.state if isinstance(event, StateChanged) and not event.goal else None
             if state is State.PENDING or (state and state.terminal):
                 return  # it comes twice: with the whole goal to those who watch
-            for buffer in self._watches or ():
+            for buffer in self._watches:
                 buffer.add(event)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from heapq import merge
 from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
@@ -43,25 +42,20 @@ class History:
     """The last goals that ended, oldest first."""
 
     def __init__(self) -> None:
+        self._all: OrderedDict[str, Record] = OrderedDict()
         self._ended: OrderedDict[str, Record] = OrderedDict()
         self._rejected: OrderedDict[str, Record] = OrderedDict()
         self._with_text: OrderedDict[str, Record] = OrderedDict()
         self._text_bytes = 0
-        #: how many ended before each, so that both rings can be told in one order
-        self._order: dict[str, int] = {}
-        self._count = 0
 
     def add(self, record: Record) -> None:
         """Keep a goal that has ended; the oldest give way."""
         kept, limit = (self._rejected, MAX_REJECTED) if record.state is State.REJECTED else (self._ended, MAX_ENDED)
-        kept[record.id] = record
-        self._with_text[record.id] = record
+        self._all[record.id] = kept[record.id] = self._with_text[record.id] = record
         self._text_bytes += record.text_bytes
-        self._count += 1
-        self._order[record.id] = self._count
         if len(kept) > limit:
             oldest = kept.popitem(last=False)[1]
-            del self._order[oldest.id]
+            del self._all[oldest.id]
             self._forget_text(oldest)
         while self._text_bytes > MAX_TEXT_BYTES:
             oldest = next(iter(self._with_text.values()))
@@ -69,7 +63,7 @@ class History:
             oldest.drop_text()
 
     def find(self, goal_id: str) -> Record | None:
-        return self._ended.get(goal_id) or self._rejected.get(goal_id)
+        return self._all.get(goal_id)
 
     def latest(self, count: int) -> Iterator[Record]:
         """Return the last goals that ended, REJECTED ones aside, the newest first."""
@@ -77,8 +71,7 @@ class History:
 
     def log(self, count: int) -> Iterator[Record]:
         """Return the last goals that ended, REJECTED ones too, the newest first."""
-        both = (reversed(self._ended.values()), reversed(self._rejected.values()))
-        return islice(merge(*both, key=lambda each: self._order[each.id], reverse=True), count)
+        return islice(reversed(self._all.values()), count)
 
     def _forget_text(self, record: Record) -> None:
         if self._with_text.pop(record.id, None) is not None:

@@ -174,7 +174,10 @@ class Scheduler:
         if first is not None and first.has_text(say.text):
             return Submitted(first, [], attached=True)
         self._count += 1
-        record = self._record(say, sender, now)
+        ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
+        expires_at = None if ttl is None else now.monotonic + ttl
+        number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
+        record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._preempts(say), expires_at)
         by = canceled or self._early.find(say.id, now.monotonic)
         refused = self._refuse(say, fault, first) or (None if canceled else self._throttle(say, record, now))
         way = self._way(say)
@@ -339,13 +342,6 @@ class Scheduler:
         once = {each.number: each for each in chosen}.values()
         # The active one last: another must not start, even for the length of this step, and be stopped again.
         return sorted(once, key=lambda each: (each is self.active, each.number))
-
-    def _record(self, say: Say, sender: Sender, now: Now) -> Record:
-        ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
-        if ttl != say.ttl:
-            say = replace(say, ttl=ttl)
-        expires_at = None if ttl is None else now.monotonic + ttl
-        return Record(f"{self.boot}-{self._count}", self._count, say, sender, now.wall, self._preempts(say), expires_at)
 
     def _refuse(self, say: Say, fault: tuple[str, str] | None, first: Record | None) -> tuple[str, str] | None:
         """Return reason and words why a goal can't be had, whatever else is being said."""

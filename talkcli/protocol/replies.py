@@ -104,19 +104,19 @@ def check_greeting(message: JsonObject, version: str) -> None:
         raise Busy("the server has as many clients as it takes (`talk serve --max-clients`)", "busy")
 
 
-def ok(seq: int | None, **fields: object) -> JsonObject:
-    """Return the reply that closes a request that was carried out."""
-    return {**_numbered(seq), "ok": True, **fields}
-
-
 def item(seq: int | None, **fields: object) -> JsonObject:
     """Return one line of a list; the list's reply follows."""
-    return {**_numbered(seq), **fields}
+    return fields if seq is None else {"seq": seq, **fields}
+
+
+def ok(seq: int | None, **fields: object) -> JsonObject:
+    """Return the reply that closes a request that was carried out."""
+    return item(seq, ok=True, **fields)
 
 
 def failure(seq: int | None, code: str, message: str) -> JsonObject:
     """Return the reply to a request that was not carried out."""
-    return {**_numbered(seq), "ok": False, "error": {"code": code, "message": message}}
+    return item(seq, ok=False, error={"code": code, "message": message})
 
 
 def take_seq(message: JsonObject) -> int | None:
@@ -125,7 +125,3 @@ def take_seq(message: JsonObject) -> int | None:
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
         raise BadRequest('"seq" must be an integer', "bad_field")
     return seq
-
-
-def _numbered(seq: int | None) -> JsonObject:
-    return {} if seq is None else {"seq": seq}
