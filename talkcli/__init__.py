@@ -8,17 +8,12 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # `typing` takes as long to import as a server to answer
 if TYPE_CHECKING:
-    from talkcli.client.client import Client as Client
-    from talkcli.client.goal import GoalHandle as GoalHandle
-    from talkcli.goals.goal import Goal as Goal
-    from talkcli.goals.states import State as State
-    from talkcli.protocol.events import PausedChanged as PausedChanged
-    from talkcli.protocol.events import Result as Result
-    from talkcli.protocol.events import Snapshot as Snapshot
-    from talkcli.protocol.events import StateChanged as StateChanged
-    from talkcli.protocol.events import WordHeard as WordHeard
-    from talkcli.protocol.replies import Canceled as Canceled
-    from talkcli.protocol.replies import ServerStatus as ServerStatus
+    from talkcli.client.client import Client
+    from talkcli.client.goal import GoalHandle
+    from talkcli.goals.goal import Goal
+    from talkcli.goals.states import State
+    from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
+    from talkcli.protocol.replies import Canceled, ServerStatus
 
 __version__ = "0.1.0"
 __all__ = [

@@ -437,18 +437,15 @@ def bad_text(text: str, max_characters: int | None = MAX_CHARACTERS) -> tuple[st
     return None
 
 
-def given(settings: Set) -> dict[str, Any]:
-    """Return those settings that are given, by their names."""
-    return {name: value for name, value in fields(settings).items() if value is not None}
+def given(asked: Say | Set) -> dict[str, Any]:
+    """Return those options, or settings, that are given, by their names."""
+    return {name: value for name, value in fields(asked).items() if value is not None}
 
 
 def for_engine(say: Say, settings: Set) -> dict[str, Any]:
     """Return what the engine is told of a goal, by the options' names: its own value, or the server's."""
-    found = {}
-    for name in FOR_ENGINE:
-        own = getattr(say, name)
-        found[name] = getattr(settings, name, None) if own is None else own
-    return _without_none(found)
+    known = {**fields(settings), **given(say)}
+    return _without_none({name: known.get(name) for name in FOR_ENGINE})
 
 
 def as_shown(settings: Set) -> JsonObject:

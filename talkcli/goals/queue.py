@@ -29,11 +29,11 @@ class Queue:
 
     def __init__(self) -> None:
         #: in their order: priority, negated, and turn; no two are equal
-        self._goals: list[tuple[int, int, Record]] = []
+        self._goals: list[tuple[float, int, Record]] = []
         #: those that were sent to preempt, in the same order
-        self._preempting: list[tuple[int, int, Record]] = []
+        self._preempting: list[tuple[float, int, Record]] = []
         #: in the order in which they give way, the last first: priority, negated, and number
-        self._newest: list[tuple[int, int, Record]] = []
+        self._newest: list[tuple[float, int, Record]] = []
         #: those with a time to live: its end, and their number
         self._expiries: list[tuple[float, int, Record]] = []
         self._by_key: dict[str, Record] = {}
@@ -82,12 +82,8 @@ class Queue:
 
     def remove(self, record: Record) -> None:
         """Take a goal out."""
-        del self._goals[bisect_left(self._goals, (-record.priority, record.turn))]
-        del self._newest[bisect_left(self._newest, (-record.priority, record.number))]
-        if record.preempt:
-            del self._preempting[bisect_left(self._preempting, (-record.priority, record.turn))]
-        if record.expires_at is not None:
-            del self._expiries[bisect_left(self._expiries, (record.expires_at, record.number))]
+        for goals, place in self._places(record):
+            del goals[bisect_left(goals, place)]
         if record.key is not None:
             del self._by_key[record.key]
 
@@ -100,11 +96,16 @@ class Queue:
         return list(map(_goal, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _enter(self, record: Record) -> None:
-        insort(self._goals, (-record.priority, record.turn, record))
-        insort(self._newest, (-record.priority, record.number, record))
-        if record.preempt:
-            insort(self._preempting, (-record.priority, record.turn, record))
-        if record.expires_at is not None:
-            insort(self._expiries, (record.expires_at, record.number, record))
+        for goals, place in self._places(record):
+            insort(goals, (*place, record))
         if record.key is not None:
             self._by_key[record.key] = record
+
+    def _places(self, record: Record) -> Iterator[tuple[list[tuple[float, int, Record]], tuple[float, int]]]:
+        """Return the lists that a goal is in, and its place in each."""
+        yield self._goals, (-record.priority, record.turn)
+        yield self._newest, (-record.priority, record.number)
+        if record.preempt:
+            yield self._preempting, (-record.priority, record.turn)
+        if record.expires_at is not None:
+            yield self._expiries, (record.expires_at, record.number)
