@@ -74,11 +74,10 @@ class RequestRefused(TalkError):
 
     code = "refused"
 
-    def __init__(self, message: str, code: str | None = None) -> None:
+    def __init__(self, message: str, code: str | None = None, items: list[dict[str, object]] | None = None) -> None:
         super().__init__(message)
-        self.items: list[dict[str, object]] = []
-        if code is not None:
-            self.code = code
+        self.code = code or self.code
+        self.items = items or []
 
 
 class UnknownGoal(RequestRefused):
@@ -125,9 +124,9 @@ BY_CODE: dict[str, type[RequestRefused]] = {
 }
 
 
-def refusal(code: str, message: str) -> RequestRefused:
-    """Return the error that a server's error reply stands for."""
-    return BY_CODE.get(code, RequestRefused)(message, code)
+def refusal(code: str, message: str, items: list[dict[str, object]] | None = None) -> RequestRefused:
+    """Return the error that a server's error reply stands for; `items`: what it listed before."""
+    return BY_CODE.get(code, RequestRefused)(message, code, items)
 
 
 def limits() -> str:

@@ -62,7 +62,7 @@ class Scripted:
     def wait_until(
         self,
         done: Callable[[], bool],
-        deadline: Callable[[], float | None],
+        deadline: float | None,
         *,
         since: float | None = None,
         interruptible: bool = True,

@@ -195,8 +195,7 @@ class Client:
         first, *others = [None] if wanted is None else batches(wanted) or [()]
         last = None if before is None else self._full_id(before)
         requests = [Cancel(first, current, last, key), *map(Cancel, others)]
-        fault = None if key is None else bad_key(key)
-        if fault:
+        if key is not None and (fault := bad_key(key)):
             raise UsageError(fault)
         items: list[JsonObject] = []
         unknown: list[str] = []
@@ -207,9 +206,7 @@ class Client:
                 items += error.items
                 unknown.append(error.message)
         if unknown:
-            refused = UnknownGoal("\n".join(unknown))
-            refused.items = items
-            raise refused
+            raise UnknownGoal("\n".join(unknown), items=items)
         return Canceled.from_items(items)
 
     def status(self) -> ServerStatus:

@@ -92,7 +92,7 @@ class Connection(Protocol):
     def wait_until(
         self,
         done: Callable[[], bool],
-        deadline: Callable[[], float | None],
+        deadline: float | None,
         *,
         since: float | None = None,
         interruptible: bool = True,
@@ -130,19 +130,17 @@ def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> 
             with connection.changed:
                 arrived()
         else:
-            connection.wait_until(arrived, lambda: end)
+            connection.wait_until(arrived, end)
             late = end is not None and time.monotonic() >= end
         yield found
 
 
 def _refusal(reply: JsonObject, items: list[JsonObject]) -> RequestRefused:
-    error = reply.get("error")
-    code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
     from talkcli.terminal.text import printable  # no start pays for it
 
-    refused = refusal(str(code), printable(str(message)))
-    refused.items = items
-    return refused
+    error = reply.get("error")
+    code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
+    return refusal(str(code), printable(str(message)), items)
 
 
 class _Exchange:
@@ -238,11 +236,11 @@ class SocketConnection:
         interruptible = slow or not isinstance(request, Say)
         try:
             self._send(request_line({"seq": number, **write_request(request)}))
-            self.wait_until(
-                lambda: exchange.reply is not None,
-                lambda: None if slow else exchange.touched + self._patience,
-                interruptible=interruptible,
-            )
+            touched = None
+            while exchange.reply is None and self.ended is None and touched != exchange.touched:
+                touched = exchange.touched
+                deadline = None if slow else touched + self._patience
+                self.wait_until(lambda: exchange.reply is not None, deadline, interruptible=interruptible)
         finally:
             del self._exchanges[number]
         if exchange.reply is None:
@@ -261,7 +259,7 @@ class SocketConnection:
     def wait_until(
         self,
         done: Callable[[], bool],
-        deadline: Callable[[], float | None],
+        deadline: float | None,
         *,
         since: float | None = None,
         interruptible: bool = True,
@@ -275,11 +273,10 @@ class SocketConnection:
                 if self.ended is not None:
                     return False
                 now = time.monotonic()
-                limit = deadline()
                 quiet = max(began, self._heard) + SILENCE_LIMIT
-                rest = (quiet if limit is None else min(limit, quiet)) - now
+                rest = (quiet if deadline is None else min(deadline, quiet)) - now
                 if last and rest <= 0:
-                    if limit is None or quiet < limit:
+                    if deadline is None or quiet < deadline:
                         self.ended = f"it has said nothing for {SILENCE_LIMIT:g} s"
                     return False
                 # What has arrived by the deadline counts: one more look, that doesn't wait.

@@ -71,7 +71,7 @@ class GoalHandle:
         """
         end = _end(timeout)
         self._follow(feedback=False)
-        if not self._connection.wait_until(lambda: self.state.terminal, lambda: end):
+        if not self._connection.wait_until(lambda: self.state.terminal, end):
             self._give_up(timeout)
         return self.goal
 
@@ -106,7 +106,7 @@ class GoalHandle:
         if not (self._followed or self.state.terminal):
             raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
         now, since = time.monotonic(), self._followed_at
-        if not self._connection.wait_until(self._has_next, lambda: now, since=since, interruptible=False):
+        if not self._connection.wait_until(self._has_next, now, since=since, interruptible=False):
             self._lose()
         with self._connection.changed:
             event = self._next()
