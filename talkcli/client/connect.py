@@ -84,15 +84,14 @@ def reach(named: str | None, failures: tuple[tuple[str, Exception], ...] = ()) -
         connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
         # Not blocking: a server that is stopped and whose backlog is full would hold the client for ever.
         connected.setblocking(False)
-        wrong: Exception | None = None
+        wrong: Exception | None
         try:
             connected.connect(path)
+            wrong = None if named or path == paths.SYSTEM_SOCKET else _foreign(connected)
         except OSError as error:
             wrong = error
-        else:
-            wrong = None if named or path == paths.SYSTEM_SOCKET else _foreign(connected)
-            if wrong is None:
-                return Begun(connected, path, failures)
+        if wrong is None:
+            return Begun(connected, path, failures)
         connected.close()
         failures = (*failures, (path, wrong))
         if isinstance(wrong, BlockingIOError):  # a server that is there is the one, not the next
@@ -155,10 +154,8 @@ def stand_back(begun: Begun, timeout: float | None) -> Begun:
         while (left := end - time.monotonic()) > 0:
             connected.settimeout(left)
             said = connected.recv(65536)
-            if not said:
-                break
             received += said
-            if any(each in said for each in _REFUSED):
+            if not said or any(each in said for each in _REFUSED):
                 break
     except OSError:  # the time is up; or the connection has broken, which whoever reads on will find
         pass

@@ -62,11 +62,8 @@ class EventBuffer:
 
     def take(self) -> Event | None:
         """Take the oldest event; None if there is none."""
-        if not self:
-            return None
-        if not self._feedback or (self._states and self._states[0][0] < self._feedback[0][0]):
-            return self._states.popleft()[1]
-        return self._feedback.popleft()[1]
+        waiting = [each for each in (self._states, self._feedback) if each]
+        return min(waiting, key=lambda each: each[0][0]).popleft()[1] if waiting else None
 
 
 class Followed:

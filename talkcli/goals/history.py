@@ -102,7 +102,7 @@ class EarlyCancels:
     """Ids of which a cancel came before the goal did, and by whom."""
 
     def __init__(self) -> None:
-        self._until: OrderedDict[str, tuple[float, By]] = OrderedDict()
+        self._until: OrderedDict[str | None, tuple[float, By]] = OrderedDict()
 
     def note(self, goal_id: str, by: By, now: float) -> None:
         """Remember the cancel of an id."""
@@ -110,8 +110,6 @@ class EarlyCancels:
 
     def find(self, goal_id: str | None, now: float) -> By | None:
         """Return who cancelled this id."""
-        if goal_id is None:
-            return None
         until, by = self._until.get(goal_id, (now, None))
         return by if now < until else None
 
