@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from talkcli.client.goal import GoalHandle
     from talkcli.goals.goal import Goal
     from talkcli.goals.states import State
-    from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
-    from talkcli.protocol.replies import Canceled, ServerStatus
+    from talkcli.protocol.events import Canceled, PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard
 
 __version__ = "0.1.0"
 __all__ = [
@@ -33,16 +32,16 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    if name in {"Canceled", "Client", "GoalHandle", "ServerStatus"}:
+    if name in {"Client", "GoalHandle"}:
         from talkcli.client import client
 
         return getattr(client, name)
-    if name in {"PausedChanged", "Result", "Snapshot", "StateChanged", "WordHeard"}:
-        from talkcli.protocol import events
-
-        return getattr(events, name)
     if name in {"Goal", "State"}:
         from talkcli.goals import goal
 
         return getattr(goal, name)
+    if name in __all__:
+        from talkcli.protocol import events
+
+        return getattr(events, name)
     raise AttributeError(f"module 'talkcli' has no attribute {name!r}")

@@ -15,7 +15,7 @@ from talkcli.client.following import MAX_FEEDBACK, MAX_STATES, EventBuffer
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.protocol import events
-from talkcli.protocol.replies import ServerStatus
+from talkcli.protocol.events import ServerStatus
 from tests.support.connection import PATIENCE
 from tests.support.timing import assert_within, limits
 

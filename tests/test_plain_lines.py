@@ -20,7 +20,7 @@ from talkcli.client.client import check, too_long
 from talkcli.client.connect import GREETING
 from talkcli.goals.option import FLAG
 from talkcli.goals.options import Cancel, Say
-from talkcli.protocol import replies
+from talkcli.protocol import events
 from talkcli.protocol.lines import encode, write_request
 from talkcli.protocol.requests import Hello, Pause, Resume, Status
 
@@ -275,8 +275,8 @@ def test_what_the_library_may_change_or_refuse_is_not_sent_early(line: list[str]
 
 
 def test_the_greeting_that_is_looked_for_is_the_server_s() -> None:
-    assert encode(replies.greeting("0.1.0", 1, "4k7f")).startswith(GREETING)
-    assert not encode(replies.busy_greeting()).startswith(GREETING)
+    assert encode(events.greeting("0.1.0", 1, "4k7f")).startswith(GREETING)
+    assert not encode(events.busy_greeting()).startswith(GREETING)
 
 
 def test_click_is_what_is_compared_with() -> None:

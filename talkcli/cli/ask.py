@@ -12,7 +12,7 @@ from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_json
 from talkcli.errors import EXIT_SIGPIPE, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.protocol.replies import Canceled
+from talkcli.protocol.events import Canceled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

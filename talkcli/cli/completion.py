@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from talkcli.cli.show import Common
-    from talkcli.client.client import Client, ServerStatus
+    from talkcli.client.client import Client
     from talkcli.goals.goal import Goal, JsonObject
+    from talkcli.protocol.events import ServerStatus
 
     Items = list[CompletionItem[str]]
 

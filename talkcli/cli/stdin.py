@@ -32,9 +32,8 @@ from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
 from talkcli.goals.states import State
-from talkcli.protocol.events import Result
+from talkcli.protocol.events import Canceled, Result
 from talkcli.protocol.lines import Cut, LineSplitter
-from talkcli.protocol.replies import Canceled
 from talkcli.terminal.goals import ending
 
 if TYPE_CHECKING:

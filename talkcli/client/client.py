@@ -21,9 +21,8 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.option import MAX_ID, MAX_IDS, MAX_LOG
 from talkcli.goals.options import Cancel, Say, Set, bad_key, bad_option
 from talkcli.goals.states import State
-from talkcli.protocol.events import Snapshot
+from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
 from talkcli.protocol.lines import MAX_LINE, request_line, write_request
-from talkcli.protocol.replies import Canceled, ServerStatus, goal_in, goals
 from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
 
-__all__ = ["Canceled", "Client", "GoalHandle", "ServerStatus"]
+__all__ = ["Client", "GoalHandle"]
 
 #: Bytes of a request's line that are left for what isn't its list of ids: another id, a key, the names of the fields.
 _REST_OF_LINE = 4096
@@ -335,8 +334,7 @@ def check(request: Say | Set) -> None:
             fault = f"is no JSON: {error}"
         if fault:
             raise UsageError(f"{option.name!r} {fault}")
-    words = bad_option(request)
-    if words:
+    if words := bad_option(request):
         raise UsageError(words)
 
 

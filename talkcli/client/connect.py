@@ -288,8 +288,8 @@ def _checked(line: bytes, path: str) -> JsonObject:
     """Return a greeting; ServerUnavailable, ProtocolMismatch, Busy or AccessDenied for what greets nobody."""
     from talkcli import __version__
     from talkcli.errors import AccessDenied, BadRequest, ServerUnavailable
+    from talkcli.protocol.events import check_greeting
     from talkcli.protocol.lines import decode
-    from talkcli.protocol.replies import check_greeting
 
     try:
         greeting = decode(line)

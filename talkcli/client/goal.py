@@ -16,8 +16,7 @@ from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
-from talkcli.protocol.replies import Canceled, goals
+from talkcli.protocol.events import Canceled, PausedChanged, Result, StateChanged, WordHeard, goals
 from talkcli.protocol.requests import Status, Wait
 
 if TYPE_CHECKING:

@@ -1,19 +1,76 @@
-"""What a client hears, as frozen values, and their form in JSON: events, results, and the snapshot of a watch.
+"""What a server says, and its form in JSON: the greeting, replies and their lists, and the events that are heard.
 
 Rules for this file: form only, no I/O. `to_json` gives what the commands print, which is what the wire has; a server
 writes its events by hand, in `server.subscribers`, as it sends thousands of them. A field may be added, never renamed
-or given another meaning; a reader ignores what it doesn't know.
+or given another meaning; a reader ignores what it doesn't know. A change that an older peer could not read needs
+another PROTOCOL number; `{"request": "cancel"}` and `{"request": "status"}` stay the same in all of them.
 """
 
 from __future__ import annotations
 
+from talkcli.errors import BadRequest, Busy, ProtocolMismatch
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.goal import By, Goal, known
-from talkcli.protocol.replies import ServerStatus
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.states import State
+
+
+PROTOCOL = 1
+
+
+@frozen
+class ServerStatus:
+    """What a server says, will say and said. `server` is its own description, for people and programs."""
+
+    server: JsonObject
+    #: the goal that is ACTIVE or PREEMPTING
+    active: Goal | None
+    #: what comes next, in its order
+    pending: tuple[Goal, ...]
+    #: what ended last, oldest first
+    recent: tuple[Goal, ...]
+
+    def to_json(self) -> JsonObject:
+        return {
+            "server": self.server,
+            "active": None if self.active is None else self.active.to_json(),
+            "pending": [each.to_json() for each in self.pending],
+            "recent": [each.to_json() for each in self.recent],
+        }
+
+    @classmethod
+    def from_json(cls, message: JsonObject) -> ServerStatus:
+        """Return the status in an object; ValueError where one of its goals is none."""
+        server, pending, recent = message.get("server"), message.get("pending"), message.get("recent")
+        return cls(
+            server if isinstance(server, dict) else {},
+            goal_in(message, "active"),
+            tuple(map(Goal.from_json, pending)) if isinstance(pending, list) else (),
+            tuple(map(Goal.from_json, recent)) if isinstance(recent, list) else (),
+        )
+
+    @classmethod
+    def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
+        """Return what a reply and the lines of its list say."""
+        lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
+        return cls.from_json({**reply, **lists})
+
+
+@frozen
+class Canceled:
+    """What a cancel did: the goals that it ended, and those named that had ended before."""
+
+    canceled: tuple[Goal, ...]
+    ended: tuple[Goal, ...]
+
+    @classmethod
+    def from_items(cls, items: list[JsonObject]) -> Canceled:
+        """Return what the lines of a cancel's list say."""
+        return cls(tuple(goals(items, "canceled")), tuple(goals(items, "ended")))
 
 
 @frozen
@@ -126,3 +183,61 @@ def _counted(kind: str, event: StateChanged | WordHeard | PausedChanged) -> Json
     own = fields(event)
     at, n = own.pop("at"), own.pop("n")
     return {"event": kind, **own, "n": n, "at": at}
+
+
+def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
+    """Return the goals that the lines of a list have under this name."""
+    return (Goal.from_json(each[name]) for each in items if name in each)
+
+
+def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
+    """Return the goal in a reply, None where it is null; ValueError where it is no goal."""
+    return None if reply.get(name) is None else Goal.from_json(reply[name])
+
+
+def greeting(version: str, pid: int, boot: str) -> JsonObject:
+    """Return what a server says first."""
+    return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": []}
+
+
+def busy_greeting() -> JsonObject:
+    """Return what a server says first, and last, that takes no more clients."""
+    return {"talk": PROTOCOL, "error": "busy"}
+
+
+def check_greeting(message: JsonObject, version: str) -> None:
+    """Raise ProtocolMismatch or Busy where a client of `version` can't go on after this greeting."""
+    theirs = message.get("talk")
+    if theirs != PROTOCOL or isinstance(theirs, bool):
+        server = ascii(message.get("version", "unknown"))
+        older = isinstance(theirs, int) and theirs < PROTOCOL
+        side = "restart the server with the newer version" if older else "upgrade this command"
+        raise ProtocolMismatch(
+            f"this command (version {version}) speaks protocol {PROTOCOL}, the server (version {server}) speaks "
+            f"{theirs!a}: {side}"
+        )
+    if message.get("error") == "busy":
+        raise Busy("the server has as many clients as it takes (`talk serve --max-clients`)", "busy")
+
+
+def item(seq: int | None, **fields: object) -> JsonObject:
+    """Return one line of a list; the list's reply follows."""
+    return fields if seq is None else {"seq": seq, **fields}
+
+
+def ok(seq: int | None, **fields: object) -> JsonObject:
+    """Return the reply that closes a request that was carried out."""
+    return item(seq, ok=True, **fields)
+
+
+def failure(seq: int | None, code: str, message: str) -> JsonObject:
+    """Return the reply to a request that was not carried out."""
+    return item(seq, ok=False, error={"code": code, "message": message})
+
+
+def take_seq(message: JsonObject) -> int | None:
+    """Take the number of a request out of it; BadRequest where it is no number."""
+    seq = message.pop("seq", None)
+    if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
+        raise BadRequest('"seq" must be an integer', "bad_field")
+    return seq

@@ -13,7 +13,7 @@ from itertools import chain
 from types import coroutine
 from typing import TYPE_CHECKING
 
-from talkcli.protocol import replies
+from talkcli.protocol.events import failure, item, ok
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Generator, Iterable
@@ -95,15 +95,15 @@ class Call:
 
     def answer(self, items: _Lines = (), events: _Lines = (), /, **fields: object) -> None:
         """Reply that it is carried out, and with what; after the lines of a list, and before events that follow it."""
-        self._reply(replies.ok(self.seq, **fields), items, events)
+        self._reply(ok(self.seq, **fields), items, events)
 
     def refuse(self, code: str, words: str, items: _Lines = ()) -> None:
         """Reply that it can't be had, after the lines of a list."""
-        self._reply(replies.failure(self.seq, code, words), items)
+        self._reply(failure(self.seq, code, words), items)
 
     def _reply(self, reply: JsonObject, items: _Lines, events: _Lines = ()) -> None:
         if items or events:
-            lines = (replies.item(self.seq, **each) for each in items)
+            lines = (item(self.seq, **each) for each in items)
             self.connection.send_list(chain(lines, [reply], events))
         else:
             self.connection.send(reply)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 from talkcli.errors import BadRequest, LineTooLong
 from talkcli.frozen import replace
 from talkcli.goals.options import Cancel
-from talkcli.protocol import replies
+from talkcli.protocol.events import busy_greeting, failure, ok, take_seq
 from talkcli.protocol.lines import RequestSplitter, decode, encode
 from talkcli.protocol.requests import Hello, Request, Status, read_request
 from talkcli.server.stream import Stream
@@ -118,7 +118,7 @@ class Connection(asyncio.Protocol):
             self._lines.extend(error.before)
             while self._may_go_on() and self._step():
                 pass  # they were asked for, and are answered
-            self.part(replies.failure(None, error.code, str(error)))
+            self.part(failure(None, error.code, str(error)))
             return
         if b"\n" in data:
             self._stop_line_limit()  # what follows the newline is another line
@@ -176,7 +176,7 @@ class Connection(asyncio.Protocol):
     # -- inside
 
     def _limit(self, seconds: float, words: str) -> asyncio.TimerHandle:
-        return self._loop.call_later(seconds, self.part, replies.failure(None, "too_slow", words))
+        return self._loop.call_later(seconds, self.part, failure(None, "too_slow", words))
 
     def _may_go_on(self) -> bool:
         """Whether the client can be told more, and takes it."""
@@ -263,11 +263,11 @@ class Connection(asyncio.Protocol):
         try:
             message = decode(line)
             self._bad_lines = 0
-            seq = replies.take_seq(message)
+            seq = take_seq(message)
             request = read_request(message)
         except BadRequest as error:
             self._bad_lines += 1
-            self.send(replies.failure(seq, error.code, str(error)))
+            self.send(failure(seq, error.code, str(error)))
             if self._bad_lines >= MAX_BAD_LINES or not self.admitted:
                 self.stream.close()
             return
@@ -275,11 +275,11 @@ class Connection(asyncio.Protocol):
         if not self.admitted:
             # Whose business is urgent comes in; a full server sends the others away.
             if not (isinstance(request, Status | Cancel) or (isinstance(request, Hello) and request.urgent)):
-                self.part(replies.busy_greeting())
+                self.part(busy_greeting())
                 return
             self.admit()
         if isinstance(request, Hello):
             self.sender = replace(self.sender, name=request.name)
-            self.send(replies.ok(seq))
+            self.send(ok(seq))
         else:
             self._handler.handle(self, seq, request)

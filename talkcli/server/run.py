@@ -21,7 +21,7 @@ from talkcli.frozen import frozen
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, Say, Set, as_shown
 from talkcli.goals.scheduler import Scheduler
-from talkcli.protocol import replies
+from talkcli.protocol.events import PROTOCOL, busy_greeting, greeting
 from talkcli.protocol.lines import encode
 from talkcli.server import log
 from talkcli.server.connection import Connection
@@ -107,7 +107,7 @@ class Server:
         self.speech.changed = self._systemd.changed
         self._requests = Requests(self.speech, self._describe)
         self.handle, self.owes = self._requests.handle, self._requests.owes
-        self.greeting = encode(replies.greeting(__version__, os.getpid(), self._scheduler.boot))
+        self.greeting = encode(greeting(__version__, os.getpid(), self._scheduler.boot))
         self.connections: set[Connection] = set()
         #: set while there is no client
         self._deserted = asyncio.Event()
@@ -197,9 +197,9 @@ class Server:
         # The socket's mode may let others in than its owner.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
             words = f"this server is uid {os.getuid()}'s; it would have to be started with --socket-mode"
-            refusal = {"talk": replies.PROTOCOL, "error": "permission_denied", "message": words}
+            refusal = {"talk": PROTOCOL, "error": "permission_denied", "message": words}
         elif len(self.connections) >= self._settings.max_clients + DOOR:
-            refusal = replies.busy_greeting()
+            refusal = busy_greeting()
         else:
             connection.sender = Sender(pid or None, uid, peers.command_of(pid), peers.parent_command_of(pid))
             if len(self.connections) < self._settings.max_clients:

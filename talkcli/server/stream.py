@@ -17,7 +17,7 @@ import errno
 import resource
 from typing import TYPE_CHECKING
 
-from talkcli.protocol import replies
+from talkcli.protocol.events import busy_greeting
 from talkcli.protocol.lines import encode
 from talkcli.server import log
 
@@ -326,7 +326,7 @@ class Acceptor:
             f"clients are turned away: only {self._descriptors} files may be open (raise LimitNOFILE= or ulimit -n)",
         )
         with connected, contextlib.suppress(OSError):  # it is gone again
-            connected.send(encode(replies.busy_greeting()))
+            connected.send(encode(busy_greeting()))
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
         """Leave the connections waiting for a while: the loop would ask for them without end."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from talkcli.goals.goal import By, Goal, JsonObject, Sender
-    from talkcli.protocol.replies import ServerStatus
+    from talkcli.protocol.events import ServerStatus
 
 #: Characters of a text that a list shows.
 MAX_TEXT = 200

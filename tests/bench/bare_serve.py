@@ -21,7 +21,7 @@ from collections import deque
 
 from talkcli.goals.goal import Goal, Sender
 from talkcli.goals.states import State
-from talkcli.protocol import replies
+from talkcli.protocol import events
 from talkcli.protocol.lines import RequestSplitter, encode
 
 #: An engine process that ends each sentence at once.
@@ -102,7 +102,7 @@ class Client(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        self.send(replies.greeting("0", os.getpid(), "bare"))
+        self.send(events.greeting("0", os.getpid(), "bare"))
 
     def data_received(self, data: bytes) -> None:
         for line in self._lines.feed(data):
@@ -110,7 +110,7 @@ class Client(asyncio.Protocol):
             if request["request"] == "say":
                 self._server.submit(self, request["seq"])
             else:
-                self.send(replies.ok(request.get("seq"), **_READY))
+                self.send(events.ok(request.get("seq"), **_READY))
 
     def send(self, *messages: dict[str, object]) -> None:
         """Write these lines in one piece."""

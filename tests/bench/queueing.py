@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Cancel, Say
 from talkcli.goals.scheduler import Now, Scheduler
-from talkcli.protocol import replies
+from talkcli.protocol import events
 from talkcli.protocol.lines import encode
 from tests.bench.installed import serve
 from tests.bench.table import Limit, Row
@@ -64,7 +64,7 @@ class Crowd:
     def status(self, lines: int) -> None:
         """Make so many lines of a status."""
         for record in islice(self.scheduler.pending(), lines):
-            encode(replies.item(1, pending=record.snapshot().to_json()))
+            encode(events.item(1, pending=record.snapshot().to_json()))
 
 
 def queueing(stage: Stage) -> list[Row]:

@@ -16,7 +16,7 @@ import pytest
 from talkcli.goals.options import Say
 from talkcli.goals.queue import Queue
 from talkcli.goals.record import Record
-from talkcli.protocol import replies
+from talkcli.protocol import events
 from talkcli.protocol.lines import encode
 from tests.unit.robot import ARM, Robot
 
@@ -133,7 +133,7 @@ def start_the_next(crowd: Crowd) -> int:
 def a_status_line(crowd: Crowd) -> int:
     goals = crowd.scheduler.pending()
     next(goals)
-    return steps(lambda: encode(replies.item(7, pending=next(goals).snapshot().to_json())))
+    return steps(lambda: encode(events.item(7, pending=next(goals).snapshot().to_json())))
 
 
 def look_at_the_clock(crowd: Crowd) -> int:

@@ -11,8 +11,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest, LineTooLong
+from talkcli.protocol.events import failure
 from talkcli.protocol.lines import MAX_LINE, RequestSplitter, decode, encode
-from talkcli.protocol.replies import failure
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 
 from talkcli.errors import BadRequest, Busy, ProtocolMismatch
-from talkcli.protocol.lines import decode, encode
-from talkcli.protocol.replies import (
+from talkcli.protocol.events import (
     PROTOCOL,
     busy_greeting,
     check_greeting,
@@ -20,6 +19,7 @@ from talkcli.protocol.replies import (
     ok,
     take_seq,
 )
+from talkcli.protocol.lines import decode, encode
 from tests.unit.test_lines import objects
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from talkcli.errors import BadRequest
 from talkcli.goals.option import MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME
 from talkcli.goals.options import Cancel, Say, Set
+from talkcli.protocol.events import failure
 from talkcli.protocol.lines import decode, encode, request_line, write_request
-from talkcli.protocol.replies import failure
 from talkcli.protocol.requests import (
     KINDS,
     Hello,

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import State
-from talkcli.protocol.events import Event, PausedChanged, Snapshot, StateChanged, WordHeard
-from talkcli.protocol.replies import ServerStatus
+from talkcli.protocol.events import Event, PausedChanged, ServerStatus, Snapshot, StateChanged, WordHeard
 from talkcli.terminal.goals import setting_lines, status_lines, who_forms, why_forms
 from talkcli.terminal.text import Screen, cut, share, width
 from talkcli.terminal.transcript import Transcript, log_lines

@@ -15,9 +15,9 @@ import pytest
 
 from talkcli.errors import RequestRefused, refusal
 from talkcli.goals.goal import Goal
-from talkcli.protocol import events, replies
+from talkcli.protocol import events
+from talkcli.protocol.events import ServerStatus
 from talkcli.protocol.lines import decode
-from talkcli.protocol.replies import ServerStatus
 from talkcli.protocol.requests import KINDS
 from tests.conformance.rawsocket import Raw
 
@@ -164,7 +164,7 @@ def test_client_of_today_understands_every_recorded_line() -> None:
         message = decode(line.text.encode())
         assert message == line.message
         if "talk" in message:
-            replies.check_greeting(message, "any")
+            events.check_greeting(message, "any")
         elif "event" in message:
             event = events.from_json(message)
             assert event is not None, line
