@@ -176,8 +176,7 @@ class SocketConnection:
         with the events of poll that do so (broken and hung up always do); `patience`: seconds in which the server must
         greet, and answer; `begun`: how far it has come already, maybe with what is to be the first request sent.
 
-        UsageError for a name that is too long; ServerUnavailable, AccessDenied, Busy or ProtocolMismatch where there is
-        no server to be had: nothing was sent then.
+        What is raised, `Client` says.
         """
         self._interrupt = {interrupt: select.POLLIN} if isinstance(interrupt, int) else interrupt
         name = sender(name)

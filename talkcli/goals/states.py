@@ -31,6 +31,16 @@ class State(IntEnum):
         return not TRANSITIONS[self]
 
 
+#: The terminal states, each with the exit code of a command whose goal ended in it.
+EXIT_CODES: dict[State, int] = {
+    State.SUCCEEDED: 0,
+    State.ABORTED: 4,
+    State.REJECTED: 5,
+    State.RECALLED: 6,
+    State.PREEMPTED: 7,
+    State.LOST: 12,
+}
+
 #: What may follow what. A goal begins PENDING or REJECTED. PREEMPTING may end ABORTED only for the reason not_silent:
 #: the state machine allows it, the scheduler watches over the reason. LOST is what a client concludes for itself, from
 #: any state in which the goal had not ended; no server ever sets it.
@@ -39,22 +49,7 @@ TRANSITIONS: dict[State, frozenset[State]] = {
     State.RECALLING: frozenset({State.RECALLED, State.LOST}),
     State.ACTIVE: frozenset({State.PREEMPTING, State.SUCCEEDED, State.ABORTED, State.LOST}),
     State.PREEMPTING: frozenset({State.PREEMPTED, State.SUCCEEDED, State.ABORTED, State.LOST}),
-    State.PREEMPTED: frozenset(),
-    State.SUCCEEDED: frozenset(),
-    State.ABORTED: frozenset(),
-    State.REJECTED: frozenset(),
-    State.RECALLED: frozenset(),
-    State.LOST: frozenset(),
-}
-
-#: Exit code of a command whose goal ended in this state.
-EXIT_CODES: dict[State, int] = {
-    State.SUCCEEDED: 0,
-    State.ABORTED: 4,
-    State.REJECTED: 5,
-    State.RECALLED: 6,
-    State.PREEMPTED: 7,
-    State.LOST: 12,
+    **dict.fromkeys(EXIT_CODES, frozenset()),
 }
 
 

@@ -2,8 +2,9 @@
 
 Rules for this file: form only, no I/O. `to_json` gives what the commands print, which is what the wire has; a server
 writes its events by hand, in `server.subscribers`, as it sends thousands of them. A field may be added, never renamed
-or given another meaning; a reader ignores what it doesn't know. A change that an older peer could not read needs
-another PROTOCOL number; `{"request": "cancel"}` and `{"request": "status"}` stay the same in all of them.
+or given another meaning, and means the same in each event; a reader ignores what it doesn't know. A change that an
+older peer could not read needs another PROTOCOL number; `{"request": "cancel"}` and `{"request": "status"}` stay the
+same in all of them.
 """
 
 from __future__ import annotations
@@ -105,9 +106,7 @@ class WordHeard:
     number: int
     #: seconds into the sentence
     time: float
-    #: when, in seconds since 1970 UTC
     at: float | None = None
-    #: the server's count of events
     n: int | None = None
 
     def to_json(self) -> JsonObject:
@@ -123,9 +122,7 @@ class PausedChanged:
     id: str | None = None
     #: who asked for it
     by: By | None = None
-    #: when, in seconds since 1970 UTC
     at: float | None = None
-    #: the server's count of events
     n: int | None = None
 
     def to_json(self) -> JsonObject:
