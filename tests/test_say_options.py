@@ -401,7 +401,7 @@ def test_as_from_the_environment_is_no_contradiction_of_output(tmp_path: Path) -
 
 
 def test_say_loads_nothing_that_it_does_not_use(scripted: Talk) -> None:
-    unused = ["client.following", "terminal.text", "engine"]
+    unused = ["terminal.text", "engine"]
     unused += ["cli.feedback", "cli.stdin"]
     assert all(importlib.util.find_spec(f"talkcli.{each}") for each in unused)
     code = (

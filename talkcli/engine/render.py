@@ -22,7 +22,8 @@ from talkcli.engine import protocol
 from talkcli.engine.players.wav import WavStreamPlayer
 from talkcli.engine.process import Conversation, EngineFailed
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
-from talkcli.goals.options import MAX_CHARACTERS, bad_text
+from talkcli.goals import text as texts
+from talkcli.goals.options import MAX_CHARACTERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -80,7 +81,7 @@ def render(
     """
     deadline = time.monotonic() + (float("inf") if timeout is None else timeout)
     ends = None if interrupt is None else {interrupt: select.POLLIN}
-    fault = bad_text(text, None)
+    fault = texts.fault(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
     says = (protocol.Say(f"{n}", each, rate, volume, voice, pitch) for n, each in enumerate(pieces(text), 1))

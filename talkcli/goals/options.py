@@ -47,9 +47,6 @@ MAX_PRIORITY = 1_000_000
 MAX_KEY = 64
 #: Milliseconds of silence before a sentence: no output needs longer to wake.
 MAX_LEAD_IN = 5000
-#: Categories of characters that make no sound by themselves: separators, controls, format characters such as the
-#: zero-width space, and code points that are not assigned or private.
-_SILENT = frozenset({"Zs", "Zl", "Zp", "Cc", "Cf", "Cn", "Co"})
 #: What stands for the driver's own voice, where a voice is named.
 DEFAULT_VOICE = "default"
 
@@ -410,30 +407,6 @@ def bad_option(asked: Say | Set) -> str | None:
         value = getattr(asked, option.name)
         if value is not None and value != option.default and (words := option.refusal(value)):
             return words
-    return None
-
-
-def bad_text(text: str, max_characters: int | None = MAX_CHARACTERS) -> tuple[str, str] | None:
-    """Return the reason and the words for people why this text can't be a goal, or None if it can.
-
-    Whether a synthesiser finds something to say in it, only the engine can tell. `max_characters`: None for one that is
-    no goal, and may have any length.
-    """
-    import unicodedata  # no start pays for it
-
-    if max_characters is not None and len(text) > max_characters:
-        return "text_too_long", f"the text has {len(text):,} characters, the longest allowed is {max_characters:,}"
-    try:
-        size = len(text.encode())
-    except UnicodeEncodeError as error:
-        words = f"character {error.start + 1} of the text is half of a surrogate pair: it is not valid UTF-8"
-        return "invalid_text", words
-    if max_characters is not None and size > MAX_BYTES:
-        return "text_too_long", f"the text has {size:,} bytes, the longest allowed is {MAX_BYTES:,}"
-    if "\0" in text:
-        return "invalid_text", f"character {text.index(chr(0)) + 1} of the text is NUL"
-    if all(unicodedata.category(each) in _SILENT for each in text):
-        return "invalid_text", "the text is empty" if not text.strip() else "the text has nothing that can be seen"
     return None
 
 

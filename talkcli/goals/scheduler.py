@@ -14,10 +14,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import frozen, replace
+from talkcli.goals import text as texts
 from talkcli.goals.goal import By
 from talkcli.goals.history import EarlyCancels, History, Said
 from talkcli.goals.option import is_clients_id
-from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option, bad_text
+from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option
 from talkcli.goals.queue import Queue
 from talkcli.goals.record import Record
 from talkcli.goals.states import IllegalTransition, State
@@ -351,7 +352,7 @@ class Scheduler:
             return "bad_option", words
         if first is not None:
             return "id_conflict", f"the id {say.id} is that of another text already"
-        return bad_text(say.text, self.max_text) or fault
+        return texts.fault(say.text, self.max_text) or fault
 
     def _throttle(self, say: Say, record: Record, now: Now) -> tuple[str, str] | None:
         """Return reason and words where the same is being said, waits, or was said just now; note which goal it is."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
 
-from talkcli.goals.options import bad_text
+from talkcli.goals.text import fault
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -176,7 +176,7 @@ def _valid(source: random.Random) -> str:
     """Return a text that the server would take."""
     while True:
         text = made(source)
-        if bad_text(text) is None:
+        if fault(text) is None:
             return text
 
 

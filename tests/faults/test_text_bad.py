@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.render import render
-from talkcli.goals.options import bad_text
+from talkcli.goals.text import fault
 from tests.conformance.hearing import LOW, assert_same, send
 from tests.faults.fuzz_texts import speak_all
 from tests.faults.fuzz_texts_generator import SENTENCES, Case
@@ -124,7 +124,7 @@ def _every_character(common: bool) -> Iterator[str]:
     ]
     found = found[:: _FEW if common else _FEWER]
     texts = ("".join(found[at : at + _MANY]) for at in range(0, len(found), _MANY))
-    return (text for text in texts if bad_text(text) is None)  # one of controls alone says nothing
+    return (text for text in texts if fault(text) is None)  # one of controls alone says nothing
 
 
 @pytest.mark.slow
@@ -163,7 +163,7 @@ def test_the_longest_words_and_writing_from_right_to_left_are_spoken_whole(tmp_p
     ids=ENDLESS.keys(),
 )
 def test_thousands_of_characters_of_one_kind_end(text: str) -> None:
-    assert bad_text(text) is None
+    assert fault(text) is None
     tally = speak_all([Case("gmw/en", text), Case("gmw/en", LOW)], guarded=True)
     assert (tally.texts, tally.deaths, tally.faults) == (2, [], [])
     assert set(tally.outcomes) <= {"completed", "nothing_to_say"}

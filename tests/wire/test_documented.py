@@ -91,7 +91,7 @@ def reasons() -> set[str]:
         if isinstance(node, ast.Tuple) and len(node.elts) == 2:
             first, second = node.elts
             for_people = isinstance(second, ast.JoinedStr | ast.Call) or " " in str(getattr(second, "value", ""))
-            if name in {"scheduler.py", "options.py", "speech.py"} and for_people:
+            if name in {"scheduler.py", "text.py", "speech.py"} and for_people:
                 found |= constants(first)
             if name == "scheduler.py" and isinstance(first, ast.Name):
                 found |= constants(second)
