@@ -153,8 +153,13 @@ def test_silent_beside_another_user_s_server_says_as_whom_to_play(
     needs("aplay")
     talk = make_talk(watched=False)
     monkeypatch.setattr(machine, "_environment", lambda _: None)  # it is not to be read
-    found = within({**talk.env, "ALSA_CONFIG_PATH": "/dev/null"}, monkeypatch, silent=True)
+    env = {**talk.env, "ALSA_CONFIG_PATH": "/dev/null"}
+    found = within(env, monkeypatch, silent=True)
     assert found["sentence"]["next"].endswith(f": sudo -u '#{os.getuid()}' talk doctor --silent")
+    monkeypatch.setattr(machine, "owner", lambda _: None)  # nor who it is, as /proc is mounted with hidepid
+    found = within(env, monkeypatch, silent=True)
+    assert found["sentence"]["state"] == "failed"
+    assert "sudo -u" not in found["sentence"]["next"]
 
 
 def test_silent_adds_nothing_to_a_file(make_talk: MakeTalk, tmp_path: Path) -> None:

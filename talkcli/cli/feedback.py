@@ -152,7 +152,8 @@ class _Light(Feedback):
         while self._stale and self._painting.acquire(blocking=False):
             try:
                 self._stale = False
-                _write(self._line.painted() if self._line else "")
+                line = self._line  # which another thread may take away
+                _write(line.painted() if line else "")
             finally:
                 self._painting.release()
 

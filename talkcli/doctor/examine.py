@@ -118,8 +118,9 @@ class Examination:
         custom = sound.is_custom(wanted)
         behind = sentence.behind(self._found, custom=custom)
         if self._silent and self._process is not None and here.server is None:
-            # Another user's, from whose surroundings nothing can be played.
-            behind = sentence.AS_OWNER.format(machine.owner(f"/proc/{self._process}"))
+            # Another user's, from whose surroundings nothing can be played; whose, a /proc with hidepid doesn't tell.
+            owner = machine.owner(f"/proc/{self._process}")
+            behind = behind if owner is None else sentence.AS_OWNER.format(owner)
         if played.reason == "audio_stalled" and not (self._hangs or custom):
             played = replace(played, suspended=sound.suspended(env))
         silent = self._silent or is_silent(wanted)
