@@ -12,7 +12,7 @@ from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_json
 from talkcli.errors import EXIT_SIGPIPE, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.protocol.events import Canceled
+from talkcli.protocol.events import Canceled, unfinished
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -148,8 +148,7 @@ def _suggest_key(key: str, client: Client) -> None:
         status = client.status()
     except TalkError:
         return  # what was asked for is done
-    goals = [status.active, *status.pending] if status.active else status.pending
-    near = nearest(key, {each.key for each in goals if each.key})
+    near = nearest(key, {each.key for each in unfinished(status) if each.key})
     if near:
         note(f"no goal has the key '{printable(key)}': did you mean '{printable(near)}'?")
 

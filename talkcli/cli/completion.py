@@ -20,6 +20,7 @@ from click.shell_completion import CompletionItem, ShellComplete, add_completion
 
 from talkcli.cli.show import show
 from talkcli.errors import TalkError
+from talkcli.protocol.events import ServerStatus, unfinished
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from talkcli.cli.show import Common
     from talkcli.client.client import Client
     from talkcli.goals.goal import Goal, JsonObject
-    from talkcli.protocol.events import ServerStatus
 
     Items = list[CompletionItem[str]]
 
@@ -40,6 +40,8 @@ PATIENCE = 0.5
 _ENDED = 100
 #: Characters of a text that stand beside an id.
 _MAX_TEXT = 60
+#: What there is to offer where no server answers.
+_NO_STATUS = ServerStatus({}, None, (), ())
 
 _BASH = """\
 %(complete_func)s() {
@@ -221,29 +223,25 @@ def _quoted(value: str, quote: str) -> str:
 
 def goal_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Return the ids of goals that have not ended."""
-    status = _ask(context, lambda client: client.status())
-    return [] if status is None else _ids(_unfinished(status), status, incomplete)
+    status = _status(context)
+    return _ids(unfinished(status), status, incomplete)
 
 
 def known_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Return the ids of goals, the ended ones too: first what is not over, then the newest."""
-    found = _ask(context, lambda client: (client.status(), client.log(_ENDED)))
-    if found is None:
-        return []
-    status, ended = found
-    return _ids([*_unfinished(status), *reversed(ended)], status, incomplete)
+    status, ended = _ask(context, lambda client: (client.status(), client.log(_ENDED))) or (_NO_STATUS, [])
+    return _ids([*unfinished(status), *reversed(ended)], status, incomplete)
 
 
 def keys(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Return the keys of goals that have not ended, and of the last that have."""
-    status = _ask(context, lambda client: client.status())
-    return [] if status is None else _keys([*_unfinished(status), *reversed(status.recent)], incomplete)
+    status = _status(context)
+    return _keys([*unfinished(status), *reversed(status.recent)], incomplete)
 
 
 def unfinished_keys(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
     """Return the keys of goals that have not ended."""
-    status = _ask(context, lambda client: client.status())
-    return [] if status is None else _keys(_unfinished(status), incomplete)
+    return _keys(unfinished(_status(context)), incomplete)
 
 
 def voices(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
@@ -282,8 +280,8 @@ def _ask(context: click.Context, question: Callable[[Client], _Answer]) -> _Answ
         return None
 
 
-def _unfinished(status: ServerStatus) -> list[Goal]:
-    return ([status.active] if status.active else []) + list(status.pending)
+def _status(context: click.Context) -> ServerStatus:
+    return _ask(context, lambda client: client.status()) or _NO_STATUS
 
 
 def _ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Items:

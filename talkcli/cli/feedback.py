@@ -16,6 +16,7 @@ from talkcli.client.connect import ready
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
+from talkcli.terminal.goals import NOT_KEPT
 from talkcli.terminal.text import Screen, Sentence, printable
 
 if TYPE_CHECKING:
@@ -168,7 +169,7 @@ class _Line:
         self.goal = goal
         self.paused = goal.paused
         self.state = State.PENDING if goal.state.terminal else goal.state
-        self.sentence = Sentence("(text no longer kept)" if goal.text is None else goal.text)
+        self.sentence = Sentence(NOT_KEPT if goal.text is None else goal.text)
         heard = len(goal.spoken or "")
         #: where the word begins and ends that is being heard
         self.word = (heard, heard)

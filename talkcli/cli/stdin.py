@@ -32,7 +32,7 @@ from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
 from talkcli.goals.states import State
-from talkcli.protocol.events import Canceled, Result
+from talkcli.protocol.events import Canceled, Result, unfinished
 from talkcli.protocol.lines import Cut, LineSplitter
 from talkcli.terminal.goals import ending
 
@@ -359,8 +359,7 @@ class _Tally(threading.Thread):
 
 def _own(client: Client) -> list[str]:
     """Return the ids of all goals of this process that have not ended."""
-    status = client.status()
-    going = [*status.pending, *([status.active] if status.active else [])]
+    going = unfinished(client.status())
     return [each.id for each in going if each.client is not None and each.client.pid == os.getpid()]
 
 

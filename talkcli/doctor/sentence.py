@@ -146,8 +146,7 @@ def by_engine(text: str, setting: Setting, volume: float, limit: float) -> Playe
     except EngineFailed as error:
         return Played(State.ABORTED, *fault(error))
     except TimeoutError:
-        pass
-    return Played(State.ABORTED, "engine_hung", f"it was not over after {limit:g} s")
+        return Played(State.ABORTED, "engine_hung", f"it was not over after {limit:g} s")
 
 
 def behind(findings: Sequence[Finding], *, custom: bool = False) -> str | None:

@@ -61,6 +61,11 @@ class ServerStatus:
         return cls.from_json({**reply, **lists})
 
 
+def unfinished(status: ServerStatus) -> list[Goal]:
+    """Return the goals of a status that have not ended: the active one, then those that wait, in their order."""
+    return [*([status.active] if status.active else []), *status.pending]
+
+
 @frozen
 class Canceled:
     """What a cancel did: the goals that it ended, and those named that had ended before."""

@@ -26,6 +26,8 @@ MAX_TEXT = 200
 _LABEL = 9
 #: Characters of a command line that are shown.
 MAX_COMMAND = 60
+#: Stands for the text of a goal that ended long ago.
+NOT_KEPT = "(text no longer kept)"
 
 #: How a server's part is told that does not begin with its name, and which are left out where there is none.
 _ABOUT = {
@@ -163,7 +165,7 @@ def _tails(goal: Goal, now: float) -> list[str]:
 
 def quoted(goal: Goal, limit: int | None = None) -> str:
     """Return the text of a goal, cut after `limit` characters."""
-    return "(text no longer kept)" if goal.text is None else f'"{printable(goal.text, limit)}"'
+    return NOT_KEPT if goal.text is None else f'"{printable(goal.text, limit)}"'
 
 
 def _notes(goal: Goal, now: float) -> list[str]:

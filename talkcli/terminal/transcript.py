@@ -10,7 +10,7 @@ import time
 
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, Snapshot, StateChanged, WordHeard
+from talkcli.protocol.events import PausedChanged, Snapshot, StateChanged, WordHeard, unfinished
 from talkcli.terminal.goals import clock, quoted, who_forms, why_forms
 from talkcli.terminal.text import (
     GAP,
@@ -71,8 +71,7 @@ class Transcript:
 
     def _begin(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
         status = event.status
-        known = ([status.active] if status.active else []) + list(status.pending)
-        for goal in known:
+        for goal in unfinished(status):
             self._goals[goal.id] = goal
             self._make_room(goal.id, screen)  # before the first line, so that all of them line up
         self._paused = status.server.get("paused") is True
@@ -81,7 +80,7 @@ class Transcript:
         at_work = "paused" if self._paused else "speaking" if status.active else "silent"
         head = f"{clock(now)}{GAP}{pad('watching', 10)}{GAP}{at_work}{waiting}; {place}"
         lines = [cut(head, screen.room(0))]
-        for goal in known:
+        for goal in unfinished(status):
             since = goal.queued_at if goal.started_at is None else goal.started_at
             lines += self._goal(goal, goal.state, since or now, screen)
         return lines
