@@ -62,15 +62,14 @@ def watch(options: Common, words: bool) -> int:
     if not has_reader():
         return EXIT_SIGPIPE
     transcript = Transcript(full=screen().width is None, words=words)
-    with Interrupts() as interrupts:
-        interrupts.watch_output()  # in `talk watch | head`, the next event may be far
-        with options.connect(interrupt=interrupts.watched) as client:
-            for event in client.events():
-                if options.json:
-                    show_json(event.to_json())
-                else:
-                    for line in transcript.lines(event, screen(), time.time()):
-                        show(line)
+    # The reader of its output, too, ends it: in `talk watch | head`, the next event may be far.
+    with Interrupts(output=True) as interrupts, options.connect(interrupt=interrupts.watched) as client:
+        for event in client.events():
+            if options.json:
+                show_json(event.to_json())
+            else:
+                for line in transcript.lines(event, screen(), time.time()):
+                    show(line)
     return interrupts.exit_code
 
 

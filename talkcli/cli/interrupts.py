@@ -58,10 +58,11 @@ class Interrupts:
     may change. That it ends the waiting ends the `with`, too; `exit_code` then says why.
     """
 
-    def __init__(self, timeout: float | None = None, held: Iterable[int] = ()) -> None:
+    def __init__(self, timeout: float | None = None, held: Iterable[int] = (), *, output: bool = False) -> None:
         """`timeout`: seconds after which it becomes readable by itself, and `late` true; counted from the `with`.
 
-        `held`: signals that were blocked until somebody should catch them.
+        `held`: signals that were blocked until somebody should catch them; `output`: whether a reader of standard
+        output that goes away ends the waiting, too.
         """
         self.number: int | None = None
         self.late = False
@@ -69,6 +70,7 @@ class Interrupts:
         self.gone = False
         self._timeout = timeout
         self._held = held
+        self._output = output
 
     @property
     def exit_code(self) -> int:
@@ -80,7 +82,7 @@ class Interrupts:
     def __enter__(self) -> Interrupts:
         self.descriptor, self._write = os.pipe()
         os.set_blocking(self._write, False)
-        self.watched = {self.descriptor: select.POLLIN}
+        self.watched = {self.descriptor: select.POLLIN, **(watched_output() if self._output else {})}
         # A shell starts background commands with SIGINT ignored: what is ignored stays so.
         self._before = {
             each: signal.signal(each, self._caught) for each in _CAUGHT if signal.getsignal(each) != signal.SIG_IGN
@@ -104,10 +106,6 @@ class Interrupts:
         os.close(self.descriptor)
         os.close(self._write)
         return kind is Interrupted
-
-    def watch_output(self) -> None:
-        """Have a reader of standard output that goes away from now on end the waiting, too."""
-        self.watched.update(watched_output())
 
     def look(self) -> None:
         """Find out whether it was the reader of standard output that has ended the waiting."""

@@ -32,7 +32,7 @@ from talkcli.cli.wait import (
     show_if_possible,
     until_ended,
 )
-from talkcli.client.connect import ANSWER_LIMIT, Interrupted
+from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import SOUND
@@ -102,12 +102,9 @@ def _say(
 ) -> int:
     """Speak one text."""
     end = None if timeout is None else options.began + timeout
-    with Interrupts(held=options.held) as interrupts:
-        if wait:
-            interrupts.watch_output()
+    with Interrupts(held=options.held, output=wait) as interrupts:
         try:
-            patience = min(ANSWER_LIMIT, timeout or ANSWER_LIMIT)
-            with options.connect(name=name, interrupt=interrupts.watched, patience=patience) as client:
+            with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
                 if interrupts.number is not None and not (options.begun and options.begun.sent):
                     raise Interrupted  # what has been sent is cancelled, once its id is known
                 goal = client.say(text, follow=wait, feedback=feedback, **chosen)

@@ -34,8 +34,6 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 _failed = False
 #: Columns of a terminal that doesn't say how many it has.
 USUAL_WIDTH = 80
-#: Columns into which what is said always goes; a terminal that says it has fewer is not believed.
-_NARROWEST = 40
 #: Stands for a blank at which no line ends.
 _NO_BREAK = "\0"
 
@@ -60,12 +58,17 @@ class Common:
         self.began = time.monotonic()
         vars(self).update(given)
 
-    def connect(self, **options: Any) -> Client:
-        """Return a client connected to the server; see `SocketConnection` for the options."""
+    def connect(self, timeout: float | None = None, **options: Any) -> Client:
+        """Return a client connected to the server; see `SocketConnection` for the options.
+
+        `timeout`: seconds that all may take, and so the longest that an answer is waited for.
+        """
         from talkcli.client.client import Client
+        from talkcli.client.connect import ANSWER_LIMIT
         from talkcli.client.connection import SocketConnection
 
-        return Client.over(SocketConnection(self.socket, begun=self.begun, **{"urgent": self.urgent, **options}))
+        options = {"urgent": self.urgent, "patience": min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), **options}
+        return Client.over(SocketConnection(self.socket, begun=self.begun, **options))
 
 
 def ended(command: Callable[[], object], options: Common) -> int:
@@ -179,7 +182,7 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 def note(words: str) -> None:
     """Write something for people to standard error, if they are there; a terminal's lines end between two words."""
     lines = f"talk: {words}"
-    if sys.stderr is not None and len(lines) > _NARROWEST and sys.stderr.isatty():
+    if sys.stderr is not None and sys.stderr.isatty():
         lines = _folded(lines)
     end_line(lines)
 
@@ -211,8 +214,10 @@ def _folded(text: str) -> str:
     import re
     import textwrap
 
+    from talkcli.terminal.text import NARROWEST
+
     fold = textwrap.TextWrapper(
-        max(width, _NARROWEST), subsequent_indent="      ", break_long_words=False, break_on_hyphens=False
+        max(width, NARROWEST), subsequent_indent="      ", break_long_words=False, break_on_hyphens=False
     )
     # A command is not broken: it would be another one where it is copied from the terminal.
     kept = re.sub(r"'[^'\n]*'|: (?:talk|sudo) .*", lambda found: found[0].replace(" ", _NO_BREAK), text)

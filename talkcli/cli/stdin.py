@@ -26,7 +26,7 @@ from talkcli.cli.wait import (
     show_if_possible,
     until_ended,
 )
-from talkcli.client.connect import ANSWER_LIMIT, Interrupted, ready
+from talkcli.client.connect import Interrupted, ready
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, TalkError, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
@@ -122,12 +122,9 @@ def say_lines(
     `name`: what the sender calls itself; `chosen`: options of each goal; `timeout`: seconds for all of it.
     """
     shown = feedback_for(options, asked=feedback)
-    with Interrupts(timeout) as interrupts:
-        if wait:
-            interrupts.watch_output()
-        patience = min(ANSWER_LIMIT, timeout or ANSWER_LIMIT)
+    with Interrupts(timeout, output=wait) as interrupts:
         try:
-            with options.connect(name=name, interrupt=interrupts.watched, patience=patience) as client:
+            with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
                 return _Lines(client, interrupts, options, chosen, wait, shown).run()
         except Interrupted:
             interrupts.look()  # while standard output is what it was
@@ -253,7 +250,7 @@ class _Lines:
     def _cancel(self, ids: list[str]) -> None:
         """Cancel what was sent and has not ended, and tell how it ended."""
         try:
-            with self._options.connect(interrupt=self._interrupts.watched, patience=SILENCE, urgent=True) as client:
+            with self._options.connect(SILENCE, interrupt=self._interrupts.watched, urgent=True) as client:
                 # With the one that was accepted in the moment in which this command hung up, if there was one.
                 ids = list(dict.fromkeys([*ids, *_own(client)]))
                 if not ids:

@@ -10,7 +10,7 @@ import time
 
 from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.show import Feedback, give_up_failed, give_up_output, note, reader_is_gone, show_json
-from talkcli.client.connect import ANSWER_LIMIT, Interrupted
+from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import EXIT_CODES, State
@@ -118,11 +118,9 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback:
     """Wait until these goals have ended, or all that have not, and return the exit code; `timeout` in seconds."""
     end = None if timeout is None else options.began + timeout
     give_up_unread()
-    with Interrupts() as interrupts:
-        interrupts.watch_output()
+    with Interrupts(output=True) as interrupts:
         try:
-            patience = min(ANSWER_LIMIT, timeout or ANSWER_LIMIT)
-            with options.connect(interrupt=interrupts.watched, patience=patience) as client:
+            with options.connect(timeout, interrupt=interrupts.watched) as client:
                 goals = client.follow(ids or None, feedback=feedback)
                 shown = feedback_for(options, asked=feedback)
                 if feedback:
