@@ -28,7 +28,7 @@ LAYERS = ["ground", "goals", "protocol", "terminal", "client", "engine", "server
 GROUND = {"errors", "frozen", "paths", "peers"}
 #: What lies flat besides: the package's face and its command, which hand on what others have.
 FACE = {"", "__main__"}
-#: What is pure besides all of `goals` and `protocol`.
+#: What is pure besides all of `goals`, `protocol` and `terminal`.
 PURE = [
     "errors",
     "frozen",
@@ -88,7 +88,7 @@ def layer(module: str) -> int:
 
 def pure() -> list[str]:
     """Return the modules that have no I/O, no clock and no thread."""
-    return PURE + [each for each in sources() if part(each) in {"goals", "protocol"}]
+    return PURE + [each for each in sources() if part(each) in {"goals", "protocol", "terminal"}]
 
 
 def absolute(module: str, node: ast.ImportFrom) -> str:
@@ -203,8 +203,23 @@ def test_no_module_imports_itself_by_a_detour_not_even_for_its_types() -> None:
 
 @pytest.mark.parametrize("module", pure())
 def test_what_decides_is_pure(module: str) -> None:
-    assert not outside(module) & IMPURE
+    shows_times = part(module) == "terminal"
+    assert not outside(module) & (IMPURE - {"time"} if shows_times else IMPURE)
     assert not {each for each, _ in inside(module) if each not in pure()}
+
+
+def test_what_shows_times_knows_the_time_zone_and_asks_no_clock() -> None:
+    """With its last argument left out, each of these would."""
+    arguments = {"localtime": 1, "strftime": 2}
+    for module in [each for each in sources() if part(each) == "terminal" and "time" in outside(each)]:
+        nodes = [*ast.walk(sources()[module])]
+        calls = [each for each in nodes if isinstance(each, ast.Call) and ast.unparse(each.func).startswith("time.")]
+        for each in calls:
+            name = ast.unparse(each.func).removeprefix("time.")
+            assert arguments.get(name) == len(each.args), f"talkcli.{module}:{each.lineno} asks a clock"
+        # It is used in no other way, and nothing of it under another name.
+        assert not any(isinstance(each, ast.ImportFrom) and each.module == "time" for each in nodes)
+        assert len(calls) == sum(isinstance(each, ast.Name) and each.id == "time" for each in nodes) > 0
 
 
 @pytest.mark.parametrize("library", ONLY)
