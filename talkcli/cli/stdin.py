@@ -122,15 +122,14 @@ def say_lines(
     `name`: what the sender calls itself; `chosen`: options of each goal; `timeout`: seconds for all of it.
     """
     shown = feedback_for(options, asked=feedback)
-    with Interrupts(timeout, output=wait) as interrupts:
-        try:
-            with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
-                return _Lines(client, interrupts, options, chosen, wait, shown).run()
-        except Interrupted:
-            interrupts.look()  # while standard output is what it was
-            raise
-        finally:
-            regardless(shown.close)
+    try:
+        with (
+            Interrupts(timeout, output=wait) as interrupts,
+            options.connect(timeout, name=name, interrupt=interrupts.watched) as client,
+        ):
+            return _Lines(client, interrupts, options, chosen, wait, shown).run()
+    finally:
+        regardless(shown.close)
     return interrupts.exit_code
 
 
@@ -291,9 +290,8 @@ class _Tally(threading.Thread):
         self._interrupts = interrupts
         self._shown = shown
         self._changed = threading.Condition()
-        #: goals that have not ended, as far as this thread knows, and exit codes of lines that are no goals
-        self._waiting: deque[GoalHandle | int] = deque()
-        self._closed = False
+        #: goals that have not ended, as far as this thread knows, exit codes of lines that are no goals, at last None
+        self._waiting: deque[GoalHandle | int | None] = deque()
         self._error: BaseException | None = None
         #: the exit code of all lines so far
         self.code = EXIT_OK
@@ -302,24 +300,24 @@ class _Tally(threading.Thread):
     def unfinished(self) -> list[GoalHandle]:
         """The goals that were not seen to end."""
         with self._changed:
-            return [each for each in self._waiting if not isinstance(each, int)]
+            return [each for each in self._waiting if not isinstance(each, int | None)]
 
-    def add(self, sent: GoalHandle | int) -> None:
-        """Wait for this one, too, or count this exit code when its turn comes."""
+    def add(self, sent: GoalHandle | int | None) -> None:
+        """Wait for this one, too, or count this exit code when its turn comes; None: there are no more."""
         with self._changed:
             self._waiting.append(sent)
             self._changed.notify()
 
     def finish(self) -> None:
         """Return when all have ended; what stopped this thread before that is raised."""
-        self._close()
+        self.add(None)
         self.join()
         if self._error is not None:
             raise self._error
 
     def stop(self) -> None:
         """End the thread as soon as that can be done, whatever has not ended."""
-        self._close()
+        self.add(None)
         self._interrupts.wake()
         # It may hang on a standard output that nobody reads: then it ends with the process.
         self.join(SILENCE)
@@ -338,8 +336,8 @@ class _Tally(threading.Thread):
 
     def _next(self) -> GoalHandle | int | None:
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._closed)
-            return self._waiting[0] if self._waiting else None
+            self._changed.wait_for(lambda: self._waiting)
+            return self._waiting[0]
 
     def _see_end(self, handle: GoalHandle) -> int:
         self._shown.begin([handle.goal])
@@ -347,11 +345,6 @@ class _Tally(threading.Thread):
         if handle.state is State.LOST:
             self._interrupts.wake()  # nothing more can be sent
         return report(handle.goal, self._options, self._shown)
-
-    def _close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
 
 
 def _own(client: Client) -> list[str]:
