@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 
 from talkcli.cli.command import nearest
-from talkcli.cli.show import note, screen, show, show_json
+from talkcli.cli.show import note, screen, show, show_found, show_json
 from talkcli.errors import EXIT_SIGPIPE, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.protocol.events import Canceled, unfinished
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
     from typing import Any
 
     from talkcli.cli.show import Common
@@ -51,7 +52,7 @@ def status(options: Common, goal_id: str | None) -> None:
         now = time.time()
         return goal_lines(found, screen(), now) if isinstance(found, Goal) else status_lines(found, screen(), now)
 
-    _show_found(options, [found.to_json()], lines)
+    show_found(options, [found.to_json()], lines)
 
 
 def watch(options: Common, words: bool) -> int:
@@ -65,11 +66,7 @@ def watch(options: Common, words: bool) -> int:
     # The reader of its output, too, ends it: in `talk watch | head`, the next event may be far.
     with Interrupts(output=True) as interrupts, options.connect(interrupt=interrupts.watched) as client:
         for event in client.events():
-            if options.json:
-                show_json(event.to_json())
-            else:
-                for line in transcript.lines(event, screen(), time.time()):
-                    show(line)
+            show_found(options, [event.to_json()], partial(transcript.lines, event, screen(), time.time()))
     return interrupts.exit_code
 
 
@@ -79,7 +76,7 @@ def log(options: Common, count: int) -> None:
 
     with options.connect() as client:
         goals = client.log(count)
-    _show_found(options, (each.to_json() for each in goals), lambda: log_lines(goals, screen(), time.time()))
+    show_found(options, (each.to_json() for each in goals), lambda: log_lines(goals, screen(), time.time()))
 
 
 def voices(options: Common, language: str | None) -> None:
@@ -93,7 +90,7 @@ def voices(options: Common, language: str | None) -> None:
         found = [each for each in every if _language(each) == wanted or _language(each).startswith(f"{wanted}-")]
         if not found:
             raise TalkError(_no_voice(language, every))
-    _show_found(options, found, lambda: voice_lines(found))
+    show_found(options, found, lambda: voice_lines(found))
 
 
 def change(options: Common, **settings: Any) -> None:
@@ -103,7 +100,7 @@ def change(options: Common, **settings: Any) -> None:
     asked = {name: value for name, value in settings.items() if value is not None}
     with options.connect() as client:
         found = client.set(**asked) if asked else client.settings()
-    _show_found(options, [found], lambda: [] if asked else setting_lines(found))
+    show_found(options, [found], lambda: [] if asked else setting_lines(found))
 
 
 def pause(options: Common) -> None:
@@ -162,16 +159,6 @@ def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     near = nearest(language, names) or nearest(language, codes)
     hint = f"did you mean '{printable({**codes, **names}[near])}'?" if near else "'talk voices' lists all"
     return f"no voice speaks '{printable(language)}': {hint}"
-
-
-def _show_found(options: Common, found: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """Show what the server said: as it is, for programs, or in lines for people."""
-    if options.json:
-        for each in found:
-            show_json(each)
-    else:
-        for line in lines():
-            show(line)
 
 
 def _language(voice: JsonObject) -> str:

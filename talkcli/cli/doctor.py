@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.show import note, screen, show, show_json
+from talkcli.cli.show import note, screen, show_found
 from talkcli.doctor.examine import Examination
 from talkcli.doctor.report import heard, lines, verdict
 from talkcli.goals.states import EXIT_CODES, State
@@ -23,11 +24,7 @@ def doctor(options: Common, silent: bool) -> int:
     with Interrupts() as interrupts:
         for finding in Examination(options.socket, silent=silent, interrupt=interrupts.watched).findings():
             found.append(finding)
-            if options.json:
-                show_json(finding.to_json())
-            else:
-                for line in lines(finding, screen()):
-                    show(line)
+            show_found(options, [finding.to_json()], partial(lines, finding, screen()))
             if interrupts.number is not None:
                 break
     if interrupts.number is not None:

@@ -166,6 +166,16 @@ def show_json(message: JsonObject) -> None:
     _write_json(standard_output(), message)
 
 
+def show_found(options: Common, found: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
+    """Show what was found: as it is, for programs, or in lines for people."""
+    if options.json:
+        for each in found:
+            show_json(each)
+    else:
+        for line in lines():
+            show(line)
+
+
 def _write_json(stream: TextIO, message: JsonObject) -> None:
     from talkcli.protocol.lines import encode  # help and completion have nothing to do with JSON
 
