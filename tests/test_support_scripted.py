@@ -172,7 +172,6 @@ def test_a_hang_ignores_everything(engine: Engine) -> None:
     engine.say("hang at=0")
     assert isinstance(engine.receive(), protocol.Started)
     engine.stop()
-    engine.send(protocol.Quit())
     engine.socket.shutdown(socket.SHUT_WR)
     engine.process.terminate()
     with contextlib.suppress(TimeoutError):
@@ -203,7 +202,6 @@ def test_ignored_stop_changes_nothing(engine: Engine) -> None:
 def test_ignored_stop_and_no_end_stays_alive(engine: Engine) -> None:
     engine.say("ignore-stop never-ends")
     engine.stop()
-    engine.send(protocol.Quit())
     events = [engine.receive() for _ in range(4)]
     assert [type(each) for each in events[-2:]] == [protocol.Word, protocol.Alive]
     engine.socket.close()
@@ -234,13 +232,6 @@ def test_on_stop_does_what_it_says(engine: Engine, what: str, outcome: str | Non
 def test_silent_start_says_nothing_before_the_end(engine: Engine) -> None:
     engine.say("silent-start some words")
     assert engine.until_end()[0] == []
-
-
-def test_quit_stops_the_goal_and_ends_it(engine: Engine) -> None:
-    engine.say("length=10")
-    engine.send(protocol.Quit())
-    assert engine.until_end()[1] == protocol.Ended("a", protocol.STOPPED)
-    assert engine.process.wait(5) == 0
 
 
 def test_end_of_input_ends_it(engine: Engine) -> None:

@@ -6,7 +6,7 @@ engine process can be written against it.
 
 Order, as the process must keep it: `Configure` comes in once, first. Then `Ready` goes out, or `StartFailed` and the
 process ends. After that each `Say` gets one `Started`, any number of `Word`, `Alive` and `Paused`, and exactly one
-`Ended`.
+`Ended`. Where the server's half is closed, the sentence being spoken is stopped and the process ends.
 """
 
 from __future__ import annotations
@@ -114,11 +114,6 @@ class Followed:
 
 
 @frozen
-class Quit:
-    """End the process; the sentence being spoken, if any, is stopped first."""
-
-
-@frozen
 class Voice:
     """One voice of the driver's."""
 
@@ -197,13 +192,13 @@ class Ended:
     duration: float | None = None  # seconds of audio, where all of it was synthesised
 
 
-Command = Configure | Say | Stop | Pause | Resume | Followed | Quit
+Command = Configure | Say | Stop | Pause | Resume | Followed
 Event = Ready | StartFailed | Voices | Started | Alive | Word | Paused | Ended
 #: The events that belong to a goal, by its `id`.
 OF_A_GOAL = (Started, Alive, Word, Paused, Ended)
 
 # In a line a message is called as its class is.
-_COMMANDS = {each.__name__: each for each in (Configure, Say, Stop, Pause, Resume, Followed, Quit)}
+_COMMANDS = {each.__name__: each for each in (Configure, Say, Stop, Pause, Resume, Followed)}
 _EVENTS = {each.__name__: each for each in (Ready, StartFailed, Voices, Started, Alive, Word, Paused, Ended)}
 
 # Made once: `json.dumps` makes another for each line that isn't written in its own way, and `json.loads` guesses at the

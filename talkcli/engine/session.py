@@ -117,7 +117,6 @@ class Session:
         #: what our own driver plays with
         self.players = players
         self._backlog: deque[Command] = deque()
-        self._leaving = False
         self._goal: InHand | None = None
         self._engine: Any = None
         self._apply: Any = None
@@ -145,7 +144,7 @@ class Session:
         engine.connect("error", _told(self._error))
 
     def run(self, voices: bool) -> None:
-        """Carry out commands until the server leaves or says so; before that tell the voices, if they are wanted."""
+        """Carry out commands until the server is gone; before that tell the voices, if they are wanted."""
         try:
             if voices:
                 try:
@@ -154,15 +153,14 @@ class Session:
                     traceback.print_exc()
                     found = ()
                 self._channel.send(protocol.Voices(found))
-            while not (self._leaving or self._channel.closed):
+            while not self._channel.closed:
                 if not self._backlog:
                     self._backlog.extend(self._channel.receive())
                     continue
                 command = self._backlog.popleft()
+                # What else comes out of a goal came too late; a second Configure has nothing to change.
                 if isinstance(command, protocol.Say):
                     self._say(command)
-                # What else comes out of a goal came too late; a second Configure has nothing to change.
-                self._leaving = self._leaving or isinstance(command, protocol.Quit)
         finally:
             self._engine.endLoop()
 
@@ -182,7 +180,7 @@ class Session:
         if self._channel.descriptor in ready:
             for command in self._channel.receive():
                 self._carry_out_now(command)
-            if self._leaving or self._channel.closed:
+            if self._channel.closed:
                 self._silence()
         due = self._alive_due()
         if self._goal is not None and due is not None and time.monotonic() >= due:
@@ -192,7 +190,6 @@ class Session:
         """Carry out what concerns the goal in hand; the rest has to wait."""
         goal = self._goal
         if not isinstance(command, protocol.Stop | protocol.Followed | protocol.Pause | protocol.Resume):
-            self._leaving = self._leaving or isinstance(command, protocol.Quit)
             self._backlog.append(command)
         elif goal is None or goal.id != command.id:
             return  # it ended before this arrived
@@ -232,8 +229,6 @@ class Session:
         waiting, self._backlog = self._backlog, deque()
         for command in waiting:
             self._carry_out_now(command)
-        if self._leaving:
-            self._silence()
         try:
             self._apply(say)
         except CannotSpeak as error:
@@ -242,7 +237,7 @@ class Session:
         if self._goal is not None and self._pump is not None and say.lead_in:
             self._end(protocol.FAILED, "bad_option", "this driver plays by itself: it can't be given a lead-in")
         goal.error = None
-        while self._goal is not None and not self._leaving:
+        while self._goal is not None:
             self._go_on(goal)
 
     def _go_on(self, goal: InHand) -> None:

@@ -68,8 +68,6 @@ for command in arriving:
     elif isinstance(command, protocol.Say):
         for word in command.text.split():
             does(word, command)
-    elif isinstance(command, protocol.Quit):
-        sys.exit()
 """
 SERVE = """
 import sys

@@ -94,6 +94,10 @@ class Spawned:
         """Send commands in one piece, so that they are read at once."""
         self._socket.sendall(lines)
 
+    def leave(self) -> None:
+        """Send nothing more, and let the process end; what it says can still be read."""
+        self._socket.shutdown(socket.SHUT_WR)
+
     def hang_up(self) -> None:
         """Do what the kernel does when the server dies."""
         self._socket.shutdown(socket.SHUT_RDWR)

@@ -171,7 +171,7 @@ def test_no_memory_is_copied_for_it_and_it_starts_before_the_text_is_read(player
     with Spawned(player.plays(), before=_WATCHED) as engine:
         engine.until(protocol.Ready)
         assert engine.spoken("battery low").outcome == protocol.COMPLETED
-        engine.send(protocol.Quit())
+        engine.leave()
         assert engine.errors().split() == ["os.posix_spawn", "text"]
 
 

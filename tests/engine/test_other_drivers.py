@@ -167,7 +167,7 @@ def _timed(text: str = "battery low, please come home") -> Spawned:
 
 def _texts(engine: Spawned) -> list[str]:
     """Return what the driver was told to say; ends the process."""
-    engine.send(protocol.Quit())
+    engine.leave()
     return engine.errors().splitlines()
 
 

@@ -43,7 +43,7 @@ def test_voices_that_are_known_are_not_listed() -> None:
         engine.until(protocol.Ready)
         assert engine.spoken("yes").outcome == protocol.COMPLETED
         assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
-        engine.send(protocol.Quit())
+        engine.leave()
         assert engine.event() is None
         assert not any(isinstance(event, protocol.Voices) for event in engine.events)
 
@@ -193,24 +193,21 @@ def test_the_player_dies_with_a_killed_process(tmp_path: Path) -> None:
         assert engine.all_gone()
 
 
-def test_a_stop_and_a_quit_that_come_with_the_sentence_are_obeyed() -> None:
+def test_a_stop_that_comes_with_the_sentence_is_obeyed() -> None:
     with Spawned() as engine:
         engine.until(protocol.Voices)
         say = protocol.encode(protocol.Say("g1", "one two three four five", 200, 1.0, None, 50))
         engine.send_raw(say + protocol.encode(protocol.Stop("g1")))
         assert engine.until(protocol.Ended).outcome == protocol.STOPPED
-        engine.send_raw(say + protocol.encode(protocol.Quit()))
-        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
-        assert engine.event() is None
         assert engine.words() == []
 
 
-def test_quit_stops_the_sentence_and_ends_the_process() -> None:
+def test_the_end_of_the_connection_stops_the_sentence_and_ends_the_process() -> None:
     with Spawned() as engine:
         engine.until(protocol.Ready)
         engine.say("one two three four five")
         engine.until(protocol.Word)
-        engine.send(protocol.Quit())
+        engine.leave()
         assert engine.until(protocol.Ended).outcome == protocol.STOPPED
         assert engine.event() is None
         assert engine.process.wait(5) == 0

@@ -33,7 +33,7 @@ def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: s
     with Spawned(player.plays(), before=_TELL) as engine:
         engine.until(protocol.Ready)
         engine.spoken(text)
-        engine.send(protocol.Quit())
+        engine.leave()
         imported = set(engine.errors().split())
     assert "talkcli.engine.playback" in imported
     assert imported.isdisjoint(_NOT_NEEDED), imported.intersection(_NOT_NEEDED)

@@ -68,7 +68,7 @@ class Engine:
         self._untold: int | None = None
 
     def run(self) -> None:
-        """Serve until the other side closes, or tells it to quit."""
+        """Serve until the other side closes."""
         while True:
             ready, _, _ = select.select([_FD], [], [], self._patience())
             if ready and not self._read():
@@ -90,9 +90,11 @@ class Engine:
         if not data:
             return False
         *lines, self._buffer = (self._buffer + data).split(b"\n")
-        return all(self._take(protocol.decode_command(line)) for line in lines)
+        for line in lines:
+            self._take(protocol.decode_command(line))
+        return True
 
-    def _take(self, command: protocol.Command) -> bool:
+    def _take(self, command: protocol.Command) -> None:
         if isinstance(command, protocol.Configure):
             self._start(command.list_voices)
         elif isinstance(command, protocol.Say):
@@ -103,11 +105,7 @@ class Engine:
             self._pause(command)
         elif isinstance(command, protocol.Resume):
             self._resume(command)
-        elif isinstance(command, protocol.Followed):
-            pass  # it makes no sound that it could shorten
-        else:
-            return not self._quit()
-        return True
+        # What else there is tells that another goal follows: it makes no sound that it could shorten.
 
     def _start(self, voices: bool) -> None:
         what, value = script.start()
@@ -172,13 +170,6 @@ class Engine:
         if self._goal and self._goal.id == resume.id:
             self._goal.resume(time.monotonic())
             self._untold = None
-
-    def _quit(self) -> bool:
-        if self._goal:
-            if self._goal.script.ignore_stop:
-                return False
-            self._end(protocol.STOPPED)
-        return True
 
     def _work(self) -> None:
         while (goal := self._goal) and goal.plan and goal.plan[0][0] <= time.monotonic():
