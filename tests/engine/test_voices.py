@@ -7,6 +7,7 @@ import subprocess
 import sys
 import wave
 from functools import cache
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,7 +15,7 @@ import pytest
 from talkcli.engine import protocol
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import espeak
-from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
+from talkcli.engine.synthesizers.voices import find_voice, list_voices, unknown_voice
 from tests.engine.spawned import USUAL, Spawned
 from tests.support.reference import Sentence, render
 
@@ -178,6 +179,14 @@ def test_a_word_of_any_length_is_answered_shortly() -> None:
     for wanted in ("x" * 60_000, "en-us+" + "y" * 60_000):
         assert find_voice(wanted, listed()) is None
         assert len(unknown_voice(wanted, listed())) < 200
+
+
+@pytest.mark.parametrize(
+    ("languages", "language"), [(["en-US", "en-GB"], "en-US"), ([b"\x05en-us"], "en-us"), ([None], None), ([], None)]
+)
+def test_a_language_is_listed_however_another_driver_tells_it(languages: list[object], language: str | None) -> None:
+    engine = SimpleNamespace(getProperty=lambda _: [SimpleNamespace(id="a", name="Anna", languages=languages)])
+    assert list_voices(engine) == (Voice("a", language, "Anna"),)
 
 
 def test_a_plus_in_the_name_of_another_drivers_voice_is_part_of_it() -> None:

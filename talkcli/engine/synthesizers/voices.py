@@ -132,5 +132,7 @@ def _in_english(wanted: str, voices: list[Voice]) -> list[str]:
 
 
 def _voice(found: Any) -> Voice:
-    language = str(found.languages[0]) if found.languages else None
+    language = found.languages[0] if found.languages else None
+    if isinstance(language, bytes):  # as drivers told it that were written for an older pyttsx3: behind a priority
+        language = language[1:].decode("utf-8", "replace")
     return Voice(id=str(found.id), language=language or None, name=str(found.name or found.id))
