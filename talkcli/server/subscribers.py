@@ -7,6 +7,7 @@ goals. It knows connections and goals, of the engine what a word is, and of requ
 from __future__ import annotations
 
 from collections import deque
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from talkcli.goals.states import State
@@ -51,7 +52,6 @@ class Subscribers:
         self._count = 0
         #: by goal, until its end: those who wait for that, and whether they want its feedback
         self._waiters: dict[str, dict[Connection, bool]] = {}
-        self._awaited: dict[Connection, set[str]] = {}
         self._watchers: dict[Connection, None] = {}
         self._alive: asyncio.TimerHandle | None = None
 
@@ -59,12 +59,11 @@ class Subscribers:
         """Tell this connection of the goal's states, of each word where it wants `feedback`, and at last its result."""
         waiting = self._waiters.setdefault(goal_id, {})
         waiting[connection] = waiting.get(connection, False) or feedback
-        self._awaited.setdefault(connection, set()).add(goal_id)
         self.keep_alive()
 
     def has(self, connection: Connection) -> bool:
         """Whether this connection is to be told of a goal, or of everything."""
-        return connection in self._awaited or connection in self._watchers
+        return connection in self._watchers or any(connection in each for each in self._waiters.values())
 
     def watch(self, connection: Connection) -> None:
         """Tell this connection of everything."""
@@ -74,8 +73,8 @@ class Subscribers:
     def left(self, connection: Connection) -> None:
         """Forget a connection that is gone."""
         self._watchers.pop(connection, None)
-        for goal_id in self._awaited.pop(connection, ()):
-            del self._waiters[goal_id][connection]
+        for waiting in self._waiters.values():
+            waiting.pop(connection, None)
 
     def changed(self, record: Record, state: State, at: float) -> None:
         """Publish a goal's new state; with its last one, its result."""
@@ -122,14 +121,10 @@ class Subscribers:
         piece = last + encode({"event": "result", "goal": record.snapshot().to_json()})
         for connection in self._waiters.pop(record.id):
             connection.publish(piece)
-            awaited = self._awaited[connection]
-            awaited.discard(record.id)
-            if not awaited:
-                del self._awaited[connection]
 
     def _say_alive(self) -> None:
         self._alive = None
-        listening = dict.fromkeys([*self._awaited, *self._watchers, *self._others()])
+        listening = dict.fromkeys(chain(self._watchers, self._others(), *self._waiters.values()))
         _publish({"event": "alive"}, listening)
         if listening:
             self.keep_alive()

@@ -13,6 +13,7 @@ import errno
 import itertools
 import os
 
+from talkcli.engine.players import on_path
 from talkcli.engine.players.base import SAMPLE, CannotSpeak
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import guard
@@ -205,7 +206,7 @@ def _variants(espeak: Any) -> list[Voice]:
 
 def _mbrola_voices(espeak: Any) -> list[Voice]:
     """Return those of MBROLA's voices that are installed; libespeak-ng lists all that it knows of."""
-    if not any(os.access(os.path.join(each, "mbrola"), os.X_OK) for each in os.get_exec_path()):
+    if not on_path("mbrola"):
         return []
     return [each for each in _listed(espeak, _MBROLA) if _has_sounds(each.id)]
 
