@@ -270,14 +270,22 @@ class Conversation:
         process = self._process
         watched = {process.socket.fileno(): select.POLLIN, process.stderr: select.POLLIN}
         while True:
-            due = min(self._heard_at + self._limit(), self._deadline)
+            limit = HANG_AFTER if process.ready else START_LIMIT
+            due = min(self._heard_at + limit, self._deadline)
             found = ready(watched, due - time.monotonic(), self._interrupt)
             if process.stderr in found and not process.read_stderr():
                 del watched[process.stderr]
             # Before the limits: who was stopped by Ctrl-Z finds all that was said meanwhile, and the limits long past.
             if process.socket.fileno() in found:
                 yield from self._received()
-            self._keep_limits()
+            now = time.monotonic()
+            if now >= self._deadline:
+                raise TimeoutError
+            if now < self._heard_at + limit:
+                continue
+            if process.ready:
+                raise EngineFailed("engine_hung", f"the engine gave no sign of life for {limit:g} s", limit)
+            raise EngineFailed("engine_failed", f"the engine was not ready after {limit:g} s", limit)
 
     def _received(self) -> Iterator[protocol.Event]:
         for event in self._process.receive():
@@ -289,19 +297,6 @@ class Conversation:
             if isinstance(event, protocol.Ready):
                 self._process.ready = True
             yield event
-
-    def _limit(self) -> float:
-        return HANG_AFTER if self._process.ready else START_LIMIT
-
-    def _keep_limits(self) -> None:
-        now, limit = time.monotonic(), self._limit()
-        if now >= self._deadline:
-            raise TimeoutError
-        if now < self._heard_at + limit:
-            return
-        if self._process.ready:
-            raise EngineFailed("engine_hung", f"the engine gave no sign of life for {limit:g} s", limit)
-        raise EngineFailed("engine_failed", f"the engine was not ready after {limit:g} s", limit)
 
 
 class Quota:
