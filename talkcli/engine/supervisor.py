@@ -190,7 +190,10 @@ class Supervisor:
 
     def follow(self, goal_id: str, followed: bool) -> None:
         """Tell whether another goal waits behind this one: the silence between them may be made shorter then."""
-        self._inbox.call(lambda: self._tell_followed(goal_id, followed))
+        process = self._open
+        if process:
+            # An engine that has no room for it at this moment is not hung for that, and little is lost.
+            process.send(protocol.Followed(goal_id, followed))
 
     def give_up(self, goal_id: str) -> None:
         """Let go of a goal that didn't end in time: its process is left behind, there will be no `Ended`."""
@@ -307,12 +310,6 @@ class Supervisor:
             goal.heard_at = time.monotonic()
             if not process.send(goal.say):
                 self._not_taken(goal.id, process)
-
-    def _tell_followed(self, goal_id: str, followed: bool) -> None:
-        goal = self._in_hand(goal_id)
-        if self._process and goal and goal.spoken:
-            # No command: an engine that has no room for it at this moment is not hung for that, and little is lost.
-            self._process.send(protocol.Followed(goal_id, followed))
 
     def _hold(self, goal_id: str, pause: int | None) -> None:
         goal = self._in_hand(goal_id)

@@ -40,6 +40,39 @@ for line in os.fdopen(0, "rb"):
         os.write(0, b"".join(map(protocol.encode, told)))
 """
 
+#: One that has played a goal as soon as it hears that another follows, or that none does any more.
+FOLLOWED = """
+import os, sys
+sys.path.insert(0, {root!r})
+from talkcli.engine import protocol
+for line in os.fdopen(0, "rb"):
+    command = protocol.decode_command(line)
+    if isinstance(command, protocol.Configure):
+        os.write(0, protocol.encode(protocol.Ready("followed", None, None)))
+    elif isinstance(command, protocol.Say):
+        os.write(0, protocol.encode(protocol.Started(command.id)))
+    elif isinstance(command, protocol.Followed):
+        os.write(0, protocol.encode(protocol.Ended(command.id, protocol.COMPLETED, str(command.followed))))
+"""
+
+
+@pytest.mark.parametrize("followed", [True, False])
+def test_the_process_is_told_what_becomes_of_the_goals_behind(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, followed: bool
+) -> None:
+    program = tmp_path / "engine.py"
+    program.write_text(FOLLOWED.format(root=os.path.dirname(os.path.dirname(talkcli.__file__))))
+    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, str(program)])
+    thread = Thread()
+    try:
+        thread.engine.follow("g1", followed)  # there is none yet that could be told
+        thread.until(protocol.Ready)
+        thread.say("battery low")
+        thread.engine.follow("g1", followed)
+        assert thread.until(protocol.Ended) == protocol.Ended("g1", protocol.COMPLETED, str(followed))
+    finally:
+        thread.close()
+
 
 def test_a_goal_behind_another_wakes_the_thread_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     program = tmp_path / "engine.py"
