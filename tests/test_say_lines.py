@@ -7,12 +7,13 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conformance.bareserve import TALK, environment
+from tests.conformance.bareserve import TALK, environment, run
 from tests.support.forking import Forked
 from tests.support.surroundings import short_directory
 from tests.support.timing import assert_within, limits
@@ -390,3 +391,18 @@ def test_standard_input_that_cannot_be_read_is_told(scripted: Talk) -> None:
             )
         assert (done.returncode, done.stdout) == (2, b"")
         assert b"standard input cannot be read: Bad file descriptor" in done.stderr
+
+
+def test_a_thread_that_cannot_be_had_is_told_before_anything_is_read(scripted: Talk) -> None:
+    """As where a unit's TasksMax= is reached."""
+    code = (
+        "import sys, threading\n"
+        'def start(_): raise RuntimeError("can\'t start new thread")\n'
+        "threading.Thread.start = start\n"
+        "from talkcli.cli import run\n"
+        "sys.exit(run(['say', '--lines']))"
+    )
+    done = run([sys.executable, "-c", code], scripted.env)
+    assert (done.code, done.out) == (1, ""), done
+    assert "no thread can be started to wait for the goals: see 'free', 'ulimit -u'" in done.err
+    assert texts(scripted, "PENDING") == []

@@ -27,7 +27,7 @@ from talkcli.cli.wait import (
     until_ended,
 )
 from talkcli.client.connect import Interrupted, ready
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, TalkError, UnknownGoal, UsageError
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, TalkError, UnknownGoal, UsageError, limits
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
@@ -158,7 +158,10 @@ class _Lines:
 
     def run(self) -> int:
         """Send all lines; with --wait, see them end."""
-        self._tally.start()
+        try:
+            self._tally.start()
+        except RuntimeError as error:  # all that Python says of a thread that it can't have
+            raise TalkError(f"no thread can be started to wait for the goals: {limits()}") from error
         try:
             self._send_all()
             self._tally.finish()
