@@ -62,7 +62,7 @@ _STEPS = {
 _AS = {"TALK_SOCKET": "=", "--socket": " "}
 _OFF: dict[str | None, str] = {"TALK_SOCKET": "unset TALK_SOCKET", "--socket": "leave --socket out"}
 #: Volume below which a server's setting may be why nobody hears it.
-_FAINT = 0.2
+_FAINT_SETTING = 0.2
 
 
 @frozen
@@ -242,7 +242,7 @@ def _settings(server: JsonObject) -> Finding:
     volume = server.get("volume")
     lead_in = [f"lead-in {server['lead_in']} ms"] if server.get("lead_in") else []
     words = ", ".join([*told(server), *lead_in])
-    if isinstance(volume, int | float) and volume < _FAINT:
+    if isinstance(volume, int | float) and volume < _FAINT_SETTING:
         broken = failed if volume <= 0 else warning
         return broken("settings", words, "talk set --volume 1")
     return done("settings", words)

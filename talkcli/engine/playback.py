@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from talkcli.engine.players.base import Player
     from talkcli.engine.session import Session
 
-#: Seconds within which a player must take the first sound: a Bluetooth or USB device that sleeps needs one or two, a
-#: null sink that nobody records up to two.
+#: Seconds within which a player must take the first sound, be it to read ahead: a Bluetooth or USB device that sleeps
+#: needs one or two, a null sink that nobody records up to two. From then on the next limit holds.
 FIRST_WITHIN = 5.0
 
 #: Seconds without any sound taken after which a player is stalled; healthy waits are below 0.04 on a busy machine, and

@@ -1,7 +1,8 @@
-"""The engine thread: owns the engine process, hands it one goal at a time, and is its watchdog.
+"""The engine thread: owns the engine process, sees to it that it has one goal at a time, and is its watchdog.
 
-Whatever the process does, a goal that was handed in ends with exactly one `Ended`, unless it was given up. The thread
-holds no lock while it waits, and everything it learns goes out through `post`. It knows no client and no queue.
+Who has a goal hands it in, in another thread, which sends it to the process by itself. Whatever the process does, a
+goal that was handed in ends with exactly one `Ended`, unless it was given up. The thread holds no lock while it
+waits, and everything it learns goes out through `post`. It knows no client and no queue.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The goals that wait, in the order in which they will be spoken: one sorted list.
 
-Pure, and no rule of admission: it keeps what it is given. Higher priority goes first, first in first out among equals,
-but for what is put at the front of its priority or in the place of another.
+Pure: it keeps what it is given, and knows who would give way; whether anybody must is the scheduler's. Higher
+priority goes first, first in first out among equals, but for what is put at the front of its priority or in the place
+of another.
 
 Ten thousand wait at most (`--max-queue`): a place among them is found in fourteen comparisons, and what stands behind
 it moves up in a microsecond. What is asked at each goal looks at no other; what looks at all of them says so: thousands
@@ -33,7 +34,7 @@ class Queue:
         #: those that were sent to preempt, in the same order
         self._preempting: list[tuple[float, int, Record]] = []
         #: in the order in which they give way, the last first: priority, negated, and number
-        self._newest: list[tuple[float, int, Record]] = []
+        self._giving_way: list[tuple[float, int, Record]] = []
         #: those with a time to live: its end, and their number
         self._expiries: list[tuple[float, int, Record]] = []
         self._by_key: dict[str, Record] = {}
@@ -66,7 +67,7 @@ class Queue:
 
     def giving_way_to(self, priority: int) -> Record | None:
         """Return the goal that gives way to one of this priority: of a lower and the lowest, the one accepted last."""
-        last = self._newest[-1][2] if self._newest else None
+        last = self._giving_way[-1][2] if self._giving_way else None
         return last if last and last.priority < priority else None
 
     def add(self, record: Record) -> None:
@@ -104,7 +105,7 @@ class Queue:
     def _places(self, record: Record) -> Iterator[tuple[list[tuple[float, int, Record]], tuple[float, int]]]:
         """Return the lists that a goal is in, and its place in each."""
         yield self._goals, (-record.priority, record.turn)
-        yield self._newest, (-record.priority, record.number)
+        yield self._giving_way, (-record.priority, record.number)
         if record.preempt:
             yield self._preempting, (-record.priority, record.turn)
         if record.expires_at is not None:
