@@ -290,6 +290,7 @@ SOUND = tuple(each for each in OPTIONS if each.engine and each.setting)
 SHOWN = tuple(each.name for each in OPTIONS if each.shown)
 #: The options of which a server has a value of its own: first what the engine is told, then what decides who is spoken.
 SETTINGS = tuple(sorted((each for each in OPTIONS if each.setting), key=lambda each: not each.engine))
+_NONES = {each.name: each.setting.none for each in SETTINGS if each.setting}
 
 
 @frozen
@@ -417,8 +418,11 @@ def given(asked: Say | Set) -> dict[str, Any]:
 
 def for_engine(say: Say, settings: Set) -> dict[str, Any]:
     """Return what the engine is told of a goal, by the options' names: its own value, or the server's."""
-    known = {**fields(settings), **given(say)}
-    return _without_none({name: known.get(name) for name in FOR_ENGINE})
+    found = {}
+    for name in FOR_ENGINE:
+        own = getattr(say, name)
+        found[name] = getattr(settings, name, None) if own is None else own
+    return _without_none(found)
 
 
 def as_shown(settings: Set) -> JsonObject:
@@ -428,8 +432,7 @@ def as_shown(settings: Set) -> JsonObject:
 
 def _without_none(values: dict[str, Any]) -> dict[str, Any]:
     """Return values by the options' names, with None for what stands for none: the default voice, a ttl of 0."""
-    nones = {each.name: each.setting.none for each in SETTINGS if each.setting}
-    return {name: None if value == nones.get(name) else value for name, value in values.items()}
+    return {name: None if value == _NONES.get(name) else value for name, value in values.items()}
 
 
 def told(settings: JsonObject) -> list[str]:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from talkcli.goals.record import Record
 
+    #: a goal in a list: by what it is sorted, and itself, which is never compared: no two have the same place
+    _Entry = tuple[float, int, Record]
 
 _goal = itemgetter(2)
 
@@ -30,13 +32,13 @@ class Queue:
 
     def __init__(self) -> None:
         #: in their order: priority, negated, and turn; no two are equal
-        self._goals: list[tuple[float, int, Record]] = []
+        self._goals: list[_Entry] = []
         #: those that were sent to preempt, in the same order
-        self._preempting: list[tuple[float, int, Record]] = []
+        self._preempting: list[_Entry] = []
         #: in the order in which they give way, the last first: priority, negated, and number
-        self._giving_way: list[tuple[float, int, Record]] = []
+        self._giving_way: list[_Entry] = []
         #: those with a time to live: its end, and their number
-        self._expiries: list[tuple[float, int, Record]] = []
+        self._expiries: list[_Entry] = []
         self._by_key: dict[str, Record] = {}
 
     def __len__(self) -> int:
@@ -83,8 +85,8 @@ class Queue:
 
     def remove(self, record: Record) -> None:
         """Take a goal out."""
-        for goals, place in self._places(record):
-            del goals[bisect_left(goals, place)]
+        for goals, entry in self._entries(record):
+            del goals[bisect_left(goals, entry)]
         if record.key is not None:
             del self._by_key[record.key]
 
@@ -97,16 +99,17 @@ class Queue:
         return list(map(_goal, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _enter(self, record: Record) -> None:
-        for goals, place in self._places(record):
-            insort(goals, (*place, record))
+        for goals, entry in self._entries(record):
+            insort(goals, entry)
         if record.key is not None:
             self._by_key[record.key] = record
 
-    def _places(self, record: Record) -> Iterator[tuple[list[tuple[float, int, Record]], tuple[float, int]]]:
-        """Return the lists that a goal is in, and its place in each."""
-        yield self._goals, (-record.priority, record.turn)
-        yield self._giving_way, (-record.priority, record.number)
+    def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
+        """Return the lists that a goal is in, and what it is in each: the same, where it has its place by its number."""
+        entry = -record.priority, record.turn, record
+        yield self._goals, entry
+        yield self._giving_way, entry if record.turn == record.number else (-record.priority, record.number, record)
         if record.preempt:
-            yield self._preempting, (-record.priority, record.turn)
+            yield self._preempting, entry
         if record.expires_at is not None:
-            yield self._expiries, (record.expires_at, record.number)
+            yield self._expiries, (record.expires_at, record.number, record)

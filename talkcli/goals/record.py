@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Sender
     from talkcli.goals.options import Say
 
-#: What is known of a goal only after it was accepted.
-_LATER = ("reason", "by", "message", "started_at", "ended_at", "duration")
-
 
 @dataclass(slots=True, eq=False)
 class Record:
@@ -91,18 +88,21 @@ class Record:
     def snapshot(self, state: State | None = None) -> Goal:
         """Return the goal as it is now; with PENDING, as it was when it was accepted."""
         state = self.state if state is None else state
-        later = {}
-        if state is not State.PENDING:
-            later = {name: getattr(self, name) for name in _LATER}
-            if self.started_at is not None and self.text is not None:
-                later["spoken"] = self.text[: self.spoken_end]
+        accepted = state is State.PENDING
+        spoken = None if accepted or self.started_at is None or self.text is None else self.text[: self.spoken_end]
         return Goal(
             id=self.id,
             state=state,
             text=self.text,
+            reason=None if accepted else self.reason,
+            by=None if accepted else self.by,
+            message=None if accepted else self.message,
+            spoken=spoken,
             client=self.sender,
             paused=self.paused and state is self.state,
             queued_at=self.queued_at,
-            **later,
+            started_at=None if accepted else self.started_at,
+            ended_at=None if accepted else self.ended_at,
+            duration=None if accepted else self.duration,
             **{name: getattr(self.say, name) for name in SHOWN},
         )
