@@ -89,7 +89,7 @@ class Goal:
         return {
             "id": self.id,
             "state": self.state.name,
-            "status": self.state.value,
+            "status": int(self.state),
             "reason": self.reason,
             "by": None if self.by is None else self.by.to_json(),
             "message": self.message,

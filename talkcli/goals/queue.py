@@ -105,7 +105,7 @@ class Queue:
             self._by_key[record.key] = record
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
-        """Return the lists that a goal is in, and what it is in each: the same, where it has its place by its number."""
+        """Return the lists that a goal is in, and what it is in each; the same where it stands by its number."""
         entry = -record.priority, record.turn, record
         yield self._goals, entry
         yield self._giving_way, entry if record.turn == record.number else (-record.priority, record.number, record)
