@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import selectors
+import threading
 import time
 from collections import deque
 from typing import TYPE_CHECKING
@@ -28,6 +29,8 @@ class Inbox:
         self.selector = selectors.DefaultSelector()
         self._actions: deque[Callable[[], None]] = deque()
         self._closed = False
+        #: held while an action is left, so that the descriptor that wakes is not closed meanwhile, and another's then
+        self._entering = threading.Lock()
         #: whether a wake-up is on its way: it does for all that comes until it is seen
         self._woken = False
         #: the monotonic time until which the thread sleeps if nothing wakes it; 0 while it is awake
@@ -49,13 +52,15 @@ class Inbox:
         To wake a thread, and to have it take the interpreter from the one that runs, costs some 50 µs: as much as a
         hundred lines.
         """
-        if self._closed:
-            return
-        self._actions.append(action)
-        # In this order; `wait` looks in the opposite one. So either this sees that it sleeps, or that sees the action.
-        if self._sleeps_until > by and not self._woken:
-            self._woken = True
-            os.write(self._wake, b"\0")
+        with self._entering:
+            if self._closed:
+                return
+            self._actions.append(action)
+            # In this order; `wait` looks in the opposite one. So either this sees that it sleeps, or that sees the
+            # action.
+            if self._sleeps_until > by and not self._woken:
+                self._woken = True
+                os.write(self._wake, b"\0")
 
     def wait(self, until: float) -> list[selectors.SelectorKey]:
         """Wait for a descriptor or an action, at most until this monotonic time; do the actions, return the keys."""
@@ -82,7 +87,8 @@ class Inbox:
 
     def refuse(self) -> None:
         """Take no more actions; before `close`, so that no thread is in between."""
-        self._closed = True
+        with self._entering:
+            self._closed = True
 
     def close(self) -> None:
         """Close the descriptors, of others' none."""

@@ -144,3 +144,24 @@ def test_nothing_is_done_once_no_more_is_taken() -> None:
     assert inbox.wait(0.0) == []
     assert done == []
     inbox.close()
+
+
+def test_it_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The descriptor could be another file's by then, and get the byte."""
+    inbox, closed, write = Inbox(0.0), threading.Event(), os.write
+
+    def close() -> None:
+        inbox.refuse()
+        inbox.close()
+        closed.set()
+
+    def slowly(descriptor: int, data: bytes) -> int:
+        threading.Thread(target=close).start()
+        assert not closed.wait(0.1)
+        return write(descriptor, data)
+
+    monkeypatch.setattr(os, "write", slowly)
+    monkeypatch.setattr(inbox, "_sleeps_until", NEVER)
+    inbox.call(lambda: None)
+    assert closed.wait(PATIENCE)
+    inbox.call(lambda: None)  # nothing happens
