@@ -97,7 +97,8 @@ def report(goal: Goal, options: Common, shown: Feedback) -> int:
     """Tell how a goal ended, or how it stands, and return the exit code for it."""
     if options.json and not shown.shows:
         show_if_possible(show_json, goal.to_json())
-    if goal.state is not State.SUCCEEDED and goal.state.terminal and not options.quiet:
+    muted = goal.output is not None and goal.output.muted
+    if goal.state.terminal and (muted or goal.state is not State.SUCCEEDED) and not options.quiet:
         from talkcli.terminal.goals import ending
 
         words = ending(goal)

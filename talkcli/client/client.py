@@ -98,6 +98,7 @@ class Client:
         voice: str | None = None,
         pitch: int | None = None,
         lead_in: int | None = None,
+        audible: bool | None = None,
         data: JsonObject | None = None,
         follow: bool = True,
         feedback: bool = False,
@@ -114,8 +115,8 @@ class Client:
 
         `rate`: 80 to 450 words per minute; `volume`: 0 to 1; `voice`: id, name or language; `pitch`: 0 to 100; None is
         the server's setting when it starts. `lead_in`: 0 to 5,000 milliseconds of silence before it, also where the
-        output was not idle; None is the server's, where it was. `data`: an object of at most 1 KiB that travels with
-        the goal.
+        output was not idle; None is the server's, where it was. `audible`: whether it is ABORTED, `muted`, where its
+        output is muted; None leaves that to the server. `data`: an object of at most 1 KiB that travels with the goal.
 
         `follow`: have this connection told how it ends; `feedback`: and each word as it is heard, for
         `GoalHandle.feedback` and `events`; `patient`: where the queue is full, wait until there is room, any time.
@@ -141,6 +142,7 @@ class Client:
             voice=voice,
             pitch=pitch,
             lead_in=lead_in,
+            audible=audible,
             data=data,
         )
         check(request)

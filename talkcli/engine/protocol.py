@@ -5,8 +5,8 @@ directions). This module holds only the form of the messages: it opens, reads an
 engine process can be written against it.
 
 Order, as the process must keep it: `Configure` comes in once, first. Then `Ready` goes out, or `StartFailed` and the
-process ends. After that each `Say` gets one `Started`, any number of `Word`, `Alive` and `Paused`, and exactly one
-`Ended`. Where the server's half is closed, the sentence being spoken is stopped and the process ends.
+process ends. After that each `Say` gets one `Started`, any number of `Word`, `Alive`, `Output` and `Paused`, and
+exactly one `Ended`. Where the server's half is closed, the sentence being spoken is stopped and the process ends.
 """
 
 from __future__ import annotations
@@ -67,6 +67,8 @@ class Configure:
     list_voices: bool = True
     #: a descriptor that the process inherits: it gets a WAV file of all sentences, and nothing is played.
     output: int | None = None
+    #: whether a sentence fails whose output is muted, where it doesn't say so itself.
+    audible: bool = False
 
 
 @frozen
@@ -81,6 +83,7 @@ class Say:
     pitch: int  # 0 to 100, 50 is the voice's own
     followed: bool = False  # whether another goal waits behind it
     lead_in: int | None = None  # milliseconds of silence before it, whatever the output did; None for `Configure`'s
+    audible: bool | None = None  # whether it fails where its output is muted; None for `Configure`'s
 
 
 @frozen
@@ -174,6 +177,17 @@ class Word:
 
 
 @frozen
+class Output:
+    """Where the sentence goes, and how loud; as soon as that is known, and whenever it changes."""
+
+    id: str
+    player: str
+    device: str
+    volume: float  # 0 to 1
+    muted: bool  # now, or earlier in the sentence
+
+
+@frozen
 class Paused:
     """The sentence is held and silent, until `Resume` or `Stop`."""
 
@@ -193,13 +207,13 @@ class Ended:
 
 
 Command = Configure | Say | Stop | Pause | Resume | Followed
-Event = Ready | StartFailed | Voices | Started | Alive | Word | Paused | Ended
+Event = Ready | StartFailed | Voices | Started | Alive | Word | Output | Paused | Ended
 #: The events that belong to a goal, by its `id`.
-OF_A_GOAL = (Started, Alive, Word, Paused, Ended)
+OF_A_GOAL = (Started, Alive, Word, Output, Paused, Ended)
 
 # In a line a message is called as its class is.
 _COMMANDS = {each.__name__: each for each in (Configure, Say, Stop, Pause, Resume, Followed)}
-_EVENTS = {each.__name__: each for each in (Ready, StartFailed, Voices, Started, Alive, Word, Paused, Ended)}
+_EVENTS = {each.__name__: each for each in (Ready, StartFailed, Voices, *OF_A_GOAL)}
 
 # Made once: `json.dumps` makes another for each line that isn't written in its own way, and `json.loads` guesses at the
 # encoding of each; together that is a third of what the two ends of this socket do for a line.

@@ -397,7 +397,7 @@ class Supervisor:
                 goal.started = True
             elif isinstance(event, protocol.Ended):
                 self._finish(event)
-            elif isinstance(event, protocol.Word):
+            elif isinstance(event, protocol.Word | protocol.Output):
                 self._post(event)
             elif isinstance(event, protocol.Paused) and event.number == goal.pause:
                 goal.pause_at = None

@@ -56,6 +56,28 @@ class By:
 
 
 @frozen
+class Output:
+    """Where a goal's sound goes, and whether anybody can hear it, as far as the sound server tells."""
+
+    #: the player's name
+    player: str
+    #: the device, by the sound server's name for it
+    device: str
+    #: 0 to 1; 1 is what the device calls 100 %
+    volume: float
+    #: whether it was muted, or its volume 0, at any time while the goal was spoken
+    muted: bool
+
+    def to_json(self) -> JsonObject:
+        return fields(self)
+
+    @classmethod
+    def from_json(cls, value: object) -> Output | None:
+        found = known(cls, value) if isinstance(value, dict) else {}
+        return cls(**found) if len(found) == len(cls.__annotations__) else None
+
+
+@frozen
 class Goal:
     """A goal as it is at one moment. In JSON it always has all its keys, null where unknown.
 
@@ -83,6 +105,8 @@ class Goal:
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
+    #: None where it can't be known
+    output: Output | None = None
 
     def to_json(self) -> JsonObject:
         # Written out: each goal is told of two or three times, and a busy server does little else.
@@ -106,6 +130,7 @@ class Goal:
             "started_at": self.started_at,
             "ended_at": self.ended_at,
             "duration": self.duration,
+            "output": None if self.output is None else self.output.to_json(),
         }
 
     @classmethod
@@ -147,5 +172,6 @@ _READ: dict[str, Callable[[object], object]] = {
     "State": lambda value: State.__members__.get(value) if isinstance(value, str) else None,
     "By": By.from_json,
     "Sender": Sender.from_json,
+    "Output": Output.from_json,
     "Goal": Goal.from_json,
 }

@@ -274,6 +274,15 @@ OPTIONS = (
         engine=True,
     ),
     Option(
+        "audible",
+        FLAG,
+        "whether it is ABORTED, `muted`, where its output is muted; where that can't be known it is spoken",
+        absent="the server's",
+        flags="--audible",
+        help="Abort it where its output is muted. [default: as 'talk serve' was told]",
+        engine=True,
+    ),
+    Option(
         "data",
         DATA,
         "travels with the goal, untouched",
@@ -315,6 +324,7 @@ class Say:
     voice: str | None = None
     pitch: int | None = None
     lead_in: int | None = None
+    audible: bool | None = None
     data: JsonObject | None = None
     format: str = "text"
 

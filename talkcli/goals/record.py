@@ -14,7 +14,7 @@ from talkcli.goals.options import SHOWN
 from talkcli.goals.states import State, follow
 
 if TYPE_CHECKING:
-    from talkcli.goals.goal import Sender
+    from talkcli.goals.goal import Output, Sender
     from talkcli.goals.options import Say
 
 
@@ -55,6 +55,7 @@ class Record:
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
+    output: Output | None = None
     #: monotonic time of the first stop
     stop_since: float | None = None
 
@@ -104,5 +105,6 @@ class Record:
             started_at=None if accepted else self.started_at,
             ended_at=None if accepted else self.ended_at,
             duration=None if accepted else self.duration,
+            output=None if accepted else self.output,
             **{name: getattr(self.say, name) for name in SHOWN},
         )

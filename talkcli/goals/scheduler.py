@@ -26,7 +26,7 @@ from talkcli.goals.states import IllegalTransition, State
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from talkcli.goals.goal import Sender
+    from talkcli.goals.goal import Output, Sender
     from talkcli.goals.options import Cancel, Say, Set
 
 #: Seconds after a stop in which silence must be confirmed: `cancel` is answered within 2 s whatever happens.
@@ -274,13 +274,20 @@ class Scheduler:
         record.spoken_end = max(record.spoken_end, end)
         return record
 
+    def goes_to(self, goal_id: str, output: Output) -> None:
+        """Note where the active goal's sound goes."""
+        self._spoken(goal_id).output = output
+
     def completed(self, goal_id: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal: all of it was played."""
         record = self._spoken(goal_id)
         record.duration = duration
         record.spoken_end = len(record.text or "")
+        words = "Talk completed successfully"
+        if record.output and record.output.muted:
+            words += f", but the output was muted: {record.output.device}"
         # A stop that came too late ended nothing: its reason goes.
-        return self._end(record, State.SUCCEEDED, None, "Talk completed successfully", None, now)
+        return self._end(record, State.SUCCEEDED, None, words, None, now)
 
     def failed(self, goal_id: str, reason: str, words: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal: engine or audio failed.

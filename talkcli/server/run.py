@@ -61,6 +61,7 @@ class Settings:
     player: str | None = None
     device: str | None = None
     lead_in: int = 0  # milliseconds of silence before a sentence, where the device has been idle
+    audible: bool = False  # whether sentences are aborted whose output is muted, unless they say otherwise
     driver: str | None = None
     socket: str | None = None
     socket_mode: int = 0o600
@@ -133,7 +134,13 @@ class Server:
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # whoever started this may have had some of them blocked
         speech.engine = Supervisor(
             protocol.Configure(
-                os.getpid(), settings.driver, settings.player, settings.device, settings.goals.voice, settings.lead_in
+                os.getpid(),
+                settings.driver,
+                settings.player,
+                settings.device,
+                settings.goals.voice,
+                settings.lead_in,
+                audible=settings.audible,
             ),
             speech.report,
         )
@@ -237,6 +244,7 @@ class Server:
             "player": ready.player if ready else settings.player,
             "device": settings.device,
             "lead_in": settings.lead_in,
+            "audible": settings.audible,
             **as_shown(scheduler.settings),
             "paused": scheduler.paused,
             "pending": scheduler.pending_count,

@@ -18,6 +18,7 @@ from talkcli.engine import protocol
 from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
+from talkcli.goals.goal import Output
 from talkcli.goals.options import DEFAULT_VOICE, for_engine
 from talkcli.goals.scheduler import Changed, Effect, GiveUp, Hold, Now, Resume, Start
 from talkcli.goals.states import State
@@ -100,6 +101,7 @@ class Speech:
             protocol.StartFailed: self._start_failed,
             protocol.Voices: self._voices_known,
             protocol.Word: self._word,
+            protocol.Output: self._output,
             protocol.Paused: self._paused,
             protocol.Ended: self._ended,
             EngineSaid: lambda said: log.line(f"engine: {log.shown(said.words)}"),
@@ -345,6 +347,11 @@ class Speech:
         record = self.scheduler.heard(word.id, word.end)
         text = (record.text or "")[word.start : word.end]
         self.news.tell([partial(self.subscribers.heard, word, text, time.time())])
+
+    def _output(self, told: protocol.Output) -> None:
+        active = self.scheduler.active
+        if active is not None and active.id == told.id:
+            self.scheduler.goes_to(told.id, Output(told.player, told.device, told.volume, told.muted))
 
     def _paused(self, paused: protocol.Paused) -> None:
         active = self.scheduler.active

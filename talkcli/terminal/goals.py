@@ -17,7 +17,7 @@ from talkcli.terminal.text import GAP, LONGEST_ID, Screen, cut, fitted, folded, 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from talkcli.goals.goal import By, Goal, JsonObject, Sender
+    from talkcli.goals.goal import By, Goal, JsonObject, Output, Sender
     from talkcli.protocol.events import ServerStatus
 
 #: Characters of a text that a list shows.
@@ -76,6 +76,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("started", _moment(goal.started_at)),
         ("ended at", _moment(goal.ended_at)),
         ("duration", None if goal.duration is None else f"{goal.duration:.2f} s of audio"),
+        ("output", goal.output and _output(goal.output)),
     ]
     lines = []
     for name, value in rows:
@@ -158,7 +159,7 @@ def _head(goal: Goal, id_columns: int, screen: Screen) -> str:
 def _tails(goal: Goal, now: float) -> list[str]:
     """Return what stands after a goal's text, the longest form first."""
     if goal.state.terminal:
-        return [] if goal.state is State.SUCCEEDED else why_forms(goal)
+        return _muted(goal) if goal.state is State.SUCCEEDED else why_forms(goal)
     # The sender first: what does not fit is cut at its end.
     return [", ".join([f"from {each}", *_notes(goal, now)]) for each in who_forms(goal.client)]
 
@@ -223,7 +224,7 @@ def by_whom(by: By) -> str:
 def why_forms(goal: Goal) -> list[str]:
     """Return why a goal ended and who ended it, for a column: the longest form first."""
     if goal.state is State.SUCCEEDED:
-        return ["" if goal.duration is None else f"{goal.duration:.1f} s"]
+        return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())
     by = []
     if goal.by is not None:
@@ -245,6 +246,16 @@ def _words(goal: Goal) -> str:
         return ""
     head, colon, words = (goal.message or "").partition(": ")
     return printable(words) if colon and head.startswith("Talk ") else ""
+
+
+def _output(output: Output) -> str:
+    muted = ", muted" if output.muted else ""
+    return f"{printable(output.device)}, by {printable(output.player)}, volume {output.volume:g}{muted}"
+
+
+def _muted(goal: Goal) -> list[str]:
+    """Return what is said of a goal that nobody could hear, though it was played."""
+    return ["muted"] if goal.output and goal.output.muted else []
 
 
 def _program(sender: Sender) -> str:

@@ -21,6 +21,8 @@ sentences are spoken plainly:
 | `slow-pause=SECONDS` | goes on that long after it was told to pause, before it is silent |
 | `stale-pause` | answers each pause but the first at once, as if it were the one before, and then as it is |
 | `ignore-pause` | ignores pause and resume, and says nothing about it |
+| `volume=X` | tells that it plays to the device "card", at that volume |
+| `muted` | … and that it is muted; fails for it, where the goal is to be audible |
 | `linger=SECONDS` | leaves a process that holds the pipe of `TALK_LIVENESS_FD` open so long, whatever happens |
 
 While it is paused all that it has planned waits, and it shows that it is alive.
@@ -39,10 +41,10 @@ from dataclasses import dataclass
 #: No scripted process outlives this many seconds of hanging or lingering, whatever happens to the test.
 LONGEST = 30.0
 _FLAGS = frozenset(
-    {"silent-start", "crash", "exit", "hang", "never-ends", "ignore-stop", "stale-pause", "ignore-pause"}
+    {"silent-start", "crash", "exit", "hang", "never-ends", "ignore-stop", "stale-pause", "ignore-pause", "muted"}
 )
 _VALUED = frozenset(
-    {"length", "words", "at", "fail", "message", "exit", "slow-stop", "on-stop", "slow-pause", "linger"}
+    {"length", "words", "at", "fail", "message", "exit", "slow-stop", "on-stop", "slow-pause", "linger", "volume"}
 )
 
 
@@ -66,6 +68,8 @@ class Script:
     stale_pause: bool = False
     ignore_pause: bool = False
     linger: float = 0.0
+    volume: float | None = None
+    muted: bool = False
     words: tuple[tuple[int, int], ...] = ()
 
     @property
@@ -101,6 +105,8 @@ def parse(text: str) -> Script:
         stale_pause="stale-pause" in asked,
         ignore_pause="ignore-pause" in asked,
         linger=min(LONGEST, _number(asked, "linger", 0)),
+        volume=_number(asked, "volume", 1.0) if asked.keys() & {"volume", "muted"} else None,
+        muted="muted" in asked,
         words=tuple(spans[:count]) if "silent-start" not in asked else (),
     )
 

@@ -132,6 +132,12 @@ class Engine:
             self._linger(asked.linger)
         if asked.started:
             self._send(protocol.Started(goal.id))
+        if asked.volume is not None:
+            self._send(protocol.Output(goal.id, "scripted", "card", asked.volume, asked.muted))
+        if asked.muted and say.audible:
+            self._send(protocol.Ended(goal.id, protocol.FAILED, "muted", "the output is muted: card"))
+            self._goal = None
+            return
         for number, (start, end) in enumerate(asked.words):
             at = asked.length * number / len(asked.words)
             word = protocol.Word(goal.id, start, end, number + 1, round(at, 3))

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.goals.goal import By, Goal, Sender
+from talkcli.goals.goal import By, Goal, Output, Sender
 from talkcli.goals.states import State
 
 #: A goal always has all of these, null where unknown.
 KEYS = [
     "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "priority", "key", "ttl", "data",
-    "client", "paused", "queued_at", "started_at", "ended_at", "duration",
+    "client", "paused", "queued_at", "started_at", "ended_at", "duration", "output",
 ]  # fmt: skip
 SENDER_KEYS = ["pid", "uid", "command", "parent", "name"]
 
@@ -30,6 +30,7 @@ senders = st.builds(
     Sender, pid=st.none() | numbers, uid=st.none() | numbers, command=strings, parent=strings, name=strings
 )
 ends = st.builds(By, goal=st.text()) | st.builds(By, client=senders)
+outputs = st.builds(Output, player=st.text(), device=st.text(), volume=st.floats(0, 1), muted=st.booleans())
 goals = st.builds(
     Goal,
     id=st.text(),
@@ -50,6 +51,7 @@ goals = st.builds(
     started_at=seconds,
     ended_at=seconds,
     duration=seconds,
+    output=st.none() | outputs,
 )
 
 
@@ -74,6 +76,15 @@ def test_a_goal_goes_there_and_back(goal: Goal) -> None:
     assert Goal.from_json(json.loads(json.dumps(goal.to_json()))) == goal
 
 
+def test_an_output_that_lacks_something_is_none() -> None:
+    message = Goal("4k7f-1", State.ACTIVE, output=Output("pulse", "card", 0.5, True)).to_json()
+    assert Goal.from_json(message).output == Output("pulse", "card", 0.5, True)
+    for name in ("player", "device", "volume", "muted"):
+        whole = message["output"]
+        assert isinstance(whole, dict)
+        assert Goal.from_json({**message, "output": {**whole, name: None}}).output is None
+
+
 def test_a_goal_without_a_client_has_none_there_and_back() -> None:
     assert Goal.from_json(Goal("4k7f-1", State.REJECTED).to_json()).client is None
 
@@ -86,7 +97,7 @@ def test_fields_that_a_client_does_not_know_are_ignored(goal: Goal, extra: dict[
 @given(goals)
 def test_fields_within_sender_and_by_that_a_client_does_not_know_are_ignored(goal: Goal) -> None:
     message = goal.to_json()
-    for name in ("by", "client"):
+    for name in ("by", "client", "output"):
         within = message[name]
         if isinstance(within, dict):
             message[name] = {**within, "group": "robots"}
