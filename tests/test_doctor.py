@@ -86,7 +86,7 @@ def test_all_is_well_and_its_sentence_is_heard_as_a_goal_of_its_own(make_talk: M
     assert "eSpeak NG" in found["libespeak-ng"]["message"]
     assert f"{talk.socket} (TALK_SOCKET, process {talk.pid})" in found["socket"]["message"]
     assert "plays to null" in found["sound server"]["message"]
-    assert "through the server, aplay" in found["sentence"]["message"]
+    assert "through the server, pulse" in found["sentence"]["message"]
     (goal,) = logged(talk)
     assert (goal["text"], goal["state"], goal["client"]["name"]) == (sentence.TEXT, "SUCCEEDED", "talk doctor")
     assert extent(talk.recording.samples)
@@ -98,7 +98,7 @@ def test_silent_leaves_out_the_sound_and_nothing_else(make_talk: MakeTalk, sink:
     assert done.code == 0, done.out
     assert list(found) == CHECKS
     message = found["sentence"]["message"]
-    assert message.startswith("played to its end without sound by an engine of this command's own, aplay, 0.")
+    assert message.startswith("played to its end without sound by an engine of this command's own, pulse, 0.")
     assert_silent(talk.recording)
 
 
@@ -327,11 +327,11 @@ def test_a_sink_that_is_suspended_is_named_with_the_command_that_wakes_it(
 
 def test_a_sink_that_is_muted_is_not_heard_though_all_was_played(make_talk: MakeTalk, sink: Sink) -> None:
     talk = make_talk(*FAST, sink=sink, forked=False)
-    sink._pactl("set-sink-mute", "null", "1")
+    sink.pactl("set-sink-mute", "null", "1")
     try:
         done, found = doctor(talk, "--silent")
     finally:
-        sink._pactl("set-sink-mute", "null", "0")
+        sink.pactl("set-sink-mute", "null", "0")
     assert (done.code, found["sentence"]["state"]) == (4, "done")
     assert (found["loudness"]["state"], found["loudness"]["message"]) == ("failed", "the default sink is muted")
 
@@ -396,7 +396,7 @@ def test_sound_behind_a_forwarded_socket_is_not_looked_for_here(make_talk: MakeT
     assert done.code == 0, done.out
     assert "on another machine or in a container: run talk doctor there" in found["session"]["message"]
     assert not found.keys() & {"player", "device", "cards", "group", "sound server", "loudness"}
-    assert "through the server, aplay" in found["sentence"]["message"]
+    assert "through the server, pulse" in found["sentence"]["message"]
     assert extent(talk.recording.samples)
     # Its player is out of reach, and no goal is sent: then nothing is proved.
     assert (silent.code, found_silently["sentence"]["state"]) == (4, "failed")

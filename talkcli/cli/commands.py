@@ -83,9 +83,9 @@ _SERVE = (
     option(
         "--player",
         TEXT,
-        "What plays the sound. One of aplay, pacat and pw-cat; null (silent, in real time); file:PATH.wav; or a "
-        "command that reads 16-bit mono PCM, with {rate} for its rate and {device} for the --device. [default: the "
-        "first of the three that works]",
+        "What plays the sound. One of pulse (the sound server), aplay, pacat and pw-cat; null (silent, in real time); "
+        "file:PATH.wav; or a command that reads 16-bit mono PCM, with {rate} for its rate and {device} for the "
+        "--device. [default: the first of the four that works]",
         metavar="PLAYER",
         env="TALK_PLAYER",
         offers="players",
@@ -94,8 +94,8 @@ _SERVE = (
         "--device",
         TEXT,
         "Device, by the player's own name for it. For aplay one that 'aplay -L' lists, such as plughw:1,0; for "
-        "pacat one of 'pactl list short sinks'; for pw-cat the name of a node, as in 'pw-cli ls Node'. Name the "
-        "--player, too.",
+        "pulse and pacat one of 'pactl list short sinks'; for pw-cat the name of a node, as in 'pw-cli ls Node'. Name "
+        "the --player, too.",
         metavar="NAME",
     ),
     option(
@@ -107,6 +107,7 @@ _SERVE = (
         limits=(0, MAX_LEAD_IN),
         metavar="MS",
     ),
+    option("--audible", FLAG, "Abort every sentence whose output is muted."),
     option("--driver", TEXT, "A driver of pyttsx3's. [default: the one for this system]", metavar="NAME"),
     option("--socket-mode", MODE, "Who may connect: the socket's file mode.", default="0600"),
     option("--greeting", TEXT, "A sentence to speak at the start."),

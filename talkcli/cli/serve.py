@@ -204,9 +204,11 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
 def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
-    from talkcli.engine.players import PLAYERS, commands
+    from talkcli.engine.players import PACKAGES, PLAYERS, commands
     from talkcli.engine.players.base import CannotSpeak
 
+    if player in PLAYERS and player not in PACKAGES:
+        return  # it is no program
     try:
         commands(player, None, 0)
     except CannotSpeak as error:

@@ -12,6 +12,7 @@ import time
 from talkcli.engine.players.base import PIECE, SAMPLE, CannotEnd, CannotSpeak, Stopped
 from talkcli.engine.stream import Samples, Stream
 from talkcli.engine.words import TimedWord, WordClock
+from talkcli.frozen import replace
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -41,6 +42,10 @@ EARLY_END = 0.25
 #: Seconds for which a device that somebody else holds is tried again, and those between two tries: a sound of another
 #: program's, or `talk doctor --silent`, must not cost a sentence.
 BUSY_FOR, BUSY_PAUSE = 1.0, 0.05
+
+#: Seconds of zeros that may stand before a sentence: libespeak-ng makes 0 to 11 ms. More is silence that is wanted, as
+#: of a voice whose volume is 0.
+ZEROS = 0.1
 
 #: Seconds within which a player that was killed must be gone: it takes 1 ms, unless it hangs in a device's driver.
 GONE_WITHIN = 1.0
@@ -84,20 +89,23 @@ class Playback:
         self._sent = 0  # bytes that players have taken
         self._began = False  # whether any are known to be heard
         self._stopped = False
+        #: whether it is settled where the sound begins, and the bytes of zeros before that, which are left out
+        self._settled = False
+        self._left_out = 0
         #: until when a device that is busy is tried again; 0 before it was found so
         self._busy_until = 0.0
         #: since when the player has been given nothing but silence, because the sentence is held
         self._silent_at: float | None = None
 
     def begin(self, rate: int) -> None:
-        """Set the samples per second, and start a player program for them: it needs 5 to 15 ms, the synthesis 2.
+        """Set the samples per second, and open a player for them: it needs 1 to 15 ms, the synthesis 2.
 
         What goes wrong with it is told by `write`.
         """
         if self._stream is not None and rate != self._rate:
             self._let_go(0)  # it was started for another
         self._rate = rate
-        if self._players.is_program and not self._session.held:
+        if self._players.takes_time and not self._session.held:
             try:
                 self._try(lambda _: True)
             except CannotSpeak:
@@ -113,22 +121,21 @@ class Playback:
         self._samples.add(samples)
         self._wait((), 0.0)  # a file is never waited for, and it must be possible to stop that too
         self._check_stopped()
-        if self._samples.speaks:
+        if self._samples.speaks and self._settle():
             self._try(self._feed_all)
 
     def finish(self) -> float:
         """Play to the end and return the length in seconds. Returns only if all of it was heard."""
         if not self._samples.speaks:
             raise CannotSpeak("nothing_to_say", "nothing in the text can be spoken")
-        self._complete = True
+        self._complete = self._settled = True
         self._try(self._drain)
-        for word in self._clock.rest():
-            self._on_word(word)
+        self._tell(self._clock.rest())
         if self._stream is not None:
             name, now = self._stream.player.name, time.monotonic()
             self._players.worked = name
             self._players.gap.ended(name, now + self._stream.unheard(self._stream.written, now))
-        return self._seconds(self._sent)
+        return self._seconds(self._sent - self._left_out)
 
     def stop(self) -> None:
         """Be silent now; what waits ends with Stopped."""
@@ -141,6 +148,7 @@ class Playback:
         if self._stream is None:
             return
         player = self._stream.player
+        self._players.output = player.output
         player.kill()
         limit = time.monotonic() + GONE_WITHIN
         while not player.gone():
@@ -173,7 +181,7 @@ class Playback:
         player = self._candidates.pop(0)()
         self._sent = self._begin
         self._silent_at = None
-        lead_in = self._players.lead_in(begins=self._begin == 0)
+        lead_in = self._players.lead_in(begins=self._begin == self._left_out)
         return Stream(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _next_player(self, error: CannotSpeak) -> None:
@@ -182,9 +190,11 @@ class Playback:
         if stream is not None and stream.player.real_time and self._session.held:
             self._go_back(stream)  # what is held is spoken by another later, and fails then if there is none
             return
-        first = self._first_error or error
-        self._first_error = first
-        lost = stream is not None and (stream.player.proven or error.reason == "audio_stalled")
+        first = self._first_error
+        if first is None or first.reason == "no_player":  # what is there and fails says more than what isn't there
+            first = self._first_error = error
+        proven = stream is not None and stream.player.proven
+        lost = proven or error.final or (stream is not None and error.reason == "audio_stalled")
         if lost or not (self._candidates or self._is_busy(first)):
             raise error if lost else first
         self._leave()
@@ -261,6 +271,25 @@ class Playback:
             raise CannotSpeak("audio_lost", f"{player.name} ended {missing:.1f} s before the sound did")
         return True
 
+    def _settle(self) -> bool:
+        """Whether it is settled where the sound begins; the zeros before that are left out, which nobody can hear.
+
+        Behind another sentence they are a part of the pause between the two, and a file gets what was made.
+        """
+        if self._settled:
+            return True
+        zeros = self._samples.zeros()
+        silent = zeros == self._samples.end
+        if silent and self._seconds(zeros) < ZEROS:
+            return False
+        self._settled = True
+        if not silent and self._players.takes_time and not self._players.gap.follows and self._sent == 0:
+            self._left_out = self._begin = self._sent = zeros
+            self._clock.leave_out(self._seconds(zeros))
+            if self._stream is not None:
+                self._stream.begin(self._seconds(zeros))
+        return True
+
     def _offer(self, stream: Stream) -> int:
         if stream.lead_in:
             taken = stream.offer_silence(self._seconds(self._begin), stream.lead_in)
@@ -284,14 +313,19 @@ class Playback:
         last = self._complete and self._sent == self._audible_end(stream)
         stream.tick(now, last=last and not self._session.held)
         player = stream.player
+        self._players.output = player.output
         if not player.proven:
             return
         if stream.taken and not self._began:
             self._began = True
             self._players.gap.began(player.name, now - self._clock.elapsed(now))
         self._samples.forget(self._unheard() if player.real_time else self._sent)
-        for word in self._clock.due(now) if player.real_time else self._clock.rest():
-            self._on_word(word)
+        self._tell(self._clock.due(now) if player.real_time else self._clock.rest())
+
+    def _tell(self, words: list[TimedWord]) -> None:
+        """Report words that are heard, at their place in what is played."""
+        for word in words:
+            self._on_word(replace(word, position=word.position - self._seconds(self._left_out)))
 
     # -- holding
 

@@ -20,6 +20,7 @@ from talkcli.engine import protocol
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.synthesizers.voices import list_voices
 from talkcli.engine.words import Words
+from talkcli.frozen import fields
 from talkcli.protocol.lines import LineSplitter
 
 TYPE_CHECKING = False
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from talkcli.engine.players.base import Interest
     from talkcli.engine.players.choice import Players
     from talkcli.engine.protocol import Command, Event
+    from talkcli.goals.goal import Output
 
 #: Seconds between two steps of a driver that is not ours while it has a goal in hand: it has no way to wake us.
 STEP = 0.05
@@ -116,6 +118,8 @@ class Session:
         self._channel = channel
         #: what our own driver plays with
         self.players = players
+        #: where the goal in hand goes, as the server was told
+        self._told: Output | None = None
         self._backlog: deque[Command] = deque()
         self._goal: InHand | None = None
         self._engine: Any = None
@@ -182,6 +186,7 @@ class Session:
                 self._carry_out_now(command)
             if self._channel.closed:
                 self._silence()
+        self._tell_output()
         due = self._alive_due()
         if self._goal is not None and due is not None and time.monotonic() >= due:
             self._channel.send(protocol.Alive(self._goal.id))
@@ -205,6 +210,12 @@ class Session:
                 goal.interrupted = True
                 self._engine.stop()
 
+    def _tell_output(self) -> None:
+        output = self.players.output
+        if self._goal is not None and output is not None and output != self._told:
+            self._told = output
+            self._channel.send(protocol.Output(self._goal.id, **fields(output)))
+
     def confirm(self) -> None:
         """Take note that the sentence that is to be held is silent; may be called again and again."""
         if self._goal is not None and not self._goal.stop_asked and self._confirmed != self.held:
@@ -223,7 +234,8 @@ class Session:
         """Speak a goal to its end."""
         self._goal = goal = InHand(say, time.monotonic())
         self.held = self._confirmed = 0
-        self.players.begin(say.lead_in, say.followed)
+        self.players.begin(say)
+        self._told = None
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
         waiting, self._backlog = self._backlog, deque()
@@ -312,6 +324,7 @@ class Session:
         self, outcome: str, reason: str | None = None, message: str | None = None, duration: float | None = None
     ) -> None:
         assert self._goal is not None
+        self._tell_output()
         goal, self._goal = self._goal, None
         self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration))
 

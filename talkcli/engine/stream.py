@@ -54,6 +54,10 @@ class Samples:
         loud = next((number for number, each in enumerate(last) if abs(each) > QUIET), None)
         self._quiet = self._quiet + len(samples) if loud is None else loud * SAMPLE
 
+    def zeros(self) -> int:
+        """Return how many bytes at the beginning are zero samples."""
+        return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE * SAMPLE
+
     def part(self, begin: int, end: int) -> memoryview:
         """Return the samples between two places. It must be released before more are added or forgotten."""
         return memoryview(self._kept)[begin - self.begin : end - self.begin]
@@ -87,7 +91,11 @@ class Stream:
         self._first_write = 0.0
         #: bytes of silence that are to be written before the first sample
         self.lead_in = int(lead_in * rate) * SAMPLE if player.real_time else 0
-        clock.begin(begin)
+        self.begin(begin)
+
+    def begin(self, position: float) -> None:
+        """Take over at that position of the audio, before anything was written."""
+        self._clock.begin(position)
 
     def offer(self, samples: memoryview) -> int:
         """Offer samples, no more than a piece; return the bytes that were taken."""
@@ -117,7 +125,10 @@ class Stream:
             self.taken = consumed
             if consumed >= self.written:  # one that nibbles would never be done
                 self.progress_at = now
-        if self.player.real_time and not (last and consumed >= self.written):
+        heard = self.player.heard()
+        if heard is not None:
+            self._clock.tell(now, heard)
+        elif self.player.real_time and not (last and consumed >= self.written):
             self._clock.hold(now, max(0.0, self._seconds(consumed) - PLAYER_HOLDS))
 
     def ahead(self, now: float) -> float:

@@ -11,7 +11,7 @@ import re
 import unicodedata
 from collections import deque
 
-from talkcli.frozen import frozen
+from talkcli.frozen import frozen, replace
 
 #: What goes on behind a letter without a report of its own: "it's", "well-known", "U.S.A".
 _GOES_ON = re.compile(r"(?:['’-][^\W\d_]\w*|\.[^\W\d_](?!\w))+")
@@ -103,6 +103,10 @@ class WordClock:
         """Add a word; positions never decrease."""
         self._waiting.append(word)
 
+    def leave_out(self, until: float) -> None:
+        """Have the words that would begin before that position begin there."""
+        self._waiting = deque(replace(each, position=max(until, each.position)) for each in self._waiting)
+
     def begin(self, position: float) -> None:
         """Prepare for another stream, which begins at that position of the audio; the clock stands."""
         self._begin = position
@@ -131,6 +135,11 @@ class WordClock:
                 break
             position = max(before, position - seconds)
         return position
+
+    def tell(self, now: float, elapsed: float) -> None:
+        """Go by a better clock: so many seconds of the stream have been heard."""
+        if self._zero is not None:
+            self._zero = now - elapsed
 
     def hold(self, now: float, elapsed: float) -> None:
         """Move the clock back to `elapsed` seconds if it is ahead of that: no more can have been heard."""

@@ -128,7 +128,8 @@ def test_a_killed_engine_that_was_idle_is_replaced_within_half_a_second(talk: Ta
         assert_within(time_heard(recording, compared, reference, 0) - killed, 0.5, "the next goal after a crash")
 
 
-def test_a_killed_player_aborts_its_goal_and_no_other(talk: Talk) -> None:
+def test_a_killed_player_aborts_its_goal_and_no_other(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = quick_talk(make_talk, sink, "--player", "aplay")
     engine = engine_process(talk)
     goal, client = begin_with_client(talk, LONG, number=5)
     os.kill(player_process(talk), signal.SIGKILL)

@@ -144,7 +144,8 @@ def test_row_38_a_first_one_that_expired_throttles_nothing(talk: Talk) -> None:
     assert_heard(heard(talk), render_quick([HELP, LOW]))
 
 
-def test_row_38_a_first_one_that_was_aborted_throttles_nothing(talk: Talk) -> None:
+def test_row_38_a_first_one_that_was_aborted_throttles_nothing(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = quick_talk(make_talk, sink, "--player", "aplay")
     first = begin(talk, LONG, key="battery", throttle=60)
     os.kill(player_process(talk), signal.SIGKILL)
     assert talk.watcher.wait_for_terminal(first) == "ABORTED"

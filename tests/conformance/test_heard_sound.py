@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.engine.players.pulse import SUSPENDED_FOR
 from tests.conformance import stopped
 from tests.conformance.hearing import (
     HOME,
@@ -38,6 +39,15 @@ ABORTED = ["PENDING", "ACTIVE", "ABORTED"]
 NO_CARD = "pcm.!default { type hw card 31 }\nctl.!default { type hw card 31 }\n"
 
 
+#: What is said of a sink that is gone in mid-sentence, and of a sound server that is.
+LOST = {
+    "aplay": ("aplay: ", "error: Input/output error"),
+    "pulse": ("the sound server ended the stream: Entity killed",),
+}
+KILLED = LOST | {"pulse": ("the sound server ended the stream: Connection terminated",)}
+each_player = pytest.mark.parametrize("player", LOST)
+
+
 @pytest.fixture(scope="module")
 def broken() -> Iterator[list[Sink]]:
     """Sound servers that tests of this module have broken and brought back."""
@@ -61,7 +71,8 @@ def breakable(broken: list[Sink]) -> Sink:
 def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
     make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path
 ) -> None:
-    talk = make_talk("--rate", str(QUICK), sink=sink, env={"PATH": str(tmp_path)})
+    env = {"PATH": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"}  # which aplay does not go by here
+    talk = make_talk("--rate", str(QUICK), sink=sink, env=env)
     goal = _aborted(talk, talk.run("say", "--wait", "--", LOW))
     assert_aborted(goal, "no_player", "no player found: install alsa-utils (aplay)", "pulseaudio-utils (pacat)")
     assert goal["spoken"] == ""
@@ -93,7 +104,11 @@ def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
 
 @pytest.mark.parametrize(
     ("player", "line"),
-    [("aplay", "aplay: audio open error: No such file or directory"), ("pacat", "No such entity")],
+    [
+        ("aplay", "aplay: audio open error: No such file or directory"),
+        ("pacat", "No such entity"),
+        ("pulse", 'the sound server has no sink "nonesuch": see pactl list short sinks'),
+    ],
 )
 def test_row_41_a_device_of_another_name_is_told(make_talk: MakeTalk, sink: Sink, player: str, line: str) -> None:
     talk = make_talk("--player", player, "--device", "nonesuch", sink=sink)
@@ -101,23 +116,27 @@ def test_row_41_a_device_of_another_name_is_told(make_talk: MakeTalk, sink: Sink
     assert_silent(heard(talk))
 
 
-def test_row_41_a_device_that_is_lost_in_mid_sentence(make_talk: MakeTalk, breakable: Sink) -> None:
+@each_player
+def test_row_41_a_device_that_is_lost_in_mid_sentence(make_talk: MakeTalk, breakable: Sink, player: str) -> None:
     sink = breakable
-    talk = quick_talk(make_talk, sink)
+    talk = quick_talk(make_talk, sink, "--player", player)
     _, client = begin_with_client(talk, LONG, number=5)
     sink.unload()
-    _lost(talk, client)
+    _lost(talk, client, *LOST[player])
     sink.reload()
     _heard_again(talk, sink, LONG)
 
 
 @pytest.mark.slow
-def test_row_41_a_sound_server_that_is_killed_in_mid_sentence(make_talk: MakeTalk, breakable: Sink) -> None:
+@each_player
+def test_row_41_a_sound_server_that_is_killed_in_mid_sentence(
+    make_talk: MakeTalk, breakable: Sink, player: str
+) -> None:
     sink = breakable
-    talk = quick_talk(make_talk, sink)
+    talk = quick_talk(make_talk, sink, "--player", player)
     _, client = begin_with_client(talk, LONG, number=5)
     sink.kill_server()
-    _lost(talk, client)
+    _lost(talk, client, *KILLED[player])
     without = quick_talk(make_talk, sink)
     goal = _aborted(without, without.run("say", "--wait", "--", LOW))
     assert_aborted(goal, "audio_device", "aplay: audio open error: Connection refused")
@@ -126,6 +145,7 @@ def test_row_41_a_sound_server_that_is_killed_in_mid_sentence(make_talk: MakeTal
     _heard_again(without, sink, LOW)
 
 
+@each_player
 @pytest.mark.parametrize(
     ("hold", "let_go"),
     [
@@ -138,11 +158,12 @@ def test_row_41_a_sink_that_takes_no_sound_in_mid_sentence(
     breakable: Sink,
     hold: Callable[[Sink], None],
     let_go: Callable[[Sink], None],
+    player: str,
 ) -> None:
     sink = breakable
 
     with limits():
-        talk = quick_talk(make_talk, sink)
+        talk = quick_talk(make_talk, sink, "--player", player)
         _, client = begin_with_client(talk, LONG, number=5)
         hold(sink)
         held = time.monotonic()
@@ -150,14 +171,17 @@ def test_row_41_a_sink_that_takes_no_sound_in_mid_sentence(
         ended = time.monotonic()
         let_go(sink)
         goal = _aborted(talk, done)
-        assert_aborted(goal, "audio_stalled", "aplay took no sound for 3 s")
+        told = player == "pulse" and hold is Sink.suspend
+        assert_aborted(goal, "audio_stalled", "has suspended null" if told else f"{player} took no sound for 3 s")
         assert goal["spoken"].startswith("two three")
         assert goal["spoken"] != LONG
         assert talk.run("say", "--wait", "--", HOME).code == 0
         # What the sound server had when it was frozen is heard when it goes on, so all of it is looked at here.
         stopped.assert_heard_after_stop(heard(talk), LONG, [HOME])
         # 3 s after it took something the last time, which the engine sees within a tenth; and the end of the client.
-        assert_within(ended - held, 3.3, "the end of a goal whose sink takes no sound")
+        # A sound server that suspends its sink says so to its own clients.
+        limit = SUSPENDED_FOR + 0.3 if told else 3.3
+        assert_within(ended - held, limit, "the end of a goal whose sink takes no sound")
 
 
 def _aborted(talk: Talk, done: Finished) -> Message:
@@ -168,10 +192,10 @@ def _aborted(talk: Talk, done: Finished) -> Message:
     return goal
 
 
-def _lost(talk: Talk, client: Process) -> None:
+def _lost(talk: Talk, client: Process, *words: str) -> None:
     """Assert of a client whose goal, the server's first, was LONG: it ended in mid-sentence, as the sound did."""
     goal = _aborted(talk, talk.finish(client))
-    assert_aborted(goal, "audio_lost", "aplay: ", "error: Input/output error")
+    assert_aborted(goal, "audio_lost", *words)
     assert goal["spoken"].startswith("two three")
     assert goal["spoken"] != LONG
     assert_begun(talk.recording, render_quick([LONG])[0], shortest=0.2)

@@ -12,7 +12,7 @@ import pytest
 
 from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_same, heard, quick_talk, render_quick, send
 from tests.support.compare import EXTENT, assert_heard, assert_silent
-from tests.support.reference import RATE, render
+from tests.support.reference import RATE, played, render
 
 if TYPE_CHECKING:
     import pathlib
@@ -32,7 +32,7 @@ def test_row_01_a_goal_is_spoken_and_its_end_is_told(talk: Talk) -> None:
     assert (goal["reason"], goal["spoken"]) == (None, LOW)
     assert talk.watcher.states(done.id) == SPOKEN
     (reference,) = render([LOW])
-    assert goal["duration"] == pytest.approx(len(reference) / RATE, abs=0.001)
+    assert goal["duration"] == pytest.approx(len(played(reference)) / RATE, abs=0.001)
     assert_heard(heard(talk), [reference])
 
 

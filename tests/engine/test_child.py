@@ -18,7 +18,7 @@ from talkcli.engine.players.child import Child
 from talkcli.engine.players.program import ProgramPlayer
 from tests.engine.spawned import FAST, Spawned, children
 from tests.engine.test_player_faults import Player
-from tests.support.reference import render
+from tests.support.reference import played, render
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -198,7 +198,7 @@ espeak.load = lambda: (*load()[:2], 16_000)
         engine.until(protocol.Voices)
         assert engine.spoken("battery low").outcome == protocol.COMPLETED
     assert set(rates.read_text().split()) == {"22050"}
-    assert player.heard.read_bytes() == render(["battery low"], rate=FAST)[0].tobytes()
+    assert player.heard.read_bytes() == played(render(["battery low"], rate=FAST)[0]).tobytes()
 
 
 def test_all_that_a_player_has_started_dies_with_a_killed_process(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from talkcli.engine.players.choice import LONGEST, MOST, REMEMBERED, Gap
 from talkcli.engine.stream import QUIET, Samples
 from tests.engine.spawned import FAST, Spawned
 from tests.engine.test_player_faults import Player
-from tests.support.reference import RATE, render
+from tests.support.reference import RATE, played, render
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +34,9 @@ def _say(text: str, goal: str, *, followed: bool, rate: int = FAST) -> protocol.
 
 
 def _sentences(rate: int = FAST) -> list[bytes]:
-    return [each.tobytes() for each in render(TEXTS, rate=rate)]
+    """Return what is played of each: of those that follow another, all."""
+    first, *others = render(TEXTS, rate=rate)
+    return [each.tobytes() for each in (played(first), *others)]
 
 
 def _changed(gap: Gap, took: float, player: str = "aplay") -> None:
@@ -152,7 +154,7 @@ def test_a_file_gets_every_sample(tmp_path: Path) -> None:
         for number, text in enumerate(TEXTS):
             engine.send(_say(text, f"g{number}", followed=True))
             assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-    assert target.read_bytes()[44:] == b"".join(_sentences())
+    assert target.read_bytes()[44:] == b"".join(each.tobytes() for each in render(TEXTS, rate=FAST))
 
 
 def test_a_player_that_ends_too_early_is_seen_as_before(player: Player) -> None:

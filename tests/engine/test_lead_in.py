@@ -13,7 +13,7 @@ from talkcli.engine.players import choice
 from tests.engine.spawned import FAST, SOON, Spawned, children
 from tests.engine.test_player_faults import Player, player
 from tests.support import compare
-from tests.support.reference import RATE, render
+from tests.support.reference import RATE, played, render
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ _LEAD = LEAD_IN * RATE // 1000 * 2
 
 
 def _bytes(texts: list[str] = TEXTS) -> list[bytes]:
-    return [samples.astype("<i2").tobytes() for samples in render(texts, rate=FAST)]
+    return [played(samples).astype("<i2").tobytes() for samples in render(texts, rate=FAST)]
 
 
 def test_it_is_heard_before_the_first_sentence_and_not_before_the_next(sink: Sink) -> None:
@@ -51,7 +51,7 @@ def test_it_is_heard_before_the_first_sentence_and_not_before_the_next(sink: Sin
                 ended = engine.until(protocol.Ended)
                 assert ended.outcome == protocol.COMPLETED
                 recording.wait_until_quiet(0.1)
-        compare.assert_heard(recording, render(TEXTS, rate=FAST))
+        compare.assert_heard(recording, [played(each) for each in render(TEXTS, rate=FAST)])
         assert onsets[0] > LEAD_IN / 1000
         assert_within(onsets[0], LEAD_IN / 1000 + 0.2, "the first sentence")
         assert_within(onsets[1], 0.2, "the second sentence")
@@ -251,7 +251,7 @@ def test_a_file_gets_none(tmp_path: Path) -> None:
         engine.until(protocol.Ready)
         assert engine.spoken(TEXTS[0], lead_in=LEAD_IN).outcome == protocol.COMPLETED
     with wave.open(str(target), "rb") as file:
-        assert file.readframes(file.getnframes()) == _bytes()[0]
+        assert file.readframes(file.getnframes()) == render(TEXTS, rate=FAST)[0].astype("<i2").tobytes()
 
 
 def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,20 +7,25 @@ from __future__ import annotations
 
 import os
 import select
+import socket
+import subprocess
 import threading
 import time
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 from talkcli.engine.players import Command
 from talkcli.engine.players.base import PIECE, SAMPLE, CannotSpeak
 from talkcli.engine.players.null import NullPlayer
 from talkcli.engine.players.program import ProgramPlayer
+from talkcli.engine.players.pulse import PulsePlayer
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
 from tests.engine.spawned import PATIENCE, children
+from tests.support.surroundings import short_directory
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -28,6 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from talkcli.engine.players.base import Player
+    from tests.support.sink import Sink
 
 RATE = 22050
 _PIECE = int(PIECE * RATE) * SAMPLE
@@ -95,7 +101,60 @@ def _behind_a_header(path: Path) -> bytes:
     return path.read_bytes()[44:] if path.exists() else b""
 
 
+def _pulse(at: Path) -> PulsePlayer:
+    """Return one at a sink that writes what it plays into a pipe, and the tape that is read from it."""
+    os.mkfifo(at / "pipe")
+    options = [f"file={at / 'pipe'}", f"rate={RATE}", "channels=1", "format=s16le", "use_system_clock_for_timing=yes"]
+    module = _sinks[0].pactl("load-module", "module-pipe-sink", "sink_name=pipe", *options).strip()
+    _opened.callback(_sinks[0].pactl, "unload-module", module)
+    with open(at / "tape", "wb") as tape:
+        reader = subprocess.Popen(["cat", at / "pipe"], stdout=tape)
+    _opened.callback(reader.wait)
+    _opened.callback(reader.kill)
+    return PulsePlayer(RATE, "pipe")
+
+
+def _taped(at: Path) -> bytes:
+    """Return what such a sink has played, without the silence around it, and where a busy machine let it run dry."""
+    samples = np.frombuffer((at / "tape").read_bytes(), "<i2")
+    found = samples[samples != 0].tobytes()  # of the sound only the first sample is zero
+    return SOUND[:2] + found if found else b""
+
+
+def _cut_off(_: Path) -> PulsePlayer:
+    """Return one whose connection to the sound server breaks as soon as its stream is there."""
+    folder = _opened.enter_context(short_directory())
+    relay = subprocess.Popen(["socat", f"UNIX-LISTEN:{folder}/s", f"UNIX-CONNECT:{_sinks[0].socket}"])
+    try:
+        while not os.path.exists(f"{folder}/s"):
+            time.sleep(0.005)  # it says nowhere when it begins to listen
+        os.environ["PULSE_SERVER"] = f"unix:{folder}/s"
+        player = PulsePlayer(RATE)
+        while player.device is None:
+            _await(player)
+    finally:
+        relay.kill()
+        relay.wait()
+    return player
+
+
+def _without_server(at: Path) -> PulsePlayer:
+    os.environ["PULSE_SERVER"] = f"unix:{at}/none"
+    return PulsePlayer(RATE)
+
+
+def _with_silent_server(_: Path) -> PulsePlayer:
+    """Return one whose server takes clients, and says nothing."""
+    folder = _opened.enter_context(short_directory())
+    listening = _opened.enter_context(socket.socket(socket.AF_UNIX))
+    listening.bind(f"{folder}/s")
+    listening.listen()
+    os.environ["PULSE_SERVER"] = f"unix:{folder}/s"
+    return PulsePlayer(RATE)
+
+
 PLAYERS = {
+    "the sound server": Case(_pulse, played=_taped, lost=_cut_off, refused=_without_server, stuck=_with_silent_server),
     "null": Case(lambda _: NullPlayer(RATE), stuck=lambda _: NullPlayer(RATE, clock=lambda: 100.0)),
     "a program": Case(
         lambda at: _program("tee", str(at / "tape")),
@@ -119,6 +178,8 @@ PLAYERS = {
 }
 #: What the test has opened itself, and closes after it.
 _opened = ExitStack()
+#: The sound server of the test that runs.
+_sinks: list[Sink] = []
 
 every = pytest.mark.parametrize("case", PLAYERS.values(), ids=PLAYERS)
 
@@ -130,8 +191,11 @@ def those(what: str) -> pytest.MarkDecorator:
 
 
 @pytest.fixture(autouse=True)
-def nothing_left() -> Iterator[None]:
+def nothing_left(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Assert after each test that its players have left nothing open, and nothing that runs."""
+    for name, value in sink.env.items():
+        monkeypatch.setenv(name, value)
+    _sinks[:] = [sink]
     before = _left()
     with _opened:
         yield

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -11,6 +12,9 @@ from talkcli.engine.players import PACKAGES, PLAYERS, commands
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.choice import Players
 from talkcli.engine.players.program import ProgramPlayer
+
+if TYPE_CHECKING:
+    from tests.support.sink import Sink
 
 #: Sets which programs can be run.
 There = Callable[[set[str]], None]
@@ -45,7 +49,9 @@ def test_the_device_is_given_in_the_players_own_words(there: There, player: str,
     assert "16000" in " ".join(command.argv) or b"\x80\x3e\x00\x00" in command.preamble
 
 
-def test_a_player_with_a_name_that_is_no_program_is_built_in() -> None:
+def test_a_player_with_a_name_that_is_no_program_is_built_in(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in sink.env.items():
+        monkeypatch.setenv(name, value)
     for name in PLAYERS.keys() - PACKAGES.keys():
         (opens,) = Players(protocol.Configure(0, None, name, None, None)).candidates(22050)
         player = opens()

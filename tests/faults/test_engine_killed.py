@@ -80,7 +80,8 @@ def test_engine_process_signalled_while_idle(talk: Talk, sink: Sink, number: sig
 
 
 @signals(signal.SIGSEGV, signal.SIGSTOP)
-def test_engine_process_signalled_in_synthesis(talk: Talk, sink: Sink, number: signal.Signals) -> None:
+def test_engine_process_signalled_in_synthesis(make_talk: MakeTalk, sink: Sink, number: signal.Signals) -> None:
+    talk = make_talk("--player", "aplay", sink=sink)
     with limits():
         with nothing_left(talk), sink.record() as recording:
             goal = begin(talk, LONG)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     Samples = npt.NDArray[np.int16]
 
-__all__ = ["RATE", "Rendering", "Sentence", "render", "render_with_words"]
+__all__ = ["RATE", "Rendering", "Sentence", "played", "render", "render_with_words"]
 
 _PROGRAM = os.path.join(os.path.dirname(os.path.abspath(__file__)), "espeak.py")
 
@@ -69,6 +69,11 @@ def render(
     plain = Sentence("", rate, volume, voice, pitch)
     asked = [replace(plain, text=each) if isinstance(each, str) else each for each in sentences]
     return [each.samples for each in render_with_words(asked, timeout=timeout)]
+
+
+def played(samples: Samples) -> Samples:
+    """Return a sentence as it is played where none was spoken before it: from the first sample on that is not zero."""
+    return samples[np.argmax(samples != 0) :]
 
 
 def render_with_words(sentences: Sequence[str | Sentence], *, timeout: float = 30) -> list[Rendering]:

@@ -49,7 +49,7 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
         self._module = ""
         with contextlib.ExitStack() as stack:
             self.directory = stack.enter_context(short_directory("sink-"))
-            self._socket = f"{self.directory}/pulse.sock"
+            self.socket = f"{self.directory}/pulse.sock"
             self._write_settings()
             stack.callback(self._end)
             self.start_server()
@@ -67,7 +67,7 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
         """The variables with which a child's aplay and pacat play into this sink."""
         return {
             "HOME": self.directory,
-            "PULSE_SERVER": f"unix:{self._socket}",
+            "PULSE_SERVER": f"unix:{self.socket}",
             "PULSE_RUNTIME_PATH": self.directory,
             "PULSE_STATE_PATH": self.directory,
             "PULSE_COOKIE": f"{self.directory}/cookie",
@@ -101,15 +101,15 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
 
     def suspend(self) -> None:
         """Suspend the sink: players' data is taken no more, nothing is heard."""
-        self._pactl("suspend-sink", _NAME, "1")
+        self.pactl("suspend-sink", _NAME, "1")
 
     def resume(self) -> None:
         """Let a suspended sink go on."""
-        self._pactl("suspend-sink", _NAME, "0")
+        self.pactl("suspend-sink", _NAME, "0")
 
     def unload(self) -> None:
         """Take the sink away, as if a device were unplugged: its streams are killed, there is no other sink."""
-        self._pactl("unload-module", self._module)
+        self.pactl("unload-module", self._module)
         self._module = ""
         if self._monitor:
             self._monitor.close()
@@ -120,7 +120,7 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
 
         One that is not `warm` is there at once, as a robot would find it: its first sound comes 1 to 2 s late.
         """
-        self._module = self._pactl("load-module", *_NULL_SINK).strip()
+        self._module = self.pactl("load-module", *_NULL_SINK).strip()
         self._monitor = Monitor(self._child(), f"{_NAME}.monitor", self._taps, self._changed)
         if warm:
             self._warm_up()
@@ -146,9 +146,9 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
     def start_server(self, *, warm: bool = True) -> None:
         """Start the sound server and its sink, as `reload()` does; again after `kill_server()`."""
         with contextlib.suppress(FileNotFoundError):
-            os.unlink(self._socket)
+            os.unlink(self.socket)
         options = ["-n", "--daemonize=no", "--exit-idle-time=-1", "--use-pid-file=no", "--disable-shm=yes"]
-        native = f"module-native-protocol-unix auth-anonymous=1 auth-cookie-enabled=0 socket={self._socket}"
+        native = f"module-native-protocol-unix auth-anonymous=1 auth-cookie-enabled=0 socket={self.socket}"
         with open(f"{self.directory}/log", "ab") as log:
             self._server = subprocess.Popen(
                 dying_with_parent(["pulseaudio", *options, "--log-target=stderr", "--log-level=warn", "-L", native]),
@@ -170,12 +170,13 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
 
     def _write_settings(self) -> None:
         with open(f"{self.directory}/.asoundrc", "w", encoding="utf-8") as file:
-            where = f'type pulse server "unix:{self._socket}"'
+            where = f'type pulse server "unix:{self.socket}"'
             file.write(f"pcm.!default {{ {where} }}\nctl.!default {{ {where} }}\n")
         with open(f"{self.directory}/client.conf", "w", encoding="utf-8") as file:
             file.write("autospawn = no\nenable-shm = no\n")
 
-    def _pactl(self, *words: str) -> str:
+    def pactl(self, *words: str) -> str:
+        """Run pactl and return what it printed."""
         done = subprocess.run(
             ["pactl", *words], env=self._child(), capture_output=True, text=True, timeout=_START, check=False
         )
@@ -187,7 +188,7 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
         end = time.monotonic() + _START
         while True:
             with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
-                probe.connect(self._socket)
+                probe.connect(self.socket)
                 return
             if self._running().poll() is not None or time.monotonic() > end:
                 with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as log:

@@ -58,8 +58,8 @@ class Known:
     package: str = ""
     #: makes the program's command, of the samples per second and a device; None for a player that is no program
     command: Callable[[int, str | None], Command] | None = None
-    #: … and opens that one, of the same
-    opens: Callable[[int, str | None], Player] | None = None
+    #: … and opens that one, of the same, and of whether it is to fail where it is muted
+    opens: Callable[[int, str | None, bool], Player] | None = None
 
 
 def _aplay(rate: int, device: str | None) -> Command:
@@ -95,19 +95,27 @@ def _au_header(rate: int) -> bytes:
     return b"dns." + struct.pack("<5I", 24, endless, pcm16, rate, 1)
 
 
-def _null(rate: int, _: str | None) -> Player:
+def sound_server(rate: int, device: str | None = None, audible: bool = False) -> Player:
+    """Open a player that speaks to the sound server; CannotSpeak."""
+    from talkcli.engine.players.pulse import PulsePlayer
+
+    return PulsePlayer(rate, device, audible=audible)
+
+
+def _null(rate: int, _device: str | None, _audible: bool) -> Player:
     from talkcli.engine.players.null import NullPlayer
 
     return NullPlayer(rate)
 
 
-#: The players that `talk` knows by name. The programs among them are tried in this order where none is named: `aplay`
-#: first, as it opens the device before it reads, so that a failure is known before a sample is lost, and as it is there
-#: on a robot without a desktop.
+#: The players that `talk` knows by name. Where none is named the sound server is asked first: it begins at once, and
+#: tells more than any program. Then the programs are tried, in this order: `aplay` first, as it opens the device before
+#: it reads, so that a failure is known before a sample is lost, and as it is there on a robot without a desktop.
 PLAYERS = {
     "aplay": Known("ALSA", "alsa-utils", _aplay),
     "pacat": Known("PulseAudio", "pulseaudio-utils", _pacat),
     "pw-cat": Known("PipeWire", "pipewire-bin", _pw_cat),
+    "pulse": Known("the sound server, PulseAudio's or PipeWire's", "libpulse0", opens=sound_server),
     "null": Known("silent, in real time", opens=_null),
 }
 #: How the player begins that is a file; its path follows.

@@ -10,6 +10,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Protocol
+
+    from talkcli.goals.goal import Output
 else:
     Protocol = object
 
@@ -24,11 +26,15 @@ Interest = tuple[int, int]
 
 
 class CannotSpeak(Exception):
-    """The sentence cannot be spoken (any further): `reason` is for programs, the text for people."""
+    """The sentence cannot be spoken (any further): `reason` is for programs, the text for people.
 
-    def __init__(self, reason: str, message: str) -> None:
+    `final`: no other player would be heard either, so none is tried.
+    """
+
+    def __init__(self, reason: str, message: str, *, final: bool = False) -> None:
         super().__init__(message)
         self.reason = reason
+        self.final = final
 
 
 class Stopped(Exception):
@@ -64,6 +70,11 @@ class Player(Protocol):
     #: again; a player that never lets go of what it was offered may be born with it.
     proven: bool
 
+    @property
+    def output(self) -> Output | None:
+        """Where the sound goes, and how loud; None as long as that isn't known, for ever where it can't be."""
+        return None
+
     def offer(self, data: memoryview) -> int:
         """Take what fits now and return its length, which may end within a sample; 0 if it is full.
 
@@ -78,6 +89,13 @@ class Player(Protocol):
         `close` it may count what the player has still to take. The word clock starts where it begins to grow, and is
         held back by it.
         """
+
+    def heard(self) -> float | None:
+        """Return the seconds of its stream that are heard by now, where the output has a clock; None where it has none.
+
+        0 until it begins to be heard. Words and pauses go by this then, and not by what was consumed.
+        """
+        return None
 
     def close(self) -> None:
         """Take note that no more samples follow: what was taken is played to its end. CannotSpeak if that is lost."""
@@ -108,7 +126,7 @@ class Player(Protocol):
         """
 
 
-class BuiltIn:
+class BuiltIn(Player):
     """What the players that are no programs have in common: what they took is gone at once, and so are they."""
 
     proven = True

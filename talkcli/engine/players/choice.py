@@ -6,11 +6,12 @@ took: none is open between two. That the next one is tried where a player fails 
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import deque
 from functools import partial
 
-from talkcli.engine.players import FILE, PLAYERS, commands
+from talkcli.engine.players import FILE, PLAYERS, commands, sound_server
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from talkcli.engine.players.base import Player
-    from talkcli.engine.protocol import Configure
+    from talkcli.engine.protocol import Configure, Say
+    from talkcli.goals.goal import Output
 
 #: Seconds after which a device that was let go of counts as idle, and gets the lead-in again: the power saving of sound
 #: cards (snd_hda_intel) begins after 1 s where it is on, sound servers suspend a device after 5 s. Silence counts as
@@ -56,6 +58,11 @@ class Gap:
         #: the player of the sentence before, and when its last sample was to be heard; None if nothing waited behind it
         self._before: tuple[str, float] | None = None
 
+    @property
+    def follows(self) -> bool:
+        """Whether the sentence that begins comes right behind another."""
+        return self._before is not None
+
     def allowance(self, player: str) -> float:
         """Return the seconds of silence that can be left out at the end of a sentence by this player."""
         took = sorted(self._took.get(player, ()))
@@ -81,13 +88,19 @@ class Players:
         self._inherited = inherited
         #: opens the player that is no program, for samples per second; None where programs play
         self._built_in = self._opens()
-        #: whether what plays is a program, which takes a while to start
-        self.is_program = self._built_in is None
+        #: whether what plays takes the time of its sound, and a while to begin: all but a file
+        self.takes_time = configure.output is None and not (configure.player or "").startswith(FILE)
+        #: whether nothing says what is to play
+        self._any = configure.player is configure.device is None
         self._streaming = False
         #: what lies between two sentences
         self.gap = Gap()
+        #: where the sentence in hand goes, and how loud, as far as that is known
+        self.output: Output | None = None
         #: milliseconds of silence that the sentence in hand brings along; None for what it was told at the start
         self._own_lead_in: int | None = None
+        #: whether the sentence in hand is to fail where it is muted
+        self._audible = configure.audible
         #: the name of the player by which a sentence was played whole, the last time
         self.worked: str | None = None
         self._used_at: float | None = None
@@ -96,13 +109,21 @@ class Players:
         """Return what opens the players to try for a sentence, best first; CannotSpeak if there is none."""
         if self._built_in is not None:
             return [partial(self._built_in, rate)]
-        found = commands(self._configure.player, self._configure.device, rate, self.worked)
-        return [partial(ProgramPlayer, command, self._inherited) for command in found]
+        server = [partial(sound_server, rate, None, self._audible)] if self._any else []
+        try:
+            found = commands(self._configure.player, self._configure.device, rate, self.worked)
+        except CannotSpeak as error:
+            if not server:
+                raise
+            return [*server, partial(_fail, error)]
+        return [*server, *(partial(ProgramPlayer, command, self._inherited) for command in found)]
 
-    def begin(self, lead_in: int | None, followed: bool) -> None:
-        """Take note of a new sentence: milliseconds of a lead-in of its own, and whether a goal waits behind it."""
-        self._own_lead_in = lead_in
-        self.gap.followed = followed
+    def begin(self, say: Say) -> None:
+        """Take note of a new sentence."""
+        self._own_lead_in = say.lead_in
+        self._audible = self._configure.audible if say.audible is None else say.audible
+        self.output = None
+        self.gap.followed = say.followed
 
     def let_go(self, silent_at: float | None = None) -> None:
         """Take note that a device was closed; `silent_at`: since when it had played nothing but silence."""
@@ -125,6 +146,11 @@ class Players:
             return WavStreamPlayer.name
         if self._configure.player is not None:
             return self._configure.player
+        if self._any:
+            with contextlib.suppress(CannotSpeak):
+                server = sound_server(1)
+                server.kill()
+                return server.name
         try:
             return commands(None, None, 1)[0].name
         except CannotSpeak:
@@ -137,8 +163,12 @@ class Players:
         if player.startswith(FILE):
             return partial(WavPlayer, player.removeprefix(FILE))
         opens = PLAYERS[player].opens if player in PLAYERS else None
-        return opens and (lambda rate: opens(rate, device))
+        return opens and (lambda rate: opens(rate, device, self._audible))
 
     def _stream(self, output: int, rate: int) -> WavStreamPlayer:
         first, self._streaming = not self._streaming, True
         return WavStreamPlayer(output, rate, first=first)
+
+
+def _fail(error: CannotSpeak) -> Player:
+    raise error

@@ -14,7 +14,7 @@ import struct
 import termios
 import time
 
-from talkcli.engine.players.base import CannotSpeak
+from talkcli.engine.players.base import CannotSpeak, Player
 from talkcli.engine.players.child import Child, is_held, signal_name
 from talkcli.protocol.lines import LineSplitter
 
@@ -86,7 +86,7 @@ class Complaint:
         self._first = self._first or line
 
 
-class ProgramPlayer:
+class ProgramPlayer(Player):
     """The running player of one sentence."""
 
     real_time = True

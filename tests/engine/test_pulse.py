@@ -1,0 +1,182 @@
+"""The player "pulse" at a real sound server, with a relay before it: answers between any two calls, in pieces, errors.
+
+What happens to the device (unplugged, suspended, muted, moved) is done to a real one in `tests/faults`.
+"""
+
+from __future__ import annotations
+
+import random
+import select
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from talkcli.engine.players import libpulse
+from talkcli.engine.players.base import PIECE, SAMPLE, CannotSpeak
+from talkcli.engine.players.pulse import PulsePlayer
+from tests.support.relay import Relay
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
+
+    from tests.support.sink import Sink
+
+RATE = 22050
+_PIECE = int(PIECE * RATE) * SAMPLE
+#: Seconds of sound: more than the server holds, so that it has to ask for some of it.
+SECONDS = 0.2
+SOUND = b"".join((number % 3000).to_bytes(2, "little") for number in range(int(SECONDS * RATE)))
+#: Seconds after which nothing more is awaited: there is always something that is due sooner.
+PATIENCE = 5.0
+#: The server's own numbers: access denied, no such entity, connection killed, and one that nobody knows.
+ERRORS = [1, 5, 12, 4711]
+
+
+class Rig:
+    """A player behind a relay; `wait` is as the playback's, which knows what the player says and no more."""
+
+    def __init__(self, relay: Relay) -> None:
+        self.relay = relay
+        #: seconds after which a wait that nothing ends is taken for the playback's limit; None where none is to be
+        self.limit: float | None = None
+
+    def wait(self, player: PulsePlayer) -> None:
+        until, end = player.wake_at(), time.monotonic() + (self.limit or PATIENCE)
+        while time.monotonic() < end:
+            now = time.monotonic()
+            if until is not None and now >= until:
+                return
+            own, all_of_it = select.poll(), select.poll()
+            for descriptor, events in player.interests():
+                own.register(descriptor, events)
+                all_of_it.register(descriptor, events)
+            if own.poll(0):
+                return
+            self.relay.register(all_of_it)
+            due = end if until is None else min(until, end)
+            # a piece that is left is handed on at once
+            all_of_it.poll(0 if self.relay.waiting and self.limit is None else max(0.0, due - now) * 1000)
+            self.relay.pump()
+        if self.limit is not None:
+            raise CannotSpeak("silent", "nothing came any more")
+        raise AssertionError(f"nothing has woken it in {PATIENCE:g} s")
+
+    def end(self) -> CannotSpeak | None:
+        """Play the sound and return how that failed; None if it has ended well."""
+        player = None
+        try:
+            player = PulsePlayer(RATE)
+            self.play(player)
+        except CannotSpeak as error:
+            return error
+        finally:
+            if player is not None:
+                player.kill()
+                assert player.gone()
+        return None
+
+    def play(self, player: PulsePlayer, sound: bytes = SOUND) -> None:
+        sent = 0
+        while sent < len(sound):
+            taken = player.offer(memoryview(sound)[sent : sent + _PIECE])
+            sent += taken
+            player.consumed()
+            if not taken:
+                self.wait(player)
+        player.close()
+        while not player.ended():
+            self.wait(player)
+
+
+@pytest.fixture
+def rig(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> Callable[[], AbstractContextManager[Rig]]:
+    """Puts a fresh relay before the sound server."""
+    for name, value in sink.env.items():
+        monkeypatch.setenv(name, value)
+
+    @contextmanager
+    def make() -> Iterator[Rig]:
+        with short_directory("relay-") as folder, Relay(f"{folder}/s", sink.socket) as relay:
+            monkeypatch.setenv("PULSE_SERVER", f"unix:{folder}/s")
+            yield Rig(relay)
+
+    return make
+
+
+@contextmanager
+def answered_between_calls(monkeypatch: pytest.MonkeyPatch, answer: Callable[[], None]) -> Iterator[None]:
+    """Have something happen before every single call of libpulse."""
+    library = libpulse.load()
+
+    class Interposed:
+        def __getattr__(self, name: str) -> Any:
+            function = getattr(library, name)
+
+            def call(*arguments: Any) -> Any:
+                answer()
+                return function(*arguments)
+
+            return call
+
+    with monkeypatch.context() as patch:
+        patch.setattr(libpulse, "load", Interposed)
+        yield
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_wakeup_is_lost_whenever_the_server_answers_and_in_whatever_pieces(
+    rig: Callable[[], AbstractContextManager[Rig]], monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    chance = random.Random(seed)
+    with rig() as behind:
+        behind.relay.piece = chance.choice([7, 19, 64, 65536])
+
+        def answer() -> None:
+            if chance.random() < 0.5:
+                behind.relay.pump()
+
+        with answered_between_calls(monkeypatch, answer):
+            player = PulsePlayer(RATE)
+            began = time.monotonic()
+            behind.play(player)
+            took = time.monotonic() - began
+            assert player.consumed() == len(SOUND)
+            player.kill()
+    assert SECONDS <= took < SECONDS + 1
+
+
+@pytest.mark.parametrize("number", ERRORS)
+def test_an_error_at_any_step_is_the_end_in_words_or_no_matter(
+    rig: Callable[[], AbstractContextManager[Rig]], number: int
+) -> None:
+    ends = []
+    for step in range(8):
+        with rig() as behind:
+            behind.relay.error = (step, number)
+            ends.append(behind.end())
+    # hello and auth, the client's name, the stream; what is asked besides is no matter
+    assert [end is None for end in ends[:3]] == [False] * 3, ends
+    assert {end.reason for end in ends if end is not None} <= {"audio_device", "audio_lost"}
+
+
+@pytest.mark.parametrize("hush", [False, True], ids=["cut", "silent"])
+def test_a_connection_that_ends_anywhere_is_the_end_in_words(
+    rig: Callable[[], AbstractContextManager[Rig]], hush: bool
+) -> None:
+    with rig() as behind:
+        assert behind.end() is None
+        whole = behind.relay.handed_on
+    for at in range(0, whole // 2, 61):  # how often it tells the time is by chance; in the half of it nothing has ended
+        with rig() as behind:
+            if hush:
+                behind.relay.hushed_at = at
+                behind.limit = 0.05
+            else:
+                behind.relay.cut_at = at
+            end = behind.end()
+            assert end is not None, f"it ended well with {at} of {whole} bytes"
+            assert end.reason in {"audio_device", "audio_lost", "silent"}
