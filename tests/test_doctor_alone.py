@@ -102,7 +102,7 @@ def test_with_sound_and_no_server_its_own_engine_is_heard_and_the_server_is_what
     assert extent(recording.samples)
     assert {each["check"] for each in found.values() if each["state"] == "failed"} == {"socket"}
     assert found["socket"]["next"] == "unset TALK_SOCKET, or start a server there: talk serve"
-    assert "by an engine of this command's own, aplay" in found["sentence"]["message"]
+    assert "by an engine of this command's own, pulse" in found["sentence"]["message"]
     assert "server" not in found
 
 

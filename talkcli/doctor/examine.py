@@ -12,7 +12,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.doctor import machine, sentence, server, sound, voice
-from talkcli.engine.players import PACKAGES, is_silent
+from talkcli.engine.players import PLAYERS, is_silent
 from talkcli.engine.synthesizers import is_own
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
@@ -91,13 +91,13 @@ class Examination:
             return  # it plays by itself
         wanted, device = self._player(), self._told("device")
         players = sound.players(env, wanted)
-        used = wanted or next(iter(players.found), None)
-        devices = sound.devices(env, used, device)
         cards, found = machine.cards(here), sound.sound_server(env, here)
+        used = wanted or ("pulse" if found.name else next(iter(players.found), None))
+        devices = sound.devices(env, used, device)
         self._hangs = found.hangs
         yield from sound.judge(players, devices, cards, found, here, running=running)
         if not is_silent(wanted):
-            default = device is None and used in PACKAGES
+            default = device is None and used in PLAYERS
             yield from sound.judge_levels(sound.levels(env, found, cards), default=default)
 
     def _sentence(
@@ -131,7 +131,7 @@ class Examination:
         player = self._told("player")
         if is_silent(player):
             player = "null"  # a file would get a sentence more, perhaps in the middle of one of the server's
-        elif player in PACKAGES and not machine.names_a_player(process, env):
+        elif player in PLAYERS and not machine.names_a_player(process, env):
             player = None  # that one is the first that the server tries, and not the only one
         return voice.Setting(
             player, self._told("device"), self._told("voice"), self._interrupt, self._told("driver"), env

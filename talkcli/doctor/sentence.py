@@ -38,6 +38,7 @@ REMEDIES = {
     "audio_device": "plug in and switch on the loudspeaker, close what else plays, and try: aplay -l",
     "audio_lost": "look whether the loudspeaker was unplugged, and try another: talk serve --device NAME",
     "audio_stalled": "wake the device (pactl suspend-sink @DEFAULT_SINK@ 0), or restart the sound server",
+    "muted": "undo it: pactl set-sink-mute @DEFAULT_SINK@ 0; pactl set-sink-volume @DEFAULT_SINK@ 70%",
     "engine_failed": "install what the message names, into the Python that serves",
     "engine_crashed": "run talk doctor again; if it comes back, try another voice: talk set --voice en",
     "engine_hung": "run talk doctor again on a machine that is less busy",

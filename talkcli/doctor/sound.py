@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor.machine import judge_access, judge_cards
 from talkcli.doctor.report import Finding, done, failed, some, warning
-from talkcli.engine.players import PACKAGES, is_silent
+from talkcli.engine.players import PACKAGES, PLAYERS, is_silent
 from talkcli.engine.players.devices import sound_servers
 from talkcli.frozen import frozen
 
@@ -38,6 +38,8 @@ _SERVER, _LOUDNESS = "sound server", "loudness"
 _FAINT = 20
 #: ALSA's controls that a loudspeaker hangs on, as `amixer scontrols` names them.
 _CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
+#: What a sound server plays to that has nothing else, as `engine.players.pulse` knows it.
+_DUMMY = "auto_null"
 #: What a sound server's mixer tells of; and, by its program, what undoes a mute of it and what makes it louder.
 _SINK = "the default sink"
 _PACTL = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
@@ -168,7 +170,7 @@ def _read(descriptor: int) -> str:
 def is_custom(player: str | None) -> bool:
     """Tell whether a player is a command of the user's own: what another program needs, only its user knows."""
     program = program_of(player) if player and not is_silent(player) else None
-    return program is not None and program.rpartition("/")[2] not in PACKAGES
+    return program is not None and program.rpartition("/")[2] not in PLAYERS
 
 
 def program_of(command: str) -> str | None:
@@ -183,7 +185,7 @@ def players(env: Mapping[str, str], wanted: str | None) -> Players:
     """Return which players there are; `wanted`: the setting."""
     found = tuple(each for each in PACKAGES if path_of(each, env))
     program = program_of(wanted or "")
-    return Players(found, wanted, runs=bool(program and path_of(program, env)))
+    return Players(found, wanted, runs=program == "pulse" or bool(program and path_of(program, env)))
 
 
 def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> Devices | None:
@@ -206,6 +208,10 @@ def _sinks(said: Said) -> list[tuple[str, str]]:
     return [(each[1], each[-1].strip()) for each in lines if said.trouble is None and len(each) > 2]
 
 
+def _sink_names(said: Said) -> list[str]:
+    return [name for name, _ in _sinks(said)]
+
+
 def _node_names(said: Said) -> list[str]:
     nodes = re.split(r"^\s*id \d+,", said.out, flags=re.MULTILINE)
     found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
@@ -216,7 +222,8 @@ _SINKS = "pactl list short sinks"
 #: How the devices of a player are listed, and read from what that says.
 _LISTING: dict[str | None, tuple[str, Callable[[Said], list[str]]]] = {
     "aplay": ("aplay -L", _alsa_names),
-    "pacat": (_SINKS, lambda said: [name for name, _ in _sinks(said)]),
+    "pulse": (_SINKS, _sink_names),
+    "pacat": (_SINKS, _sink_names),
     "pw-cat": ("pw-cli ls Node", _node_names),
 }
 
@@ -296,7 +303,7 @@ def judge(
     """Judge what plays; `running`: whether a talk server runs, which has a player of its own, and set by itself."""
     served = server.name is not None
     return judge_silent(players.wanted, running=running) or [
-        _player(players, running=running),
+        _player(players, server, running=running),
         *([] if devices is None else [_device(devices)]),
         judge_cards(cards, session, served=served),
         judge_access(cards, session, served=served),
@@ -309,9 +316,12 @@ def _by(running: bool) -> str:
     return "the server's" if running else "TALK_PLAYER"
 
 
-def _player(players: Players, *, running: bool) -> Finding:
+def _player(players: Players, server: SoundServer, *, running: bool) -> Finding:
     wanted, found = players.wanted, players.found
     broken = warning if running else failed
+    if wanted is None and server.name is not None:
+        after = f"; then {', '.join(found)}" if found else ""
+        return done("player", f"pulse is used, by the sound server{after}")
     if wanted is None and not found:
         first = next(iter(PACKAGES.values()))
         return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {first}")
@@ -347,6 +357,9 @@ def _device(devices: Devices) -> Finding:
 
 def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Finding:
     where = "from here" if session.server is None else f"from the server (process {session.server})"
+    if server.name is not None and server.sink == _DUMMY:
+        step = "plug in a loudspeaker, and look whether it is there: pactl list short sinks"
+        return warning(_SERVER, f"{server.name} has only a dummy output, {_DUMMY}: nobody hears it", step)
     if server.name is not None:
         sink = f", plays to {server.sink}" if server.sink else ""
         return done(_SERVER, f"{server.name}{sink}")

@@ -8,6 +8,7 @@ from talkcli.doctor import machine, sound
 from talkcli.doctor.machine import Cards, Session
 from talkcli.doctor.report import DONE, FAILED, WARNING, Finding
 from talkcli.doctor.sound import Devices, Level, Players, SoundServer
+from talkcli.engine.players.pulse import DUMMY
 from talkcli.frozen import replace
 
 PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)
@@ -38,6 +39,21 @@ def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
     assert [each.check for each in found] == ["player", "device", "cards", "group", "sound server"]
     assert {each.state for each in found} == {DONE}, found
     assert found[0].message == "aplay is used; then pacat"
+
+
+def test_a_sound_server_that_answers_is_played_to_without_a_program() -> None:
+    assert judged("player", server=PULSE).message == "pulse is used, by the sound server; then aplay, pacat"
+    alone = judged("player", Players((), None), server=PULSE)
+    assert (alone.state, alone.message) == (DONE, "pulse is used, by the sound server")
+    assert judged("player", Players((), "pulse"), server=PULSE, running=True).message == "pulse (the server's)"
+
+
+def test_a_sound_server_with_a_dummy_alone_is_heard_by_nobody() -> None:
+    found = judged("sound server", server=replace(PULSE, sink=DUMMY))
+    assert (found.state, found.next) == (
+        WARNING, "plug in a loudspeaker, and look whether it is there: pactl list short sinks"
+    )  # fmt: skip
+    assert "has only a dummy output, auto_null: nobody hears it" in found.message
 
 
 def test_no_player_names_the_package() -> None:
