@@ -92,6 +92,9 @@ class PulsePlayer(Player):
         self._on_stream = libpulse.SinkInputTold(self._stream_told)
         self._loop: libpulse.Loop | None = libpulse.Loop(self._lib)
         self._context = self._lib.context_new(self._loop.api, b"talk")
+        if self._context is None:
+            self._loop.free()
+            raise CannotSpeak("no_player", "libpulse makes no connection: is there enough memory?")
         self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)  # its state tells how that went
         self._go_on()
         if self._failed is not None:
@@ -122,7 +125,7 @@ class PulsePlayer(Player):
         """Return the seconds of its stream that are heard by now."""
         if self._drained:
             self._heard = self._written
-        elif self.proven:
+        elif self.proven and self._loop is not None:
             told = c_uint64()
             if self._lib.stream_get_time(self._stream, byref(told)) == 0:
                 heard = told.value * self._rate // 1_000_000 * SAMPLE
@@ -217,6 +220,9 @@ class PulsePlayer(Player):
         sizes = libpulse.BufferSizes(2 * held, held, start, asked, libpulse.NONE)
         spec = libpulse.SampleSpec(libpulse.S16LE, self._rate, 1)
         self._stream = self._lib.stream_new(self._context, b"talk", byref(spec), None)
+        if self._stream is None:
+            self._fail("audio_device")
+            return False
         self._lib.stream_set_started_callback(self._stream, self._on_started, None)
         flags = libpulse.ADJUST_LATENCY | libpulse.INTERPOLATE_TIMING | libpulse.AUTO_TIMING_UPDATE
         wanted = None if self._wanted is None else self._wanted.encode()
