@@ -93,7 +93,7 @@ class Examination:
         players = sound.players(env, wanted)
         cards, found = machine.cards(here), sound.sound_server(env, here)
         used = wanted or ("pulse" if found.name else next(iter(players.found), None))
-        devices = sound.devices(env, used, device)
+        devices = None if used == "pulse" and found.hangs else sound.devices(env, used, device)
         self._hangs = found.hangs
         yield from sound.judge(players, devices, cards, found, here, running=running)
         if not is_silent(wanted):

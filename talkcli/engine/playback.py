@@ -148,7 +148,8 @@ class Playback:
         if self._stream is None:
             return
         player = self._stream.player
-        self._players.output = player.output
+        if player.proven:
+            self._players.tell(player.output)
         player.kill()
         limit = time.monotonic() + GONE_WITHIN
         while not player.gone():
@@ -196,6 +197,8 @@ class Playback:
         proven = stream is not None and stream.player.proven
         lost = proven or error.final or (stream is not None and error.reason == "audio_stalled")
         if lost or not (self._candidates or self._is_busy(first)):
+            if stream is not None:
+                self._players.tell(stream.player.output)
             raise error if lost else first
         self._leave()
         if not self._candidates:
@@ -313,9 +316,9 @@ class Playback:
         last = self._complete and self._sent == self._audible_end(stream)
         stream.tick(now, last=last and not self._session.held)
         player = stream.player
-        self._players.output = player.output
         if not player.proven:
             return
+        self._players.tell(player.output)
         if stream.taken and not self._began:
             self._began = True
             self._players.gap.began(player.name, now - self._clock.elapsed(now))

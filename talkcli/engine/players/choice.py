@@ -15,6 +15,7 @@ from talkcli.engine.players import FILE, PLAYERS, commands, sound_server
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
+from talkcli.frozen import replace
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -124,6 +125,11 @@ class Players:
         self._audible = self._configure.audible if say.audible is None else say.audible
         self.output = None
         self.gap.followed = say.followed
+
+    def tell(self, output: Output | None) -> None:
+        """Take note of where the sentence in hand goes now; that it was muted before is not forgotten."""
+        before = self.output
+        self.output = replace(output, muted=True) if output and before and before.muted else output or before
 
     def let_go(self, silent_at: float | None = None) -> None:
         """Take note that a device was closed; `silent_at`: since when it had played nothing but silence."""

@@ -38,6 +38,10 @@ SETTLED_AFTER = 0.1
 #: it. No other is taken for one: echo cancellers, remaps, tunnels and effects lead on to a real device.
 DUMMY = "auto_null"
 
+#: Seconds within which the server must have made the stream: it takes 1 to 20 ms. One that hangs is not waited for:
+#: nothing was given to it, and another player may be heard.
+READY_WITHIN = 2.0
+
 #: Seconds for which the sink may be suspended under a stream: one that slept is awake again before the stream begins.
 SUSPENDED_FOR = 0.5
 
@@ -76,7 +80,10 @@ class PulsePlayer(Player):
         self._index = libpulse.NONE
         #: until when a volume of 0 means nothing
         self._settled_at = 0.0
+        self._ready_by = time.monotonic() + READY_WITHIN
         self._suspended_at: float | None = None
+        #: questions about the stream that are not answered
+        self._asked = 0
         self._of_sink: Loudness | None = None
         self._of_stream: Loudness | None = None
         #: whether it was muted at any time, and whether the server won't say how loud it is
@@ -152,6 +159,8 @@ class PulsePlayer(Player):
         if self._failed is not None or self._drained or self._room():
             return 0.0
         moments = [self._loop.due if self._loop is not None else None]
+        if self._index == libpulse.NONE:
+            moments.append(self._ready_by)
         if self._suspended_at is not None:
             moments.append(self._suspended_at + SUSPENDED_FOR)
         if self._is_settling():
@@ -167,7 +176,7 @@ class PulsePlayer(Player):
             self._lib.stream_unref(self._stream)
         self._lib.context_unref(self._context)
         self._loop.free()
-        self._loop = None
+        self._loop = self._stream = None
         self._failed = self._failed or CannotSpeak("audio_lost", "the stream was ended")
 
     def gone(self) -> bool:
@@ -205,14 +214,17 @@ class PulsePlayer(Player):
         if state in (libpulse.CONTEXT_FAILED, libpulse.CONTEXT_TERMINATED):
             self._fail("audio_device" if self._written == 0 else "audio_lost")
             return False
+        if self._index == libpulse.NONE and time.monotonic() >= self._ready_by:
+            self._failed = CannotSpeak("audio_device", f"the sound server does not answer within {READY_WITHIN:g} s")
+            return False
         if self._stream is None:
             return state == libpulse.CONTEXT_READY and self._open()
         state = self._lib.stream_get_state(self._stream)
         if state in (libpulse.STREAM_FAILED, libpulse.STREAM_TERMINATED):
             self._fail("audio_device" if self._written == 0 else "audio_lost")
         elif state == libpulse.STREAM_READY:
-            self._look_at_sink()
-            return self._closed and not self._draining and self._failed is None and self._drain()
+            asked = self._look_at_sink()
+            return asked or (self._closed and not self._draining and self._failed is None and self._drain())
         return False
 
     def _open(self) -> bool:
@@ -230,10 +242,11 @@ class PulsePlayer(Player):
             self._fail("audio_device")
         return True
 
-    def _look_at_sink(self) -> None:
-        """See which sink it is by now, and whether that takes sound."""
-        index = self._lib.stream_get_device_index(self._stream)
-        if index != self._index:
+    def _look_at_sink(self) -> bool:
+        """See which sink it is by now, and whether that takes sound; return whether the server was asked anything."""
+        index = int(self._lib.stream_get_device_index(self._stream))
+        asks = index != self._index
+        if asks:
             begins, self._index = self._index == libpulse.NONE, index
             self._settled_at = time.monotonic() + SETTLED_AFTER if begins else self._settled_at
             self.device = (self._lib.stream_get_device_name(self._stream) or b"").decode("utf-8", "replace")
@@ -248,16 +261,18 @@ class PulsePlayer(Player):
         self._judge()
         if not self._lib.stream_is_suspended(self._stream):
             self._suspended_at = None
-            return
+            return asks
         now = time.monotonic()
         self._suspended_at = self._suspended_at or now
         if now >= self._suspended_at + SUSPENDED_FOR:
             self._failed = CannotSpeak("audio_stalled", f"the sound server has suspended {self.device}")
+        return asks
 
     def _ask_sink(self) -> None:
         self._begin(self._lib.context_get_sink_info_by_index(self._context, self._index, self._on_sink, None))
 
     def _ask_stream(self) -> None:
+        self._asked += 1
         number = self._lib.stream_get_index(self._stream)
         self._begin(self._lib.context_get_sink_input_info(self._context, number, self._on_stream, None))
 
@@ -275,7 +290,7 @@ class PulsePlayer(Player):
             self._ask_stream()
 
     def _sink_told(self, _context: int, found: Any, over: int, _data: object) -> None:
-        if over == 0:
+        if over == 0 and found[0].index == self._index:  # else it is of a sink that it has left
             flat = bool(found[0].flags & libpulse.FLAT_VOLUME)
             self._of_sink = Loudness(libpulse.loudness(found[0].volume), bool(found[0].mute), flat)
             self._judge()
@@ -283,6 +298,7 @@ class PulsePlayer(Player):
             self._untold = True
 
     def _stream_told(self, _context: int, found: Any, over: int, _data: object) -> None:
+        self._asked -= over != 0
         if over == 0:
             self._of_stream = Loudness(libpulse.loudness(found[0].volume), bool(found[0].mute))
             self._judge()
@@ -292,7 +308,9 @@ class PulsePlayer(Player):
     def _is_settling(self) -> bool:
         """Whether the stream's volume is still to be set."""
         stream = self._of_stream
-        return stream is not None and stream.volume == 0 and not stream.muted and time.monotonic() < self._settled_at
+        if stream is None or stream.volume > 0 or stream.muted or self._drained:
+            return False
+        return self._asked > 0 or time.monotonic() < self._settled_at
 
     def _judge(self) -> None:
         """Take note of whether it is muted now, for good: what was not heard doesn't become so later."""
@@ -326,9 +344,10 @@ class PulsePlayer(Player):
 
     def _drain_over(self, _stream: int, success: int, _data: object) -> None:
         if success:
+            self._look_at_sink()  # it may have been moved in the same moment
             self._settled_at = 0.0
             self._judge()
-            self._drained = self.proven = True
+            self._drained = self.proven = self._failed is None
         else:
             self._fail("audio_lost")
 
