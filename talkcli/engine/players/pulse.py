@@ -361,6 +361,8 @@ class PulsePlayer(Player):
             self._failed = CannotSpeak("no_player", f"no sound server answers: {words}")
         elif self._stream is None:
             self._failed = CannotSpeak(reason, f"the sound server lets nobody in: {words}")
+        elif self._index != libpulse.NONE:  # the number may be of a question about a sink that is gone
+            self._failed = CannotSpeak(reason, "the sound server ended the stream")
         elif number == libpulse.NO_ENTITY and self._wanted is not None:
             self._failed = CannotSpeak(
                 reason, f'the sound server has no sink "{self._wanted}": see pactl list short sinks'
