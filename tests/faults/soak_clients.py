@@ -99,7 +99,10 @@ class Senders:
         if chance.random() < 0.9:
             assert wire.request("cancel", ids=[goal["id"]])["ok"]
         if waits:
-            result = wire.receive_event("result", timeout=PATIENCE)["goal"]
+            try:
+                result = wire.receive_event("result", timeout=PATIENCE)["goal"]
+            except TimeoutError:
+                raise AssertionError(f"{goal} has not ended; the server: {self._talk.request('status')}") from None
             assert result["id"] == goal["id"], result
 
 
