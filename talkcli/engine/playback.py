@@ -149,7 +149,7 @@ class Playback:
             return
         player = self._stream.player
         if player.proven:
-            self._players.tell(player.output)
+            self._players.tell(player)
         player.kill()
         limit = time.monotonic() + GONE_WITHIN
         while not player.gone():
@@ -198,7 +198,7 @@ class Playback:
         lost = proven or error.final or (stream is not None and error.reason == "audio_stalled")
         if lost or not (self._candidates or self._is_busy(first)):
             if stream is not None:
-                self._players.tell(stream.player.output)
+                self._players.tell(stream.player)
             raise error if lost else first
         self._leave()
         if not self._candidates:
@@ -318,7 +318,7 @@ class Playback:
         player = stream.player
         if not player.proven:
             return
-        self._players.tell(player.output)
+        self._players.tell(player)
         if stream.taken and not self._began:
             self._began = True
             self._players.gap.began(player.name, now - self._clock.elapsed(now))

@@ -19,6 +19,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+    from talkcli.goals.goal import JsonObject
+
 #: Seconds between two messages of an engine process that has a goal in hand. Far below `HANG_AFTER`, so that one
 #: late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
 ALIVE_EVERY = 0.5
@@ -181,10 +183,7 @@ class Output:
     """Where the sentence goes, and how loud; as soon as that is known, and whenever it changes."""
 
     id: str
-    player: str
-    device: str
-    volume: float  # 0 to 1
-    muted: bool  # now, or earlier in the sentence
+    output: JsonObject | None  # as a goal has it; None where another player goes on that can't tell
 
 
 @frozen

@@ -20,7 +20,6 @@ from talkcli.engine import protocol
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.synthesizers.voices import list_voices
 from talkcli.engine.words import Words
-from talkcli.frozen import fields
 from talkcli.protocol.lines import LineSplitter
 
 TYPE_CHECKING = False
@@ -212,9 +211,9 @@ class Session:
 
     def _tell_output(self) -> None:
         output = self.players.output
-        if self._goal is not None and output is not None and output != self._told:
+        if self._goal is not None and output != self._told:
             self._told = output
-            self._channel.send(protocol.Output(self._goal.id, **fields(output)))
+            self._channel.send(protocol.Output(self._goal.id, output.to_json() if output else None))
 
     def confirm(self) -> None:
         """Take note that the sentence that is to be held is silent; may be called again and again."""

@@ -274,8 +274,8 @@ class Scheduler:
         record.spoken_end = max(record.spoken_end, end)
         return record
 
-    def goes_to(self, goal_id: str, output: Output) -> None:
-        """Note where the active goal's sound goes."""
+    def goes_to(self, goal_id: str, output: Output | None) -> None:
+        """Note where the active goal's sound goes, as far as that is known."""
         self._spoken(goal_id).output = output
 
     def completed(self, goal_id: str, duration: float | None, now: Now) -> list[Effect]:

@@ -351,7 +351,7 @@ class Speech:
     def _output(self, told: protocol.Output) -> None:
         active = self.scheduler.active
         if active is not None and active.id == told.id:
-            self.scheduler.goes_to(told.id, Output(told.player, told.device, told.volume, told.muted))
+            self.scheduler.goes_to(told.id, Output.from_json(told.output))
 
     def _paused(self, paused: protocol.Paused) -> None:
         active = self.scheduler.active

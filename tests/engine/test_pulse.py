@@ -15,7 +15,7 @@ import pytest
 
 from talkcli.engine.players import libpulse
 from talkcli.engine.players.base import PIECE, SAMPLE, CannotSpeak
-from talkcli.engine.players.pulse import PulsePlayer
+from talkcli.engine.players.pulse import DUMMY, PulsePlayer
 from tests.support.relay import Relay
 from tests.support.surroundings import short_directory
 
@@ -79,15 +79,21 @@ class Rig:
                 assert player.gone()
         return None
 
-    def play(self, player: PulsePlayer, sound: bytes = SOUND) -> None:
+    def play(self, player: PulsePlayer) -> None:
+        self.feed(player)
+        player.close()
+        self.await_end(player)
+
+    def feed(self, player: PulsePlayer) -> None:
         sent = 0
-        while sent < len(sound):
-            taken = player.offer(memoryview(sound)[sent : sent + _PIECE])
+        while sent < len(SOUND):
+            taken = player.offer(memoryview(SOUND)[sent : sent + _PIECE])
             sent += taken
             player.consumed()
             if not taken:
                 self.wait(player)
-        player.close()
+
+    def await_end(self, player: PulsePlayer) -> None:
         while not player.ended():
             self.wait(player)
 
@@ -180,3 +186,40 @@ def test_a_connection_that_ends_anywhere_is_the_end_in_words(
             end = behind.end()
             assert end is not None, f"it ended well with {at} of {whole} bytes"
             assert end.reason in {"audio_device", "audio_lost", "silent"}
+
+
+def test_a_move_that_is_told_together_with_the_end_is_seen(
+    rig: Callable[[], AbstractContextManager[Rig]], sink: Sink
+) -> None:
+    """To a dummy: what was played there nobody has heard."""
+    with rig() as behind, dummy_of(sink):
+        player = PulsePlayer(RATE)
+        try:
+            behind.feed(player)
+            behind.relay.hushed_at = behind.relay.handed_on
+            player.close()
+            behind.relay.pump()
+            (stream,) = sink.pactl("list", "short", "sink-inputs").splitlines()
+            sink.pactl("move-sink-input", stream.split("\t")[0], DUMMY)
+            over = time.monotonic() + 2 * SECONDS
+            while (rest := over - time.monotonic()) > 0:
+                waiting = select.poll()
+                behind.relay.register(waiting)
+                waiting.poll(rest * 1000)
+                behind.relay.pump()
+            behind.relay.hushed_at = None
+            with pytest.raises(CannotSpeak, match="only a dummy output left") as error:
+                behind.await_end(player)
+            assert (error.value.reason, error.value.final) == ("audio_lost", True)
+        finally:
+            player.kill()
+
+
+@contextmanager
+def dummy_of(sink: Sink) -> Iterator[None]:
+    """Have a dummy beside the sink, which stays the default."""
+    module = sink.pactl("load-module", "module-null-sink", f"sink_name={DUMMY}").strip()
+    try:
+        yield
+    finally:
+        sink.pactl("unload-module", module)

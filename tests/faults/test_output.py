@@ -10,6 +10,7 @@ import contextlib
 import itertools
 import os
 import signal
+import socket
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple, Protocol
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 #: Seconds in which something that a sound server tells ends a sentence.
 TOLD = 0.5
+#: Clients that either server takes at once, at most: MAX_CONNECTIONS of PulseAudio's, MAX_CLIENTS of PipeWire's.
+CLIENTS = 64
 #: A sink that counts as a device beside the one of the test.
 OTHER = "other"
 #: A session manager remembers how loud a device was by its name: each has one of its own.
@@ -39,6 +42,8 @@ _NAMES = (f"card{number}" for number in itertools.count())
 
 class Server(Protocol):
     """A sound server: PulseAudio's or PipeWire's."""
+
+    socket: str
 
     @property
     def env(self) -> Mapping[str, str]: ...
@@ -254,6 +259,21 @@ def test_a_moment_of_it_is_told_as_well(talk: Talk, server: Server, card: Card) 
     server.pactl("set-sink-mute", card.name, "0")
     ended = _ended(talk, goal)
     assert (ended["state"], ended["output"]["muted"]) == ("SUCCEEDED", True)
+
+
+# -- no place for one more
+
+
+@pytest.mark.usefixtures("card")
+def test_a_server_that_takes_no_more_clients_ends_the_sentence_in_words(make_talk: MakeTalk, server: Server) -> None:
+    talk = make_talk("--player", "pulse", env=server.env)
+    with contextlib.ExitStack() as crowd:
+        for _ in range(CLIENTS):
+            each = crowd.enter_context(socket.socket(socket.AF_UNIX))
+            each.connect(server.socket)
+        done = talk.run("say", "--wait", "--", LOW)
+        assert_aborted(talk.goal(done.id), "audio_device", "the sound server lets nobody in")
+    assert talk.run("say", "--wait", "--", LOW).code == 0
 
 
 # -- the end

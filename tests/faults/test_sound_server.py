@@ -1,8 +1,8 @@
 """The sink is suspended or unloaded, the sound server frozen or killed: goals end in time, and are heard again.
 
-A private PulseAudio each, with `aplay` and with `pacat` as players. A goal is in mid-sentence when it happens, the next
-one comes while there is no sound, and the third is sent when there is sound again. All faults are there side by side,
-each at a sound server of its own: most of it is waiting.
+A private PulseAudio each, with `aplay`, with `pacat` and with the connection of the engine's own. A goal is in
+mid-sentence when it happens, the next one comes while there is no sound, and the third is sent when there is sound
+again. All faults are there side by side, each at a sound server of its own: most of it is waiting.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.playback import FIRST_WITHIN, LOOK_EVERY, STALLED_AFTER
-from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, send
+from talkcli.engine.players.pulse import READY_WITHIN, SUSPENDED_FOR
+from tests.conformance.hearing import LONG, LOW, assert_aborted, assert_same, begin, heard, render_quick, send
 from tests.faults.broken import await_end, heard_again, nothing_left, told
 from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
@@ -36,6 +37,8 @@ AGAIN = 10.0
 TOLD = 1.0
 STALLED = STALLED_AFTER + LOOK_EVERY + 0.2
 NEVER_TAKEN = FIRST_WITHIN + LOOK_EVERY + 0.2
+SUSPENDED = SUSPENDED_FOR + 0.5
+NO_ANSWER = READY_WITHIN + 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +49,11 @@ class Fault:
     mends: Callable[[Sink], None]
     lost: tuple[str, float]
     meanwhile: tuple[str, float]
+    #: … by the player "pulse", which the server tells more
+    pulse: tuple[tuple[str, float], tuple[str, float]]
+
+    def ends(self, player: str) -> tuple[tuple[str, float], tuple[str, float]]:
+        return self.pulse if player == "pulse" else (self.lost, self.meanwhile)
 
 
 def _reload(sink: Sink) -> None:
@@ -57,21 +65,46 @@ def _restart(sink: Sink) -> None:
 
 
 FAULTS = {
-    "sink suspended": Fault(Sink.suspend, Sink.resume, ("audio_stalled", STALLED), ("audio_stalled", NEVER_TAKEN)),
-    "sink unloaded": Fault(Sink.unload, _reload, ("audio_lost", TOLD), ("audio_device", TOLD)),
-    "sound server SIGSTOP": Fault(Sink.freeze, Sink.thaw, ("audio_stalled", STALLED), ("audio_stalled", NEVER_TAKEN)),
-    "sound server SIGKILL": Fault(Sink.kill_server, _restart, ("audio_lost", TOLD), ("audio_device", TOLD)),
+    "sink suspended": Fault(
+        Sink.suspend,
+        Sink.resume,
+        ("audio_stalled", STALLED),
+        ("audio_stalled", NEVER_TAKEN),
+        (("audio_stalled", SUSPENDED), ("audio_stalled", SUSPENDED)),
+    ),
+    "sink unloaded": Fault(
+        Sink.unload,
+        _reload,
+        ("audio_lost", TOLD),
+        ("audio_device", TOLD),
+        (("audio_lost", TOLD), ("audio_device", TOLD)),
+    ),
+    "sound server SIGSTOP": Fault(
+        Sink.freeze,
+        Sink.thaw,
+        ("audio_stalled", STALLED),
+        ("audio_stalled", NEVER_TAKEN),
+        (("audio_stalled", STALLED), ("audio_device", NO_ANSWER)),
+    ),
+    "sound server SIGKILL": Fault(
+        Sink.kill_server,
+        _restart,
+        ("audio_lost", TOLD),
+        ("audio_device", TOLD),
+        (("audio_lost", TOLD), ("no_player", TOLD)),
+    ),
 }
 
 
-#: The player of each fault; the other way round shows no more, and takes as long.
+#: The player of each fault; the other way round shows no more of the programs, and takes as long.
 PLAYERS = {
     "one each": ("pacat", "aplay", "aplay", "pacat"),
     "the other": ("aplay", "pacat", "pacat", "aplay"),
+    "pulse": ("pulse",) * 4,
 }
 
 
-@pytest.mark.parametrize("players", ["one each", pytest.param("the other", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("players", ["one each", "pulse", pytest.param("the other", marks=pytest.mark.slow)])
 def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: str) -> None:
     with limits(), contextlib.ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(len(FAULTS)))
@@ -80,23 +113,24 @@ def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: str) -> None
         with contextlib.ExitStack() as idle:  # counted together: they share memory
             for talk in talks:
                 idle.enter_context(nothing_left(talk))
-            times = list(pool.map(_lose, FAULTS.values(), talks, sinks))
+            times = list(pool.map(_lose, FAULTS.values(), PLAYERS[players], talks, sinks))
         for what, player, talk, (lost, meanwhile, again) in zip(FAULTS, PLAYERS[players], talks, times, strict=True):
             talk.stop()
-            fault, case = FAULTS[what], f"{what}, {player}"
+            ends, case = FAULTS[what].ends(player), f"{what}, {player}"
             told(f"{case}: lost after, ended meanwhile after {lost:.3f}, {meanwhile:.3f} s; heard again", again)
-            assert_within(lost, fault.lost[1], f"the end of a goal, {case}")
-            assert_within(meanwhile, fault.meanwhile[1], f"the end of a goal meanwhile, {case}")
+            assert_within(lost, ends[0][1], f"the end of a goal, {case}")
+            assert_within(meanwhile, ends[1][1], f"the end of a goal meanwhile, {case}")
             assert_within(again, AGAIN, f"the next goal, {case}")
 
 
-def _lose(fault: Fault, talk: Talk, sink: Sink) -> tuple[float, float, float]:
+def _lose(fault: Fault, player: str, talk: Talk, sink: Sink) -> tuple[float, float, float]:
     """Have a fault, mended at last; return after how many seconds goals ended, and one was heard again."""
+    in_hand, next_one = (reason for reason, _ in fault.ends(player))
     goal = begin(talk, LONG)
     broken = time.monotonic()
     fault.breaks(sink)
-    lost = _ends(talk, goal, fault.lost[0], broken)
-    meanwhile = _ends(talk, send(talk, LOW), fault.meanwhile[0], time.monotonic())
+    lost = _ends(talk, goal, in_hand, broken)
+    meanwhile = _ends(talk, send(talk, LOW), next_one, time.monotonic())
     fault.mends(sink)
     returned = time.monotonic()
     return lost, meanwhile, heard_again(talk, sink) - returned
@@ -123,3 +157,24 @@ def test_sound_server_that_hangs_while_the_engine_starts(make_talk: MakeTalk, tm
         talk = make_talk("--player", "null", env={"PULSE_SERVER": f"unix:{tmp_path / 's'}"})
         done = talk.run("say", "--wait", "--timeout", "8", LOW)
         assert (done.code, done.err) == (0, "")
+
+
+@pytest.mark.parametrize("hangs", [False, True], ids=["absent", "hangs"])
+def test_a_sound_server_that_takes_no_stream_is_no_reason_for_silence(
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path, hangs: bool
+) -> None:
+    """ALSA has a way of its own to the device here; a system's settings may ask the same server first."""
+    with limits(), socket.socket(socket.AF_UNIX) as frozen:
+        if hangs:
+            frozen.bind(str(tmp_path / "s"))
+            frozen.listen()
+        env = {"PULSE_SERVER": f"unix:{tmp_path / 's'}", "ALSA_CONFIG_PATH": f"{sink.directory}/.asoundrc"}
+        talk = make_talk(sink=sink, env=env)
+        assert talk.run("voices").code == 0  # the engine is ready
+        asked = time.monotonic()
+        done = talk.run("say", "--wait", "--rate", "450", "--", LOW)
+        took = time.monotonic() - asked
+        goal = talk.goal(done.id)
+        assert (done.code, goal["output"]) == (0, None)
+        assert_same(heard(talk), render_quick([LOW])[0])
+        assert_within(took - goal["duration"], READY_WITHIN * hangs + TOLD, "a sentence by the next player")

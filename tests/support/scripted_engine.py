@@ -133,7 +133,8 @@ class Engine:
         if asked.started:
             self._send(protocol.Started(goal.id))
         if asked.volume is not None:
-            self._send(protocol.Output(goal.id, "scripted", "card", asked.volume, asked.muted))
+            output = {"player": "scripted", "device": "card", "volume": asked.volume, "muted": asked.muted}
+            self._send(protocol.Output(goal.id, output))
         if asked.muted and say.audible:
             self._send(protocol.Ended(goal.id, protocol.FAILED, "muted", "the output is muted: card"))
             self._goal = None

@@ -126,10 +126,15 @@ class Players:
         self.output = None
         self.gap.followed = say.followed
 
-    def tell(self, output: Output | None) -> None:
+    def tell(self, player: Player) -> None:
         """Take note of where the sentence in hand goes now; that it was muted before is not forgotten."""
-        before = self.output
-        self.output = replace(output, muted=True) if output and before and before.muted else output or before
+        output, before = player.output, self.output
+        if before is None:
+            self.output = output
+        elif output is not None:
+            self.output = replace(output, muted=output.muted or before.muted)
+        elif before.player != player.name and not before.muted:
+            self.output = None  # nobody can know any more
 
     def let_go(self, silent_at: float | None = None) -> None:
         """Take note that a device was closed; `silent_at`: since when it had played nothing but silence."""
