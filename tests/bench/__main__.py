@@ -24,7 +24,7 @@ usual rounds it takes under ten minutes, of which a minute is the idle server's.
 absolute times are those of the machine and of what else it does. Exit code 1 where a row could not be measured (it
 says why, in the place of a figure); a goal that is not met is no error.
 """
-_NULL_SINK_ROWS = ("recorder", "onset", "cancel", "connection", "preempt", "gap", "long-text")
+_NULL_SINK_ROWS = ("recorder", "onset", "at-once", "cancel", "connection", "pause", "preempt", "gap", "long-text", "idle")
 
 
 def main() -> None:

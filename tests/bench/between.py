@@ -37,7 +37,7 @@ def gap(stage: Stage) -> list[Row]:
     theirs: list[float] = []
     # espeak-ng says nothing twice alike in one process: the reference is of all that this server has said, in order.
     references = render([*SENTENCES] * (rounds + 1))
-    with stage.server("--player", "aplay") as server, server.client() as client:
+    with stage.server() as server, server.client() as client:
         for number in range(rounds + 1):
             expected = references[number * len(SENTENCES) : (number + 1) * len(SENTENCES)]
             found = _gaps(stage, partial(_queue, client), expected)
@@ -46,7 +46,7 @@ def gap(stage: Stage) -> list[Row]:
                 ours += found
                 theirs += peer
     name = "end of a queued sentence → start of the next, above espeak-ng's own pause"
-    limits = (Limit("median", 5),)
+    limits = Limit("median", 5), Limit("median", -5, at_least=True), Limit("least", -10, at_least=True)
     return [Row("gap", name, "ms", milliseconds(ours), "spd-say", milliseconds(theirs), limits)]
 
 

@@ -9,9 +9,9 @@ from tests.bench.between import gap, long_text
 from tests.bench.crowd import crowd
 from tests.bench.failure import FailedError
 from tests.bench.idle import idle
-from tests.bench.onset import onset, recorder
+from tests.bench.onset import at_once, onset, recorder
 from tests.bench.queueing import queueing
-from tests.bench.silence import cancel, connection, preempt
+from tests.bench.silence import cancel, connection, pause, preempt
 from tests.bench.table import Row
 from tests.bench.throughput import throughput
 from tests.bench.whole_process import commands
@@ -24,8 +24,10 @@ if TYPE_CHECKING:
 GROUPS: dict[str, Callable[[Stage], list[Row]]] = {
     "recorder": recorder,
     "onset": onset,
+    "at-once": at_once,
     "cancel": cancel,
     "connection": connection,
+    "pause": pause,
     "preempt": preempt,
     "gap": gap,
     "long-text": long_text,

@@ -41,8 +41,18 @@ def connection(stage: Stage) -> list[Row]:
         say, stop = partial(_say, client, VOICED), partial(_cancel, client)
         rounds = range(stage.options.rounds * MORE_ROUNDS + 1)
         times = [until_silence(stage.sink, say, stop, stage.jitter()) for _ in rounds]
-    limits = Limit("median", 5), Limit("p99", 20)
+    limits = Limit("median", 2), Limit("p99", 20)
     return [Row("connection", "cancel on an open connection → silence", "ms", milliseconds(times[1:]), limits=limits)]
+
+
+def pause(stage: Stage) -> list[Row]:
+    """Measure a pause on an open connection."""
+    with stage.speaking.client() as client:
+        say, hold = partial(_say, client, VOICED), partial(_pause, client)
+        rounds = range(stage.options.rounds + 1)
+        times = [until_silence(stage.sink, say, hold, stage.jitter()) for _ in rounds]
+    name = "pause on an open connection → silence"
+    return [Row("pause", name, "ms", milliseconds(times[1:]), limits=(Limit("p99", 60),))]
 
 
 def preempt(stage: Stage) -> list[Row]:
@@ -52,7 +62,7 @@ def preempt(stage: Stage) -> list[Row]:
         rounds = range(stage.options.rounds * 2 + 1)
         times = [from_old_to_new(stage.sink, say, newcomer, stage.jitter()) for _ in rounds]
     name = "preempt: last sample of the old → first of the new"
-    return [Row("preempt", name, "ms", milliseconds(times[1:]), limits=(Limit("median", 15),))]
+    return [Row("preempt", name, "ms", milliseconds(times[1:]), limits=(Limit("median", 6),))]
 
 
 def _run(command: list[str], env: dict[str, str]) -> Callable[[], object]:
@@ -66,3 +76,13 @@ def _say(client: Client, text: str, *, preempt: bool = False) -> Callable[[], ob
 def _cancel(client: Client) -> Callable[[], object]:
     client.cancel()
     return int
+
+
+def _pause(client: Client) -> Callable[[], object]:
+    client.pause()
+
+    def go_on() -> None:
+        client.cancel()
+        client.resume()
+
+    return go_on

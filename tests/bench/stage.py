@@ -96,8 +96,8 @@ class Stage(contextlib.AbstractContextManager["Stage"]):
 
     @cached_property
     def speaking(self) -> Server:
-        """A server with the real engine that plays into the sink."""
-        return self._stack.enter_context(self.server("--player", "aplay"))
+        """A server with the real engine that plays into the sink, as one does that is told nothing."""
+        return self._stack.enter_context(self.server())
 
     @contextlib.contextmanager
     def server(self, *options: str, heard: bool = True) -> Iterator[Server]:

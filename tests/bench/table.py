@@ -14,9 +14,10 @@ from tests.bench.arithmetic import median, percentile, ratio
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-Figure = Literal["median", "p99", "ratio"]
+Figure = Literal["median", "p99", "least", "ratio", "above"]
 HEADINGS = ("from → to", "n", "median", "99th", "peer", "its median", "ratio", "goal", "met")
-_SHORT = {"median": "median", "p99": "99th", "ratio": "×"}
+#: What stands behind a goal's unit.
+_BEHIND = {"median": "", "p99": " 99th", "least": " each", "above": " above"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +50,17 @@ class Row:
 
     @property
     def figures(self) -> dict[Figure, float]:
-        """The figures there are; no ratio without a peer."""
+        """The figures there are; without a peer no ratio, and nothing by which it is above one."""
         if self.failure is not None or not self.values:
             return {}
-        found: dict[Figure, float] = {"median": median(self.values), "p99": percentile(self.values, 99)}
+        found: dict[Figure, float] = {
+            "median": median(self.values),
+            "p99": percentile(self.values, 99),
+            "least": min(self.values),
+        }
         if self.peer_values:
             found["ratio"] = ratio(found["median"], median(self.peer_values))
+            found["above"] = found["median"] - median(self.peer_values)
         return found
 
     @property
@@ -142,9 +148,7 @@ def as_markdown(rows: Sequence[Row]) -> str:
 
 
 def _after(figure: Figure, unit: str) -> str:
-    if figure == "ratio":
-        return " ×"
-    return f" {unit}" if figure == "median" else f" {unit} {_SHORT[figure]}"
+    return " ×" if figure == "ratio" else f" {unit}{_BEHIND[figure]}"
 
 
 def _with_unit(value: float, unit: str) -> str:

@@ -13,7 +13,7 @@ FAILED = Row("gap", "(gap)", "", failure="it was not heard", limits=(Limit("medi
 
 
 def test_figures_are_of_the_values_and_the_peers() -> None:
-    assert ONSET.figures == {"median": 25, "p99": 30, "ratio": 1.25}
+    assert ONSET.figures == {"median": 25, "p99": 30, "least": 20, "ratio": 1.25, "above": 5}
     assert ONSET.met is True
     assert ONSET.cells() == ["start → sound", "3", "25 ms", "30", "spd-say", "20 ms", "1.25", "≤ 1.60 ×", "yes"]
 
@@ -27,6 +27,9 @@ def test_figures_are_of_the_values_and_the_peers() -> None:
         ((Limit("median", 25), Limit("p99", 29)), False),
         ((Limit("median", 25, at_least=True),), True),
         ((Limit("median", 26, at_least=True),), False),
+        ((Limit("least", 20, at_least=True), Limit("above", 5)), True),
+        ((Limit("least", 21, at_least=True),), False),
+        ((Limit("above", 4),), False),
     ],
 )
 def test_a_goal_is_met_if_all_its_limits_hold(limits: tuple[Limit, ...], met: bool | None) -> None:
@@ -42,6 +45,8 @@ def test_without_its_peer_a_ratio_is_neither_met_nor_missed() -> None:
 
 def test_goals_are_told_in_their_units() -> None:
     assert Row("a", "a", "ms", limits=(Limit("median", 5), Limit("p99", 20))).goal == "≤ 5 ms, ≤ 20 ms 99th"
+    assert Row("a", "a", "ms", limits=(Limit("above", 8),)).goal == "≤ 8 ms above"
+    assert Row("a", "a", "ms", limits=(Limit("least", -10, at_least=True),)).goal == "≥ -10 ms each"
     assert Row("a", "a", "/s", limits=(Limit("median", 5_000, at_least=True),)).goal == "≥ 5,000 /s"
 
 
