@@ -137,9 +137,8 @@ class WordClock:
         return position
 
     def tell(self, now: float, elapsed: float) -> None:
-        """Go by a better clock: so many seconds of the stream have been heard."""
-        if self._zero is not None:
-            self._zero = now - elapsed
+        """Go by a better clock: so many seconds of the stream have been heard; as long as it is none, ours stands."""
+        self._zero = now - elapsed if elapsed > 0 else None
 
     def hold(self, now: float, elapsed: float) -> None:
         """Move the clock back to `elapsed` seconds if it is ahead of that: no more can have been heard."""

@@ -24,7 +24,7 @@ usual rounds it takes under ten minutes, of which a minute is the idle server's.
 absolute times are those of the machine and of what else it does. Exit code 1 where a row could not be measured (it
 says why, in the place of a figure); a goal that is not met is no error.
 """
-_NULL_SINK_ROWS = ("recorder", "onset", "at-once", "cancel", "connection", "pause", "preempt", "gap", "long-text", "idle")
+_HEARD = ("recorder", "onset", "at-once", "cancel", "connection", "pause", "preempt", "gap", "long-text", "idle")
 
 
 def main() -> None:
@@ -81,7 +81,7 @@ def _run(options: Options, names: list[str]) -> tuple[dict[str, str], list[Row]]
 
 
 def _refuse_without_programs(names: list[str], *, peers: bool) -> None:
-    lacking = missing(peers=peers) if set(names) & set(_NULL_SINK_ROWS) else {}
+    lacking = missing(peers=peers) if set(names) & set(_HEARD) else {}
     if not lacking:
         return
     packages = " ".join(dict.fromkeys(" ".join(lacking.values()).split()))

@@ -12,7 +12,8 @@ import pytest
 
 from tests.conformance.hearing import LONG, await_word, heard, send
 from tests.support.compare import assert_begun, compare, extent, time_heard
-from tests.support.reference import RATE, Rendering, Sentence, render_with_words
+from tests.support.distant_sink import DistantSink
+from tests.support.reference import RATE, Rendering, Sentence, played, render_with_words
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 #: Seconds between a word's feedback and the moment it is heard: of the word in the middle, and of the worst.
 MEDIAN, WORST = 0.03, 0.1
+#: How much alike a sentence is that came through a tunnel: 0.985 were measured, of another one 0.1.
+ALIKE = 0.95
 #: Thirty words, of which libespeak-ng says some neighbours as one. It begins with a moment of silence, see `hearing`.
 THIRTY = (
     "coming home to the charger in the kitchen, because the battery of this robot is low; "
@@ -53,19 +56,22 @@ class Measured:
             assert_within(max(map(abs, late)), WORST, f"the worst of words ({self})")
 
 
-def measure(talk: Talk, text: str, rate: int) -> Measured:
-    """Speak a server's first sentence to its end, and measure it."""
+def measure(talk: Talk, text: str, rate: int, *, exact: bool = True) -> Measured:
+    """Speak a server's first sentence to its end, and measure it.
+
+    `exact`: whether the sink plays every sample as it is; a tunnel doesn't.
+    """
     wall = time.time() - time.monotonic()
     done = talk.run("say", "--wait", "--", text, timeout=60)
     assert (done.code, done.err) == (0, "")
     samples = heard(talk)
     (reference,) = render_with_words([Sentence(text, rate)])
     compared = compare(samples, reference.samples)
-    assert compared.same, compared
+    assert compared.same or (not exact and compared.correlation > ALIKE), compared
     words = talk.watcher.words(done.id)
-    moments = [
-        time_heard(talk.recording, compared, reference.samples, position(reference, each["start"])) for each in words
-    ]
+    begins = (len(reference.samples) - len(played(reference.samples))) / RATE
+    positions = [max(begins, position(reference, each["start"])) for each in words]
+    moments = [time_heard(talk.recording, compared, reference.samples, each) for each in positions]
     received = [talk.watcher.arrived(each) - moment for each, moment in zip(words, moments, strict=True)]
     stamped = [each["at"] - wall - moment for each, moment in zip(words, moments, strict=True)]
     return Measured(words, received, stamped)
@@ -80,8 +86,10 @@ def position(reference: Rendering, start: int) -> float:
     ("player", "rate"),
     [
         ("aplay", 350),
+        ("pulse", 350),
         *(pytest.param("aplay", rate, marks=pytest.mark.slow) for rate in (100, 200)),
         *(pytest.param("pacat", rate, marks=pytest.mark.slow) for rate in (200, 350)),
+        *(pytest.param("pulse", rate, marks=pytest.mark.slow) for rate in (100, 200)),
     ],
 )
 def test_done_when_thirty_words_are_told_as_they_are_heard(
@@ -97,6 +105,16 @@ def test_done_when_thirty_words_are_told_as_they_are_heard(
         merged = re.sub(r"\b(in|from|of) the\b", r"\1", re.sub("[,;]", "", THIRTY))
         assert told == merged.split()
         print(f"{player}, rate {rate}: {measured}")
+        measured.assert_in_time()
+
+
+def test_words_are_told_as_they_are_heard_where_that_is_late(make_talk: MakeTalk, sink: Sink) -> None:
+    """By a clock of our own they would be told 200 ms before."""
+    with limits(), DistantSink(sink) as distant:
+        talk = make_talk("--rate", "350", sink=sink, env=distant.env)
+        measured = measure(talk, THIRTY, 350, exact=False)
+        talk.stop()
+        print(measured)
         measured.assert_in_time()
 
 

@@ -38,7 +38,7 @@ NO_AUTOSPAWN = 1
 S16LE = 3
 CONTEXT_READY, CONTEXT_FAILED, CONTEXT_TERMINATED = 4, 5, 6
 STREAM_READY, STREAM_FAILED, STREAM_TERMINATED = 2, 3, 4
-INTERPOLATE_TIMING, AUTO_TIMING_UPDATE, ADJUST_LATENCY = 0x2, 0x8, 0x2000
+AUTO_TIMING_UPDATE, ADJUST_LATENCY = 0x8, 0x2000
 FLAT_VOLUME = 0x40
 ABOUT_SINKS, ABOUT_SINK_INPUTS = 0x1, 0x4
 FACILITY, OF_SINK, OF_SINK_INPUT = 0xF, 0, 2
@@ -162,7 +162,8 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "pa_stream_drain": (c_void_p, [c_void_p, Success, c_void_p]),
     "pa_stream_get_time": (c_int, [c_void_p, POINTER(u64)]),
     "pa_stream_set_started_callback": (None, [c_void_p, Notice, c_void_p]),
-    "pa_stream_set_moved_callback": (None, [c_void_p, Notice, c_void_p]),
+    "pa_stream_set_latency_update_callback": (None, [c_void_p, Notice, c_void_p]),
+    "pa_stream_update_timing_info": (c_void_p, [c_void_p, c_void_p, c_void_p]),
 }
 
 

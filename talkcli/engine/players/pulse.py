@@ -45,6 +45,10 @@ READY_WITHIN = 2.0
 #: Seconds for which the sink may be suspended under a stream: one that slept is awake again before the stream begins.
 SUSPENDED_FOR = 0.5
 
+#: Seconds between two questions for the time as long as nothing is heard: a word begins when that ends. A near sink says
+#: so after 1 to 10 ms, a loudspeaker by Bluetooth after 200.
+ASK_EVERY = 0.002
+
 
 @frozen
 class Loudness:
@@ -74,6 +78,10 @@ class PulsePlayer(Player):
         self._wanted = device
         self._audible = audible
         self._written = self._heard = 0
+        #: the seconds of the stream that were heard, as the server told last, and when; None before there are any
+        self._told: tuple[float, float] | None = None
+        #: when it is asked next, as long as that is so
+        self._ask_at = 0.0
         self._closed = self._draining = self._drained = False
         self._failed: CannotSpeak | None = None
         self._stream: int | None = None
@@ -93,6 +101,7 @@ class PulsePlayer(Player):
         except OSError as error:
             raise CannotSpeak("no_player", f"libpulse cannot be loaded: {error}") from error
         self._on_started = libpulse.Notice(self._started)
+        self._on_time = libpulse.Notice(self._time_told)
         self._on_drained = libpulse.Success(self._drain_over)
         self._on_change = libpulse.Changed(self._changed)
         self._on_sink = libpulse.SinkTold(self._sink_told)
@@ -132,11 +141,10 @@ class PulsePlayer(Player):
         """Return the seconds of its stream that are heard by now."""
         if self._drained:
             self._heard = self._written
-        elif self.proven and self._loop is not None:
-            told = c_uint64()
-            if self._lib.stream_get_time(self._stream, byref(told)) == 0:
-                heard = told.value * self._rate // 1_000_000 * SAMPLE
-                self._heard = max(self._heard, min(heard, self._written))
+        elif self._told is not None:
+            seconds, at = self._told
+            heard = int((seconds + time.monotonic() - at) * self._rate) * SAMPLE
+            self._heard = max(self._heard, min(heard, self._written))
         return self._heard / (self._rate * SAMPLE)
 
     def close(self) -> None:
@@ -165,6 +173,8 @@ class PulsePlayer(Player):
             moments.append(self._suspended_at + SUSPENDED_FOR)
         if self._is_settling():
             moments.append(self._settled_at)
+        if self.proven and self._told is None:
+            moments.append(self._ask_at)
         return min((moment for moment in moments if moment is not None), default=None)
 
     def kill(self) -> None:
@@ -223,7 +233,7 @@ class PulsePlayer(Player):
         if state in (libpulse.STREAM_FAILED, libpulse.STREAM_TERMINATED):
             self._fail("audio_device" if self._written == 0 else "audio_lost")
         elif state == libpulse.STREAM_READY:
-            asked = self._look_at_sink()
+            asked = self._look_at_sink() or self._ask_time()
             return asked or (self._closed and not self._draining and self._failed is None and self._drain())
         return False
 
@@ -236,7 +246,8 @@ class PulsePlayer(Player):
             self._fail("audio_device")
             return False
         self._lib.stream_set_started_callback(self._stream, self._on_started, None)
-        flags = libpulse.ADJUST_LATENCY | libpulse.INTERPOLATE_TIMING | libpulse.AUTO_TIMING_UPDATE
+        self._lib.stream_set_latency_update_callback(self._stream, self._on_time, None)
+        flags = libpulse.ADJUST_LATENCY | libpulse.AUTO_TIMING_UPDATE
         wanted = None if self._wanted is None else self._wanted.encode()
         if self._lib.stream_connect_playback(self._stream, wanted, byref(sizes), flags, None, None) < 0:
             self._fail("audio_device")
@@ -267,6 +278,14 @@ class PulsePlayer(Player):
         if now >= self._suspended_at + SUSPENDED_FOR:
             self._failed = CannotSpeak("audio_stalled", f"the sound server has suspended {self.device}")
         return asks
+
+    def _ask_time(self) -> bool:
+        """Ask whether it is heard by now; return whether it was time for that."""
+        if not self.proven or self._told is not None or time.monotonic() < self._ask_at:
+            return False
+        self._ask_at = time.monotonic() + ASK_EVERY
+        self._begin(self._lib.stream_update_timing_info(self._stream, None, None))
+        return True
 
     def _ask_sink(self) -> None:
         self._begin(self._lib.context_get_sink_info_by_index(self._context, self._index, self._on_sink, None))
@@ -341,6 +360,11 @@ class PulsePlayer(Player):
 
     def _started(self, *_: Any) -> None:
         self.proven = True
+
+    def _time_told(self, *_: Any) -> None:
+        told = c_uint64()
+        if self._lib.stream_get_time(self._stream, byref(told)) == 0 and told.value:
+            self._told = told.value / 1_000_000, time.monotonic()
 
     def _drain_over(self, _stream: int, success: int, _data: object) -> None:
         if success:
