@@ -45,8 +45,8 @@ READY_WITHIN = 2.0
 #: Seconds for which the sink may be suspended under a stream: one that slept is awake again before the stream begins.
 SUSPENDED_FOR = 0.5
 
-#: Seconds between two questions for the time as long as nothing is heard: a word begins when that ends. A near sink says
-#: so after 1 to 10 ms, a loudspeaker by Bluetooth after 200.
+#: Seconds from an answer to the next question for the time, as long as nothing is heard: a word begins when that ends.
+#: It does after 1 to 10 ms at a near sink, after 200 by Bluetooth.
 ASK_EVERY = 0.002
 
 
@@ -80,8 +80,8 @@ class PulsePlayer(Player):
         self._written = self._heard = 0
         #: the seconds of the stream that were heard, as the server told last, and when; None before there are any
         self._told: tuple[float, float] | None = None
-        #: when it is asked next, as long as that is so
-        self._ask_at = 0.0
+        #: when it is asked next, as long as that is so; None while a question is not answered
+        self._ask_at: float | None = 0.0
         self._closed = self._draining = self._drained = False
         self._failed: CannotSpeak | None = None
         self._stream: int | None = None
@@ -281,9 +281,9 @@ class PulsePlayer(Player):
 
     def _ask_time(self) -> bool:
         """Ask whether it is heard by now; return whether it was time for that."""
-        if not self.proven or self._told is not None or time.monotonic() < self._ask_at:
+        if not self.proven or self._told or self._ask_at is None or time.monotonic() < self._ask_at:
             return False
-        self._ask_at = time.monotonic() + ASK_EVERY
+        self._ask_at = None
         self._begin(self._lib.stream_update_timing_info(self._stream, None, None))
         return True
 
@@ -362,9 +362,10 @@ class PulsePlayer(Player):
         self.proven = True
 
     def _time_told(self, *_: Any) -> None:
-        told = c_uint64()
+        told, now = c_uint64(), time.monotonic()
+        self._ask_at = now + ASK_EVERY
         if self._lib.stream_get_time(self._stream, byref(told)) == 0 and told.value:
-            self._told = told.value / 1_000_000, time.monotonic()
+            self._told = told.value / 1_000_000, now
 
     def _drain_over(self, _stream: int, success: int, _data: object) -> None:
         if success:
