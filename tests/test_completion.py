@@ -98,7 +98,7 @@ def test_scripts_that_are_checked_in_are_what_the_command_prints(tmp_path: pathl
     done = run([*TALK, "completion", shell], environment(str(tmp_path)))
     assert (done.code, done.err) == (0, "")
     with open(os.path.join(CHECKED_IN, FILES[shell]), encoding="utf-8") as file:
-        assert file.read() == done.out, f"talk completion {shell} > completions/{FILES[shell]}"
+        assert file.read() == done.out
 
 
 @pytest.mark.parametrize(("shell", "name"), FILES.items())

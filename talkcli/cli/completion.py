@@ -6,7 +6,7 @@ server answers at once, there is nothing to offer.
 The scripts and formats are our own, on click's machinery. click's scripts give a shell the words as it cuts them: bash
 cuts at `:` and `=`, which ids may hold, and a value with a blank, a comma, a quote or a `*` doesn't survive the way
 back. Here the shell sends the line up to the cursor, as it was typed; what goes back is quoted, and begins where the
-shell puts it. `talk completion` prints the scripts; the files in completions/ are the same.
+shell puts it. The scripts are the files beside this one, which `talk completion` prints.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+    from typing import ClassVar
 
     from talkcli.cli.show import Common
     from talkcli.client.client import Client
@@ -43,75 +44,20 @@ _MAX_TEXT = 60
 #: What there is to offer where no server answers.
 _NO_STATUS = ServerStatus({}, None, (), ())
 
-_BASH = """\
-%(complete_func)s() {
-    local IFS=$'\\n' program=$1 line
-    [[ $program == '~/'* ]] && program=$HOME/${program:2}
-    COMPREPLY=()
-    while IFS= read -r line; do
-        case $line in
-            file) compopt -o default 2>/dev/null ;;
-            plain,*) COMPREPLY+=("${line#*,}") ;;
-        esac
-    done < <(COMP_WORDS=${COMP_LINE:0:COMP_POINT} COMP_CWORD=$2 %(complete_var)s=bash_complete "$program" 2>/dev/null)
-}
-
-complete -o nosort -F %(complete_func)s %(prog_name)s 2>/dev/null || complete -F %(complete_func)s %(prog_name)s
-"""
-
-_ZSH = """\
-#compdef %(prog_name)s
-
-%(complete_func)s() {
-    local program=${(Q)words[1]} line typed="${(j: :)words[1,CURRENT-1]} $QIPREFIX$PREFIX"
-    local -a lines plain described
-    [[ $program == '~/'* ]] && program=$HOME/${program#??}
-    lines=("${(@f)$(COMP_WORDS=$typed COMP_CWORD= %(complete_var)s=zsh_complete $program 2>/dev/null)}")
-    for line in $lines; do
-        case $line in
-            file) _files; return ;;
-            described,*) described+=("${line#*,}") ;;
-            plain,*) plain+=("${line#*,}") ;;
-        esac
-    done
-    # What follows the = of --option= is completed by itself.
-    [[ $PREFIX == -*=* ]] && compset -P '*='
-    (( $#described )) && _describe -V talk described
-    (( $#plain )) && compadd -V talk -a plain
-    (( $#described + $#plain ))
-}
-
-if [[ $zsh_eval_context[-1] == loadautofunc ]]; then
-    %(complete_func)s "$@"  # from fpath
-else  # sourced
-    (( $+functions[compdef] )) || { autoload -U compinit && compinit }
-    compdef %(complete_func)s %(prog_name)s
-fi
-"""
-
-_FISH = """\
-function %(complete_func)s
-    set -l program (string replace --regex '^~/' "$HOME/" -- (commandline -poc)[1])
-    set -l typed (commandline -pc | string collect)
-    for line in (COMP_WORDS=$typed COMP_CWORD= %(complete_var)s=fish_complete $program 2>/dev/null)
-        switch $line
-            case file
-                __fish_complete_path (commandline -ct)
-            case 'plain,*'
-                string replace 'plain,' '' -- $line
-        end
-    end
-end
-
-complete --no-files --command %(prog_name)s --arguments '(%(complete_func)s)'
-"""
-
 #: What bash takes as it stands; letters and digits of other scripts, too.
 _BASH_PLAIN = re.compile(r"[^\w@%+=:,./-]")
 
 
 class _Line(ShellComplete):
     """A shell that sends its line up to the cursor in COMP_WORDS."""
+
+    #: the file of its script
+    script: ClassVar[str]
+
+    def source(self) -> str:
+        """Return the script."""
+        with open(os.path.join(os.path.dirname(__file__), self.script), encoding="utf-8") as file:
+            return file.read()
 
     def get_completion_args(self) -> tuple[list[str], str]:
         line = os.environ["COMP_WORDS"]
@@ -133,7 +79,7 @@ class Bash(_Line):
     """bash replaces what it takes for the word, COMP_CWORD, by what it gets, and quotes nothing."""
 
     name = "bash"
-    source_template = _BASH
+    script = "talk.bash"
 
     def line(self, value: str, words: str | None) -> str:  # noqa: ARG002
         typed, quote = _last_word(os.environ["COMP_WORDS"])
@@ -149,7 +95,7 @@ class Zsh(_Line):
     """zsh quotes what it inserts; a help stands behind a colon."""
 
     name = "zsh"
-    source_template = _ZSH
+    script = "_talk"
 
     def line(self, value: str, words: str | None) -> str:
         if not words:
@@ -163,7 +109,7 @@ class Fish(_Line):
     """fish quotes what it inserts; a help stands behind a tab."""
 
     name = "fish"
-    source_template = _FISH
+    script = "talk.fish"
 
     def line(self, value: str, words: str | None) -> str:
         typed, _ = _last_word(os.environ["COMP_WORDS"])
