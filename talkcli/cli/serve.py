@@ -38,10 +38,7 @@ NO_DEVICE = (
 GROUP = "audio"
 
 _SERVICE = """\
-
-[Unit]
-Description=talk, speech for robots
-{order}# A robot has nobody who looks after it: what can't start now is tried again for as long as it takes.
+# A robot has nobody who looks after it: what can't start now is tried again for as long as it takes.
 StartLimitIntervalSec=0
 
 [Service]
@@ -58,9 +55,6 @@ TimeoutStartSec=30
 TimeoutStopSec=10
 # The server ends its goals, and then its engine; what is left after that is killed.
 KillMode=mixed
-{hardening}
-[Install]
-WantedBy={target}
 """
 
 _USER_HEAD = """\
@@ -70,8 +64,12 @@ _USER_HEAD = """\
 #   systemctl --user daemon-reload && systemctl --user enable --now talk
 #   loginctl enable-linger        so that it runs from the start of the machine, without a login
 #   journalctl --user -u talk     is its log
+
+[Unit]
+Description=talk, speech for robots
+After=pipewire.service pipewire-pulse.service pulseaudio.service
 """
-_USER_HARDENING = """
+_USER_END = """
 # What works without privileges everywhere. Sound servers are reached through their sockets, or over the network.
 NoNewPrivileges=yes
 LockPersonality=yes
@@ -81,6 +79,9 @@ RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6
 SystemCallArchitectures=native
 SystemCallFilter=@system-service
 SystemCallErrorNumber=EPERM
+
+[Install]
+WantedBy=default.target
 """
 
 _SYSTEM_HEAD = """\
@@ -90,8 +91,12 @@ _SYSTEM_HEAD = """\
 #   sudo usermod -aG {group} NAME    lets NAME talk, from the next login on
 #   journalctl -u talk             is its log
 # Where PipeWire or PulseAudio runs in a user's session, the sound devices are theirs: take the user's unit.
+
+[Unit]
+Description=talk, speech for robots
+After=sound.target
 """
-_SYSTEM_HARDENING = """
+_SYSTEM_END = """
 # It runs as a user of its own that exists as long as it runs. The group opens the sound devices, and is the socket's.
 User=talk
 DynamicUser=yes
@@ -128,6 +133,9 @@ SystemCallFilter=~@privileged @resources
 SystemCallErrorNumber=EPERM
 # Left out on purpose: PrivateUsers= and ProtectProc= would hide who sent a goal, PrivateDevices= the sound card,
 # PrivateIPC= the programs that ALSA mixes with; and with MemoryDenyWriteExecute= an older libffi stops the engine.
+
+[Install]
+WantedBy=multi-user.target
 """
 
 _SOCKET = """\
@@ -136,9 +144,11 @@ _SOCKET = """\
 Description=The socket of talk, speech for robots
 
 [Socket]
-ListenStream={path}
+ListenStream={socket}
 SocketMode={mode}
-{extra}RemoveOnStop=yes
+"""
+_SOCKET_END = """\
+RemoveOnStop=yes
 
 [Install]
 WantedBy=sockets.target
@@ -158,6 +168,13 @@ _SYSTEM_SOCKET_HEAD = """\
 #   sudo systemctl daemon-reload && sudo systemctl stop talk && sudo systemctl enable --now talk.socket
 """
 
+#: Each unit; what stands in braces is filled in when it is printed.
+_UNITS = {
+    "user": _USER_HEAD + _SERVICE + _USER_END,
+    "system": _SYSTEM_HEAD + _SERVICE + _SYSTEM_END,
+    "user-socket": _USER_SOCKET_HEAD + _SOCKET + "DirectoryMode=0700\n" + _SOCKET_END,
+    "system-socket": _SYSTEM_SOCKET_HEAD + _SOCKET + "SocketGroup={group}\nDirectoryMode=0755\n" + _SOCKET_END,
+}
 
 #: What would end a line of a unit, or is no UTF-8.
 _CONTROLS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
@@ -230,12 +247,17 @@ def _print_unit(options: Common, name: str, given: Mapping[str, Any]) -> None:
         mode = 0o660
         words.insert(0, "--socket-mode=0660")
     program = _program(sys.argv[0])
+    # What the program is made of: its script, its interpreter, its package.
     files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
-    if name.endswith("-socket"):
-        unit = _socket_unit(socket, mode, system=system)
-    else:
-        command = " ".join(map(_quoted, (*program, "serve", *words)))
-        unit = _system_service(command, socket, files) if system else _user_service(command)
+    shown = _place if name.endswith("-socket") else printable
+    usual = paths.SYSTEM_SOCKET if system else f"%t/talk/{paths.SOCKET}"
+    unit = _UNITS[name].format(
+        command=" ".join(map(_quoted, (*program, "serve", *words))),
+        group=GROUP,
+        home="read-only" if any(each.startswith(_HOMES) for each in files) else "yes",
+        mode=f"{mode:04o}",
+        socket=shown(socket) if socket else usual,
+    )
     show(unit.rstrip("\n"))
     hidden = _hidden_from_others(files) if name == "system" else None
     if hidden:
@@ -245,37 +267,6 @@ def _print_unit(options: Common, name: str, given: Mapping[str, Any]) -> None:
             "it for all, as with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in a "
             "checkout, then print the unit"
         )
-
-
-def _user_service(command: str) -> str:
-    return _USER_HEAD + _SERVICE.format(
-        order="After=pipewire.service pipewire-pulse.service pulseaudio.service\n",
-        command=command,
-        hardening=_USER_HARDENING,
-        target="default.target",
-    )
-
-
-def _system_service(command: str, socket: str | None, files: Sequence[str]) -> str:
-    """Return the unit; `files`: what the program is made of, its script, its interpreter, its package."""
-    home = "read-only" if any(each.startswith(_HOMES) for each in files) else "yes"
-    head = _SYSTEM_HEAD.format(socket=printable(socket or paths.SYSTEM_SOCKET), group=GROUP)
-    return head + _SERVICE.format(
-        order="After=sound.target\n",
-        command=command,
-        hardening=_SYSTEM_HARDENING.format(group=GROUP, home=home),
-        target="multi-user.target",
-    )
-
-
-def _socket_unit(socket: str | None, mode: int, *, system: bool) -> str:
-    if system:
-        head, path = _SYSTEM_SOCKET_HEAD, _place(socket or paths.SYSTEM_SOCKET)
-        extra = f"SocketGroup={GROUP}\nDirectoryMode=0755\n"
-    else:
-        head, path = _USER_SOCKET_HEAD, _place(socket) if socket else f"%t/talk/{paths.SOCKET}"
-        extra = "DirectoryMode=0700\n"
-    return head + _SOCKET.format(path=path, mode=f"{mode:04o}", extra=extra)
 
 
 def _program(started_as: str) -> tuple[str, ...]:
