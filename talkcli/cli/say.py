@@ -162,8 +162,7 @@ def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: 
     """
     try:
         _introduce(goal, options, shown)
-        shown.begin([goal.goal])
-        until_ended(goal, rest(end), shown)
+        until_ended([goal], rest(end), shown)
     except (Interrupted, OSError) as error:
         if isinstance(error, OSError) and not isinstance(error, TimeoutError):
             if not reader_is_gone(error):

@@ -343,8 +343,7 @@ class _Tally(threading.Thread):
             return self._waiting[0]
 
     def _see_end(self, handle: GoalHandle) -> int:
-        self._shown.begin([handle.goal])
-        until_ended(handle, None, self._shown)
+        until_ended([handle], None, self._shown)
         if handle.state is State.LOST:
             self._interrupts.wake()  # nothing more can be sent
         return report(handle.goal, self._options, self._shown)

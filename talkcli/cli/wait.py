@@ -16,7 +16,7 @@ from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import EXIT_CODES, State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from typing import Any, TypeVar
 
     from talkcli.cli.show import Common
@@ -68,9 +68,12 @@ def feedback_for(options: Common, *, asked: bool) -> Feedback:
     return feedback(options)
 
 
-def until_ended(goal: GoalHandle, timeout: float | None, shown: Feedback) -> None:
-    """Wait until a goal has ended, and show what happens meanwhile; TimeoutError, Interrupted."""
-    for event in goal.events(timeout):
+def until_ended(goals: Sequence[GoalHandle], timeout: float | None, shown: Feedback) -> None:
+    """Wait until these goals have ended, and show what happens meanwhile; TimeoutError, Interrupted."""
+    from talkcli.client.goal import merged
+
+    shown.begin([each.goal for each in goals])
+    for goal, event in merged(goals, timeout):
         show_if_possible(shown.show, goal.goal, event)
 
 
@@ -83,7 +86,7 @@ def give_up(goal: GoalHandle, interrupts: Interrupts, options: Common, shown: Fe
     unknown = ""
     try:
         goal.request_cancel()
-        regardless(until_ended, goal, SILENCE, shown)
+        regardless(until_ended, [goal], SILENCE, shown)
     except TimeoutError:
         unknown = f"the server did not confirm within {SILENCE:g} s that it is silent"
     except (Interrupted, ServerUnavailable) as error:
@@ -135,12 +138,8 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback:
 
 def _show(goals: list[GoalHandle], end: float | None, interrupts: Interrupts, shown: Feedback) -> None:
     """Show what happens to the goals until all have ended."""
-    from talkcli.client.goal import merged
-
     try:
-        shown.begin([each.goal for each in goals])
-        for goal, event in merged(goals, rest(end)):
-            show_if_possible(shown.show, goal.goal, event)
+        until_ended(goals, rest(end), shown)
     except Interrupted:
         interrupts.look()  # while standard output is what it was
         raise
