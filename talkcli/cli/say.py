@@ -26,6 +26,7 @@ from talkcli.cli.wait import (
     SPEECH_IS_PAUSED,
     feedback_for,
     give_up,
+    refuse,
     regardless,
     report,
     rest,
@@ -37,7 +38,6 @@ from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import SOUND
 from talkcli.goals.states import State
-from talkcli.protocol.events import Result
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
     from talkcli.cli.show import Common
     from talkcli.client.client import GoalHandle
-    from talkcli.goals.goal import Goal
 
 
 def say(
@@ -79,7 +78,7 @@ def say(
         try:
             sentence = read_text(end, watched_output() if wait else {}, whole=output is not None)
         except InputTooLong as error:
-            return _refuse(rejected(str(error)), options, feedback_for(options, asked=feedback))
+            return regardless(refuse, rejected(str(error)), options, feedback_for(options, asked=feedback))
         except Interrupted:  # nothing was sent
             return EXIT_SIGPIPE
         except KeyboardInterrupt:
@@ -127,17 +126,10 @@ def _readable(text: str, options: Common) -> str:
     return text
 
 
-def _refuse(goal: Goal, options: Common, shown: Feedback) -> int:
-    """Tell of a goal that is REJECTED, be it before it is sent, and return the exit code."""
-    if options.json:
-        regardless(show_if_possible, shown.show, goal, Result(goal))
-    return regardless(report, goal, options, shown)
-
-
 def _tell(goal: GoalHandle, options: Common, shown: Feedback) -> int:
     """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
     if goal.state is State.REJECTED:
-        code = _refuse(goal.goal, options, shown)
+        code = refuse(goal.goal, options, shown)
         if goal.goal.reason == "text_too_long" and not options.quiet:
             note("'talk say --lines' speaks standard input line by line, each line a goal of its own")
         return code

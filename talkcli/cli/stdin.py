@@ -18,8 +18,8 @@ from talkcli.cli.show import Feedback, give_up_output, note, reader_is_gone, sho
 from talkcli.cli.wait import (
     SILENCE,
     SPEECH_IS_PAUSED,
-    exit_code,
     feedback_for,
+    refuse,
     regardless,
     report,
     rest,
@@ -34,14 +34,15 @@ from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, Result, unfinished
 from talkcli.protocol.lines import Cut, LineSplitter
-from talkcli.terminal.goals import ending
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
-    from typing import Any
+    from typing import Any, TypeVar
 
     from talkcli.cli.show import Common
     from talkcli.client.client import Client, GoalHandle
+
+    _T = TypeVar("_T")
 
 #: Bytes that are read at once: what a pipe holds.
 _CHUNK = 65_536
@@ -198,9 +199,9 @@ class _Lines:
             return
         if self._options.json:
             if not self._wait:
-                self._print(show_json, handle.goal.to_json())
+                self._tell(show_if_possible, show_json, handle.goal.to_json())
         elif not self._options.quiet and not self._shown.shows:
-            self._print(show, handle.id)
+            self._tell(show_if_possible, show, handle.id)
         if handle.speech_paused and not (self._options.quiet or self._told_of_pause):
             self._shown.aside(SPEECH_IS_PAUSED)
         self._told_of_pause = handle.speech_paused
@@ -209,25 +210,11 @@ class _Lines:
 
     def _refuse(self, number: int, goal: Goal) -> None:
         """Tell of a line that is no goal, and go on."""
-        if self._shown.shows and self._options.json:
-            self._print(self._shown.show, goal, Result(goal))
-        elif self._options.json:
-            self._print(show_json, goal.to_json())
-        if not self._options.quiet:
-            self._shown.aside(f"line {number}: {ending(goal)}")
-        self._tally.add(exit_code(goal))
+        self._tally.add(self._tell(refuse, goal, self._options, self._shown, f"line {number}: "))
 
-    def _print(self, put: Callable[..., None], *what: object) -> None:
+    def _tell(self, act: Callable[..., _T], *given: object) -> _T:
         """Show something; where its reader is gone, who waits ends as by a signal, and who doesn't goes on without."""
-        try:
-            show_if_possible(put, *what)
-        except OSError as error:
-            if not reader_is_gone(error):
-                raise
-            if self._wait:
-                self._interrupts.gone = True
-                raise Interrupted from error
-            give_up_output()
+        return act(*given) if self._wait else regardless(act, *given)
 
     def _interrupted(self) -> int:
         """End before the input does: by a signal, by the timeout, because its output has no reader any more or the

@@ -14,6 +14,7 @@ from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import EXIT_CODES, State
+from talkcli.protocol.events import Result
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -96,8 +97,15 @@ def give_up(goal: GoalHandle, interrupts: Interrupts, options: Common, shown: Fe
     return regardless(report, goal.goal, options, shown)
 
 
-def report(goal: Goal, options: Common, shown: Feedback) -> int:
-    """Tell how a goal ended, or how it stands, and return the exit code for it."""
+def refuse(goal: Goal, options: Common, shown: Feedback, where: str = "") -> int:
+    """Tell of a goal that is REJECTED, be it before it is sent, and return the exit code; `where`: as of `report`."""
+    if options.json:
+        show_if_possible(shown.show, goal, Result(goal))
+    return report(goal, options, shown, where)
+
+
+def report(goal: Goal, options: Common, shown: Feedback, where: str = "") -> int:
+    """Tell how a goal ended, or how it stands, and return the exit code for it; `where`: what a note begins with."""
     if options.json and not shown.shows:
         show_if_possible(show_json, goal.to_json())
     muted = goal.output is not None and goal.output.muted
@@ -107,12 +115,7 @@ def report(goal: Goal, options: Common, shown: Feedback) -> int:
         words = ending(goal)
         if goal.state is State.ABORTED and goal.reason != "nothing_to_say":
             words += "; see 'talk doctor'"
-        shown.aside(words)
-    return exit_code(goal)
-
-
-def exit_code(goal: Goal) -> int:
-    """Return the exit code for how a goal ended."""
+        shown.aside(f"{where}{words}")
     if goal.reason == "throttled":
         return EXIT_OK  # not speaking was what the sender asked for
     return EXIT_CODES.get(goal.state, EXIT_TIMEOUT)
