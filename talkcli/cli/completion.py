@@ -215,12 +215,9 @@ def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
 
 def _ask(context: click.Context, question: Callable[[Client], _Answer]) -> _Answer | None:
     """Return the server's answer, or None if there is none for whatever reason."""
-    from talkcli.client.client import Client
-    from talkcli.client.connection import SocketConnection
-
-    socket = getattr(context.find_root().obj, "socket", None)  # --socket, where it stood before
+    options: Common = context.find_root().obj  # with --socket, where it stood before
     try:
-        with Client.over(SocketConnection(socket, patience=PATIENCE)) as client:
+        with options.connect(PATIENCE) as client:
             return question(client)
     except (TalkError, OSError, ValueError):
         return None
