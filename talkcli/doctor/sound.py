@@ -11,16 +11,16 @@ import contextlib
 import os
 import re
 import shlex
-import shutil
-import signal
 import subprocess
 import tempfile
 from typing import TYPE_CHECKING
 
 from talkcli.doctor.machine import judge_access, judge_cards
 from talkcli.doctor.report import Finding, done, failed, some, warning
-from talkcli.engine.players import PACKAGES, PLAYERS, is_silent
+from talkcli.engine.players import PACKAGES, PLAYERS, is_silent, on_path
+from talkcli.engine.players.child import kill
 from talkcli.engine.players.devices import sound_servers
+from talkcli.engine.players.pulse import DUMMY
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
@@ -38,8 +38,6 @@ _SERVER, _LOUDNESS = "sound server", "loudness"
 _FAINT = 20
 #: ALSA's controls that a loudspeaker hangs on, as `amixer scontrols` names them.
 _CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
-#: What a sound server plays to that has nothing else, as `engine.players.pulse` knows it.
-_DUMMY = "auto_null"
 #: What a sound server's mixer tells of; and, by its program, what undoes a mute of it and what makes it louder.
 _SINK = "the default sink"
 _PACTL = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
@@ -118,21 +116,15 @@ class Level:
     louder: str
 
 
-def path_of(program: str, env: Mapping[str, str]) -> str | None:
-    """Return where a program is on the PATH of an environment; None where it is not."""
-    return shutil.which(program, path=env.get("PATH", os.defpath))
-
-
 def asked(program: str, *words: str, env: Mapping[str, str]) -> Said:
     """Run a program to its end, in its own language, and return what it said."""
-    path = path_of(program, env)
-    if path is None:
+    if not on_path(program, env):
         return Said(f"{program} is not there")
     # Files, not pipes: what a program leaves running behind it would hold a pipe open.
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         try:
             process = subprocess.Popen(
-                [path, *words],
+                [program, *words],
                 env={**env, "LC_ALL": "C"},
                 stdin=subprocess.DEVNULL,
                 stdout=out,
@@ -156,9 +148,7 @@ def asked(program: str, *words: str, env: Mapping[str, str]) -> Said:
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     if process.returncode is None:
-        # Its group is its own, and it is not reaped: nobody else can be hit.
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
+        kill([-process.pid])  # its group is its own, and it is not reaped: nobody else can be hit
         with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs in a driver: init will reap it
             process.wait(1)
 
@@ -183,9 +173,9 @@ def program_of(command: str) -> str | None:
 
 def players(env: Mapping[str, str], wanted: str | None) -> Players:
     """Return which players there are; `wanted`: the setting."""
-    found = tuple(each for each in PACKAGES if path_of(each, env))
+    found = tuple(each for each in PACKAGES if on_path(each, env))
     program = program_of(wanted or "")
-    return Players(found, wanted, runs=program == "pulse" or bool(program and path_of(program, env)))
+    return Players(found, wanted, runs=program == "pulse" or bool(program and on_path(program, env)))
 
 
 def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> Devices | None:
@@ -243,7 +233,7 @@ def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
     if wire.trouble is None:
         return SoundServer("PipeWire, without its PulseAudio part")
     answers = {"pactl": pulse, "pw-cli": wire}
-    trouble = next((said.trouble for each, said in answers.items() if path_of(each, env)), None)
+    trouble = next((said.trouble for each, said in answers.items() if on_path(each, env)), None)
     sockets = sound_servers(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else []))
     named = env.get("PULSE_SERVER") or None
     return SoundServer(sockets=tuple(sockets), trouble=trouble, hangs=wire.late, named=named)
@@ -357,9 +347,9 @@ def _device(devices: Devices) -> Finding:
 
 def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Finding:
     where = "from here" if session.server is None else f"from the server (process {session.server})"
-    if server.name is not None and server.sink == _DUMMY:
+    if server.name is not None and server.sink == DUMMY:
         step = "plug in a loudspeaker, and look whether it is there: pactl list short sinks"
-        return warning(_SERVER, f"{server.name} has only a dummy output, {_DUMMY}: nobody hears it", step)
+        return warning(_SERVER, f"{server.name} has only a dummy output, {DUMMY}: nobody hears it", step)
     if server.name is not None:
         sink = f", plays to {server.sink}" if server.sink else ""
         return done(_SERVER, f"{server.name}{sink}")

@@ -17,7 +17,7 @@ from talkcli.frozen import frozen
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from talkcli.engine.players.base import Player
 
@@ -147,9 +147,11 @@ def commands(player: str | None, device: str | None, rate: int, last: str | None
     return [_custom(player, device, rate)]
 
 
-def on_path(program: str) -> bool:
-    """Return whether the program can be run; a name without a slash is looked for on the PATH."""
-    places = [""] if os.sep in program else os.get_exec_path()
+def on_path(program: str, env: Mapping[str, str] | None = None) -> bool:
+    """Return whether the program can be run; a name without a slash is looked for on the PATH: this process's, or of
+    that environment.
+    """
+    places = [""] if os.sep in program else os.get_exec_path(env)
     paths = [os.path.join(place, program) for place in places]
     return any(os.path.isfile(each) and os.access(each, os.X_OK) for each in paths)
 
