@@ -17,15 +17,14 @@ from talkcli.cli.show import (
     give_up_output,
     note,
     reader_is_gone,
-    show,
     show_error,
     show_json,
     standard_output,
 )
 from talkcli.cli.wait import (
-    SPEECH_IS_PAUSED,
     feedback_for,
     give_up,
+    introduce,
     refuse,
     regardless,
     report,
@@ -133,19 +132,9 @@ def _tell(goal: GoalHandle, options: Common, shown: Feedback) -> int:
         if goal.goal.reason == "text_too_long" and not options.quiet:
             note("'talk say --lines' speaks standard input line by line, each line a goal of its own")
         return code
-    _introduce(goal, options, shown)
+    introduce(goal, options, shown)
     code = report(goal.goal, options, shown)
     return code if goal.state.terminal else EXIT_OK
-
-
-def _introduce(goal: GoalHandle, options: Common, shown: Feedback) -> None:
-    """Print the id of a goal that was accepted, and why it may take long."""
-    if options.quiet:
-        return
-    if not options.json and not shown.shows:
-        show_if_possible(show, goal.id)
-    if goal.speech_paused and not goal.state.terminal:
-        note(SPEECH_IS_PAUSED)
 
 
 def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common, shown: Feedback) -> int:
@@ -153,7 +142,7 @@ def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: 
     `say` had sent it before, with the same id.
     """
     try:
-        _introduce(goal, options, shown)
+        introduce(goal, options, shown)
         until_ended([goal], rest(end), shown)
     except (Interrupted, OSError) as error:
         if isinstance(error, OSError) and not isinstance(error, TimeoutError):

@@ -11,19 +11,19 @@ import os
 import select
 import threading
 from collections import deque
+from functools import partial
 
 from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.show import Feedback, give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.cli.show import Feedback, give_up_output, note, reader_is_gone, show_error
 from talkcli.cli.wait import (
     SILENCE,
-    SPEECH_IS_PAUSED,
     feedback_for,
+    introduce,
     refuse,
     regardless,
     report,
     rest,
-    show_if_possible,
     until_ended,
 )
 from talkcli.client.connect import Interrupted, ready
@@ -197,24 +197,21 @@ class _Lines:
         if handle.state is State.REJECTED:
             self._refuse(number, handle.goal)
             return
-        if self._options.json:
-            if not self._wait:
-                self._tell(show_if_possible, show_json, handle.goal.to_json())
-        elif not self._options.quiet and not self._shown.shows:
-            self._tell(show_if_possible, show, handle.id)
-        if handle.speech_paused and not (self._options.quiet or self._told_of_pause):
-            self._shown.aside(SPEECH_IS_PAUSED)
+        self._tell(introduce, handle, pause_is_known=self._told_of_pause)
         self._told_of_pause = handle.speech_paused
         if self._wait:
             self._tally.add(handle)
+        else:
+            self._tell(report, handle.goal)
 
     def _refuse(self, number: int, goal: Goal) -> None:
         """Tell of a line that is no goal, and go on."""
-        self._tally.add(self._tell(refuse, goal, self._options, self._shown, f"line {number}: "))
+        self._tally.add(self._tell(refuse, goal, where=f"line {number}: "))
 
-    def _tell(self, act: Callable[..., _T], *given: object) -> _T:
-        """Show something; where its reader is gone, who waits ends as by a signal, and who doesn't goes on without."""
-        return act(*given) if self._wait else regardless(act, *given)
+    def _tell(self, act: Callable[..., _T], goal: Goal | GoalHandle, **how: object) -> _T:
+        """Tell of a goal; where its reader is gone, who waits ends as by a signal, and who doesn't goes on without."""
+        tell = partial(act, goal, self._options, self._shown, **how)
+        return tell() if self._wait else regardless(tell)
 
     def _interrupted(self) -> int:
         """End before the input does: by a signal, by the timeout, because its output has no reader any more or the

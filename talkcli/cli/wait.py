@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 
 from talkcli.cli.interrupts import Interrupts, give_up_unread
-from talkcli.cli.show import Feedback, give_up_failed, give_up_output, note, reader_is_gone, show_json
+from talkcli.cli.show import Feedback, give_up_failed, give_up_output, note, reader_is_gone, show, show_json
 from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.frozen import TYPE_CHECKING
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 #: Seconds for which a goal that was given up is awaited to be silent.
 SILENCE = 1.0
-#: What the sender of a goal is told that nobody hears yet.
-SPEECH_IS_PAUSED = "speech is paused: talk resume"
 
 
 def rest(end: float | None) -> float | None:
@@ -67,6 +65,16 @@ def feedback_for(options: Common, *, asked: bool) -> Feedback:
     from talkcli.cli.feedback import feedback
 
     return feedback(options)
+
+
+def introduce(goal: GoalHandle, options: Common, shown: Feedback, *, pause_is_known: bool = False) -> None:
+    """Print the id of a goal that was accepted, and why it may take long."""
+    if options.quiet:
+        return
+    if not options.json and not shown.shows:
+        show_if_possible(show, goal.id)
+    if goal.speech_paused and not (pause_is_known or goal.state.terminal):
+        shown.aside("speech is paused: talk resume")
 
 
 def until_ended(goals: Sequence[GoalHandle], timeout: float | None, shown: Feedback) -> None:
