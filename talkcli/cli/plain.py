@@ -11,7 +11,6 @@ same command: the library takes it for its own, see `SocketConnection`. A test s
 from __future__ import annotations
 
 import _signal
-import os
 import time
 
 from talkcli.cli.command import COMMON, FILE, read_value
@@ -20,6 +19,7 @@ from talkcli.client.connect import ask, hello, reach, sender, stand_back
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.option import FLAG, MAX_ID, MAX_NAME
 from talkcli.goals.options import MAX_CHARACTERS, Cancel, Say, bad_key
+from talkcli.paths import named_socket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -152,7 +152,7 @@ def asks_at_once(plain: Plain) -> bool:
 
 def _begin(plain: Plain, before: Callable[[], None]) -> Begun | None:
     """Return the command's connection, as far as it comes in no time; `before`: called before its request is sent."""
-    begun = reach(plain.common.get("socket") or os.environ.get("TALK_SOCKET") or None)
+    begun = reach(named_socket(plain.common.get("socket")))
     if begun.socket is None:
         return begun
     # After it has connected: the server greets meanwhile.
