@@ -184,9 +184,6 @@ def _render(path: str, text: str, chosen: Mapping[str, Any], timeout: float | No
             seconds = render(text, path, timeout=timeout, interrupt=interrupts.descriptor, **settings)
         except Interrupted:
             return interrupts.exit_code
-        except TimeoutError as error:
-            note(str(error))
-            return EXIT_TIMEOUT
     if options.json:
         done = {"output": path, "seconds": seconds, "text": text, **settings}
         regardless(show_if_possible, show_json, done)  # the file is there

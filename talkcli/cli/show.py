@@ -12,7 +12,7 @@ import sys
 import time
 
 from talkcli import __version__
-from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, TalkError, limits
+from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, EXIT_TIMEOUT, TalkError, limits
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -82,6 +82,9 @@ def ended(command: Callable[[], object], options: Common) -> int:
         return error.exit_code
     except KeyboardInterrupt:
         return EXIT_SIGINT
+    except TimeoutError as error:  # what was asked for was not done in the time that it was given
+        note(str(error))
+        return EXIT_TIMEOUT
     except MemoryError:
         note(f"there is not enough memory for talk: {limits()}")
         return EXIT_ERROR

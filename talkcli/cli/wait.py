@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 
 from talkcli.cli.interrupts import Interrupts, give_up_unread
-from talkcli.cli.show import Feedback, give_up_failed, give_up_output, note, reader_is_gone, show, show_json
+from talkcli.cli.show import Feedback, give_up_failed, give_up_output, reader_is_gone, show, show_json
 from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.frozen import TYPE_CHECKING
@@ -133,17 +133,12 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback:
     """Wait until these goals have ended, or all that have not, and return the exit code; `timeout` in seconds."""
     end = None if timeout is None else options.began + timeout
     give_up_unread()
-    with Interrupts(output=True) as interrupts:
-        try:
-            with options.connect(timeout, interrupt=interrupts.watched) as client:
-                goals = client.follow(ids or None, feedback=feedback)
-                shown = feedback_for(options, asked=feedback)
-                if feedback:
-                    _show(goals, end, interrupts, shown)
-                return _wait(goals, end, options, shown, named=bool(ids))
-        except TimeoutError as error:
-            note(str(error))
-            return EXIT_TIMEOUT
+    with Interrupts(output=True) as interrupts, options.connect(timeout, interrupt=interrupts.watched) as client:
+        goals = client.follow(ids or None, feedback=feedback)
+        shown = feedback_for(options, asked=feedback)
+        if feedback:
+            _show(goals, end, interrupts, shown)
+        return _wait(goals, end, options, shown, named=bool(ids))
     return interrupts.exit_code
 
 
