@@ -7,7 +7,6 @@ imported: a tenth of the life of a command that sends one request. It has all th
 from __future__ import annotations
 
 import _socket
-import os
 import sys
 
 #: Characters of a command line that are kept: enough for an interpreter, a script and its first arguments.
@@ -34,14 +33,14 @@ def _integer(data: bytes) -> int:
 
 def command_of(pid: int) -> str | None:
     """Return the name of the program that runs as this process, or None if it can't be known."""
-    line = _read(f"/proc/{pid}/comm")
+    line = contents(f"/proc/{pid}/comm")
     return line.decode(errors="replace").rstrip("\n") if line else None
 
 
 def parent_command_of(pid: int) -> str | None:
     """Return the command line of the process that started this one, or None if it can't be known."""
     parent = stat_of(pid)[1:2]
-    line = _read(f"/proc/{int(parent[0])}/cmdline") if parent else None
+    line = contents(f"/proc/{int(parent[0])}/cmdline") if parent else None
     if not line:
         return None
     return line.rstrip(b"\0").replace(b"\0", b" ").decode(errors="replace")[:MAX_COMMAND]
@@ -49,20 +48,17 @@ def parent_command_of(pid: int) -> str | None:
 
 def stat_of(pid: int) -> list[bytes]:
     """Return what /proc says of a process: state, parent, group, session, and more; empty if it can't be known."""
-    stat = _read(f"/proc/{pid}/stat") or b""
+    stat = contents(f"/proc/{pid}/stat") or b""
     # Before these is the program's name, in brackets; it may itself hold blanks and brackets.
     return stat.rpartition(b")")[2].split()
 
 
-def _read(path: str) -> bytes | None:
-    """Return the start of a file under /proc; None where it isn't there, or is another user's."""
+def contents(path: str, most: int = 4096) -> bytes | None:
+    """Return the start of a file under /proc, at most so many bytes, all of it for -1; None where it isn't there, or
+    is another user's.
+    """
     try:
-        fd = os.open(path, os.O_RDONLY)
-    except OSError:
+        with open(path, "rb", buffering=0) as file:
+            return file.read(most)
+    except OSError:  # which may come of reading, too: the process is gone by now
         return None
-    try:
-        return os.read(fd, 4096)
-    except OSError:  # it is gone by now
-        return None
-    finally:
-        os.close(fd)

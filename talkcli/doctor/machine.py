@@ -104,7 +104,7 @@ def owner(path: str) -> int | None:
 
 def _environment(pid: int) -> dict[str, str] | None:
     """Return the environment of a process of the same user; None for another's, whose sound server shuts us out."""
-    data = _bytes(f"/proc/{pid}/environ")
+    data = peers.contents(f"/proc/{pid}/environ", -1)
     if data is None or owner(f"/proc/{pid}") != os.getuid():
         return None
     pairs = (each.partition("=") for each in os.fsdecode(data).split("\0") if "=" in each)
@@ -222,13 +222,7 @@ def _access_list(path: str) -> list[tuple[int, int, int]]:
 
 def _text(path: str) -> str:
     """Return a file under /proc; "" where it isn't there, or is another user's."""
-    return (_bytes(path) or b"").decode(errors="replace")
-
-
-def _bytes(path: str) -> bytes | None:
-    with contextlib.suppress(OSError), open(path, "rb") as file:
-        return file.read()
-    return None
+    return (peers.contents(path, -1) or b"").decode(errors="replace")
 
 
 def judge_session(session: Session) -> Finding:
