@@ -121,10 +121,9 @@ class Transcript:
         tail_room = room // 3
         # Who ended it must not give way to its column; who sent it was told when it began.
         whole = forms[:-1] if ended and goal.by is not None and len(forms) > 1 else forms
-        tail = next((each for each in whole if width(each) <= tail_room), None)
-        if tail is None and ended:
+        if ended and all(width(each) > tail_room for each in whole):
             return self._ending(head, goal, whole, screen)
-        tail = cut(forms[-1], tail_room) if tail is None else tail
+        tail = longest_that_fits(whole, tail_room)
         text_room = room - tail_room - len(GAP)
         return [(head + pad(shortened(quoted(goal), text_room), text_room) + GAP + tail).rstrip()]
 
