@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -41,8 +42,33 @@ def connection(stage: Stage) -> list[Row]:
         say, stop = partial(_say, client, VOICED), partial(_cancel, client)
         rounds = range(stage.options.rounds * MORE_ROUNDS + 1)
         times = [until_silence(stage.sink, say, stop, stage.jitter()) for _ in rounds]
+        running, stopped = _returns(stage, client)
     limits = Limit("median", 2), Limit("p99", 20)
-    return [Row("connection", "cancel on an open connection → silence", "ms", milliseconds(times[1:]), limits=limits)]
+    name = "`Client.cancel()` → its return, while the sound server is stopped"
+    return [
+        Row("connection", "cancel on an open connection → silence", "ms", milliseconds(times[1:]), limits=limits),
+        Row("connection", name, "ms", milliseconds(stopped), "running", milliseconds(running), (Limit("above", 5),)),
+    ]
+
+
+def _returns(stage: Stage, client: Client) -> tuple[list[float], list[float]]:
+    """Return the seconds of cancels while the sound server runs, and while it is stopped, in turn."""
+    times: tuple[list[float], list[float]] = ([], [])
+    for number in range(2 * stage.options.rounds + 2):
+        stops = number % 2
+        with stage.sink.record() as recording:
+            client.say(VOICED)
+            recording.wait_for_sound()
+            if stops:
+                stage.sink.freeze()
+            began = time.monotonic()
+            client.cancel()
+            if number > 1:  # the first of each warmed up
+                times[stops].append(time.monotonic() - began)
+            if stops:
+                stage.sink.thaw()
+            recording.wait_until_quiet(0.3)
+    return times
 
 
 def pause(stage: Stage) -> list[Row]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tests.bench.table import Row
 
 #: How many rows a group has.
-ROWS = {"onset": 6, "at-once": 2, "commands": 13, "idle": 3, "throughput": 4, "queue": 4}
+ROWS = {"onset": 6, "at-once": 2, "connection": 2, "commands": 13, "idle": 3, "throughput": 4, "queue": 4}
 
 
 def _form(name: str, goal: str) -> tuple[str, str]:
