@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import random
 import select
+import socket
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from tests.support.surroundings import short_directory
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from contextlib import AbstractContextManager
+    from pathlib import Path
 
     from tests.support.sink import Sink
 
@@ -39,8 +41,8 @@ ERRORS = [1, 5, 12, 4711]
 class Rig:
     """A player behind a relay; `wait` is as the playback's, which knows what the player says and no more."""
 
-    def __init__(self, relay: Relay) -> None:
-        self.relay = relay
+    def __init__(self, relay: Relay | None = None) -> None:
+        self._relay = relay
         #: seconds after which a wait that nothing ends is taken for the playback's limit; None where none is to be
         self.limit: float | None = None
 
@@ -56,27 +58,40 @@ class Rig:
                 all_of_it.register(descriptor, events)
             if own.poll(0):
                 return
-            self.relay.register(all_of_it)
             due = end if until is None else min(until, end)
+            if self._relay is None:
+                all_of_it.poll(max(0.0, due - now) * 1000)
+                continue
+            self._relay.register(all_of_it)
             # a piece that is left is handed on at once
-            all_of_it.poll(0 if self.relay.waiting and self.limit is None else max(0.0, due - now) * 1000)
-            self.relay.pump()
+            all_of_it.poll(0 if self._relay.waiting and self.limit is None else max(0.0, due - now) * 1000)
+            self._relay.pump()
         if self.limit is not None:
             raise CannotSpeak("silent", "nothing came any more")
         raise AssertionError(f"nothing has woken it in {PATIENCE:g} s")
 
-    def end(self) -> CannotSpeak | None:
-        """Play the sound and return how that failed; None if it has ended well."""
+    @property
+    def relay(self) -> Relay:
+        assert self._relay
+        return self._relay
+
+    def play_alone(self) -> None:
+        """Play the sound by a player of its own."""
         player = None
         try:
             player = PulsePlayer(RATE)
             self.play(player)
-        except CannotSpeak as error:
-            return error
         finally:
             if player is not None:
                 player.kill()
                 assert player.gone()
+
+    def end(self) -> CannotSpeak | None:
+        """Play the sound and return how that failed; None if it has ended well."""
+        try:
+            self.play_alone()
+        except CannotSpeak as error:
+            return error
         return None
 
     def play(self, player: PulsePlayer) -> None:
@@ -223,3 +238,30 @@ def dummy_of(sink: Sink) -> Iterator[None]:
         yield
     finally:
         sink.pactl("unload-module", module)
+
+
+@pytest.mark.parametrize("cookie", ["none is asked for", "the right one", "another"])
+def test_a_server_is_reached_over_the_network_by_its_cookie(
+    sink: Sink, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cookie: str
+) -> None:
+    """As by pacat: PULSE_SERVER and PULSE_COOKIE are libpulse's own."""
+    for name in ("wanted", "other"):
+        (tmp_path / name).write_bytes(name[:1].encode() * 256)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    asked = "auth-anonymous=1" if cookie == "none is asked for" else f"auth-cookie={tmp_path / 'wanted'}"
+    module = sink.pactl("load-module", "module-native-protocol-tcp", "listen=127.0.0.1", f"port={port}", asked)
+    try:
+        for name, value in sink.env.items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setenv("PULSE_SERVER", f"tcp:127.0.0.1:{port}")
+        monkeypatch.setenv("PULSE_COOKIE", str(tmp_path / ("other" if cookie == "another" else "wanted")))
+        if cookie == "another":
+            with pytest.raises(CannotSpeak, match="the sound server lets nobody in: Access denied") as error:
+                Rig().play_alone()
+            assert error.value.reason == "audio_device"
+        else:
+            Rig().play_alone()
+    finally:
+        sink.pactl("unload-module", module.strip())
