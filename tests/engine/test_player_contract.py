@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    import numpy.typing as npt
+
     from talkcli.engine.players.base import Player
     from tests.support.sink import Sink
 
@@ -39,6 +41,8 @@ RATE = 22050
 _PIECE = int(PIECE * RATE) * SAMPLE
 #: A quarter of a second, of which no two pieces are alike.
 SOUND = b"".join(number.to_bytes(2, "little") for number in range(RATE // 4))
+#: Samples of silence before which a tape has all that was played: 0.1 s.
+SETTLED = RATE // 10
 #: Seconds within which any call returns: nothing waits in them.
 AT_ONCE = 0.05
 #: Times that one waits in a sound, or for its end: a few a piece, for what is heard is asked for as well.
@@ -115,10 +119,20 @@ def _pulse(at: Path) -> PulsePlayer:
 
 
 def _taped(at: Path) -> bytes:
-    """Return what such a sink has played, without the silence around it, and where a busy machine let it run dry."""
-    samples = np.frombuffer((at / "tape").read_bytes(), "<i2")
+    """Return what such a sink has played, without the silence around it, and where a busy machine let it run dry.
+
+    The sink goes on with zeros: what stands before them on the tape is all there is.
+    """
+    end = time.monotonic() + PATIENCE
+    while not len(samples := _on(at / "tape")) or np.any(samples[-SETTLED:]):
+        assert time.monotonic() < end, "the sink stands still"
+        time.sleep(0.005)  # what another process writes is no event
     found = samples[samples != 0].tobytes()  # of the sound only the first sample is zero
     return SOUND[:2] + found if found else b""
+
+
+def _on(tape: Path) -> npt.NDArray[np.int16]:
+    return np.frombuffer(tape.read_bytes()[: tape.stat().st_size // SAMPLE * SAMPLE], "<i2")
 
 
 def _cut_off(_: Path) -> PulsePlayer:
