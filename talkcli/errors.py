@@ -108,13 +108,9 @@ class BadRequest(RequestRefused):
 
 
 class LineTooLong(BadRequest):
-    """A line past its limit. `before`: the lines that were complete before it, which count all the same."""
+    """A line past its limit."""
 
     code = "line_too_long"
-
-    def __init__(self, limit: int, before: list[bytes]) -> None:
-        super().__init__(f"a line has at most {limit} bytes")
-        self.before = before
 
 
 #: Classes that a client raises for an error code of the server's; any other code is a RequestRefused.

@@ -69,31 +69,6 @@ class LineSplitter:
         self._begun += data[: self._most - len(self._begun)]
 
 
-class RequestSplitter(LineSplitter):
-    """Cuts what comes from a client into lines, none of them past a limit; a server is trusted."""
-
-    __slots__ = ()
-
-    def __init__(self) -> None:
-        super().__init__(MAX_LINE - 1)
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that are complete now, without their newlines; LineTooLong, with those before it, past the
-        limit.
-
-        After that error the stream cannot be followed any further: the connection has to be closed.
-        """
-        from talkcli.errors import LineTooLong
-
-        lines = super().feed(data)
-        for place, line in enumerate(lines):
-            if isinstance(line, Cut):
-                raise LineTooLong(MAX_LINE, lines[:place])
-        if self.size >= MAX_LINE:
-            raise LineTooLong(MAX_LINE, lines)
-        return lines
-
-
 def write_request(request: Request) -> JsonObject:
     """Return a request as the object that goes over the wire; fields at their defaults are left out."""
     message: JsonObject = {"request": request.kind}
@@ -146,8 +121,10 @@ def encode(message: JsonObject) -> bytes:
 
 def decode(line: bytes) -> JsonObject:
     """Return the object in a line; BadRequest, whose code says why, where there is none."""
-    from talkcli.errors import BadRequest
+    from talkcli.errors import BadRequest, LineTooLong
 
+    if isinstance(line, Cut):
+        raise LineTooLong(f"a line has at most {MAX_LINE} bytes")
     try:
         value = _json("decode")(line.decode())
     except UnicodeDecodeError as error:

@@ -11,11 +11,11 @@ import contextlib
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
 
-from talkcli.errors import BadRequest, LineTooLong
+from talkcli.errors import BadRequest
 from talkcli.frozen import replace
 from talkcli.goals.options import Cancel
 from talkcli.protocol.events import busy_greeting, failure, ok, take_seq
-from talkcli.protocol.lines import RequestSplitter, decode, encode
+from talkcli.protocol.lines import MAX_LINE, Cut, LineSplitter, decode, encode
 from talkcli.protocol.requests import Hello, Request, Status, read_request
 from talkcli.server.stream import Stream
 
@@ -75,7 +75,7 @@ class Connection(asyncio.Protocol):
         self.stream = Stream(streams, connected, self, SOFT_OUTPUT)
         self._handler = handler
         self._loop = streams.loop
-        self._splitter = RequestSplitter()
+        self._splitter = LineSplitter(MAX_LINE - 1)
         self._lines: deque[bytes] = deque()
         #: what has to be sent in its order while a list is on its way: lists, and what came after them
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
@@ -112,14 +112,9 @@ class Connection(asyncio.Protocol):
         self._handler.left(self)
 
     def data_received(self, data: bytes) -> None:
-        try:
-            self._lines.extend(self._splitter.feed(data))
-        except LineTooLong as error:
-            self._lines.extend(error.before)
-            while self._may_go_on() and self._step():
-                pass  # they were asked for, and are answered
-            self.part(failure(None, error.code, str(error)))
-            return
+        self._lines.extend(self._splitter.feed(data))
+        if self._splitter.size >= MAX_LINE:
+            self._lines.append(self._splitter.end())  # its end need not be awaited
         if b"\n" in data:
             self._stop_line_limit()  # what follows the newline is another line
         self._work()
@@ -208,12 +203,9 @@ class Connection(asyncio.Protocol):
 
     def _hear_last_requests(self) -> None:
         """Take what a client sent that closed without reading: the error hid it, but it is still in the socket."""
-        try:
-            with contextlib.suppress(OSError):
-                while data := self.stream.socket.recv(SOFT_OUTPUT):
-                    self._lines.extend(self._splitter.feed(data))
-        except LineTooLong as error:
-            self._lines.extend(error.before)
+        with contextlib.suppress(OSError):
+            while data := self.stream.socket.recv(SOFT_OUTPUT):
+                self._lines.extend(self._splitter.feed(data))
         while self._lines and self._bad_lines < MAX_BAD_LINES:
             self._take(self._lines.popleft())
 
@@ -266,7 +258,7 @@ class Connection(asyncio.Protocol):
             seq = take_seq(message)
             request = read_request(message)
         except BadRequest as error:
-            self._bad_lines += 1
+            self._bad_lines += MAX_BAD_LINES if isinstance(line, Cut) else 1  # nobody knows what follows it
             self.send(failure(seq, error.code, str(error)))
             if self._bad_lines >= MAX_BAD_LINES or not self.admitted:
                 self.stream.close()

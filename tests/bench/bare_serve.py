@@ -22,7 +22,7 @@ from collections import deque
 from talkcli.goals.goal import Goal, Sender
 from talkcli.goals.states import State
 from talkcli.protocol import events
-from talkcli.protocol.lines import RequestSplitter, encode
+from talkcli.protocol.lines import MAX_LINE, LineSplitter, encode
 
 #: An engine process that ends each sentence at once.
 _ENGINE = "import os\nwhile data := os.read(0, 65536):\n    os.write(0, data)"
@@ -97,7 +97,7 @@ class Client(asyncio.Protocol):
     def __init__(self, server: Server) -> None:
         self._server = server
         self._transport: asyncio.Transport
-        self._lines = RequestSplitter()
+        self._lines = LineSplitter(MAX_LINE - 1)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)

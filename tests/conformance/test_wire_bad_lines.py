@@ -189,6 +189,15 @@ def test_requests_that_stand_before_a_line_that_is_too_long_are_carried_out(talk
         assert_error(error, "line_too_long")
 
 
+def test_as_many_as_stand_before_a_line_that_is_too_long_are_answered_and_none_behind_it(talk: Talk) -> None:
+    requests = [b'{"seq": %d, "request": "resume"}\n' % number for number in range(101)]
+    with Raw(talk.socket) as raw:
+        raw.send(b"".join([*requests[:100], b"a" * MAX_LINE, b"\n", requests[100]]))
+        _, *answers, error = raw.receive_all()
+        assert [each["seq"] for each in answers] == list(range(100))
+        assert_error(error, "line_too_long")
+
+
 def test_nothing_but_bad_lines_end_the_connection(talk: Talk) -> None:
     for lines in (
         b"\n" * 10_000,

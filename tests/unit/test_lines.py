@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest, LineTooLong
 from talkcli.protocol.events import failure
-from talkcli.protocol.lines import MAX_LINE, RequestSplitter, decode, encode
+from talkcli.protocol.lines import MAX_LINE, Cut, LineSplitter, decode, encode
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
@@ -155,48 +155,41 @@ def test_integers_of_twenty_digits_are_read() -> None:
 
 def test_requests_in_one_segment_and_in_segments_of_one_byte_are_the_same() -> None:
     stream = encode({"request": "status"}) + encode({"request": "say", "text": "日"})
-    at_once, byte_by_byte = RequestSplitter(), RequestSplitter()
+    at_once, byte_by_byte = LineSplitter(), LineSplitter()
     lines = [line for byte in stream for line in byte_by_byte.feed(bytes([byte]))]
     assert at_once.feed(stream) == lines
     assert [decode(line).get("request") for line in lines] == ["status", "say"]
 
 
 def feed(stream: bytes, segment: int) -> list[bytes]:
-    splitter = RequestSplitter()
-    return [each for at in range(0, len(stream), segment) for each in splitter.feed(stream[at : at + segment])]
+    """Return the lines of a stream that comes in such segments, the last as if it ended there."""
+    splitter = LineSplitter(MAX_LINE - 1)
+    lines = [each for at in range(0, len(stream), segment) for each in splitter.feed(stream[at : at + segment])]
+    return [*lines, splitter.end()]
 
 
 @pytest.mark.parametrize("segment", [1, 7, 4 * KIB, 64 * KIB, 10 * KIB * KIB])
 def test_a_line_of_64_kib_with_its_newline_is_the_longest(segment: int) -> None:
     assert MAX_LINE == 64 * KIB
     line = b"a" * (64 * KIB - 1)
-    assert feed(line + b"\n", segment) == [line]
-    with pytest.raises(BadRequest) as refused:
-        feed(line + b"a\n", segment)
+    assert feed(line + b"\n", segment) == [line, b""]
+    too_long, _ = feed(line + b"a\n", segment)
+    with pytest.raises(LineTooLong) as refused:
+        decode(too_long)
     assert refused.value.code == "line_too_long"
 
 
 @pytest.mark.parametrize("segment", [4 * KIB, 64 * KIB, 10 * KIB * KIB])
 def test_ten_megabytes_without_a_newline_are_refused(segment: int) -> None:
-    with pytest.raises(BadRequest) as refused:
-        feed(b"[" * (10 * KIB * KIB), segment)
-    assert refused.value.code == "line_too_long"
-
-
-def test_a_line_without_an_end_is_refused_as_soon_as_it_is_too_long() -> None:
-    splitter = RequestSplitter()
-    assert splitter.feed(b"[" * (MAX_LINE - 1)) == []
-    with pytest.raises(BadRequest):
-        splitter.feed(b"[")
+    with pytest.raises(LineTooLong):
+        decode(*feed(b"[" * (10 * KIB * KIB), segment))
 
 
 @pytest.mark.parametrize("end", [b"", b"\n", b'\n{"request": "status"}\n'])
 def test_lines_before_one_that_is_too_long_are_not_lost(end: bytes) -> None:
-    splitter = RequestSplitter()
-    assert splitter.feed(b'{"request":') == []
-    with pytest.raises(LineTooLong) as refused:
-        splitter.feed(b' "cancel"}\n\n' + b"[" * MAX_LINE + end)
-    assert refused.value.before == [b'{"request": "cancel"}', b""]
+    first, blank, too_long, *_ = feed(b'{"request": "cancel"}\n\n' + b"[" * MAX_LINE + end, 11)
+    assert (first, blank) == (b'{"request": "cancel"}', b"")
+    assert isinstance(too_long, Cut)
 
 
 def test_a_longest_text_fits_in_a_line() -> None:
