@@ -45,21 +45,20 @@ class History:
         self._all: OrderedDict[str, Record] = OrderedDict()
         self._ended: OrderedDict[str, Record] = OrderedDict()
         self._rejected: OrderedDict[str, Record] = OrderedDict()
-        self._with_text: OrderedDict[str, Record] = OrderedDict()
         self._text_bytes = 0
 
     def add(self, record: Record) -> None:
         """Keep a goal that has ended; the oldest give way."""
         kept, limit = (self._rejected, MAX_REJECTED) if record.state is State.REJECTED else (self._ended, MAX_ENDED)
-        self._all[record.id] = kept[record.id] = self._with_text[record.id] = record
+        self._all[record.id] = kept[record.id] = record
         self._text_bytes += record.text_bytes
         if len(kept) > limit:
             oldest = kept.popitem(last=False)[1]
             del self._all[oldest.id]
-            self._forget_text(oldest)
+            self._text_bytes -= oldest.text_bytes
         while self._text_bytes > MAX_TEXT_BYTES:
-            oldest = next(iter(self._with_text.values()))
-            self._forget_text(oldest)
+            oldest = next(each for each in self._all.values() if each.text is not None)
+            self._text_bytes -= oldest.text_bytes
             oldest.drop_text()
 
     def find(self, goal_id: str) -> Record | None:
@@ -72,10 +71,6 @@ class History:
     def log(self, count: int) -> Iterator[Record]:
         """Return the last goals that ended, REJECTED ones too, the newest first."""
         return islice(reversed(self._all.values()), count)
-
-    def _forget_text(self, record: Record) -> None:
-        if self._with_text.pop(record.id, None) is not None:
-            self._text_bytes -= record.text_bytes
 
 
 class Said:

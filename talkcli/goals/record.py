@@ -36,7 +36,7 @@ class Record:
     text: str | None = field(init=False)
     #: stands for the text once that is dropped
     text_hash: int = 0
-    #: what the text takes in the history
+    #: bytes that the text takes; none once that is dropped
     text_bytes: int = field(init=False)
     state: State = State.PENDING
     #: its place among the pending goals of its priority; the queue's business alone
@@ -80,7 +80,7 @@ class Record:
     def drop_text(self) -> None:
         """Forget the text, to make room; the result stays."""
         self.text_hash = hash(self.text)
-        self.text, self.say = None, replace(self.say, text="")
+        self.text, self.text_bytes, self.say = None, 0, replace(self.say, text="")
 
     def has_text(self, text: str) -> bool:
         """Whether this was the goal's text, also where it is not kept any more."""
