@@ -20,7 +20,7 @@ from talkcli.engine.protocol import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, STAR
 from talkcli.frozen import frozen, replace
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 #: Seconds before the next start, by the number of processes in a row that died before they were of use.
 BACK_OFF = (0.0, 0.1, 0.5, 2.0, 10.0)
@@ -227,28 +227,27 @@ class Supervisor:
             self._shut_down()
 
     def _next_deadline(self) -> float:
-        process, goal, due = self._process, self._goal, [each.gone_by for each in self._dying]
-        if process is None:
-            due.append(self._restarts.due_at)
-        elif not process.ready:
-            due.append(self._started_at + START_LIMIT)
-        if goal:
-            limits = (goal.heard_at, HANG_AFTER), (goal.stop_at, STOP_LIMIT), (goal.pause_at, PAUSE_LIMIT)
-            due += [since + limit for since, limit in limits if since is not None]
-        return min(due, default=NEVER)
+        due = [limit for limit, _ in self._limits()] + [each.gone_by for each in self._dying]
+        return min([*due, NEVER] if self._process else [*due, self._restarts.due_at])
+
+    def _limits(self) -> Iterator[tuple[float, str]]:
+        """Return until when the process may take for what is waited for, and what is said of one that takes longer."""
+        goal = self._goal
+        if self._process and not self._process.ready:
+            yield self._started_at + START_LIMIT, f"the engine was not ready after {START_LIMIT:g} s"
+        if goal and goal.stop_at is not None:
+            yield goal.stop_at + STOP_LIMIT, f"the engine did not confirm a stop within {STOP_LIMIT * 1000:.0f} ms"
+        if goal and goal.heard_at is not None:
+            yield goal.heard_at + HANG_AFTER, f"the engine gave no sign of life for {HANG_AFTER:g} s"
+        if goal and goal.pause_at is not None:
+            yield goal.pause_at + PAUSE_LIMIT, f"the engine did not confirm a pause within {PAUSE_LIMIT:g} s"
 
     def _keep_limits(self, now: float) -> None:
-        goal = self._goal
-        if self._process is None and now >= self._restarts.due_at:
+        late = next((words for limit, words in self._limits() if now >= limit), None)
+        if late:
+            self._lose_process(late, "engine_hung")
+        elif self._process is None and now >= self._restarts.due_at:
             self._start()
-        elif self._process and not self._process.ready and now >= self._started_at + START_LIMIT:
-            self._lose_process(f"the engine was not ready after {START_LIMIT:g} s", "engine_failed")
-        elif goal and goal.stop_at is not None and now >= goal.stop_at + STOP_LIMIT:
-            self._lose_process(f"the engine did not confirm a stop within {STOP_LIMIT * 1000:.0f} ms", "engine_hung")
-        elif goal and goal.heard_at is not None and now >= goal.heard_at + HANG_AFTER:
-            self._lose_process(f"the engine gave no sign of life for {HANG_AFTER:g} s", "engine_hung")
-        elif goal and goal.pause_at is not None and now >= goal.pause_at + PAUSE_LIMIT:
-            self._lose_process(f"the engine did not confirm a pause within {PAUSE_LIMIT:g} s", "engine_hung")
         for process in self._dying:
             if now < process.gone_by:
                 continue
