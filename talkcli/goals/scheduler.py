@@ -11,6 +11,7 @@ speech is paused, or while there is no engine; a goal ends once; the order in wh
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import frozen, replace
@@ -52,42 +53,28 @@ class Changed:
     state: State
 
 
-@frozen
-class Start:
-    """The engine shall speak this goal."""
+class Order(Enum):
+    """What the engine shall do with a goal, as the log calls it."""
 
-    record: Record
-
-
-@frozen
-class Stop:
-    """The engine shall stop this goal; the answer is `ended`."""
-
-    record: Record
-
-
-@frozen
-class GiveUp:
-    """The engine didn't become silent in time: it must be replaced before it may be given another goal."""
-
-    record: Record
+    START = "Start"
+    #: the answer is `ended`
+    STOP = "Stop"
+    #: it didn't become silent in time: it must be replaced before it may be given another goal
+    GIVE_UP = "GiveUp"
+    #: be silent, and go on with it at `RESUME`
+    HOLD = "Hold"
+    RESUME = "Resume"
 
 
 @frozen
-class Hold:
-    """The engine shall be silent and go on with this goal at `Resume`."""
+class Ordered:
+    """The engine shall do this with a goal."""
 
     record: Record
+    order: Order
 
 
-@frozen
-class Resume:
-    """The engine shall go on with the goal that it holds."""
-
-    record: Record
-
-
-Effect = Changed | Start | Stop | GiveUp | Hold | Resume
+Effect = Changed | Ordered
 
 
 @frozen
@@ -238,7 +225,7 @@ class Scheduler:
             return []
         self.active.paused = True
         self.active.holds += 1
-        return [Hold(self.active)]
+        return [Ordered(self.active, Order.HOLD)]
 
     def resume(self, now: Now) -> list[Effect]:
         """Go on with the goal that is held, or else with the next."""
@@ -248,7 +235,7 @@ class Scheduler:
         if not (self.active and self.active.paused):
             return self._start_next(now)  # nothing where one is being stopped
         self.active.paused = False
-        return [Resume(self.active)]
+        return [Ordered(self.active, Order.RESUME)]
 
     # -- what the engine says
 
@@ -321,7 +308,8 @@ class Scheduler:
                 effects = self._stop(record, "expired", None, now)
             else:
                 words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
-                effects = [GiveUp(record), *self._end(record, State.ABORTED, "not_silent", words, record.by, now)]
+                effects = [Ordered(record, Order.GIVE_UP)]
+                effects += self._end(record, State.ABORTED, "not_silent", words, record.by, now)
         return effects + self._expire(now)
 
     # -- inside
@@ -439,7 +427,7 @@ class Scheduler:
         if not self.has_engine:
             return []
         record, effects = self._activate_next(now)
-        return [*effects, Start(record)] if record else effects
+        return [*effects, Ordered(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
         """Make the goal whose turn it is the active one, if there is one and nothing speaks against it."""
@@ -469,7 +457,7 @@ class Scheduler:
         record.become(State.PREEMPTING)
         record.reason, record.by, record.stop_since = reason, by, now.monotonic
         record.paused = False
-        return [Changed(record, State.PREEMPTING), Stop(record)]
+        return [Changed(record, State.PREEMPTING), Ordered(record, Order.STOP)]
 
     def _spoken(self, goal_id: str) -> Record:
         if self.active is None or self.active.id != goal_id:

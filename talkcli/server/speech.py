@@ -20,7 +20,7 @@ from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.goals.goal import Output
 from talkcli.goals.options import DEFAULT_VOICE, for_engine
-from talkcli.goals.scheduler import Changed, Effect, GiveUp, Hold, Now, Resume, Start
+from talkcli.goals.scheduler import Changed, Effect, Now, Order
 from talkcli.goals.states import State
 from talkcli.server import log
 from talkcli.server.call import go_on
@@ -92,6 +92,13 @@ class Speech:
         self._for_silence: dict[Record, Place] = {}
         #: the goal that was last known to be held and silent
         self.silent: Record | None = None
+        self._orders: dict[Order, Callable[[Record], None]] = {
+            Order.START: self._start,
+            Order.STOP: lambda goal: self.engine.stop(goal.id),
+            Order.GIVE_UP: lambda goal: self.engine.give_up(goal.id),
+            Order.HOLD: lambda goal: self.engine.pause(goal.id, goal.holds),
+            Order.RESUME: lambda goal: self.engine.resume(goal.id),
+        }
         #: what the engine thread has said, and is still to be taken
         self._reports: deque[Report] = deque()
         #: whether the loop has been told so: to wake it for each costs as much as to take one
@@ -201,9 +208,9 @@ class Speech:
                 moved = moved or effect.state is not State.REJECTED
                 continue
             try:
-                self._carry_out(effect)
+                self._orders[effect.order](effect.record)
             except Exception as error:  # noqa: BLE001 - the effects after it must not be lost: the engine would wait
-                log.bug(type(effect).__name__, error)
+                log.bug(effect.order.value, error)
         if moved:
             self.queue_changed()
         self.news.tell(told)
@@ -211,18 +218,6 @@ class Speech:
         self._set_timer()
         self.changed()
         self.look_finished()
-
-    def _carry_out(self, effect: Effect) -> None:
-        if isinstance(effect, Start):
-            self._start(effect.record)
-        elif isinstance(effect, GiveUp):
-            self.engine.give_up(effect.record.id)
-        elif isinstance(effect, Hold):
-            self.engine.pause(effect.record.id, effect.record.holds)
-        elif isinstance(effect, Resume):
-            self.engine.resume(effect.record.id)
-        else:
-            self.engine.stop(effect.record.id)
 
     def _tell_changed(self, record: Record, state: State, at: float) -> None:
         self.subscribers.changed(record, state, at)

@@ -38,7 +38,7 @@ class Robot:
 
     def see(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
-            what = effect.state.name if isinstance(effect, Changed) else type(effect).__name__
+            what = effect.state.name if isinstance(effect, Changed) else effect.order.value
             self.seen.append(f"{effect.record.number} {what}")
         return effects
 

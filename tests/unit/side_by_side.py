@@ -14,7 +14,7 @@ import pytest
 
 from talkcli.frozen import replace
 from talkcli.goals.options import INITIAL, Cancel, Say
-from talkcli.goals.scheduler import Changed, Effect, GiveUp, Hold, Now, Resume, Scheduler, Start, Stop
+from talkcli.goals.scheduler import Changed, Now, Order, Ordered, Scheduler
 from talkcli.goals.states import IllegalTransition, State
 from tests.unit.random_goals import BOOT, MAX_TEXT
 from tests.unit.slow_goal import ENDS, Selection, Wish
@@ -26,9 +26,15 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import By, Goal, Sender
     from talkcli.goals.record import Record
-    from talkcli.goals.scheduler import Submitted
+    from talkcli.goals.scheduler import Effect, Submitted
 
-ORDERS: dict[type[Effect], str] = {Start: "start", Stop: "stop", GiveUp: "give up", Hold: "hold", Resume: "resume"}
+ORDERS = {
+    Order.START: "start",
+    Order.STOP: "stop",
+    Order.GIVE_UP: "give up",
+    Order.HOLD: "hold",
+    Order.RESUME: "resume",
+}
 
 
 class SideBySide:
@@ -97,7 +103,7 @@ class SideBySide:
             assert done.effects == [Changed(record, State.REJECTED)]
             return
         assert done.effects[0] == Changed(record, State.PENDING), "it comes before all that it causes"
-        begun = [each for each in done.effects if isinstance(each, Start)]
+        begun = [each for each in done.effects if each == Ordered(each.record, Order.START)]
         if begun:
             assert done.effects[-2:] == [Changed(begun[0].record, State.ACTIVE), *begun], "it waits for others' ends"
 
@@ -203,7 +209,7 @@ class SideBySide:
         self.witness.see(effects)
         real = [(each.record.id, each.state.name) for each in effects if isinstance(each, Changed)]
         assert by_goal(real) == by_goal(self.model.events)
-        orders = [(ORDERS[type(each)], each.record.id) for each in effects if not isinstance(each, Changed)]
+        orders = [(ORDERS[each.order], each.record.id) for each in effects if isinstance(each, Ordered)]
         assert orders == self.model.orders
         self.amidst = False
 

@@ -6,7 +6,7 @@ import pytest
 
 from talkcli.goals.goal import By
 from talkcli.goals.options import Say
-from talkcli.goals.scheduler import SILENCE_LIMIT, GiveUp, Now, Start, Stop
+from talkcli.goals.scheduler import SILENCE_LIMIT, Now, Order, Ordered
 from talkcli.goals.states import IllegalTransition, State
 from tests.unit.robot import DOOR, Robot, ending
 
@@ -133,8 +133,8 @@ def test_effects_of_the_last_resort_come_before_the_next_start() -> None:
     goal, following = robot.says(), robot.says()
     robot.cancels(goal.id)
     effects = robot.scheduler.tick(Now(robot.seconds + 2, 0))
-    assert effects.index(GiveUp(goal)) < effects.index(Start(following))
-    assert Stop(goal) not in effects
+    assert effects.index(Ordered(goal, Order.GIVE_UP)) < effects.index(Ordered(following, Order.START))
+    assert Ordered(goal, Order.STOP) not in effects
 
 
 # An engine that is not there

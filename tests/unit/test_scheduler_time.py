@@ -7,7 +7,7 @@ import pytest
 from talkcli.frozen import replace
 from talkcli.goals.goal import By
 from talkcli.goals.options import Say
-from talkcli.goals.scheduler import SILENCE_LIMIT, Hold, Now, Resume
+from talkcli.goals.scheduler import SILENCE_LIMIT, Now, Order, Ordered
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, ending
 
@@ -128,9 +128,9 @@ def test_many_goals_that_come_and_go_leave_no_deadline_behind() -> None:
 def test_pause_holds_the_goal_being_spoken_and_resume_goes_on_with_it() -> None:
     robot = Robot()
     goal = robot.says()
-    assert robot.see(robot.scheduler.pause()) == [Hold(goal)]
+    assert robot.see(robot.scheduler.pause()) == [Ordered(goal, Order.HOLD)]
     assert (robot.scheduler.paused, goal.state, goal.snapshot().paused) == (True, State.ACTIVE, True)
-    assert robot.see(robot.scheduler.resume(robot.now)) == [Resume(goal)]
+    assert robot.see(robot.scheduler.resume(robot.now)) == [Ordered(goal, Order.RESUME)]
     assert (robot.scheduler.paused, goal.state, goal.snapshot().paused) == (False, State.ACTIVE, False)
     robot.tells("completed", goal.id)
     assert robot.seen == ["1 PENDING", "1 ACTIVE", "1 Start", "1 Hold", "1 Resume", "1 SUCCEEDED"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
-from talkcli.goals.scheduler import Changed, Effect, GiveUp, Hold, Resume, Start, Stop
+from talkcli.goals.scheduler import Changed, Effect, Order, Ordered
 from tests.unit.slow_goal import ENDS, FIRST, TABLE
 
 if TYPE_CHECKING:
@@ -31,24 +31,24 @@ class Witness:
             match effect:
                 case Changed(state=state):
                     self._changed(goal_id, state.name)
-                case Start():
+                case Ordered(order=Order.START):
                     self._started(goal_id)
-                case Stop():
+                case Ordered(order=Order.STOP):
                     assert goal_id == self.speaking, "a stop for a goal that the engine doesn't have"
                     assert goal_id not in self.told_to_stop, "a goal was told to stop twice"
                     self.told_to_stop.add(goal_id)
                     self.held = None
-                case Hold():
+                case Ordered(order=Order.HOLD):
                     assert self.paused, "a goal was held though nobody paused"
                     assert self.held is None, "a goal was held twice"
                     assert goal_id == self.speaking, "the engine shall hold a goal that it doesn't have"
                     assert goal_id not in self.told_to_stop, "the engine shall hold a goal that it shall stop"
                     self.held = goal_id
-                case Resume():
+                case Ordered(order=Order.RESUME):
                     assert not self.paused, "a goal goes on though speech is paused"
                     assert goal_id == self.held, "a goal goes on that was not held"
                     self.held = None
-                case GiveUp():
+                case Ordered(order=Order.GIVE_UP):
                     assert goal_id in self.told_to_stop, "an engine was given up that nobody told to stop"
                     assert self.started[-1] == goal_id, "an engine was given up that has the next goal already"
 
