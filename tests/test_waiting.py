@@ -167,7 +167,7 @@ def test_requests_of_all_connections_wait_up_to_a_number_of_bytes() -> None:
 def test_a_request_is_counted_with_the_memory_that_small_values_take(request_: Say | Wait) -> None:
     async def scene() -> None:
         server = Server()
-        assert server.requests._keep(Call(cast("Any", Client()), None, request_)) is None
+        assert server.requests._keep(Call(cast("Any", Client()), None, request_))
         assert server.requests._size > EACH + 16_000
 
     play(scene)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class Call:
     """One request of one client, until it is answered."""
 
-    __slots__ = ("_steps", "by", "connection", "ended", "place", "request", "seq", "size")
+    __slots__ = ("_steps", "by", "connection", "ended", "fault", "place", "request", "seq", "size")
 
     def __init__(self, connection: Connection, seq: int | None, request: Request) -> None:
         self.connection = connection
@@ -42,6 +42,8 @@ class Call:
         self.place: Place | None = None
         #: bytes that it is counted with
         self.size = 0
+        #: of a goal: reason and words why it can't wait, where it would have to
+        self.fault: tuple[str, str] | None = None
         #: of a goal: who cancelled it while it waited, and what became of it by that
         self.by: By | None = None
         self.ended: Record | None = None

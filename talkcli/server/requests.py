@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Iterator
     from typing import Any
 
-    from talkcli.goals.goal import JsonObject, Sender
+    from talkcli.goals.goal import JsonObject
     from talkcli.goals.record import Record
     from talkcli.server.call import Place
     from talkcli.server.connection import Connection
@@ -101,20 +101,16 @@ class Requests:
         self._speech.news.tell([*ends, self._speech.look_finished])
 
     async def _carry_out(self, call: Call) -> None:
-        request, fault = call.request, None
+        request = call.request
         try:
             if isinstance(request, Cancel | Pause):
                 self._hurry(call.connection)  # silence waits for nothing; what was asked for before comes before it
             elif self._must_wait(call):
-                fault = self._keep(call)
-                if fault is None:
+                if self._keep(call):
                     await call.wait(self._speech.for_voices, VOICES_LIMIT)
                 elif not isinstance(request, Say):
                     self._hurry(call.connection)
-            if fault and isinstance(request, Say):
-                self._submit(call, request, call.connection.sender, fault)
-            else:
-                await self._by_kind[type(request)](call, request)
+            await self._by_kind[type(request)](call, request)
         except RequestRefused as error:
             call.refuse(error.code, str(error))
         except Exception as error:  # noqa: BLE001 - one client's request must not take the voice from the others
@@ -148,18 +144,19 @@ class Requests:
         """Return the requests of this connection that wait for the voices: what comes after them must not overtake."""
         return [each for each in self._waiting(connection) if each.place is self._speech.for_voices]
 
-    def _keep(self, call: Call) -> tuple[str, str] | None:
-        """Count a request that is to wait; return reason and words why it can't, or None."""
+    def _keep(self, call: Call) -> bool:
+        """Count a request that is to wait; where it can't, return False, and it has a fault."""
         if call.size:
-            return None  # it has waited for something else already
+            return True  # it has waited for something else already
         size = EACH + sum(map(_bytes_of, fields(call.request).values()))
         if len(self._waiting(call.connection)) > MAX_WAITING:  # it is one of them
-            return "queue_full", f"{MAX_WAITING:,} requests of this connection are waiting already"
-        if self._size + size > ALL_WAITING:
-            return "queue_full", f"{ALL_WAITING >> 20} MiB of requests are waiting already"
-        call.size = size
-        self._size += size
-        return None
+            call.fault = "queue_full", f"{MAX_WAITING:,} requests of this connection are waiting already"
+        elif self._size + size > ALL_WAITING:
+            call.fault = "queue_full", f"{ALL_WAITING >> 20} MiB of requests are waiting already"
+        else:
+            call.size = size
+            self._size += size
+        return call.fault is None
 
     def _hurry(self, connection: Connection) -> None:
         """Have go on what of this connection waits for the voices; the others' know nothing of what hurries."""
@@ -211,23 +208,17 @@ class Requests:
     # -- one method a request
 
     async def _say(self, call: Call, say: Say) -> None:
-        sender, fault = call.connection.sender, None
+        connection, sender = call.connection, call.connection.sender
         if call.by is None:
             now = self._speech.now()
             if self._turn:  # a goal that comes now must not take the room of one that waits
                 self._turn.cancel()
                 self._let_go()
-            fault = self._speech.voice_fault(say.voice)
-            if say.patient and self._scheduler.lacks_room(say, now, fault):
-                fault = self._keep(call)
-                if fault is None:
-                    self._speech.subscribers.keep_alive()
-                    await call.wait(self._speech.for_room)
-        self._submit(call, say, sender, fault)
-
-    def _submit(self, call: Call, say: Say, sender: Sender, fault: tuple[str, str] | None) -> None:
-        connection, now = call.connection, self._speech.now()
-        fault = fault or self._speech.voice_fault(say.voice)
+            fault = call.fault or self._speech.voice_fault(say.voice)
+            if say.patient and self._scheduler.lacks_room(say, now, fault) and self._keep(call):
+                self._speech.subscribers.keep_alive()
+                await call.wait(self._speech.for_room)
+        now, fault = self._speech.now(), call.fault or self._speech.voice_fault(say.voice)
         submitted = self._scheduler.submit(say, sender, now, fault, call.by)
         record = submitted.record
         extra: JsonObject = {"paused": True} if self._scheduler.paused else {}
