@@ -69,7 +69,7 @@ class Engine:
                 return None
             self._buffer += data
         line, _, self._buffer = self._buffer.partition(b"\n")
-        return protocol.decode_event(line)
+        return protocol.decode(line, protocol.EVENTS)
 
     def until_end(self) -> tuple[list[protocol.Event], protocol.Ended | None]:
         """Return the events before the goal's end, and that: None where the process ended instead."""

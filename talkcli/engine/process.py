@@ -129,7 +129,7 @@ class EngineProcess:
             yield None
         for line in self._lines.feed(data):
             try:
-                yield protocol.decode_event(line)
+                yield protocol.decode(line, protocol.EVENTS)
             except (ValueError, TypeError, KeyError):
                 yield None
                 return

@@ -17,7 +17,10 @@ from talkcli.frozen import fields, frozen
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from typing import Any
+    from collections.abc import Mapping
+    from typing import TypeVar
+
+    _M = TypeVar("_M")
 
     from talkcli.goals.goal import JsonObject
 
@@ -210,9 +213,9 @@ Event = Ready | StartFailed | Voices | Started | Alive | Word | Output | Paused 
 #: The events that belong to a goal, by its `id`.
 OF_A_GOAL = (Started, Alive, Word, Output, Paused, Ended)
 
-# In a line a message is called as its class is.
-_COMMANDS = {each.__name__: each for each in (Configure, Say, Stop, Pause, Resume, Followed)}
-_EVENTS = {each.__name__: each for each in (Ready, StartFailed, Voices, *OF_A_GOAL)}
+#: What goes in and what comes out; in a line a message is called as its class is.
+COMMANDS: dict[str, type[Command]] = {each.__name__: each for each in Command.__args__}
+EVENTS: dict[str, type[Event]] = {each.__name__: each for each in Event.__args__}
 
 # Made once: `json.dumps` makes another for each line that isn't written in its own way, and `json.loads` guesses at the
 # encoding of each; together that is a third of what the two ends of this socket do for a line.
@@ -225,23 +228,12 @@ def encode(message: Command | Event) -> bytes:
     return _ENCODER.encode({"kind": type(message).__name__, **fields(message)}).encode() + b"\n"
 
 
-def decode_command(line: bytes) -> Command:
-    """Return the command in a line; ValueError, TypeError or KeyError if there is none."""
-    fields = _fields(line)
-    return _COMMANDS[fields.pop("kind")](**fields)
-
-
-def decode_event(line: bytes) -> Event:
-    """Return the event in a line; ValueError, TypeError or KeyError if there is none."""
-    fields = _fields(line)
-    event = _EVENTS[fields.pop("kind")]
-    if event is Voices:
-        fields["voices"] = tuple(Voice(**each) for each in fields["voices"])
-    return event(**fields)
-
-
-def _fields(line: bytes) -> dict[str, Any]:
+def decode(line: bytes, kinds: Mapping[str, type[_M]]) -> _M:
+    """Return the message in a line, one of `COMMANDS` or `EVENTS`; ValueError, TypeError or KeyError if it has none."""
     fields = _DECODER.decode(line.decode())
     if not isinstance(fields, dict):
         raise TypeError("a message is a JSON object")
-    return fields
+    kind = kinds[fields.pop("kind")]
+    if kind is Voices:
+        fields["voices"] = tuple(Voice(**each) for each in fields["voices"])
+    return kind(**fields)

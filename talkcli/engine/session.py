@@ -80,7 +80,7 @@ class Channel:
         if not data:
             self.closed = True
             return []
-        return [protocol.decode_command(line) for line in self._lines.feed(data)]
+        return [protocol.decode(line, protocol.COMMANDS) for line in self._lines.feed(data)]
 
 
 class InHand:

@@ -36,7 +36,7 @@ def commands():
                 sys.exit()
             buffer += data
         line, _, buffer = buffer.partition(b"\\n")
-        yield protocol.decode_command(line)
+        yield protocol.decode(line, protocol.COMMANDS)
 
 def send(event):
     os.write(0, protocol.encode(event))

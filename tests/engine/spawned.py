@@ -133,7 +133,7 @@ class Spawned:
                 return None
             self._rest += data
         line, self._rest = self._rest.split(b"\n", 1)
-        event = protocol.decode_event(line)
+        event = protocol.decode(line, protocol.EVENTS)
         self.events.append(event)
         return event
 

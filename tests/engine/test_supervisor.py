@@ -245,7 +245,7 @@ import os, sys
 sys.path.insert(0, {root!r})
 from talkcli.engine import protocol
 for line in os.fdopen(0, "rb"):
-    command = protocol.decode_command(line)
+    command = protocol.decode(line, protocol.COMMANDS)
     if isinstance(command, protocol.Configure):
         os.write(0, protocol.encode(protocol.Ready("complaining", None, None)))
     elif isinstance(command, protocol.Say):

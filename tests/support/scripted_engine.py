@@ -91,7 +91,7 @@ class Engine:
             return False
         *lines, self._buffer = (self._buffer + data).split(b"\n")
         for line in lines:
-            self._take(protocol.decode_command(line))
+            self._take(protocol.decode(line, protocol.COMMANDS))
         return True
 
     def _take(self, command: protocol.Command) -> None:
