@@ -114,9 +114,7 @@ class Resume:
 
 Request = Hello | Say | Wait | Cancel | Status | Voices | Watch | Log | Set | Pause | Resume
 
-KINDS: dict[str, type[Request]] = {
-    each.kind: each for each in (Hello, Say, Wait, Cancel, Status, Voices, Watch, Log, Set, Pause, Resume)
-}
+KINDS: dict[str, type[Request]] = {each.kind: each for each in Request.__args__}
 _OPTIONS = {kind: {each.name: each for each in request.options} for kind, request in KINDS.items()}
 
 
