@@ -15,9 +15,8 @@ from talkcli.engine.protocol import Ready, StartFailed
 from talkcli.engine.synthesizers import SYNTHESIZERS, is_own
 from talkcli.engine.synthesizers.base import NotInstalled, Sound, UnknownVoice
 from talkcli.engine.synthesizers.voices import find_voice, list_voices, unknown_voice
-from talkcli.frozen import fields, replace
+from talkcli.frozen import TYPE_CHECKING, fields, replace
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from typing import Any

@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import json
 
-from talkcli.frozen import fields, frozen
+from talkcli.frozen import TYPE_CHECKING, fields, frozen
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import TypeVar

@@ -20,9 +20,9 @@ from talkcli.engine import protocol
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.synthesizers.voices import list_voices
 from talkcli.engine.words import Words
+from talkcli.frozen import TYPE_CHECKING
 from talkcli.protocol.lines import LineSplitter
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from typing import Any

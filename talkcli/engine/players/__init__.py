@@ -13,9 +13,8 @@ import os
 import struct
 
 from talkcli.engine.players.base import PIECE, SAMPLE, CannotSpeak
-from talkcli.frozen import frozen
+from talkcli.frozen import TYPE_CHECKING, frozen
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 

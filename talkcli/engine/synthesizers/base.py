@@ -6,9 +6,8 @@ makes anything. `tests/engine/test_synthesizer_contract.py` puts every synthesiz
 
 from __future__ import annotations
 
-from talkcli.frozen import frozen
+from talkcli.frozen import TYPE_CHECKING, frozen
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Protocol
 
