@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import select
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -231,7 +232,7 @@ def test_interrupt_ends_the_wait_for_a_goal_and_loses_nothing(interrupt: tuple[i
         peer.reply("status", **OVERVIEW)
         peer.send(peer.word(), result())
 
-    with serving(play) as path, Client.over(SocketConnection(path, interrupt=interrupt[0])) as client:
+    with serving(play) as path, Client.over(SocketConnection(path, interrupt={interrupt[0]: select.POLLIN})) as client:
         handle = client.say("a", feedback=True)
         waiting: dict[str, Callable[[], object]] = {
             "events": lambda: list(handle.events(5)),
@@ -253,7 +254,7 @@ def test_interrupt_ends_what_may_take_long(interrupt: tuple[int, int], how: str)
             peer.send({"seq": request["seq"], "ok": True, **OVERVIEW})
         os.write(interrupt[1], b"x")
 
-    with serving(play) as path, Client.over(SocketConnection(path, interrupt=interrupt[0])) as client:
+    with serving(play) as path, Client.over(SocketConnection(path, interrupt={interrupt[0]: select.POLLIN})) as client:
         doing: dict[str, Callable[[], object]] = {
             "watch": lambda: list(client.events()),
             "say": lambda: client.say("a", patient=True),

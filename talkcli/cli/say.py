@@ -181,7 +181,7 @@ def _render(path: str, text: str, chosen: Mapping[str, Any], timeout: float | No
     text = _readable(text, options)
     with Interrupts() as interrupts:
         try:
-            seconds = render(text, path, timeout=timeout, interrupt=interrupts.descriptor, **settings)
+            seconds = render(text, path, timeout=timeout, interrupt=interrupts.watched, **settings)
         except Interrupted:
             return interrupts.exit_code
     if options.json:

@@ -164,7 +164,7 @@ class SocketConnection:
         *,
         name: str | None = None,
         urgent: bool = False,
-        interrupt: Mapping[int, int] | int | None = None,
+        interrupt: Mapping[int, int] | None = None,
         patience: float = ANSWER_LIMIT,
         begun: Begun | None = None,
     ) -> None:
@@ -172,13 +172,13 @@ class SocketConnection:
 
         `socket`: path of the server's socket, default TALK_SOCKET, then the usual places; `name`: what the sender calls
         itself, default TALK_NAME; `urgent`: for status and cancel alone, for which a full server keeps some places;
-        `interrupt`: a descriptor that ends any waiting with Interrupted as soon as it is readable, or several, each
-        with the events of poll that do so (broken and hung up always do); `patience`: seconds in which the server must
-        greet, and answer; `begun`: how far it has come already, maybe with what is to be the first request sent.
+        `interrupt`: what ends any waiting with Interrupted, as in `connect.ready`; `patience`: seconds in which the
+        server must greet, and answer; `begun`: how far it has come already, maybe with what is to be the first request
+        sent.
 
         What is raised, `Client` says.
         """
-        self._interrupt = {interrupt: select.POLLIN} if isinstance(interrupt, int) else interrupt
+        self._interrupt = interrupt
         name = sender(name)
         if name and len(name) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")

@@ -12,7 +12,6 @@ import contextlib
 import errno
 import os
 import re
-import select
 import stat
 import time
 from typing import TYPE_CHECKING
@@ -71,16 +70,15 @@ def render(
     pitch: int = 50,
     driver: str | None = None,
     timeout: float | None = None,
-    interrupt: int | None = None,
+    interrupt: Mapping[int, int] | None = None,
 ) -> float:
     """Render the text into the file at `path` and return the seconds of audio; "-" is standard output.
 
-    The settings are those of a goal. `timeout`: seconds in which it must be done, else TimeoutError; `interrupt`: a
-    descriptor that ends it with `Interrupted` as soon as it is readable. RenderFailed; BrokenPipeError where whoever
-    reads standard output is gone; UsageError for a driver that writes no file, or for a terminal.
+    The settings are those of a goal. `timeout`: seconds in which it must be done, else TimeoutError; `interrupt`: what
+    ends it with Interrupted, as in `connect.ready`. RenderFailed; BrokenPipeError where whoever reads standard output
+    is gone; UsageError for a driver that writes no file, or for a terminal.
     """
     deadline = time.monotonic() + (float("inf") if timeout is None else timeout)
-    ends = None if interrupt is None else {interrupt: select.POLLIN}
     fault = texts.fault(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
@@ -88,11 +86,11 @@ def render(
     if path not in STANDARD_OUTPUT and not _is_stream(path):
         with _replacing(path) as hidden:
             configure = protocol.Configure(os.getpid(), driver, f"file:{hidden}", None, None, list_voices=False)
-            return _speak_into(Conversation(configure, deadline=deadline, interrupt=ends), hidden, path, says)
-    with _stream(path, deadline, ends) as output:
+            return _speak_into(Conversation(configure, deadline=deadline, interrupt=interrupt), hidden, path, says)
+    with _stream(path, deadline, interrupt) as output:
         configure = protocol.Configure(os.getpid(), driver, None, None, None, list_voices=False, output=output)
         try:
-            conversation = Conversation(configure, deadline=deadline, interrupt=ends)
+            conversation = Conversation(configure, deadline=deadline, interrupt=interrupt)
             return _speak_into(conversation, WavStreamPlayer.name, _named(path), says)
         except CannotWrite as error:
             if path in STANDARD_OUTPUT and ready({output: 0}, 0.0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import socket
 import stat
 import struct
@@ -245,7 +246,7 @@ def test_a_named_pipe_that_nobody_reads_is_waited_for_as_long_as_is_asked(tmp_pa
     reader, writer = os.pipe()
     os.write(writer, b"x")
     with pytest.raises(Interrupted):
-        render("yes", str(path), interrupt=reader)
+        render("yes", str(path), interrupt={reader: select.POLLIN})
     os.close(reader)
     os.close(writer)
 
@@ -391,7 +392,7 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path) -> None:
     try:
         os.write(writer, b"x")
         with pytest.raises(Interrupted):
-            render(LONGEST, str(path), interrupt=reader)
+            render(LONGEST, str(path), interrupt={reader: select.POLLIN})
     finally:
         os.close(reader)
         os.close(writer)
