@@ -262,12 +262,13 @@ def test_who_begins_to_watch_while_much_is_told_hears_what_happens_from_then_on(
         server, watcher = Server(count), Client()
         server.fill(1 + count)
         server.ask(Client(), Cancel(before=f"4k7f-{count + 1}"))
-        told: list[int] = []
-        monkeypatch.setattr(server.speech.subscribers, "watch", lambda _: told.append(server.speech.subscribers._count))
+        told: list[str] = []
+        subscribed = server.speech.subscribers
+        monkeypatch.setattr(subscribed, "watch", lambda _: told.append(str(subscribed._numbers)))
         server.ask(watcher, Watch())
         assert (told, server.speech.news.told) == ([], False)
         await all_told(server.speech.news)
-        assert told == [server.speech.subscribers._count]
+        assert told == [str(subscribed._numbers)]
 
     play(scene)
 

@@ -1,10 +1,9 @@
 """What a server says, and its form in JSON: the greeting, replies and their lists, and the events that are heard.
 
-Rules for this file: form only, no I/O. `to_json` gives what the commands print, which is what the wire has; a server
-writes its events by hand, in `server.subscribers`, as it sends thousands of them. A field may be added, never renamed
-or given another meaning, and means the same in each event; a reader ignores what it doesn't know. A change that an
-older peer could not read needs another PROTOCOL number; `{"request": "cancel"}` and `{"request": "status"}` stay the
-same in all of them.
+Rules for this file: form only, no I/O. `to_json` gives what the wire has, which is what the commands print. A field may
+be added, never renamed or given another meaning, and means the same in each event; a reader ignores what it doesn't
+know. A change that an older peer could not read needs another PROTOCOL number; `{"request": "cancel"}` and
+`{"request": "status"}` stay the same in all of them.
 """
 
 from __future__ import annotations

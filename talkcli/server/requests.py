@@ -17,6 +17,7 @@ from talkcli.frozen import fields, replace
 from talkcli.goals.goal import By
 from talkcli.goals.options import Cancel, Say, Set, as_shown, bad_option, given
 from talkcli.goals.states import State
+from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
 from talkcli.server import log
@@ -254,8 +255,8 @@ class Requests:
         spoken = active.snapshot() if active else None
         told = [(record, record.state) for record in records]
         goals = (spoken if spoken and record is active else record.snapshot(state) for record, state in told)
-        ended = (record.snapshot() for record, state in told if state.terminal)  # subscribers are told of the others
-        results: Iterator[JsonObject] = ({"event": "result", "goal": each.to_json()} for each in ended)
+        # Subscribers are told of the others.
+        results = (Result(record.snapshot()).to_json() for record, state in told if state.terminal)
         call.answer(({"goal": each.to_json()} for each in goals), results, count=len(records))
 
     async def _cancel(self, call: Call, selection: Cancel) -> None:

@@ -7,10 +7,12 @@ goals. It knows connections and goals, of the engine what a word is, and of requ
 from __future__ import annotations
 
 from collections import deque
-from itertools import chain
+from itertools import chain, count
 from typing import TYPE_CHECKING
 
+from talkcli.frozen import replace
 from talkcli.goals.states import State
+from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.protocol.lines import encode
 from talkcli.server import log
 
@@ -48,8 +50,8 @@ class Subscribers:
         """`others`: who else is told that the server is alive, because a request waits."""
         self._loop = loop
         self._others = others
-        #: events published so far: a watcher sees by a gap that feedback was dropped
-        self._count = 0
+        #: counts the events: a watcher sees by a gap that feedback was dropped
+        self._numbers = count(1)
         #: by goal, until its end: those who wait for that, and whether they want its feedback
         self._waiters: dict[str, dict[Connection, bool]] = {}
         self._watchers: dict[Connection, None] = {}
@@ -78,36 +80,33 @@ class Subscribers:
 
     def changed(self, record: Record, state: State, at: float) -> None:
         """Publish a goal's new state; with its last one, its result."""
-        event: JsonObject = {"event": "state", "id": record.id, "state": state.name, **self._counted(at)}
+        event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
             # Its first state, and its last, tell watchers all of it.
-            whole = {"goal": record.snapshot(state).to_json()} if state is State.PENDING or state.terminal else {}
-            _publish({**event, **whole}, self._watchers)
+            whole = record.snapshot(state) if state is State.PENDING or state.terminal else None
+            _publish(replace(event, goal=whole).to_json(), self._watchers)
         if not state.terminal:
-            _publish(event, self._waiters.get(record.id, ()))
+            _publish(event.to_json(), self._waiters.get(record.id, ()))
         elif record.id in self._waiters:
-            self._send_result(record, encode(event))
+            # In one piece: a thousand may wait for it.
+            piece = encode(event.to_json()) + encode(Result(record.snapshot()).to_json())
+            for connection in self._waiters.pop(record.id):
+                connection.publish(piece)
 
     def heard(self, word: Word, text: str, at: float) -> None:
         """Publish that a word of a goal is being heard; `text`: as it stands there."""
-        event: JsonObject = {"event": "word", "id": word.id, "word": text, "start": word.start, "end": word.end}
-        event |= {"number": word.number, "time": word.time, **self._counted(at)}
-        _publish(event, self._listening([self._waiters.get(word.id, {})]), feedback=True)
+        event = WordHeard(word.id, text, word.start, word.end, word.number, word.time, at, next(self._numbers))
+        _publish(event.to_json(), self._listening([self._waiters.get(word.id, {})]), feedback=True)
 
     def paused(self, held: str | None, *, paused: bool, by: By, at: float) -> None:
         """Publish that speech is held, or goes on: `held` is the goal that was being spoken."""
-        event: JsonObject = {"event": "paused", "paused": paused, "id": held, "by": by.to_json(), **self._counted(at)}
-        _publish(event, self._listening(self._waiters.values()))
+        event = PausedChanged(paused, held, by, at, next(self._numbers))
+        _publish(event.to_json(), self._listening(self._waiters.values()))
 
     def keep_alive(self) -> None:
         """Tell those who wait for anything, from now on, that the server is alive."""
         if self._alive is None:
             self._alive = self._loop.call_later(ALIVE_EVERY, self._say_alive)
-
-    def _counted(self, at: float) -> JsonObject:
-        """Return what every event has that is of the world, not of one client."""
-        self._count += 1
-        return {"n": self._count, "at": at}
 
     def _listening(self, waiting: Iterable[dict[Connection, bool]]) -> dict[Connection, None]:
         """Return who hears of these goals' feedback: those of who waits for them that want it, and who watches all."""
@@ -115,12 +114,6 @@ class Subscribers:
         for each in waiting:
             listening.update((connection, None) for connection, feedback in each.items() if feedback)
         return listening
-
-    def _send_result(self, record: Record, last: bytes) -> None:
-        """Send a goal's last state and its result, in one piece: a thousand may wait for it."""
-        piece = last + encode({"event": "result", "goal": record.snapshot().to_json()})
-        for connection in self._waiters.pop(record.id):
-            connection.publish(piece)
 
     def _say_alive(self) -> None:
         self._alive = None
