@@ -324,8 +324,7 @@ class Requests:
             if self._scheduler.active:
                 words += ", and busy with its first sentence: ask again after that"
             raise RequestRefused(words, "engine_failed")
-        told: list[JsonObject] = [{"id": each.id, "language": each.language, "name": each.name} for each in voices]
-        call.answer(({"voice": each} for each in told), count=len(voices))
+        call.answer(({"voice": fields(each)} for each in voices), count=len(voices))
 
     async def _log(self, call: Call, request: Log) -> None:
         records = list(self._scheduler.history.log(request.count))
