@@ -72,16 +72,17 @@ class Queue:
         last = self._giving_way[-1][2] if self._giving_way else None
         return last if last and last.priority < priority else None
 
-    def add(self, record: Record) -> None:
-        """Put a goal at the end of its priority, or at the front where it preempts."""
-        record.turn = -record.number if record.preempt else record.number
-        self._enter(record)
+    def add(self, record: Record, instead: Record | None = None) -> None:
+        """Put a goal at the end of its priority, or at the front where it preempts.
 
-    def replace(self, old: Record, new: Record) -> None:
-        """Put a goal into the place of one of the same priority, which leaves."""
-        self.remove(old)
-        new.turn = old.turn
-        self._enter(new)
+        `instead`: into the place of this one, of the same priority, which has left.
+        """
+        usual = -record.number if record.preempt else record.number
+        record.turn = instead.turn if instead else usual
+        for goals, entry in self._entries(record):
+            insort(goals, entry)
+        if record.key is not None:
+            self._by_key[record.key] = record
 
     def remove(self, record: Record) -> None:
         """Take a goal out."""
@@ -97,12 +98,6 @@ class Queue:
     def expired(self, now: float) -> list[Record]:
         """Return the goals whose time is over, the first to be so first."""
         return list(map(_goal, self._expiries[: bisect_left(self._expiries, (now, inf))]))
-
-    def _enter(self, record: Record) -> None:
-        for goals, entry in self._entries(record):
-            insort(goals, entry)
-        if record.key is not None:
-            self._by_key[record.key] = record
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
         """Return the lists that a goal is in, and what it is in each; the same where it stands by its number."""

@@ -390,18 +390,14 @@ class Scheduler:
         """Queue a goal that was accepted, and end what it replaces, preempts or displaces."""
         by = By(goal=record.id)
         effects: list[Effect] = []
-        queued = False
+        instead = None
         for each, reason in ended:
             if reason == "replaced" and each.priority == record.priority and not record.preempt:
-                self._queue.replace(each, record)
-                queued = True
-            else:
-                self._queue.remove(each)
-            effects += self._recalled(each, reason, f"{reason} by {record.id}", by, now)
+                instead = each
+            effects += self._recall(each, reason, f"{reason} by {record.id}", by, now)
         if record.preempt and self.active and self.active.priority <= record.priority:
             effects += self._stop(self.active, "preempted", by, now)
-        if not queued:
-            self._queue.add(record)
+        self._queue.add(record, instead)
         return effects
 
     def _expire(self, now: Now) -> list[Effect]:

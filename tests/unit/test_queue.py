@@ -48,7 +48,8 @@ class Both:
             self.take_out(what, seconds)
         elif what == "replace" and old is not None:
             self.told[self.told.index(old)] = record
-            self.queue.replace(old, record)
+            self.queue.remove(old)
+            self.queue.add(record, old)
         else:
             if old is not None:
                 self.told.remove(old)
