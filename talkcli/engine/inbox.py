@@ -85,13 +85,10 @@ class Inbox:
         while self._actions:
             self._actions.popleft()()
 
-    def refuse(self) -> None:
-        """Take no more actions; before `close`, so that no thread is in between."""
-        with self._entering:
-            self._closed = True
-
     def close(self) -> None:
-        """Close the descriptors, of others' none."""
+        """Take no more actions, and close the descriptors, of others' none."""
+        with self._entering:  # no thread is in between
+            self._closed = True
         self.selector.close()
         os.close(self._descriptor)
         os.close(self._wake)

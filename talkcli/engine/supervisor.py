@@ -482,7 +482,6 @@ class Supervisor:
         while self._dying and time.monotonic() < limit:
             for key in self._inbox.wait(limit):
                 self._handle(key)
-        self._inbox.refuse()
         for process in self._dying:
             process.close()
         self._inbox.close()

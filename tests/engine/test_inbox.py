@@ -65,7 +65,6 @@ class Sleeper:
         self.inbox.call(end)
         self._thread.join(PATIENCE)
         assert not self._thread.is_alive()
-        self.inbox.refuse()
         self.inbox.close()
 
 
@@ -139,11 +138,10 @@ def test_nothing_is_lost_and_nothing_overtakes_while_several_threads_hand_in(sta
 
 def test_nothing_is_done_once_no_more_is_taken() -> None:
     inbox, done = Inbox(0.0), list[str]()
-    inbox.refuse()
-    inbox.call(lambda: done.append("late"))
-    assert inbox.wait(0.0) == []
-    assert done == []
     inbox.close()
+    inbox.call(lambda: done.append("late"))
+    inbox.run()
+    assert done == []
 
 
 def test_it_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,7 +149,6 @@ def test_it_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.Monke
     inbox, closed, write = Inbox(0.0), threading.Event(), os.write
 
     def close() -> None:
-        inbox.refuse()
         inbox.close()
         closed.set()
 
