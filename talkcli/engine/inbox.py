@@ -1,6 +1,6 @@
 """What other threads want done in a thread that waits for descriptors: actions, and one descriptor that wakes it.
 
-It knows nothing of what the actions do. `call` and `leave` are for other threads, the rest for the one that waits.
+It knows nothing of what the actions do. `call` is for other threads, the rest for the one that waits.
 """
 
 from __future__ import annotations
@@ -42,15 +42,11 @@ class Inbox:
         os.set_blocking(self._wake, False)
         self.selector.register(self._descriptor, selectors.EVENT_READ)
 
-    def call(self, action: Callable[[], None]) -> None:
-        """Have the action done by the thread that waits; from any thread. Nothing happens once it is closed."""
-        self.leave(action, by=0.0)
+    def call(self, action: Callable[[], None], by: float = 0.0) -> None:
+        """Have the action done by the thread that waits; from any thread. Nothing happens once it is closed.
 
-    def leave(self, action: Callable[[], None], by: float) -> None:
-        """Have the action done as soon as the thread wakes for whatever reason, at the latest at this monotonic time.
-
-        To wake a thread, and to have it take the interpreter from the one that runs, costs some 50 µs: as much as a
-        hundred lines.
+        `by`: the monotonic time up to which it may lie until the thread wakes for another reason. To wake a thread, and
+        to have it take the interpreter from the one that runs, costs some 50 µs: as much as a hundred lines.
         """
         with self._entering:
             if self._closed:

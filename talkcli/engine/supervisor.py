@@ -173,7 +173,7 @@ class Supervisor:
         if process is None:
             self._inbox.call(lambda: self._take(goal))
             return
-        self._inbox.leave(lambda: self._take(goal, process, now), by=now + HANG_AFTER)
+        self._inbox.call(lambda: self._take(goal, process, now), by=now + HANG_AFTER)
         if not process.send(goal):
             self._inbox.call(lambda: self._not_taken(goal.id, process))
 

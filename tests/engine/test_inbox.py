@@ -89,7 +89,7 @@ def test_what_is_left_for_a_thread_that_dozes_does_not_wake_it_and_is_done_befor
     sleeper.do(lambda: None)
     wakes = sleeper.wakes
     for each in ("first", "second"):
-        sleeper.inbox.leave(lambda each=each: done.append(each), by=time.monotonic() + 1000)  # type: ignore[misc]
+        sleeper.inbox.call(lambda each=each: done.append(each), by=time.monotonic() + 1000)  # type: ignore[misc]
     assert sleeper.wakes == wakes
     sleeper.do(lambda: done.append("third"))
     assert done == ["first", "second", "third"]
@@ -100,7 +100,7 @@ def test_what_must_be_done_sooner_than_the_thread_would_wake_wakes_it(start: Cal
     sleeper, done = start(0.0), threading.Event()
     sleeper.do(lambda: None)
     wakes = sleeper.wakes
-    sleeper.inbox.leave(done.set, by=time.monotonic() + 1000)  # it does not doze, so it would sleep for ever
+    sleeper.inbox.call(done.set, by=time.monotonic() + 1000)  # it does not doze, so it would sleep for ever
     assert done.wait(PATIENCE)
     assert sleeper.wakes == wakes + 1
 
@@ -109,7 +109,7 @@ def test_a_thread_that_dozes_looks_at_what_was_left_when_it_would_sleep_on(start
     sleeper, done = start(0.2), threading.Event()
     sleeper.do(lambda: None)
     wakes = sleeper.wakes
-    sleeper.inbox.leave(done.set, by=time.monotonic() + 1000)
+    sleeper.inbox.call(done.set, by=time.monotonic() + 1000)
     assert done.wait(PATIENCE)
     assert sleeper.wakes <= wakes + 1  # one, where this test itself came later than the doze was long
 
@@ -124,7 +124,7 @@ def test_nothing_is_lost_and_nothing_overtakes_while_several_threads_hand_in(sta
             if number % 3:
                 sleeper.inbox.call(action)
             else:
-                sleeper.inbox.leave(action, by=time.monotonic() + 0.002 * (number % 2))
+                sleeper.inbox.call(action, by=time.monotonic() + 0.002 * (number % 2))
 
     threads = [threading.Thread(target=hand_in, args=(who,)) for who in range(3)]
     for each in threads:
