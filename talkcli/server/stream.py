@@ -142,7 +142,7 @@ class Stream:
         except BlockingIOError:
             return
         except OSError as error:
-            self._end(error)
+            self.abort(error)
             return
         try:
             if data:
@@ -196,11 +196,7 @@ class Stream:
         self.closing = True
         self.pause_reading()
         if not self._waiting:
-            self._end(None)
-
-    def abort(self) -> None:
-        """Close now."""
-        self._end(None)
+            self.abort()
 
     def _send(self) -> None:
         try:
@@ -208,7 +204,7 @@ class Stream:
         except BlockingIOError:
             sent = 0
         except OSError as error:
-            self._end(error)
+            self.abort(error)
             return
         del self._waiting[:sent]
         self._streams.waiting -= sent
@@ -219,7 +215,7 @@ class Stream:
             self._blocked = False
             self._loop.remove_writer(self.socket)
         if self.closing and not self._waiting:
-            self._end(None)
+            self.abort()
         else:
             self._tell_congestion()
 
@@ -233,7 +229,8 @@ class Stream:
 
     # -- the end
 
-    def _end(self, error: OSError | None) -> None:
+    def abort(self, error: OSError | None = None) -> None:
+        """Close now; `error`: what the system said, where the connection broke."""
         if self not in self._streams.open:
             return
         if self.closing:
