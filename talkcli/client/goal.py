@@ -43,12 +43,10 @@ class GoalHandle:
         self.attached = False
         #: whether the server holds all speech, as far as it was heard of: nothing is spoken until somebody resumes
         self.speech_paused = False
-        #: whether the server tells this connection how it ends
-        self._followed = False
-        #: … and each word
+        #: since when the server tells this connection how it ends, by the monotonic clock; None where it doesn't
+        self._followed_at: float | None = None
+        #: whether it tells each word, too
         self._fed = False
-        #: since when the server has said that it is alive, by the monotonic clock
-        self._followed_at = 0.0
         self._buffer = EventBuffer()
         #: whether its Result has been handed out
         self._told = False
@@ -102,7 +100,7 @@ class GoalHandle:
         For a loop that must not: it reads what the server has said meanwhile, so it has to be called again and again.
         UsageError for a goal that was sent with `follow=False`, of which nothing comes until `wait` or `events` asks.
         """
-        if not (self._followed or self.state.terminal):
+        if self._followed_at is None and not self.state.terminal:
             raise UsageError(f"nothing is heard of {self.id}, which was sent with follow=False: leave that out")
         now, since = time.monotonic(), self._followed_at
         if not self._connection.wait_until(self._has_next, now, since=since, interruptible=False):
@@ -131,10 +129,10 @@ class GoalHandle:
     def _listen(self, *, feedback: bool) -> None:
         """Hear of the goal from now on, which the server tells this connection of; under the connection's lock."""
         self._fed = self._fed or feedback
-        if not (self._followed or self.state.terminal):
-            self._connection.followed.add(self.id, self._hear)
+        if self._followed_at is None:
             self._followed_at = time.monotonic()
-        self._followed = True
+            if not self.state.terminal:
+                self._connection.followed.add(self.id, self._hear)
 
     def _hear(self, event: Event) -> None:
         """Take up an event of this goal, or of all speech."""
@@ -181,7 +179,7 @@ class GoalHandle:
 
     def _follow(self, *, feedback: bool) -> None:
         """Have this connection told of the goal, if it isn't yet."""
-        if self.state.terminal or (self._followed and (self._fed or not feedback)):
+        if self.state.terminal or (self._followed_at is not None and (self._fed or not feedback)):
             return
 
         def accepted(_: JsonObject, items: list[JsonObject]) -> None:
