@@ -113,12 +113,13 @@ class Scheduler:
         self.paused = False
         #: whether there is an engine to start the next goal; without one they wait
         self.has_engine = True
+        #: whether it was told to end, and takes no goal any more
+        self.closing = False
         self._queue = Queue()
         self._by_id: dict[str, Record] = {}
         self._said = Said()
         self._early = EarlyCancels()
         self._count = 0
-        self._closing = False
 
     # -- what there is
 
@@ -208,7 +209,7 @@ class Scheduler:
 
     def shutdown(self, now: Now) -> list[Effect]:
         """End everything, and take no goal any more."""
-        self._closing = True
+        self.closing = True
         effects: list[Effect] = []
         for record in list(self._queue):
             effects += self._recall(record, "shutdown", "the server was stopped", None, now)
@@ -341,7 +342,7 @@ class Scheduler:
 
     def _refuse(self, say: Say, fault: tuple[str, str] | None, first: Record | None) -> tuple[str, str] | None:
         """Return reason and words why a goal can't be had, whatever else is being said."""
-        if self._closing:
+        if self.closing:
             return "shutdown", "the server is being stopped"
         if words := bad_option(say):
             return "bad_option", words

@@ -155,7 +155,7 @@ class Server:
                 # Who asked for what can't be had is told so, and nothing else.
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT)
-            if not speech.closing:
+            if not self._scheduler.closing:
                 self._systemd.ready()
                 log.line(f"ready on {self._listener.path} (pid {os.getpid()})")
             if settings.greeting:

@@ -85,8 +85,6 @@ class Speech:
         self.subscribers = Subscribers(self._loop, lambda: (each.connection for each in self.for_room))
         self.streams = Streams(self._loop)
         self.news = News(self.streams)
-        #: whether it was told to end, and takes no goal any more
-        self.closing = False
         self._timer: asyncio.TimerHandle | None = None
         #: requests that wait for a goal to be silent, until its end is told
         self._for_silence: dict[Record, Place] = {}
@@ -358,11 +356,10 @@ class Speech:
 
     def shut_down(self) -> None:
         """End every goal, and take no other."""
-        self.closing = True
         self.engine_known.set()
         self.apply(self.scheduler.shutdown(self._now()))
 
     def look_finished(self) -> None:
         """Set `finished`, where everything has ended and that is told."""
-        if self.closing and self.scheduler.active is None and self.news.told:
+        if self.scheduler.closing and self.scheduler.active is None and self.news.told:
             self.finished.set()
