@@ -130,11 +130,6 @@ class Handed:
     verdict_on: EngineProcess | None = None
 
     @property
-    def id(self) -> str:
-        """The goal's id."""
-        return self.say.id
-
-    @property
     def spoken(self) -> bool:
         """Whether a process has it."""
         return self.heard_at is not None
@@ -255,7 +250,7 @@ class Supervisor:
             process.kill()  # what could not be found before, for want of a descriptor, may be found now
             if self._goal and self._goal.verdict_on is process:
                 words = f"the player could not be ended within {SILENCE_LIMIT:g} s"
-                self._finish(protocol.Ended(self._goal.id, protocol.FAILED, "not_silent", words))
+                self._finish(protocol.Ended(self._goal.say.id, protocol.FAILED, "not_silent", words))
 
     def _handle(self, key: selectors.SelectorKey) -> None:
         if key.fd not in self._selector.get_map():
@@ -278,7 +273,7 @@ class Supervisor:
 
     def _in_hand(self, goal_id: str) -> Handed | None:
         """Return the goal if it has not ended meanwhile."""
-        return self._goal if self._goal and self._goal.id == goal_id else None
+        return self._goal if self._goal and self._goal.say.id == goal_id else None
 
     def _take(self, say: protocol.Say, sent: EngineProcess | None = None, at: float = 0.0) -> None:
         """Take a goal in hand, one that was sent to a process already, or is to be: where that one is lost since."""
@@ -309,7 +304,7 @@ class Supervisor:
         if goal and waits and process and process.ready:
             goal.heard_at = time.monotonic()
             if not process.send(goal.say):
-                self._not_taken(goal.id, process)
+                self._not_taken(goal.say.id, process)
 
     def _hold(self, goal_id: str, pause: int | None) -> None:
         goal = self._in_hand(goal_id)
@@ -389,7 +384,7 @@ class Supervisor:
     def _note(self, process: EngineProcess, event: protocol.Event) -> None:
         if isinstance(event, protocol.OF_A_GOAL):
             goal = self._goal
-            if goal is None or not goal.spoken or event.id != goal.id:
+            if goal is None or not goal.spoken or event.id != goal.say.id:
                 return  # of a goal that has ended already
             goal.heard_at = time.monotonic()
             if isinstance(event, protocol.Started):
@@ -444,10 +439,10 @@ class Supervisor:
         if reason == "engine_crashed" and goal.stop_at is None and not (goal.started or goal.again):
             goal.again = True
             if goal.pause is not None:
-                self._post(protocol.Paused(goal.id, goal.pause))
+                self._post(protocol.Paused(goal.say.id, goal.pause))
         else:
-            failed = protocol.Ended(goal.id, protocol.FAILED, reason, words)
-            goal.verdict = failed if goal.stop_at is None else protocol.Ended(goal.id, protocol.STOPPED)
+            failed = protocol.Ended(goal.say.id, protocol.FAILED, reason, words)
+            goal.verdict = failed if goal.stop_at is None else protocol.Ended(goal.say.id, protocol.STOPPED)
             goal.verdict_on = process
         goal.heard_at = goal.stop_at = goal.pause_at = None
 
@@ -457,7 +452,7 @@ class Supervisor:
         waits = self._goal if self._goal and not self._goal.verdict else None
         if waits and (costs_a_goal or self._restarts.error is not None):
             why = self._restarts.error or words
-            self._finish(protocol.Ended(waits.id, protocol.FAILED, "engine_failed", why))
+            self._finish(protocol.Ended(waits.say.id, protocol.FAILED, "engine_failed", why))
         elif costs_a_goal:
             self._post(EngineMissing(words))
 
