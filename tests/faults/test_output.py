@@ -19,6 +19,7 @@ import pytest
 
 from talkcli.engine.players.pulse import DUMMY, SUSPENDED_FOR
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
+from tests.support.census import descendants
 from tests.support.pipewire import PipeWire
 from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
@@ -281,8 +282,9 @@ def test_a_server_that_takes_no_more_clients_ends_the_sentence_in_words(make_tal
 
 @pytest.mark.usefixtures("card")
 def test_nothing_of_a_stream_is_left_behind(talk: Talk, server: Server) -> None:
-    """A cancel, and an engine that is killed."""
+    """A cancel, and an engine that is killed; there is no player's process that could be."""
     begin(talk, LONG)
+    assert descendants(engine_process(talk)) == []
     talk.run("cancel")
     assert server.pactl("list", "short", "sink-inputs") == ""
     begin(talk, LONG)
