@@ -54,8 +54,8 @@ class Interrupts:
     """Catches SIGINT, SIGTERM and SIGHUP: `number` is the signal then. A second one ends the process at once, but for
     SIGHUP: of a terminal that is closed the shell tells its commands, and then the system.
 
-    `descriptor` becomes readable. `watched` has all that there is to wait for, as `connect.ready` takes it; it
-    may change. That it ends the waiting ends the `with`, too; `exit_code` then says why.
+    `watched` has all that there is to wait for, as `connect.ready` takes it, a descriptor that becomes readable then
+    among it; it may change. That it ends the waiting ends the `with`, too; `exit_code` then says why.
     """
 
     def __init__(self, timeout: float | None = None, held: Iterable[int] = (), *, output: bool = False) -> None:
@@ -80,9 +80,9 @@ class Interrupts:
         return EXIT_SIGPIPE if self.gone else EXIT_TIMEOUT
 
     def __enter__(self) -> Interrupts:
-        self.descriptor, self._write = os.pipe()
+        self._descriptor, self._write = os.pipe()
         os.set_blocking(self._write, False)
-        self.watched = {self.descriptor: select.POLLIN, **(watched_output() if self._output else {})}
+        self.watched = {self._descriptor: select.POLLIN, **(watched_output() if self._output else {})}
         # A shell starts background commands with SIGINT ignored: what is ignored stays so.
         self._before = {
             each: signal.signal(each, self._caught) for each in _CAUGHT if signal.getsignal(each) != signal.SIG_IGN
@@ -103,7 +103,7 @@ class Interrupts:
             signal.setitimer(signal.ITIMER_REAL, 0)
         for each, handler in self._before.items():
             signal.signal(each, handler)
-        os.close(self.descriptor)
+        os.close(self._descriptor)
         os.close(self._write)
         return kind is Interrupted
 
@@ -115,9 +115,9 @@ class Interrupts:
         """Have nothing end the waiting that has; no other signal will."""
         self.look()
         self.watched.pop(OUTPUT, None)
-        os.set_blocking(self.descriptor, False)
+        os.set_blocking(self._descriptor, False)
         try:
-            os.read(self.descriptor, 16)
+            os.read(self._descriptor, 16)
         except BlockingIOError:
             pass
 

@@ -12,9 +12,8 @@ import time
 from talkcli.engine.players.base import PIECE, SAMPLE, CannotEnd, CannotSpeak, Stopped
 from talkcli.engine.stream import Samples, Stream
 from talkcli.engine.words import TimedWord, WordClock
-from talkcli.frozen import replace
+from talkcli.frozen import TYPE_CHECKING, replace
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 

@@ -15,9 +15,8 @@ from talkcli.engine.players import FILE, PLAYERS, commands, sound_server
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
-from talkcli.frozen import replace
+from talkcli.frozen import TYPE_CHECKING, replace
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 

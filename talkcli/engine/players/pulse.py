@@ -12,10 +12,9 @@ from ctypes import byref, c_uint64
 
 from talkcli.engine.players import libpulse
 from talkcli.engine.players.base import SAMPLE, CannotSpeak, Player
-from talkcli.frozen import frozen
+from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Output
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
