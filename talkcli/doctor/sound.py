@@ -19,8 +19,7 @@ from talkcli.doctor.machine import judge_access, judge_cards
 from talkcli.doctor.report import Finding, done, failed, some, warning
 from talkcli.engine.players import PACKAGES, PLAYERS, is_silent, on_path
 from talkcli.engine.players.child import kill
-from talkcli.engine.players.devices import sound_servers
-from talkcli.engine.players.pulse import DUMMY
+from talkcli.engine.players.devices import DUMMY, sound_servers
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:

@@ -2,7 +2,8 @@
 
 Pure: the time comes in as an argument (monotonic seconds). The clock counts the seconds of one player's stream: it
 starts with the first samples that the player takes and runs by itself; it is held back while the player takes less than
-the clock says, so that no word is reported before it is heard. Silence that is put into the stream moves what follows.
+the clock says, so that no word is reported before it is heard. Where the output has a clock of its own, it goes by
+that, and stands until something is heard. Silence that is put into the stream moves what follows.
 """
 
 from __future__ import annotations

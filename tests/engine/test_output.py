@@ -59,3 +59,15 @@ def test_nothing_is_told_of_a_program_that_goes_on_with_it(sink: Sink, tmp_path:
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
         assert [each.output for each in _told(engine)[1:]] == [None]
+
+
+def test_what_was_told_stays_where_no_other_can_go_on_with_it(sink: Sink, tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    path.symlink_to(sink.socket)
+    environment = {**sink.env, "PULSE_SERVER": f"unix:{path}", "ALSA_CONFIG_PATH": os.devnull}
+    with Spawned(None, environment=environment, limits=AT_ONCE) as engine:
+        (told,) = _held(engine)
+        os.unlink(path)
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.FAILED
+        assert _told(engine) == [told]

@@ -16,7 +16,9 @@ import pytest
 
 from talkcli.engine.players import libpulse
 from talkcli.engine.players.base import PIECE, SAMPLE, CannotSpeak
-from talkcli.engine.players.pulse import DUMMY, PulsePlayer
+from talkcli.engine.players.devices import DUMMY
+from talkcli.engine.players.pulse import PulsePlayer
+from tests.support.pipewire import PipeWire
 from tests.support.relay import Relay
 from tests.support.surroundings import short_directory
 
@@ -47,25 +49,19 @@ class Rig:
         self.limit: float | None = None
 
     def wait(self, player: PulsePlayer) -> None:
+        told = player._told
         until, end = player.wake_at(), time.monotonic() + (self.limit or PATIENCE)
+        assert player._told is told or until == 0, "it was told the time, and nobody looks at it"
         while time.monotonic() < end:
             now = time.monotonic()
             if until is not None and now >= until:
                 return
-            own, all_of_it = select.poll(), select.poll()
+            own = select.poll()
             for descriptor, events in player.interests():
                 own.register(descriptor, events)
-                all_of_it.register(descriptor, events)
             if own.poll(0):
                 return
-            due = end if until is None else min(until, end)
-            if self._relay is None:
-                all_of_it.poll(max(0.0, due - now) * 1000)
-                continue
-            self._relay.register(all_of_it)
-            # a piece that is left is handed on at once
-            all_of_it.poll(0 if self._relay.waiting and self.limit is None else max(0.0, due - now) * 1000)
-            self._relay.pump()
+            self.pass_on(player, (end if until is None else min(until, end)) - now)
         if self.limit is not None:
             raise CannotSpeak("silent", "nothing came any more")
         raise AssertionError(f"nothing has woken it in {PATIENCE:g} s")
@@ -85,6 +81,19 @@ class Rig:
             if player is not None:
                 player.kill()
                 assert player.gone()
+
+    def pass_on(self, player: PulsePlayer, seconds: float) -> None:
+        """Wait for so long at most, until there is something for the player or the relay, and pass on what there is."""
+        poll = select.poll()
+        for descriptor, events in player.interests():
+            poll.register(descriptor, events)
+        if self._relay is None:
+            poll.poll(max(0.0, seconds) * 1000)
+            return
+        self._relay.register(poll)
+        # a piece that is left is handed on at once
+        poll.poll(0 if self._relay.waiting and self.limit is None else max(0.0, seconds) * 1000)
+        self._relay.pump()
 
     def end(self) -> CannotSpeak | None:
         """Play the sound and return how that failed; None if it has ended well."""
@@ -239,6 +248,52 @@ def dummy_of(sink: Sink) -> Iterator[None]:
         yield
     finally:
         sink.pactl("unload-module", module)
+
+
+def test_what_is_not_played_is_not_heard_where_it_had_run_dry(rig: Callable[[], AbstractContextManager[Rig]]) -> None:
+    """It goes on once it has as much as it began with, and its clock with it."""
+    with rig() as behind:
+        player = PulsePlayer(RATE)
+        try:
+            behind.feed(player)
+            assert _heard_in(behind, player, 3 * SECONDS) == len(SOUND)
+            assert player.offer(memoryview(SOUND)[:_PIECE]) == _PIECE
+            assert _heard_in(behind, player, SECONDS) == len(SOUND)
+            behind.play(player)
+            assert player.consumed() == 2 * len(SOUND) + _PIECE
+        finally:
+            player.kill()
+
+
+def _heard_in(behind: Rig, player: PulsePlayer, seconds: float) -> int:
+    """Return the bytes that were heard when these seconds are over; nothing is offered meanwhile."""
+    end = time.monotonic() + seconds
+    while (rest := end - time.monotonic()) > 0:
+        behind.pass_on(player, min(rest, 0.01))
+        player.consumed()
+        player.wake_at()
+    return player.consumed()
+
+
+def test_a_time_that_is_told_before_it_has_begun_is_none() -> None:
+    """PipeWire answers while no device runs, with what the answer took."""
+    with PipeWire() as server, pytest.MonkeyPatch.context() as patch:
+        for name, value in server.env.items():
+            patch.setenv(name, value)
+        server.load("card")
+        behind = Rig()
+        for _ in range(5):
+            player = PulsePlayer(RATE)
+            try:
+                while player.device is None:
+                    behind.wait(player)
+                server.freeze("pipewire")
+                player.offer(memoryview(SOUND)[:_PIECE])
+                assert _heard_in(behind, player, 0.1) == 0
+                assert not player.proven
+            finally:
+                server.thaw("pipewire")
+                player.kill()
 
 
 @pytest.mark.parametrize("cookie", ["none is asked for", "the right one", "another"])

@@ -69,13 +69,13 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
         """Take a sink away, as if a device were unplugged."""
         self.pactl("unload-module", module)
 
-    def freeze(self) -> None:
-        """Stop its pulse server as it is."""
-        self._running["pipewire-pulse"].send_signal(signal.SIGSTOP)
+    def freeze(self, part: str = "pipewire-pulse") -> None:
+        """Stop its pulse server as it is, or another part."""
+        self._running[part].send_signal(signal.SIGSTOP)
 
-    def thaw(self) -> None:
-        """Let its pulse server go on."""
-        self._running["pipewire-pulse"].send_signal(signal.SIGCONT)
+    def thaw(self, part: str = "pipewire-pulse") -> None:
+        """Let it go on."""
+        self._running[part].send_signal(signal.SIGCONT)
 
     def kill_server(self) -> None:
         """Kill its pulse server, as if that had crashed."""

@@ -8,7 +8,7 @@ from talkcli.doctor import machine, sound
 from talkcli.doctor.machine import Cards, Session
 from talkcli.doctor.report import DONE, FAILED, WARNING, Finding
 from talkcli.doctor.sound import Devices, Level, Players, SoundServer
-from talkcli.engine.players.pulse import DUMMY
+from talkcli.engine.players.devices import DUMMY
 from talkcli.frozen import replace
 
 PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)

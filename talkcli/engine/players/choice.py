@@ -132,7 +132,7 @@ class Players:
             self.output = output
         elif output is not None:
             self.output = replace(output, muted=output.muted or before.muted)
-        elif before.player != player.name and not before.muted:
+        elif player.proven and before.player != player.name and not before.muted:
             self.output = None  # nobody can know any more
 
     def let_go(self, silent_at: float | None = None) -> None:

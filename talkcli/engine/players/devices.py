@@ -13,6 +13,9 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+#: The sink that PulseAudio and PipeWire make where they have no other (PipeWire calls it "Dummy Output"): nobody hears
+#: it. No other is taken for one: echo cancellers, remaps, tunnels and effects lead on to a real device.
+DUMMY = "auto_null"
 #: Variables that name a sound server, or another configuration than the usual one.
 _VARIABLES = ("PULSE_SERVER", "PULSE_CLIENTCONFIG", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH")
 #: Where a PulseAudio that serves all users listens.

@@ -162,6 +162,7 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "pa_stream_drain": (c_void_p, [c_void_p, Success, c_void_p]),
     "pa_stream_get_time": (c_int, [c_void_p, POINTER(u64)]),
     "pa_stream_set_started_callback": (None, [c_void_p, Notice, c_void_p]),
+    "pa_stream_set_underflow_callback": (None, [c_void_p, Notice, c_void_p]),
     "pa_stream_set_latency_update_callback": (None, [c_void_p, Notice, c_void_p]),
     "pa_stream_update_timing_info": (c_void_p, [c_void_p, c_void_p, c_void_p]),
 }

@@ -12,6 +12,7 @@ from ctypes import byref, c_uint64
 
 from talkcli.engine.players import libpulse
 from talkcli.engine.players.base import SAMPLE, CannotSpeak, Player
+from talkcli.engine.players.devices import DUMMY
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Output
 
@@ -21,21 +22,15 @@ if TYPE_CHECKING:
     from talkcli.engine.players.base import Interest
 
 #: Milliseconds of sound that the server holds, as much as a program is asked to: what it holds is said again, or late,
-#: when something stops it, and bridges what a busy machine delays.
+#: when something stops it, and bridges what a busy machine delays. It begins with as much: with the first piece alone
+#: it would run dry behind that and go back for the second, which not every sink can.
 BUFFER_MS = 60
-#: Milliseconds of sound with which it begins: it renders half of its buffer at once. With less it would run dry behind
-#: the first piece and go back for the second, which not every sink can; libespeak-ng hands over 38 to 49 at first.
-START_MS = 30
 #: Milliseconds of room for which it wakes us.
 REQUEST_MS = 15
 
 #: Seconds after which a stream that has no volume is taken to be turned down: PipeWire makes each so, and gives it the
 #: volume that it is to have a millisecond later.
 SETTLED_AFTER = 0.1
-
-#: The sink that PulseAudio and PipeWire make where they have no other (PipeWire calls it "Dummy Output"): nobody hears
-#: it. No other is taken for one: echo cancellers, remaps, tunnels and effects lead on to a real device.
-DUMMY = "auto_null"
 
 #: Seconds within which the server must have made the stream: it takes 1 to 20 ms. One that hangs is not waited for:
 #: nothing was given to it, and another player may be heard.
@@ -79,7 +74,9 @@ class PulsePlayer(Player):
         self._written = self._heard = 0
         #: the seconds of the stream that were heard, as the server told last, and when; None before there are any
         self._told: tuple[float, float] | None = None
-        #: when it is asked next, as long as that is so; None while a question is not answered
+        #: what was written when the server ran dry; None while it plays
+        self._dry_at: int | None = None
+        #: when it is asked for the time, as long as it hasn't told any; None while a question is not answered
         self._ask_at: float | None = 0.0
         self._closed = self._draining = self._drained = False
         self._failed: CannotSpeak | None = None
@@ -100,6 +97,7 @@ class PulsePlayer(Player):
         except OSError as error:
             raise CannotSpeak("no_player", f"libpulse cannot be loaded: {error}") from error
         self._on_started = libpulse.Notice(self._started)
+        self._on_dry = libpulse.Notice(self._ran_dry)
         self._on_time = libpulse.Notice(self._time_told)
         self._on_drained = libpulse.Success(self._drain_over)
         self._on_change = libpulse.Changed(self._changed)
@@ -143,7 +141,7 @@ class PulsePlayer(Player):
         elif self._told is not None:
             seconds, at = self._told
             heard = int((seconds + time.monotonic() - at) * self._rate) * SAMPLE
-            self._heard = max(self._heard, min(heard, self._written))
+            self._heard = max(self._heard, min(heard, self._written if self._dry_at is None else self._dry_at))
         return self._heard / (self._rate * SAMPLE)
 
     def close(self) -> None:
@@ -161,9 +159,13 @@ class PulsePlayer(Player):
         return self._loop.interests if self._loop is not None else []
 
     def wake_at(self) -> float | None:
-        """Return when libpulse has something to do, or a suspended sink is given up; at once where there is room."""
+        """Return when libpulse has something to do, or a suspended sink is given up.
+
+        At once where there is room, and where the server has told the time in here: words are due by that.
+        """
+        told = self._told
         self._go_on()
-        if self._failed is not None or self._drained or self._room():
+        if self._failed is not None or self._drained or self._told is not told or self._room():
             return 0.0
         moments = [self._loop.due if self._loop is not None else None]
         if self._index == libpulse.NONE:
@@ -237,14 +239,15 @@ class PulsePlayer(Player):
         return False
 
     def _open(self) -> bool:
-        held, start, asked = (each * self._rate // 1000 * SAMPLE for each in (BUFFER_MS, START_MS, REQUEST_MS))
-        sizes = libpulse.BufferSizes(2 * held, held, start, asked, libpulse.NONE)
+        held, asked = (each * self._rate // 1000 * SAMPLE for each in (BUFFER_MS, REQUEST_MS))
+        sizes = libpulse.BufferSizes(2 * held, held, held, asked, libpulse.NONE)
         spec = libpulse.SampleSpec(libpulse.S16LE, self._rate, 1)
         self._stream = self._lib.stream_new(self._context, b"talk", byref(spec), None)
         if self._stream is None:
             self._fail("audio_device")
             return False
         self._lib.stream_set_started_callback(self._stream, self._on_started, None)
+        self._lib.stream_set_underflow_callback(self._stream, self._on_dry, None)
         self._lib.stream_set_latency_update_callback(self._stream, self._on_time, None)
         flags = libpulse.ADJUST_LATENCY | libpulse.AUTO_TIMING_UPDATE
         wanted = None if self._wanted is None else self._wanted.encode()
@@ -270,7 +273,9 @@ class PulsePlayer(Player):
                 self._ask_stream()
         self._judge()
         if not self._lib.stream_is_suspended(self._stream):
-            self._suspended_at = None
+            if self._suspended_at is not None:
+                self._suspended_at = None
+                self._begin_time()
             return asks
         now = time.monotonic()
         self._suspended_at = self._suspended_at or now
@@ -358,12 +363,21 @@ class PulsePlayer(Player):
         return 0 if room == libpulse.FAILED else room // SAMPLE * SAMPLE
 
     def _started(self, *_: Any) -> None:
-        self.proven = True
+        self.proven, self._dry_at = True, None
+        self._begin_time()
+
+    def _ran_dry(self, *_: Any) -> None:
+        self._dry_at = self._written
+
+    def _begin_time(self) -> None:
+        """Ask for the time anew: it stood still, as the stream had not begun, or had run dry, or its sink slept."""
+        self._told, self._ask_at = None, 0.0
 
     def _time_told(self, *_: Any) -> None:
         told, now = c_uint64(), time.monotonic()
         self._ask_at = now + ASK_EVERY
-        if self._lib.stream_get_time(self._stream, byref(told)) == 0 and told.value:
+        # Before it has begun, what is told is the time that the answer took.
+        if self.proven and self._lib.stream_get_time(self._stream, byref(told)) == 0 and told.value:
             self._told = told.value / 1_000_000, now
 
     def _drain_over(self, _stream: int, success: int, _data: object) -> None:
