@@ -15,7 +15,7 @@ from talkcli.engine.words import TimedWord, WordClock
 from talkcli.frozen import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from talkcli.engine.players.base import Player
     from talkcli.engine.session import Session
@@ -77,7 +77,8 @@ class Playback:
         self._wait = session.wait
         self._on_word = on_word
         self._rate = 0
-        self._candidates: list[Callable[[], Player]] = []
+        #: opens the players that were not tried, best first; None where all are to be
+        self._untried: Iterator[Callable[[], Player]] | None = None
         self._stream: Stream | None = None
         self._first_error: CannotSpeak | None = None
         self._clock = WordClock()
@@ -108,7 +109,7 @@ class Playback:
             try:
                 self._try(lambda _: True)
             except CannotSpeak:
-                self._candidates, self._first_error = [], None
+                self._untried = self._first_error = None
 
     def word(self, start: int, length: int, position: float) -> None:
         """Report this word when it is heard."""
@@ -176,9 +177,8 @@ class Playback:
                 self._next_player(error)
 
     def _open(self) -> Stream:
-        if not self._candidates:
-            self._candidates = self._players.candidates(self._rate)
-        player = self._candidates.pop(0)()
+        self._untried = self._untried or self._players.candidates(self._rate)
+        player = next(self._untried)()
         self._sent = self._begin
         self._silent_at = None
         lead_in = self._players.lead_in(begins=self._begin == self._left_out)
@@ -195,12 +195,14 @@ class Playback:
             first = self._first_error = error
         proven = stream is not None and stream.player.proven
         lost = proven or error.final or (stream is not None and error.reason == "audio_stalled")
-        if lost or not (self._candidates or self._is_busy(first)):
+        others = list(self._untried or ())
+        self._untried = iter(others) if others else None
+        if lost or not (others or self._is_busy(first)):
             if stream is not None:
                 self._players.tell(stream.player)
             raise error if lost else first
         self._leave()
-        if not self._candidates:
+        if not others:
             self._wait((), time.monotonic() + BUSY_PAUSE)
 
     def _is_busy(self, error: CannotSpeak) -> bool:
@@ -220,8 +222,7 @@ class Playback:
         stream, self._begin, self._sent = self._stream, begin, begin
         if stream is not None and stream.player.proven:
             self._players.worked = stream.player.name  # tried first again
-        self._candidates = []
-        self._first_error = None
+        self._untried = self._first_error = None
         self._leave()
 
     def _go_back(self, stream: Stream) -> None:

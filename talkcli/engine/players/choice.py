@@ -18,7 +18,7 @@ from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
 from talkcli.frozen import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from talkcli.engine.players.base import Player
     from talkcli.engine.protocol import Configure, Say
@@ -105,18 +105,19 @@ class Players:
         self.worked: str | None = None
         self._used_at: float | None = None
 
-    def candidates(self, rate: int) -> list[Callable[[], Player]]:
-        """Return what opens the players to try for a sentence, best first; CannotSpeak if there is none."""
+    def candidates(self, rate: int) -> Iterator[Callable[[], Player]]:
+        """Return what opens the players to try for a sentence, best first; programs are looked for when asked for."""
         if self._built_in is not None:
-            return [partial(self._built_in, rate)]
-        server = [partial(sound_server, rate, None, self._audible)] if self._any else []
+            yield partial(self._built_in, rate)
+            return
+        if self._any:
+            yield partial(sound_server, rate, None, self._audible)
         try:
             found = commands(self._configure.player, self._configure.device, rate, self.worked)
         except CannotSpeak as error:
-            if not server:
-                raise
-            return [*server, partial(_fail, error)]
-        return [*server, *(partial(ProgramPlayer, command, self._inherited) for command in found)]
+            yield partial(_fail, error)
+            return
+        yield from (partial(ProgramPlayer, command, self._inherited) for command in found)
 
     def begin(self, say: Say) -> None:
         """Take note of a new sentence."""
