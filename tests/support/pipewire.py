@@ -12,6 +12,7 @@ import subprocess
 import time
 from typing import TYPE_CHECKING
 
+from tests.support.sink import pactl
 from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory
 
 if TYPE_CHECKING:
@@ -92,12 +93,7 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
 
     def pactl(self, *words: str) -> str:
         """Run pactl and return what it printed."""
-        done = subprocess.run(
-            ["pactl", *words], env=self._child(), capture_output=True, text=True, timeout=_START, check=False
-        )
-        if done.returncode != 0:
-            raise AssertionError(f"pactl {' '.join(words)}: {done.stderr.strip()}")
-        return done.stdout
+        return pactl(self._child(), *words)
 
     @property
     def _bus(self) -> str:

@@ -24,7 +24,7 @@ from tests.support.recording import Recording
 from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 #: What a machine needs for a sink.
 PROGRAMS = ("pulseaudio", "pactl", "parec", "pacat", "aplay")
@@ -35,6 +35,14 @@ _WARM_UP = 20.0
 #: Blocks must have come steadily for so many seconds, with sound in them, before a sink is warm.
 _STEADY = 0.5
 _START = 10.0
+
+
+def pactl(env: Mapping[str, str], *words: str) -> str:
+    """Run pactl in an environment and return what it printed."""
+    done = subprocess.run(["pactl", *words], env=env, capture_output=True, text=True, timeout=_START, check=False)
+    if done.returncode != 0:
+        raise AssertionError(f"pactl {' '.join(words)}: {done.stderr.strip()}")
+    return done.stdout
 
 
 class Sink(contextlib.AbstractContextManager["Sink"]):
@@ -177,12 +185,7 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
 
     def pactl(self, *words: str) -> str:
         """Run pactl and return what it printed."""
-        done = subprocess.run(
-            ["pactl", *words], env=self._child(), capture_output=True, text=True, timeout=_START, check=False
-        )
-        if done.returncode != 0:
-            raise AssertionError(f"pactl {' '.join(words)}: {done.stderr.strip()}")
-        return done.stdout
+        return pactl(self._child(), *words)
 
     def _await_socket(self) -> None:
         end = time.monotonic() + _START
