@@ -1,4 +1,4 @@
-"""Where the socket is: the one place for it.
+"""Where the socket is, and the voices, and what is kept of them: the one place for it.
 
 A client looks in the places of a list that is made without platformdirs, which would double its start; a server takes
 the place that platformdirs gives, after its checks of owner and mode. A test compares the two. cron, sudo, systemd and
@@ -102,3 +102,29 @@ def server_socket(named: str | None) -> str:
             return str(platformdirs.PlatformDirs("talk", appauthor=False).place_runtime_file(SOCKET))
         except OSError as error:
             raise AddressInUse(f"no directory for the socket: {error}; name a socket with --socket PATH") from error
+
+
+def voice_directories() -> list[str]:
+    """Return where neural voices are looked for, besides installed packages: in this order, whether there or not.
+
+    What TALK_VOICES names, a list like PATH, then the user's own data and the system's. They are platformdirs' places
+    on Linux (a test compares), written down here, as the engine process looks in each of its starts.
+    """
+    named = os.environ.get("TALK_VOICES", "").split(os.pathsep)
+    system = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
+    data = [_own(os.environ.get("XDG_DATA_HOME"), "~/.local/share"), *system.split(os.pathsep)]
+    places = [*named, *(os.path.join(each, "talk", "voices") for each in data if os.path.isabs(each))]
+    return list(dict.fromkeys(os.path.abspath(each) for each in places if each))
+
+
+def cache_directory() -> str:
+    """Return where what can be made again is kept; it need not be there. Platformdirs' place, but for systemd's."""
+    given = os.environ.get("CACHE_DIRECTORY")
+    if given:
+        return given.split(":")[0]
+    return os.path.join(_own(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
+
+
+def _own(named: str | None, default: str) -> str:
+    """Return a directory of the user's, by a variable's value; not one that depends on where this runs."""
+    return named if named and os.path.isabs(named) else os.path.expanduser(default)

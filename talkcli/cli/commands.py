@@ -361,7 +361,8 @@ _ROWS = (
         about="""
         List the voices of the server's engine: id, language, name. Any of the three can be given as a voice.
 
-        At the end of the list are variants: each goes behind any voice.
+        Behind the voices are variants: each goes behind any of them. Neural voices come last, and go by their id alone,
+        as far as it takes to tell one from the others; where it has several speakers, one goes behind: "piper/NAME#3".
         """,
         runs="ask:voices",
         examples="""

@@ -39,6 +39,7 @@ REMEDIES = {
     "audio_lost": "look whether the loudspeaker was unplugged, and try another: talk serve --device NAME",
     "audio_stalled": "wake the device (pactl suspend-sink @DEFAULT_SINK@ 0), or restart the sound server",
     "muted": "undo it: pactl set-sink-mute @DEFAULT_SINK@ 0; pactl set-sink-volume @DEFAULT_SINK@ 70%",
+    "voice_failed": "do what the message says, or choose another voice: talk set --voice en",
     "engine_failed": "install what the message names, into the Python that serves",
     "engine_crashed": "run talk doctor again; if it comes back, try another voice: talk set --voice en",
     "engine_hung": "run talk doctor again on a machine that is less busy",

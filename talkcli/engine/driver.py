@@ -138,7 +138,7 @@ class Settings:
         self._driver = driver
         self._set = fields(Sound())  # what pyttsx3's drivers set themselves
         self._default_voice: Any = None
-        self._voices: tuple[Voice, ...] | None = None
+        self._voices: tuple[Voice, ...] = ()
         self._voice: str | None = None
         self._error: Exception | None = None
         engine.connect("error", self._note)
@@ -161,9 +161,10 @@ class Settings:
         self._voice = wanted
 
     def _driver_id(self, wanted: str) -> str:
-        if self._voices is None:  # once: it takes some milliseconds, and they don't change while a process lives
-            self._voices = list_voices(self._engine)
         found = find_voice(wanted, self._voices)
+        if found is None:  # not each time: it takes some milliseconds, and what is new is seldom asked for
+            self._voices = list_voices(self._engine)
+            found = find_voice(wanted, self._voices)
         if found is None:
             raise CannotSpeak("unknown_voice", unknown_voice(wanted, self._voices))
         return found.id

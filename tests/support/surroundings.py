@@ -10,6 +10,7 @@ import site
 import sys
 import tempfile
 import time
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import pytest
@@ -32,7 +33,15 @@ _KILL_LIMIT = 2.0
 
 def needs(*programs: str) -> None:
     """Skip the test if one of the programs is missing; where CI is set, fail it: there nothing may be skipped."""
-    missing = [each for each in programs if shutil.which(each) is None]
+    _skip_without([each for each in programs if shutil.which(each) is None])
+
+
+def needs_packages(*names: str) -> None:
+    """Skip the test if one of the Python packages is missing, by its name for `import`; where CI is set, fail it."""
+    _skip_without([each for each in names if find_spec(each) is None])
+
+
+def _skip_without(missing: list[str]) -> None:
     if not missing:
         return
     reason = f"needs {', '.join(missing)}, which is not installed"

@@ -34,6 +34,8 @@ PURE = [
     "frozen",
     "client.following",
     "engine.synthesizers.guard",
+    "engine.synthesizers.phonemes",
+    "engine.synthesizers.vits",
     "engine.words",
 ]
 IMPURE = {
@@ -48,6 +50,8 @@ LONGEST = 500
 ONLY = {
     "pyttsx3": {"engine"},
     "espeakng_loader": {"engine"},
+    "numpy": {"engine"},
+    "onnxruntime": {"engine"},
     "click": {"cli"},
     "asyncio": {"server"},
     "platformdirs": {"paths"},

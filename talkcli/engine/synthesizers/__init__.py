@@ -1,4 +1,4 @@
-"""What makes sound of a text: libespeak-ng, its guard, its voices; here the names of `talk`'s own synthesizers.
+"""What makes sound of a text: libespeak-ng, neural voices; here the names of `talk`'s own synthesizers.
 
 `base` has what a synthesizer does and may raise: a new one is a module here and a line of the table, and goes through
 `tests/engine/test_synthesizer_contract.py`. It may import the players and the engine's own small parts. It runs in the
@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 
 
 def _espeak() -> Synthesizer:
+    from talkcli.engine.synthesizers.choice import Choice
     from talkcli.engine.synthesizers.espeak import Espeak
 
-    return Espeak()
+    return Choice(Espeak())
 
 
 #: The synthesizers, the usual one first: what makes each, by what users call it. It stands in for a driver of pyttsx3's

@@ -52,6 +52,13 @@ class Output(Protocol):
     def write(self, samples: bytes) -> None:
         """Take samples, whole ones. With none it only lets in what may have come: it raises Stopped, or returns."""
 
+    def wait(self, descriptor: int) -> None:
+        """Go on with what was written until this is readable, for who makes the sentence in a thread of its own.
+
+        It may return before. What was asked of the sentence is done meanwhile: it is held, or Stopped is raised. It may
+        be called before `begin`.
+        """
+
 
 class Synthesizer(Protocol):
     """Makes samples and words of texts, one at a time, in the voice that was loaded last.
@@ -66,7 +73,7 @@ class Synthesizer(Protocol):
     voice: str
 
     def voices(self) -> tuple[Voice, ...]:
-        """Return all voices, each by an id of its own, the usual ones first. They don't change while a process lives.
+        """Return all voices, each by an id of its own, the usual ones first. More may be there the next time.
 
         One whose id begins with "+" is no voice but a variant, which is written behind the id of another.
         """
@@ -84,10 +91,12 @@ class Synthesizer(Protocol):
         The rate comes first, then each word before its first sample, at positions that never decrease; where in the
         text they are may jump and repeat. The first samples are written as soon as there are any, the rest bit by bit:
         between two calls of the output nothing can stop or hold the sentence, so that one that needs longer than some
-        milliseconds writes nothing (`b""`) meanwhile. A text in which nothing can be spoken, the empty one too, has no
-        words, and silence at most. Any string is a text: control characters and lone surrogates are silent.
+        milliseconds writes nothing (`b""`) meanwhile, or has it done by a thread of its own, and waits. A text in which
+        nothing can be spoken, the empty one too, has no words, and silence at most. Any string is a text: control
+        characters and lone surrogates are silent.
 
         What the output raises comes out of here, at once, and the output is not called again. Of its own it raises
-        CannotSpeak (`engine_failed`), no other. Nothing of a sentence stays, whichever way it ended: the next is what
-        it would have been without it, but for what of the samples is noise.
+        CannotSpeak, no other: `engine_failed`, `voice_failed` where a voice's files are to blame, and `bad_option` for
+        a sound that it can't make, before anything is spoken. Nothing of a sentence stays, whichever way it ended: the
+        next is what it would have been without it, but for what of the samples is noise.
         """

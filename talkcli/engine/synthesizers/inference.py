@@ -1,0 +1,210 @@
+"""A Piper voice's model in onnxruntime, in two halves: from sounds to frames, and from some of these to samples.
+
+It runs in whatever thread calls it, and that alone: onnxruntime is told to start none, so that one processor of the
+machine is taken and no other, and none where nobody speaks. Whoever holds the `Run` ends it from another thread within
+milliseconds. onnxruntime and numpy are imported here alone, when a model is loaded. What goes wrong in a model is
+BadFile, with words that name its file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+
+from talkcli.engine.synthesizers.models import BEGIN, END, PAD, BadFile, open_checked
+from talkcli.engine.synthesizers.vits import NotCut, halves
+from talkcli.frozen import TYPE_CHECKING, frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Any
+
+    from talkcli.engine.synthesizers.cache import Cache
+    from talkcli.engine.synthesizers.models import Description
+
+#: What has to be installed, and how.
+NEEDED = ("onnxruntime", "numpy")
+INSTALL = "pip install 'talkcli[neural]'"
+#: Frames on either side of some that their samples depend on. Reckoned for the largest of Piper's decoders ("high"),
+#: 13.4; of a "medium" one the samples with 10 are those of the whole to a part in 400,000.
+AROUND = 14
+#: Bytes of a model: Piper's have 15 to 120 million, and no half may have 2^31.
+_LARGEST = 1 << 30
+#: Characters of what onnxruntime says that are handed on.
+_SHOWN = 200
+#: Names of the model's inputs; the last only where there are several speakers.
+_INPUTS, _SPEAKER = ("input", "input_lengths", "scales"), "sid"
+
+
+def missing() -> str | None:
+    """Return the name of a package that is needed and not installed; nothing is imported."""
+    from importlib.util import find_spec
+
+    return next((each for each in NEEDED if find_spec(each) is None), None)
+
+
+@frozen
+class Frames:
+    """What the encoder makes of some sounds."""
+
+    values: tuple[Any, ...]
+    #: where among the frames each sound ends
+    ends: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        return self.ends[-1]
+
+
+class Run:
+    """What runs a model for one sentence, until it is ended."""
+
+    def __init__(self) -> None:
+        import onnxruntime
+
+        self.options = onnxruntime.RunOptions()
+        self.options.log_severity_level = 4  # fatal; what else there is to say is raised
+
+    def end(self) -> None:
+        """Have what runs now, or later, raise; from any thread."""
+        self.options.terminate = True
+
+
+class Model:
+    """A model that is loaded."""
+
+    def __init__(self, path: str, description: Description, cache: Cache | None = None) -> None:
+        """Load it, in 0.3 to 3 s; BadFile. What takes the most of it is kept in the cache."""
+        self.path = path
+        self.description = description
+        with open_checked(path) as file:
+            content: bytes = file.read(_LARGEST + 1)
+        if len(content) > _LARGEST:
+            raise BadFile(f"{path} is larger than any of Piper's models: get the voice anew")
+        self._encoder, self._decoder = _loaded(path, content, cache)
+        del content
+        self._several = _SPEAKER in {each.name for each in self._encoder.get_inputs()}
+        names = {each.name for each in self._encoder.get_inputs()}
+        if names - {_SPEAKER} != {*_INPUTS}:
+            raise BadFile(f"{path} is none of Piper's models: it takes {', '.join(sorted(names))[:_SHOWN]}")
+        if self._several != (description.speakers > 1):
+            raise self._foreign("one has several speakers, the other has one")
+        self._frames = [each.name for each in self._decoder.get_inputs()]
+        self._hop = self._try_out()
+
+    def encode(self, numbers: Sequence[int], speaker: int, pace: float, run: Run) -> Frames:
+        """Return the frames of these sounds, by the model's numbers for them.
+
+        `pace` is what durations are multiplied with, beside the voice's own.
+        """
+        import numpy as np
+
+        about = self.description
+        feed = {
+            "input": np.array([numbers], np.int64),
+            "input_lengths": np.array([len(numbers)], np.int64),
+            "scales": np.array([about.noise, about.pace * pace, about.noise_of_durations], np.float32),
+        }
+        if self._several:
+            feed[_SPEAKER] = np.array([speaker], np.int64)
+        *values, durations = self._outputs(self._encoder, feed, run)
+        durations = durations.reshape(-1)
+        if len(durations) != len(numbers) or not np.isfinite(durations).all() or (durations < 0).any():
+            raise BadFile(f"{self.path} does not tell how long each sound lasts: get the voice anew")
+        return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
+
+    def decode(self, frames: Frames, begin: int, end: int, run: Run) -> Any:
+        """Return the samples of the frames from `begin` to before `end`, as floats, 1.0 for full scale."""
+        import numpy as np
+
+        low, high = max(0, begin - AROUND), min(frames.count, end + AROUND)
+        # What goes for the whole, as who speaks, has no frames.
+        parts = {
+            name: each[..., low:high] if each.shape[-1] == frames.count else each
+            for name, each in zip(self._frames, frames.values, strict=True)
+        }
+        samples = self._outputs(self._decoder, parts, run)[0].reshape(-1)
+        hop, rest = divmod(len(samples), high - low)
+        if rest or not hop:
+            raise BadFile(f"{self.path} is none of Piper's models: its frames are of no whole number of samples")
+        part = samples[(begin - low) * hop : (end - low) * hop]
+        if not np.isfinite(part).all():
+            raise BadFile(f"{self.path} makes no sound, but what is no number: get the voice anew")
+        return part
+
+    def seconds(self, frames: int) -> float:
+        """Return how long so many frames are heard."""
+        return frames * self._hop / self.description.rate
+
+    def _outputs(self, half: Any, feed: dict[str, Any], run: Run) -> list[Any]:
+        try:
+            found: list[Any] = half.run(None, feed, run.options)
+        except Exception as error:
+            raise BadFile(f"{self.path} cannot be run ({_first_line(error)}): get the voice anew") from error
+        return found
+
+    def _try_out(self) -> int:
+        """Return the samples of a frame; BadFile if the model doesn't speak, or doesn't know the JSON's sounds."""
+        sounds = self.description.sounds
+        highest = max(each for every in sounds.values() for each in every)
+        numbers = [*sounds[BEGIN], *sounds[PAD], highest, *sounds[PAD], *sounds[END]]
+        run = Run()
+        try:
+            frames = self.encode(numbers, 0, 1.0, run)
+        except BadFile as error:
+            raise self._foreign(str(error.__cause__ or error)) from error
+        if not frames.count:
+            raise BadFile(f"{self.path} speaks nothing: get the voice anew")
+        return len(self.decode(frames, 0, frames.count, run)) // frames.count
+
+    def _foreign(self, why: str) -> BadFile:
+        beside = f"{os.path.basename(self.path)}.json"
+        return BadFile(
+            f"{self.path} and {beside} do not belong together ({why[:_SHOWN]}): get both from the same place"
+        )
+
+
+def _loaded(path: str, content: bytes, cache: Cache | None) -> tuple[Any, Any]:
+    """Return both halves' sessions, from the cache or by cutting the model."""
+    import onnxruntime
+
+    level = onnxruntime.GraphOptimizationLevel
+    key = f"{hashlib.sha256(content).hexdigest()}-{onnxruntime.__version__}"
+    kept = cache.find(key) if cache is not None else None
+    if cache is not None and kept is not None:
+        try:
+            return _session(kept[0], level.ORT_DISABLE_ALL), _session(kept[1])
+        except Exception:  # noqa: BLE001 - cut short by a full disk, or whatever: it is made again
+            cache.forget(key)
+    try:
+        cut = halves(content)
+    except NotCut as error:
+        raise BadFile(f"{path} {error}: get the voice anew, from a source that you trust") from error
+    try:
+        decoder = _session(cut.decoder)
+        if cache is None:
+            return _session(cut.encoder), decoder
+        return cache.keep(key, lambda place: _session(cut.encoder, kept=place), cut.decoder), decoder
+    except Exception as error:
+        raise BadFile(f"{path} cannot be loaded ({_first_line(error)}): get the voice anew") from error
+
+
+def _session(model: str | bytes, level: Any = None, kept: str | None = None) -> Any:
+    """Return what runs a model, a file's or this; `kept`: the file into which it is written as it was optimised."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # It would keep the most that it ever needed, and is no faster with it.
+    options.enable_cpu_mem_arena = options.enable_mem_pattern = False
+    # No more than this: the levels above take 0.15 s longer, make nothing faster, and fit one kind of processor only.
+    options.graph_optimization_level = level or onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    if kept is not None:
+        options.optimized_model_filepath = kept
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:_SHOWN]

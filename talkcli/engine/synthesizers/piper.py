@@ -1,0 +1,253 @@
+"""Piper's neural voices as a synthesizer: a text's sounds by libespeak-ng, and a model that speaks them.
+
+A model is loaded, and run, in a thread beside the one that calls, which waits in the output: signs of life, a stop and
+a pause go on. Libespeak-ng is asked in the calling thread alone. One model is kept, the last that was asked for.
+"""
+
+from __future__ import annotations
+
+import queue
+import traceback
+
+from talkcli.engine.players.base import SAMPLE, CannotSpeak
+from talkcli.engine.synthesizers import models
+from talkcli.engine.synthesizers.base import UnknownVoice
+from talkcli.engine.synthesizers.cache import Cache
+from talkcli.engine.synthesizers.inference import INSTALL, Model, Run, missing
+from talkcli.engine.synthesizers.models import BEGIN, END, PAD, BadFile
+from talkcli.engine.synthesizers.phonemes import pieces
+from talkcli.engine.synthesizers.voices import NEURAL, SPEAKER
+from talkcli.engine.synthesizers.work import Work
+from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.paths import cache_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from typing import Any
+
+    from talkcli.engine.protocol import Voice
+    from talkcli.engine.synthesizers.base import Output, Sound
+    from talkcli.engine.synthesizers.espeak import Espeak
+    from talkcli.engine.synthesizers.models import Description
+    from talkcli.engine.synthesizers.phonemes import Piece
+
+#: Frames that are made into samples at once, at first and at most: 0.23 s of sound, so that the first is soon there,
+#: and 0.93, as each time some on both sides are made once more (`inference.AROUND`).
+_FIRST, _MOST = 20, 80
+#: How many of these may lie ready, so that a slow moment of the machine is not heard: seven seconds.
+_AHEAD = 8
+#: Pieces of text whose sounds are known before they are needed.
+_SPELLED = 2
+#: The seconds of silence behind a sentence, as libespeak-ng has it. A player may end no more than 0.25 s early.
+_PAUSE = 0.28
+#: Samples no louder than this, of 1.0, all through a piece, are no speech.
+_SILENT = 0.001
+#: Seconds of sound that are handed on at once.
+_AT_ONCE = 0.1
+#: What 1.0 is in samples of 16 bit.
+_FULL = 32767
+_PITCH = 50
+#: Words per minute of libespeak-ng's that are as fast as a voice as it was trained, and how much of its time is no
+#: matter of its pace, as each duration is rounded up to whole frames. Five sentences, from 80 to 450 words per minute,
+#: by libespeak-ng 1.51 (gmw/en-US) and by en_US-joe-medium at paces from 0.2 to 2.2, from first to last sound: from 120
+#: to 400 the two are within 5 % then, at 80 and 450 the model is slower, by 11 and 13 %.
+_NATURAL, _ROUNDED = 195, 0.30
+_LEAST_PACE = 0.1
+
+
+@frozen
+class Made:
+    """Some sound, and before it the words that begin in it or later."""
+
+    samples: bytes
+    #: where in the text, the length there, and the seconds from the beginning of these samples
+    words: tuple[tuple[int, int, float], ...] = ()
+
+
+class Piper:
+    """The neural voices that there are, as one synthesizer."""
+
+    version: str | None = None
+
+    def __init__(self, espeak: Espeak) -> None:
+        """`espeak` knows the sounds; it is used only while this one speaks."""
+        self._espeak = espeak
+        self.voice = ""
+        self._path = ""
+        self._speaker = 0
+        self._model: Model | None = None
+        self._loading: Work[Model] | None = None
+
+    def voices(self) -> tuple[Voice, ...]:
+        """Return the voices whose files are there now."""
+        return models.voices()
+
+    def load(self, voice: str) -> None:
+        """Begin to load a voice of `voices`, with a speaker behind it or without; `speak` waits until it is there.
+
+        What is wrong with its files is said by `speak`, so that a goal says it, each time anew.
+        """
+        lacking = missing()
+        if lacking is not None:
+            raise UnknownVoice(f"{lacking} is missing: {INSTALL}, into the Python that serves")
+        name, _, speaker = voice.removeprefix(NEURAL).partition(SPEAKER)
+        path = models.found().get(name) if voice.startswith(NEURAL) else None
+        if path is None:
+            raise UnknownVoice("its file is not there")
+        try:
+            self._speaker = _speaker(models.describe(path), speaker)
+        except BadFile:  # it comes again where the model is loaded
+            self._speaker = 0
+        if path != self._path:
+            self._forget()
+        self.voice, self._path = voice, path
+        if self._model is None and self._loading is None:
+            self._begin()
+
+    def speak(self, text: str, sound: Sound, output: Output) -> None:
+        """Speak as `Synthesizer` says; the samples differ each time, as far as the voice's noise is not 0."""
+        if sound.pitch != _PITCH:
+            words = f"the voice {self.voice} has no pitch but its own: leave --pitch out, or choose one of espeak's"
+            raise CannotSpeak("bad_option", words)
+        try:
+            model = self._loaded(output)
+            output.begin(model.description.rate)
+            with self._espeak.spelling(model.description.speller) as speller:
+                self._write(model, pieces(speller, text), sound, output)
+        except BadFile as error:
+            self._forget()  # the file may be another by the next time
+            raise CannotSpeak("voice_failed", str(error)) from error
+        except UnknownVoice as error:
+            self._forget()
+            raise CannotSpeak("voice_failed", f"{self._path}.json: {error}: get the voice anew") from error
+
+    def _begin(self) -> None:
+        path = self._path
+
+        def load() -> Iterator[Model]:
+            try:
+                yield Model(path, models.describe(path), _cache())
+            except ImportError as error:
+                raise BadFile(f"{path} cannot be loaded ({error}): {INSTALL}") from error
+            except MemoryError as error:
+                raise BadFile(f"{path} cannot be loaded: there is no memory for it; end another program") from error
+
+        self._loading = Work(load(), room=1)
+
+    def _loaded(self, output: Output) -> Model:
+        if self._model is None:
+            if self._loading is None:
+                self._begin()
+            assert self._loading is not None
+            model = self._loading.take(output.wait)
+            self._loading.close()
+            assert model is not None
+            self._model, self._loading = model, None
+        return self._model
+
+    def _forget(self) -> None:
+        if self._loading is not None:
+            self._loading.close()
+        self._model = self._loading = None
+
+    def _write(self, model: Model, spelled: Iterator[Piece], sound: Sound, output: Output) -> None:
+        """Write what a thread makes of the pieces, which are spelled in this one as they are needed."""
+        given: queue.SimpleQueue[Piece | None] = queue.SimpleQueue()
+        run = Run()
+        rate = model.description.rate
+        at_once = int(_AT_ONCE * rate) * SAMPLE
+        seconds = 0.0
+        over = False
+        work = Work(_made(model, given, self._speaker, sound, run), _AHEAD)
+        try:
+            while True:
+                while not over and given.qsize() < _SPELLED:
+                    piece = next(spelled, None)
+                    over = piece is None
+                    given.put(piece)
+                made = work.take(output.wait)
+                if made is None:
+                    return
+                for start, length, position in made.words:
+                    output.word(start, length, seconds + position)
+                for at in range(0, len(made.samples), at_once):
+                    output.write(made.samples[at : at + at_once])
+                seconds += len(made.samples) / SAMPLE / rate
+        finally:
+            run.end()
+            work.close()
+            given.put(None)
+
+
+def _made(model: Model, given: queue.SimpleQueue[Piece | None], speaker: int, sound: Sound, run: Run) -> Iterator[Made]:
+    """Yield the sound of the pieces that are given, up to None."""
+    pause = bytes(int(_PAUSE * model.description.rate) * SAMPLE)
+    while (piece := given.get()) is not None:
+        numbers, places = _numbered(piece.sounds, model.description.sounds)
+        if not places:
+            continue
+        frames = model.encode(numbers, speaker, _pace(sound.rate), run)
+        begins = [0, *frames.ends]
+        words = tuple(
+            (start, length, model.seconds(begins[places[at]])) for at, start, length in piece.words if at in places
+        )
+        loudest = 0.0
+        begin, many = 0, _FIRST
+        while begin < frames.count:
+            end = min(frames.count, begin + many)
+            part = model.decode(frames, begin, end, run)
+            loudest = max(loudest, float(abs(part).max()))
+            yield Made(_samples(part, sound.volume), words)
+            words, begin, many = (), end, min(_MOST, 2 * many)
+        if loudest < _SILENT:
+            raise BadFile(f"{model.path} makes no sound of a text: get the voice anew")
+        if piece.ends:
+            yield Made(pause)
+
+
+def _samples(part: Any, volume: float) -> bytes:
+    made: bytes = (part * (_FULL * volume)).clip(-_FULL, _FULL).astype("<i2").tobytes()
+    return made
+
+
+def _numbered(sounds: Sequence[str], numbers: Mapping[str, tuple[int, ...]]) -> tuple[list[int], dict[int, int]]:
+    """Return the model's numbers for some sounds, and where among them each sound is that the model knows."""
+    result = [*numbers[BEGIN], *numbers[PAD]]
+    places = {}
+    for at, sound in enumerate(sounds):
+        if sound in numbers:
+            places[at] = len(result)
+            result += [*numbers[sound], *numbers[PAD]]
+    return [*result, *numbers[END]], places
+
+
+def _pace(rate: int) -> float:
+    """Return what durations are to be multiplied with, so that a sentence takes as long as by libespeak-ng.
+
+    Above 400 words per minute a model is slower than that: no sound is shorter than a frame.
+    """
+    return max(_LEAST_PACE, (_NATURAL / rate - _ROUNDED) / (1 - _ROUNDED))
+
+
+def _speaker(about: Description, word: str) -> int:
+    """Return the number of a speaker, which may be given by its name; UnknownVoice."""
+    number = about.speaker_names.get(word, -1)
+    if not word:
+        number = 0
+    elif number < 0 and word.isascii() and word.isdecimal():
+        number = int(word[:9])
+    if 0 <= number < about.speakers:
+        return number
+    many = (
+        f"it has {about.speakers} speakers, 0 to {about.speakers - 1}" if about.speakers > 1 else "it has one speaker"
+    )
+    raise UnknownVoice(f'it has no speaker "{word[:40]}": {many}')
+
+
+def _cache() -> Cache | None:
+    """Return where halves are kept; None where that can't be had, which the log tells."""
+    try:
+        return Cache(cache_directory())
+    except OSError:
+        traceback.print_exc()
+        return None

@@ -1,0 +1,160 @@
+"""A model in two halves makes what the whole makes, piece by piece, and ends when it is told to."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine.synthesizers.cache import Cache
+from talkcli.engine.synthesizers.inference import AROUND, NEEDED, Model, Run
+from talkcli.engine.synthesizers.models import BadFile, describe
+from tests.support import tiny_voice
+from tests.support.real_voice import real_voice, silence_noise
+from tests.support.surroundings import needs_packages
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Any
+
+#: Seconds in which a run ends that was told to: it took 1 to 5 ms.
+ENDED = 0.1
+NUMBERS = [1, 0, *(number for sound in range(14, 40) for number in (sound, 0)), 2]
+
+
+@pytest.fixture(autouse=True)
+def _needs_the_extra() -> None:
+    needs_packages(*NEEDED)
+
+
+def _loaded(path: Path, cache: Cache | None = None) -> Model:
+    return Model(str(path), describe(str(path)), cache)
+
+
+def _whole(path: Path, speaker: int | None = None) -> Any:
+    """Return what the model makes that nobody has cut."""
+    import numpy as np
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    feed = {
+        "input": np.array([NUMBERS]),
+        "input_lengths": np.array([len(NUMBERS)]),
+        "scales": np.array([0, 1, 0], np.float32),
+    }
+    if speaker is not None:
+        feed["sid"] = np.array([speaker])
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return session.run(None, feed)[0].reshape(-1)
+
+
+def _in_pieces(model: Model, speaker: int = 0, piece: int = 20) -> Any:
+    import numpy as np
+
+    frames = model.encode(NUMBERS, speaker, 1.0, Run())
+    assert len(frames.ends) == len(NUMBERS)
+    parts = [
+        model.decode(frames, begin, min(frames.count, begin + piece), Run()) for begin in range(0, frames.count, piece)
+    ]
+    return np.concatenate(parts)
+
+
+@pytest.mark.parametrize("hop", [64, 256, 300])
+def test_pieces_are_the_whole(tmp_path: Path, hop: int) -> None:
+    path = tiny_voice.put(tmp_path / "v", "a", tiny_voice.model(hop=hop))
+    whole = _whole(path)
+    pieces = _in_pieces(_loaded(path))
+    assert pieces.shape == whole.shape
+    assert abs(pieces - whole).max() < 1e-6
+
+
+def test_pieces_of_a_real_voice_are_the_whole(tmp_path: Path) -> None:
+    silence_noise(real_voice(), tmp_path)
+    path = tmp_path / real_voice().name
+    whole = _whole(path)
+    pieces = _in_pieces(_loaded(path))
+    assert pieces.shape == whole.shape
+    assert abs(whole).max() > 0.1
+    assert abs(pieces - whole).max() < 1e-4
+    assert AROUND >= 10  # with which that was measured; it is for larger decoders
+
+
+@pytest.mark.parametrize("speaker", [0, 2])
+def test_each_speaker_is_the_whole_models(tmp_path: Path, speaker: int) -> None:
+    content = tiny_voice.model(speakers=3)
+    path = tiny_voice.put(tmp_path / "v", "a", content, tiny_voice.description(speakers=3))
+    assert abs(_in_pieces(_loaded(path), speaker) - _whole(path, speaker)).max() < 1e-6
+
+
+def test_a_model_is_loaded_from_what_was_kept_of_it(tmp_path: Path) -> None:
+    path = tiny_voice.put(tmp_path / "v", "a")
+    first = _in_pieces(_loaded(path, Cache(str(tmp_path / "c"))))
+    kept = sorted((tmp_path / "c").iterdir())
+    assert len(kept) == 2
+    at = [each.stat().st_mtime_ns for each in kept]
+    assert (_in_pieces(_loaded(path, Cache(str(tmp_path / "c")))) == first).all()
+    assert sorted((tmp_path / "c").iterdir()) == kept
+    assert all(each.stat().st_mtime_ns > before for each, before in zip(kept, at, strict=True))
+
+
+@pytest.mark.parametrize("damage", [b"", b"\0" * 100, None])
+def test_what_was_kept_and_is_damaged_is_made_anew(tmp_path: Path, damage: bytes | None) -> None:
+    path = tiny_voice.put(tmp_path / "v", "a")
+    first = _in_pieces(_loaded(path, Cache(str(tmp_path / "c"))))
+    kept = next((tmp_path / "c").glob("*.encoder.onnx"))
+    whole = kept.read_bytes()
+    kept.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
+    assert (_in_pieces(_loaded(path, Cache(str(tmp_path / "c")))) == first).all()
+    assert kept.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    ("content", "beside", "why"),
+    [
+        (b"", {}, "is no ONNX model"),
+        (tiny_voice.model()[:-200], {}, "is cut short"),
+        (tiny_voice.model(loud=float("nan")), {}, "what is no number"),
+        (tiny_voice.model(sounds=5), {}, "do not belong together"),
+        (tiny_voice.model(speakers=3), {}, "do not belong together .one has several speakers"),
+        (tiny_voice.model(), {"speakers": 3}, "do not belong together .one has several speakers"),
+        (tiny_voice.model(nodes=tiny_voice.node("NoSuchThing", ["pre"], "x")), {}, "cannot be loaded"),
+        (tiny_voice.model(weights=tiny_voice.field(12, b"\x0a\x01x")), {}, "cannot be loaded|cannot be run"),
+    ],
+)
+def test_a_model_that_is_not_to_be_used_says_why_and_what_to_do(
+    tmp_path: Path, content: bytes, beside: dict[str, Any], why: str
+) -> None:
+    path = tiny_voice.put(tmp_path / "v", "a", content, tiny_voice.description(**beside))
+    with pytest.raises(BadFile, match=why) as caught:
+        _loaded(path)
+    assert str(path) in str(caught.value)
+    assert "get" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@limits()
+def test_a_run_that_is_ended_raises_at_once() -> None:
+    path = real_voice()
+    model = Model(str(path), describe(str(path)))
+    run = Run()
+    ended: list[tuple[float, BaseException]] = []
+
+    def encode() -> None:
+        try:
+            model.encode([*NUMBERS[:2], *NUMBERS[2:-1] * 30, NUMBERS[-1]], 0, 1.0, run)  # two seconds of it
+        except BadFile as error:
+            ended.append((time.monotonic(), error))
+
+    thread = threading.Thread(target=encode)
+    thread.start()
+    time.sleep(0.2)
+    assert thread.is_alive()
+    asked = time.monotonic()
+    run.end()
+    thread.join()
+    assert ended, "it came to its end"
+    assert_within(ended[0][0] - asked, ENDED, "the end of a run")

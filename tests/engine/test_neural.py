@@ -1,0 +1,315 @@
+"""A neural voice in the engine process: it speaks, is stopped and held at any time, and says what is wrong with it."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import time
+import wave
+from array import array
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine import protocol
+from talkcli.engine.synthesizers.inference import INSTALL, NEEDED
+from tests.engine.spawned import SOON, Spawned
+from tests.support import tiny_voice
+from tests.support.real_voice import REAL_VOICE, real_voice
+from tests.support.surroundings import needs_packages
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import Any
+
+TEXT = "battery low, please come home"
+VOICE = "piper/tiny"
+#: Code that runs in the process first, so that loading takes its time: the packages are what it is on a slow machine.
+SLOW_TO_LOAD = """
+import time
+from talkcli.engine.synthesizers import inference
+loaded = inference._loaded
+def slowly(*arguments):
+    time.sleep({seconds})
+    return loaded(*arguments)
+inference._loaded = slowly
+"""
+#: … and so that packages are not there.
+WITHOUT = """
+import sys, importlib.abc
+class Without(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {names}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+import importlib.util
+find_spec = importlib.util.find_spec
+importlib.util.find_spec = lambda name, *rest: None if name in {names} else find_spec(name, *rest)
+sys.meta_path.insert(0, Without())
+"""
+#: What an engine process without a neural voice has no use for.
+NEURAL_MODULES = [
+    *NEEDED,
+    *("difflib", "hashlib", "queue"),
+    *(f"talkcli.engine.synthesizers.{each}" for each in ("cache", "inference", "phonemes", "piper", "vits", "work")),
+]
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """Return a directory with a voice that hums, in some milliseconds."""
+    needs_packages(*NEEDED)
+    tiny_voice.put(tmp_path / "voices", "tiny")
+    return tmp_path / "voices"
+
+
+def _spawned(place: Path, player: str = "null", **more: Any) -> Spawned:
+    environment = {"TALK_VOICES": str(place), "XDG_CACHE_HOME": str(place.parent / "cache")}
+    return Spawned(player, environment=environment, **more)
+
+
+@contextlib.contextmanager
+def _engine(place: Path, player: str = "null", **more: Any) -> Iterator[Spawned]:
+    """Give one that is ready."""
+    with _spawned(place, player, **more) as engine:
+        engine.until(protocol.Ready)
+        yield engine
+
+
+def _failed(ended: protocol.Ended, reason: str = "voice_failed") -> str:
+    assert (ended.outcome, ended.reason) == (protocol.FAILED, reason), ended
+    return ended.message or ""
+
+
+def test_it_speaks_with_its_words_and_espeak_before_and_after(place: Path) -> None:
+    with _engine(place) as engine:
+        for number, voice in enumerate([None, VOICE, "en-us", f"{VOICE[:8]}", None]):
+            ended = engine.spoken(TEXT, f"g{number}", voice=voice)
+            assert ended.outcome == protocol.COMPLETED, ended
+            words = [TEXT[each.start : each.end] for each in engine.words(f"g{number}")]
+            assert words == ["battery", "low", "please", "come", "home"]
+
+
+@pytest.mark.parametrize("rate", [8000, 16000, 22050, 44100, 48000])
+def test_any_rate_of_samples_goes_into_a_file(place: Path, tmp_path: Path, rate: int) -> None:
+    tiny_voice.put(place, "other", beside=tiny_voice.description(rate=rate))
+    target = tmp_path / "out.wav"
+    with _engine(place, f"file:{target}") as engine:
+        ended = engine.spoken(TEXT, voice="piper/other")
+    assert ended.outcome == protocol.COMPLETED
+    with wave.open(str(target)) as file:
+        assert file.getframerate() == rate
+        assert file.getnframes() / rate == pytest.approx(ended.duration, abs=0.01)
+
+
+def test_a_speaker_is_named_behind_the_voice(place: Path) -> None:
+    tiny_voice.put(place, "many", tiny_voice.model(speakers=3), tiny_voice.description(speakers=3))
+    with _engine(place) as engine:
+        for number, voice in enumerate(["piper/many", "piper/many#2", "piper/many#p1"]):
+            assert engine.spoken("a", f"g{number}", voice=voice).outcome == protocol.COMPLETED
+        message = _failed(engine.spoken("a", "g8", voice="piper/many#3"), "unknown_voice")
+        assert 'it has no speaker "3": it has 3 speakers, 0 to 2' in message
+        message = _failed(engine.spoken("a", "g9", voice=f"{VOICE}#1"), "unknown_voice")
+        assert 'it has no speaker "1": it has one speaker' in message
+
+
+def test_a_voice_that_is_put_there_while_it_runs_is_found(place: Path) -> None:
+    with _engine(place) as engine:
+        assert engine.spoken("a", "g1", voice=VOICE).outcome == protocol.COMPLETED
+        message = _failed(engine.spoken("a", "g2", voice="piper/late"), "unknown_voice")
+        assert 'unknown voice "piper/late"' in message
+        tiny_voice.put(place, "late")
+        assert engine.spoken("a", "g3", voice="piper/late").outcome == protocol.COMPLETED
+
+
+@pytest.mark.parametrize("name", ["../voices/tiny", "/tiny", ".tiny", "tiny/../tiny", ""])
+def test_a_name_is_no_path(place: Path, name: str) -> None:
+    tiny_voice.put(place, ".tiny")
+    tiny_voice.put(place, "other")  # so that the beginning of nothing is none's
+    with _engine(place) as engine:
+        _failed(engine.spoken("a", voice=f"piper/{name}"), "unknown_voice")
+
+
+def test_a_pitch_is_refused_as_a_voice_has_none(place: Path) -> None:
+    with _engine(place) as engine:
+        engine.say(TEXT, voice=VOICE, pitch=60)
+        assert "has no pitch but its own: leave --pitch out" in _failed(engine.until(protocol.Ended), "bad_option")
+        assert engine.spoken(TEXT, "g2", voice=VOICE).outcome == protocol.COMPLETED
+
+
+# -- without the extra
+
+
+def test_an_engine_process_that_speaks_as_ever_loads_nothing_of_it(place: Path) -> None:
+    report = f"""
+import atexit, sys
+atexit.register(lambda: sys.stderr.write(repr([each for each in {NEURAL_MODULES!r} if each in sys.modules])))
+"""
+    with _engine(place, before=report) as engine:
+        assert VOICE in {each.id for each in engine.until(protocol.Voices).voices}
+        assert engine.spoken(TEXT).outcome == protocol.COMPLETED
+        engine.leave()
+        assert engine.errors() == "[]"
+
+
+@pytest.mark.parametrize("package", NEEDED)
+def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package: str) -> None:
+    tiny_voice.put(tmp_path / "voices", "tiny")
+    with _engine(tmp_path / "voices", before=WITHOUT.format(names=[package])) as engine:
+        message = _failed(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
+        assert f"{VOICE} is listed, but it cannot be loaded" in message
+        if package in NEEDED:
+            assert INSTALL in message
+        assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
+    with _spawned(tmp_path / "voices", before=WITHOUT.format(names=[package]), voice=VOICE) as engine:
+        failed = engine.until(protocol.StartFailed)
+        assert failed.usage
+        assert INSTALL in failed.message
+
+
+# -- faults
+
+
+#: What says that a weight is in another file.
+OUTSIDE = tiny_voice.field(13, tiny_voice.field(1, "location") + tiny_voice.field(2, "/etc/passwd"))
+#: Models and JSONs that are not as they should be, by what is wrong with them.
+WRONG: dict[str, tuple[bytes, dict[str, object]]] = {
+    "cut short": (tiny_voice.model()[:-300], {}),
+    "operators of its own": (tiny_voice.model(nodes=tiny_voice.node("Evil", ["input"], "x", domain="evil")), {}),
+    "weights in another file": (tiny_voice.model(weights=tiny_voice.weight("w", [1], 1, more=OUTSIDE)), {}),
+    "no number": (tiny_voice.model(loud=float("nan")), {}),
+    "silent": (tiny_voice.model(loud=0.0), {}),
+    "another's json": (tiny_voice.model(sounds=10), {}),
+    "an unknown language": (tiny_voice.model(), {"voice": "tlh"}),
+}
+
+
+def _put_wrong(place: Path, wrong: str) -> None:
+    model, beside = WRONG.get(wrong, (None, {}))
+    path = tiny_voice.put(place, "wrong", model, tiny_voice.description(**beside))  # type: ignore[arg-type]
+    if wrong == "no json":
+        (place / "wrong.onnx.json").unlink()
+    elif wrong == "writable":
+        path.chmod(0o666)
+    elif wrong == "json writable":
+        (place / "wrong.onnx.json").chmod(0o666)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("no json", "wrong.onnx.json is not there: it belongs to the model"),
+        ("another's json", "do not belong together"),
+        ("cut short", "is cut short, or no ONNX model: get the voice anew"),
+        ("operators of its own", "has operators of its own (evil:Evil): get the voice anew"),
+        ("weights in another file", "has its weights in another file: get the voice anew"),
+        ("no number", "makes no sound, but what is no number: get the voice anew"),
+        ("silent", "makes no sound of a text: get the voice anew"),
+        ("an unknown language", 'has no voice "tlh", which knows its sounds: get the voice anew'),
+        ("writable", "wrong.onnx can be written by others, who could change the voice: chmod go-w"),
+        ("json writable", "wrong.onnx.json can be written by others, who could change the voice: chmod go-w"),
+    ],
+)
+def test_what_is_wrong_with_its_files_ends_one_goal_in_words(
+    place: Path, tmp_path: Path, wrong: str, words: str
+) -> None:
+    """And it is no reason to be silent for ever: the process lives, and a file that is mended is taken at once."""
+    _put_wrong(place, wrong)
+    with _engine(place, f"file:{tmp_path / 'out.wav'}") as engine:
+        message = _failed(engine.spoken(TEXT, "g1", voice="piper/wrong"))
+        assert words in message
+        assert str(place / "wrong.onnx") in message
+        assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
+        assert words in _failed(engine.spoken(TEXT, "g3", voice="piper/wrong"))
+        tiny_voice.put(place, "wrong")
+        assert engine.spoken(TEXT, "g4", voice="piper/wrong").outcome == protocol.COMPLETED
+
+
+@pytest.mark.parametrize("text", ["日本語", "😀 привет", "\ud800 a", "x" * 10_000, "a.b " * 2_500, "word " * 2_000])
+def test_any_text_comes_to_an_end(place: Path, tmp_path: Path, text: str) -> None:
+    with _engine(place, f"file:{tmp_path / 'out.wav'}") as engine:
+        assert engine.spoken(text, voice=VOICE).outcome == protocol.COMPLETED
+        assert engine.words()
+
+
+@pytest.mark.parametrize("text", ["...", "\x00", "(-)"])
+def test_where_there_is_nothing_to_say_it_says_so(place: Path, text: str) -> None:
+    with _engine(place) as engine:
+        _failed(engine.spoken(text, voice=VOICE), "nothing_to_say")
+
+
+# -- stop and pause
+
+
+@limits()
+def test_it_is_stopped_while_it_is_loaded_and_spoken_with_when_that_is_done(place: Path) -> None:
+    with _engine(place, before=SLOW_TO_LOAD.format(seconds=1.5), alive_every=SOON) as engine:
+        engine.say(TEXT, voice=VOICE)
+        for _ in range(3):
+            engine.until(protocol.Alive)
+        asked = time.monotonic()
+        engine.send(protocol.Stop("g1"))
+        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        assert_within(time.monotonic() - asked, protocol.STOP_LIMIT, "a stop while the voice is loaded")
+        assert engine.spoken("espeak", "g2").outcome == protocol.COMPLETED
+        assert engine.spoken(TEXT, "g3", voice=VOICE).outcome == protocol.COMPLETED
+
+
+@limits()
+def test_it_is_held_while_it_is_loaded(place: Path) -> None:
+    with _engine(place, before=SLOW_TO_LOAD.format(seconds=1.0), alive_every=SOON) as engine:
+        engine.say(TEXT, voice=VOICE)
+        engine.until(protocol.Alive)
+        assert_within(engine.pause(), protocol.STOP_LIMIT, "a pause while the voice is loaded")
+        held_until = time.monotonic() + 1.5  # past the loading
+        while time.monotonic() < held_until:
+            assert isinstance(engine.event(), protocol.Alive)
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+
+
+@limits()
+def test_a_real_voice_is_stopped_and_held_in_the_midst_of_a_long_sentence(
+    tmp_path: Path,
+) -> None:
+    real_voice()
+    with _engine(tmp_path / "voices") as engine:
+        assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.COMPLETED
+        engine.say("word " * 500, "g1", voice=REAL_VOICE)
+        engine.until(protocol.Word)
+        assert_within(engine.pause("g1"), 0.2, "a pause")
+        engine.resume("g1")
+        engine.until(protocol.Word)
+        asked = time.monotonic()
+        engine.send(protocol.Stop("g1"))
+        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        assert_within(time.monotonic() - asked, protocol.STOP_LIMIT, "a stop")
+        assert engine.spoken(TEXT, "g2", voice=REAL_VOICE).outcome == protocol.COMPLETED
+
+
+def test_a_real_voice_says_a_sentence_with_its_words_in_time(tmp_path: Path) -> None:
+    """Each word begins where the sound comes up behind a pause of the sentence: at its stops."""
+    real_voice()
+    text = "Battery low. Please come home. I am stuck."
+    target = tmp_path / "out.wav"
+    with _engine(tmp_path / "voices", f"file:{target}") as engine:
+        assert engine.spoken(text, rate=200, voice=REAL_VOICE).outcome == protocol.COMPLETED
+        starts = [each.time for each in engine.words() if text[each.start - 2 : each.start] in {"", ". "}]
+    with wave.open(str(target)) as file:
+        rate, samples = file.getframerate(), array("h", file.readframes(file.getnframes()))
+    loud = [at / rate for at in range(0, len(samples) - 200, 200) if max(map(abs, samples[at : at + 200])) > 1000]
+    onsets = [loud[0], *(here for before, here in itertools.pairwise(loud) if here - before > 0.25)]
+    assert len(onsets) == len(starts) == 3
+    assert starts == pytest.approx(onsets, abs=0.12)
+
+
+def test_the_json_of_a_voice_is_read_again_with_each_load(place: Path) -> None:
+    """It is no secret kept by the process: another rate of samples is taken when the voice is next loaded."""
+    with _engine(place) as engine:
+        assert engine.spoken("a", "g1", voice=VOICE).outcome == protocol.COMPLETED
+        tiny_voice.put(place, "other")
+        assert engine.spoken("a", "g2", voice="piper/other").outcome == protocol.COMPLETED
+        (place / "tiny.onnx.json").write_text(json.dumps({"audio": {}}))
+        assert "does not describe a voice" in _failed(engine.spoken("a", "g3", voice=VOICE))

@@ -1,0 +1,263 @@
+"""Neural voices as files: where they are found, which are trusted, and what is kept of them for the next start."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from talkcli.engine.synthesizers import cache as caches
+from talkcli.engine.synthesizers.cache import Cache
+from talkcli.engine.synthesizers.models import BadFile, describe, found, open_checked, voices
+from talkcli.paths import cache_directory, voice_directories
+from tests.support import tiny_voice
+
+SYS_PATH = list(sys.path)
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a home without any voice, and no other place that has one."""
+    for name in ("TALK_VOICES", "XDG_DATA_HOME", "XDG_CACHE_HOME", "CACHE_DIRECTORY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_DATA_DIRS", str(tmp_path / "system"))
+    monkeypatch.setattr(sys, "path", [])
+    return tmp_path
+
+
+#: What platformdirs says of where data and caches are, in a process of its own, as it looks once.
+_PLATFORMDIRS = """
+import json, platformdirs
+dirs = platformdirs.PlatformDirs("talk", appauthor=False, multipath=True)
+print(json.dumps([[dirs.user_data_dir, *dirs.site_data_dir.split(":")], dirs.user_cache_dir]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="neural voices are Linux's")
+@pytest.mark.parametrize(
+    "variables", [{}, {"XDG_DATA_HOME": "/d", "XDG_CACHE_HOME": "/c", "XDG_DATA_DIRS": "/a:/b"}, {"XDG_DATA_HOME": ""}]
+)
+@pytest.mark.usefixtures("home")
+def test_the_places_are_those_of_platformdirs(monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]) -> None:
+    monkeypatch.delenv("XDG_DATA_DIRS")
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    code = f"import sys; sys.path[:] = {[*SYS_PATH]!r}\n{_PLATFORMDIRS}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    data, cache = json.loads(done.stdout)
+    assert voice_directories() == [f"{each}/voices" for each in data]
+    assert cache_directory() == cache
+
+
+def test_a_voice_is_found_in_any_of_its_places_and_the_first_has_it(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, package = home / "first", home / "lib" / "any_piper_voice" / "data"
+    monkeypatch.setenv("TALK_VOICES", f"{home / 'nowhere'}:{first}")
+    monkeypatch.setattr(sys, "path", [str(home / "lib")])
+    places = [first, home / ".local/share/talk/voices", home / "system/talk/voices", package]
+    for number, place in enumerate(places):
+        tiny_voice.put(place, f"v{number}")
+        tiny_voice.put(place, "same")
+    assert found() == {
+        **{f"v{number}": f"{place}/v{number}.onnx" for number, place in enumerate(places)},
+        "same": f"{first}/same.onnx",
+    }
+
+
+def test_only_models_that_can_be_named_are_voices(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TALK_VOICES", str(home / "v"))
+    for name in (".hidden", "a#b", "good"):
+        tiny_voice.put(home / "v", name)
+    (home / "v" / ".onnx").touch()
+    (home / "v" / "notes.txt").touch()
+    assert [*found()] == ["good"]
+
+
+def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TALK_VOICES", str(home / "v"))
+    tiny_voice.put(home / "v", "a", beside=tiny_voice.description(speakers=3, language="de_DE"))
+    (home / "v" / "b.onnx").touch()
+    assert [(each.id, each.language, each.name) for each in voices()] == [
+        ("piper/a", "de-de", "tiny, low, 3 speakers"),
+        ("piper/b", None, "b"),
+    ]
+
+
+@pytest.mark.parametrize("mode", [0o666, 0o664])
+@pytest.mark.parametrize("what", ["model", "directory", "above"])
+def test_what_others_may_write_is_refused(home: Path, mode: int, what: str) -> None:
+    path = tiny_voice.put(home / "up" / "v", "a")
+    wrong = {"model": path, "directory": path.parent, "above": path.parent.parent}[what]
+    wrong.chmod(mode if what == "model" else mode | 0o111)
+    with pytest.raises(BadFile, match=f"{wrong} can be written by others, .*: chmod go-w {wrong}"):
+        open_checked(str(path))
+    wrong.chmod(0o755)
+    open_checked(str(path)).close()
+
+
+def test_a_directory_that_is_everybodys_may_be_above_if_it_is_sticky_but_not_hold_the_voice(home: Path) -> None:
+    path = tiny_voice.put(home / "up" / "v", "a")
+    (home / "up").chmod(0o1777)
+    open_checked(str(path)).close()
+    (home / "up" / "v").chmod(0o1777)
+    with pytest.raises(BadFile, match="can be written by others"):
+        open_checked(str(path))
+
+
+def test_what_a_link_points_to_is_looked_at_too(home: Path) -> None:
+    path = tiny_voice.put(home / "there", "a")
+    link = tiny_voice.put(home / "v", "a")
+    link.unlink()
+    link.symlink_to(path)
+    open_checked(str(link)).close()
+    path.parent.chmod(0o777)
+    with pytest.raises(BadFile, match=f"{path.parent} can be written"):
+        open_checked(str(link))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file away")
+def test_another_users_file_is_refused(home: Path) -> None:
+    path = tiny_voice.put(home / "v", "a")
+    os.chown(path, 4711, -1)
+    with pytest.raises(BadFile, match=r"is another user's \(#4711\)"):
+        open_checked(str(path))
+
+
+def test_what_is_no_file_is_refused_and_not_waited_for(home: Path) -> None:
+    path = tiny_voice.put(home / "v", "a")
+    path.unlink()
+    os.mkfifo(path, 0o600)
+    with pytest.raises(BadFile, match="is no file"):
+        open_checked(str(path))
+
+
+@pytest.mark.parametrize(
+    ("beside", "why"),
+    [
+        (b"", "Expecting value"),
+        (b"[" * 100_000, "does not describe"),
+        (b"[]", "does not describe"),
+        (b"{}", "it has no 'phoneme_id_map'"),
+        (b" " * (1 << 20) + b"{}", "it is too long"),
+        ({"phoneme_type": "text"}, "its sounds are not libespeak-ng's, but 'text'"),
+        ({"phoneme_id_map": {"a": [1]}}, "phoneme_id_map has no _"),
+        ({"phoneme_id_map": {"_": [0], "^": [-1], "$": [2]}}, "-1 is no number"),
+        ({"audio": {"sample_rate": 0}}, "0 samples a second"),
+        ({"audio": {"sample_rate": "22050"}}, "is no number"),
+        ({"inference": {"noise_scale": float("nan")}}, "nan is no factor"),
+        ({"inference": {"length_scale": 1e9}}, "is no factor"),
+    ],
+)
+def test_a_json_that_describes_no_voice_is_refused_in_words(
+    home: Path, beside: bytes | dict[str, object], why: str
+) -> None:
+    path = tiny_voice.put(home / "v", "a")
+    told = path.parent / "a.onnx.json"
+    told.write_bytes(beside if isinstance(beside, bytes) else json.dumps(tiny_voice.description(**beside)).encode())  # type: ignore[arg-type]
+    with pytest.raises(BadFile, match=why) as caught:
+        describe(str(path))
+    assert str(told) in str(caught.value)
+    assert "get it anew" in str(caught.value)
+
+
+def test_a_model_without_a_json_says_where_to_get_it(home: Path) -> None:
+    path = tiny_voice.put(home / "v", "a")
+    (path.parent / "a.onnx.json").unlink()
+    with pytest.raises(BadFile, match=r"a\.onnx\.json is not there: it belongs to the model"):
+        describe(str(path))
+
+
+# -- what is kept
+
+
+def _kept(directory: Path) -> list[str]:
+    return sorted(each.name for each in directory.iterdir())
+
+
+def _keep(cache: Cache, key: str, content: bytes = b"encoder") -> str | None:
+    """Keep something, and return the path that it was to be written to."""
+    given: list[str | None] = []
+
+    def write(path: str | None) -> None:
+        given.append(path)
+        if path is not None:
+            with open(path, "wb") as file:
+                file.write(content)
+
+    cache.keep(key, write, b"decoder")
+    return given[-1]
+
+
+def test_what_is_kept_is_found_again_by_its_key(home: Path) -> None:
+    cache = Cache(str(home / "c"))
+    assert cache.find("k") is None
+    _keep(cache, "k")
+    paths = cache.find("k")
+    assert paths is not None
+    assert [Path(each).read_bytes() for each in paths] == [b"encoder", b"decoder"]
+    assert stat.S_IMODE((home / "c").stat().st_mode) == 0o700
+    assert _kept(home / "c") == ["k.decoder.onnx", "k.encoder.onnx"]
+    cache.forget("k")
+    assert cache.find("k") is None
+
+
+def test_half_of_it_is_nothing(home: Path) -> None:
+    cache = Cache(str(home / "c"))
+    _keep(cache, "k")
+    (home / "c" / "k.encoder.onnx").unlink()
+    assert cache.find("k") is None
+
+
+def test_the_oldest_go_past_the_limit_and_what_was_left_unfinished(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(caches, "LARGEST", 85)
+    cache = Cache(str(home / "c"))
+    (home / "c" / "x.1.new").write_bytes(bytes(20))
+    os.utime(home / "c" / "x.1.new", (1, 1))
+    for number, key in enumerate("abc"):
+        _keep(cache, key, bytes(20))
+        for each in (home / "c").glob(f"{key}.*"):
+            os.utime(each, (1000 + number, 1000 + number))
+    cache.find("a")  # it is used, and so the newest but for the next
+    _keep(cache, "d", bytes(20))
+    assert _kept(home / "c") == [f"{each}.{half}coder.onnx" for each in "acd" for half in ("de", "en")]
+
+
+def test_where_it_cannot_be_written_it_is_made_without(home: Path) -> None:
+    cache = Cache(str(home / "c"))
+    os.rename(home / "c", home / "gone")
+    assert _keep(cache, "k") is None
+
+
+def test_what_fails_of_itself_fails_without_being_kept_too(home: Path) -> None:
+    def fails(_: str | None) -> None:
+        raise ValueError("broken")
+
+    cache = Cache(str(home / "c"))
+    with pytest.raises(ValueError, match="broken"):
+        cache.keep("k", fails, b"")
+    assert cache.find("k") is None
+    assert not [each for each in _kept(home / "c") if each.endswith(".new")]
+
+
+@pytest.mark.parametrize("mode", [0o755, 0o777])
+def test_a_cache_that_others_may_read_or_write_is_none(home: Path, mode: int) -> None:
+    (home / "c").mkdir()
+    (home / "c").chmod(mode)
+    with pytest.raises(PermissionError, match="is not this user's alone"):
+        Cache(str(home / "c"))
+
+
+def test_what_is_used_is_marked_so(home: Path) -> None:
+    cache = Cache(str(home / "c"))
+    _keep(cache, "k")
+    os.utime(home / "c" / "k.encoder.onnx", (1, 1))
+    cache.find("k")
+    assert time.time() - (home / "c" / "k.encoder.onnx").stat().st_mtime < 60

@@ -1,0 +1,103 @@
+"""Sounds and words are laid side by side, whichever way the library counts them, in pieces with a hard limit."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from talkcli.engine.synthesizers.phonemes import LONGEST, Piece, pieces
+
+
+class Spelt:
+    """A language in which each letter is its sound, and a word is what blanks part; `joined` speaks two as one."""
+
+    def __init__(self, joined: str = "", said: dict[str, str] | None = None) -> None:
+        self._joined = joined
+        self._said = said or {}
+
+    def clauses(self, text: str) -> list[tuple[str, str]]:
+        parts = re.findall(r"[^,.!?]*[,.!?]*\s*", text)[:-1]
+        return [(each, self._sounds(each)) for each in parts]
+
+    def places(self, clause: str) -> list[tuple[int, int]]:
+        return [(each.start(), len(each[0])) for each in re.finditer(r"[^\s,.!?]+", clause)]
+
+    def _sounds(self, clause: str) -> str:
+        words = re.sub(r"[,.!?]", " ", clause).split()
+        said = " ".join(self._said.get(each, each) for each in words)
+        return said.replace(self._joined, self._joined.replace(" ", "")) if self._joined else said
+
+
+def _shown(text: str, speller: Spelt | None = None) -> list[str]:
+    return ["".join(each.sounds) for each in pieces(speller or Spelt(), text)]
+
+
+def _words(text: str, speller: Spelt | None = None) -> list[tuple[str, str]]:
+    """Return each word of the text, and what is spoken from its beginning on."""
+    found = []
+    for piece in pieces(speller or Spelt(), text):
+        for at, start, length in piece.words:
+            found.append((text[start : start + length], "".join(piece.sounds[at : at + 3])))
+    return found
+
+
+def test_a_piece_is_a_sentence_with_its_stops() -> None:
+    assert _shown("one, two. three? four") == ["one, two.", "three?", "four"]
+    assert [each.ends for each in pieces(Spelt(), "one. two")] == [True, True]
+
+
+@pytest.mark.parametrize(("sign", "mark"), [("。", "."), ("？", "?"), ("，", ","), ("…", "."), ("؟", "?"), (";", ";")])
+def test_other_scripts_stops_are_those_that_voices_know(sign: str, mark: str) -> None:
+    assert _shown(f"one{sign}", Spelt(said={f"one{sign}": "one"})) == [f"one{mark}"]
+
+
+def test_words_begin_where_they_stand_in_the_text() -> None:
+    assert _words("one, two. three") == [("one", "one"), ("two", "two"), ("three", "thr")]
+
+
+def test_words_that_are_spoken_as_one_begin_inside_of_it() -> None:
+    assert _words("go in the red", Spelt("in the")) == [("go", "go "), ("in", "int"), ("the", "the"), ("red", "red")]
+
+
+def test_a_word_that_is_spoken_as_several_begins_with_the_first() -> None:
+    said = {"20": "twen ty"}
+    assert _words("go 20 by", Spelt(said=said)) == [("go", "go "), ("20", "twe"), ("by", "by")]
+
+
+def test_accents_are_sounds_of_their_own_and_marks_of_languages_are_none() -> None:
+    assert _shown("x", Spelt(said={"x": "(en)\xf5(de)"})) == ["o\u0303"]
+
+
+@pytest.mark.parametrize("text", ["", " ", "...", "!"])
+def test_where_nothing_has_a_sound_there_is_no_piece(text: str) -> None:
+    assert list(pieces(Spelt(), text)) == []
+
+
+def test_a_long_sentence_is_parted_at_a_comma_and_without_a_pause() -> None:
+    text = ", ".join(["word " * 12] * 6)
+    found = list(pieces(Spelt(), text))
+    assert [each.ends for each in found] == [False, True]
+    assert found[0].sounds[-1] == ","
+
+
+@given(st.lists(st.sampled_from(["word", "a", "x" * 70, "y" * 600, "in the", "one,", "two.", "?"]), max_size=120))
+def test_no_piece_is_longer_than_its_limit_and_nothing_is_lost(words: list[str]) -> None:
+    text = " ".join(words)
+    found = list(pieces(Spelt("in the"), text))
+    assert all(0 < len(each.sounds) <= LONGEST for each in found)
+    spoken = re.sub(r"\W", "", text)
+    assert re.sub(r"\W", "", "".join("".join(each.sounds) for each in found)) == spoken
+    _assert_in_order(found, text)
+
+
+def _assert_in_order(found: list[Piece], text: str) -> None:
+    starts = []
+    for piece in found:
+        places = [at for at, _, _ in piece.words]
+        assert places == sorted(places)
+        assert all(0 <= at < len(piece.sounds) for at in places)
+        starts += [start for _, start, _ in piece.words]
+    assert starts == [each.start() for each in re.finditer(r"[^\s,.!?]+", text)]

@@ -1,0 +1,100 @@
+"""A model is cut in two, and what is none of Piper's, or no file that may be run, is refused in words."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from talkcli.engine.synthesizers.vits import NotCut, halves
+from tests.support import tiny_voice
+from tests.support.tiny_voice import field, node, tensor, weight
+
+MODEL = tiny_voice.model()
+#: An attribute of a node: a graph, and one with a tensor.
+_GRAPH, _TENSOR = 6, 5
+
+
+def _inside(graph: bytes, deep: int) -> bytes:
+    """Return a node with a graph inside of a graph, so many deep."""
+    for _ in range(deep):
+        graph = node("If", ["input"], "unused", field(1, "then_branch") + field(_GRAPH, graph) + field(20, 5))
+    return graph
+
+
+def test_the_first_half_has_the_inputs_and_the_second_the_output() -> None:
+    cut = halves(MODEL)
+    for name in ("input_lengths", "scales", "frames_of", "Ceil"):
+        assert name.encode() in cut.encoder
+        assert name.encode() not in cut.decoder
+    for name in ("dec.conv_pre.weight", "ConvTranspose", "output", "Identity"):
+        assert name.encode() in cut.decoder
+    assert b"dec.conv_pre.weight" not in cut.encoder
+    assert len(cut.encoder) + len(cut.decoder) < 1.2 * len(MODEL)
+
+
+def test_what_belongs_to_neither_half_is_left_out() -> None:
+    """Only what was looked at reaches the library that reads it."""
+    cut = halves(tiny_voice.model(fields=field(14, field(1, "note") + field(2, "metadata")) + field(20, b"training")))
+    for half in (cut.encoder, cut.decoder):
+        assert b"metadata" not in half
+        assert b"training" not in half
+
+
+def test_a_graph_inside_of_another_keeps_what_it_needs() -> None:
+    """A condition in the decoder takes a weight that nothing else does."""
+    inner = node("Identity", ["only_inside"], "then_out")
+    condition = node("If", ["frames"], "more", field(1, "then_branch") + field(_GRAPH, inner) + field(20, 5))
+    after = node("Add", ["output", "more"], "last")
+    cut = halves(tiny_voice.model(nodes=condition + after, weights=weight("only_inside", [1.0], 1)))
+    assert b"only_inside" in cut.encoder + cut.decoder
+
+
+@pytest.mark.parametrize(
+    ("model", "why"),
+    [
+        (b"", "is no ONNX model"),
+        (b"RIFF\x10\x00\x00\x00WAVEfmt ", "ONNX model"),
+        (b"<!DOCTYPE html><html>", "ONNX model"),
+        (MODEL[:-100], "cut short"),
+        (MODEL[: len(MODEL) // 2], "cut short"),
+        (MODEL + MODEL, "is no ONNX model"),
+        (b"\xff" * 100, "cut short"),
+        (tiny_voice.model(cut="other.weight"), "is none of Piper's models: it has no dec.conv_pre.weight"),
+        (tiny_voice.model(nodes=node("Ceil", ["floats"], "frames")), "does not tell how long each sound lasts"),
+        (tiny_voice.model(nodes=node("Format", ["input"], "x", domain="evil")), "operators of its own (evil:Format)"),
+        (tiny_voice.model(nodes=node("Gelu", ["input"], "x", domain="com.microsoft")), "operators of its own"),
+        (tiny_voice.model(fields=field(25, field(1, "mine"))), "has operators of its own"),
+        (tiny_voice.model(weights=weight("w", [1], 1, more=field(13, b"\x0a\x08location"))), "in another file"),
+        (tiny_voice.model(weights=weight("w", [1], 1, more=field(14, 1))), "in another file"),
+        (tiny_voice.model(weights=field(15, b"")), "sparse"),
+        (tiny_voice.model(nodes=_inside(node("Evil", [], "x", domain="evil"), 2)), "operators of its own (evil:Evil)"),
+        (tiny_voice.model(nodes=_inside(weight("w", [1], 1, more=field(14, 1)), 2)), "in another file"),
+        (tiny_voice.model(nodes=_inside(b"", 50)), "graphs inside of graphs"),
+        (
+            tiny_voice.model(
+                nodes=node(
+                    "Constant",
+                    [],
+                    "x",
+                    field(1, "value") + field(_TENSOR, tensor("t", [1], 1, more=field(14, 1))) + field(20, 4),
+                )
+            ),
+            "in another file",
+        ),
+    ],
+)
+def test_what_is_not_to_be_run_is_refused_in_words(model: bytes, why: str) -> None:
+    with pytest.raises(NotCut, match=why.replace("(", r"\(").replace(")", r"\)").replace(".", r"\.")):
+        halves(model)
+
+
+@given(st.integers(0, len(MODEL) - 1), st.binary(min_size=1, max_size=8))
+def test_whatever_is_wrong_with_a_model_it_is_cut_or_refused(place: int, written: bytes) -> None:
+    broken = MODEL[:place] + written + MODEL[place + len(written) :]
+    with contextlib.suppress(NotCut):
+        cut = halves(broken)
+        assert cut.encoder
+        assert cut.decoder
