@@ -318,6 +318,7 @@ class Requests:
         call.answer(goals, server=self._describe(), active=now)
 
     async def _voices(self, call: Call, _: Voices) -> None:
+        self._speech.look_for_voices()
         voices = self._speech.voices
         if voices is None:
             words = f"the engine can't list its voices now: it is {self._speech.engine_words}"

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
-from talkcli.engine.synthesizers.voices import find_voice, unknown_voice
+from talkcli.engine.synthesizers import is_own
+from talkcli.engine.synthesizers.voices import find_voice, is_neural, unknown_voice
 from talkcli.errors import TalkError, UsageError
 from talkcli.goals.goal import Output
 from talkcli.goals.options import DEFAULT_VOICE, for_engine
@@ -141,7 +142,21 @@ class Speech:
         """Return reason and words why a voice can't be had; None also where the voices aren't known."""
         if voice is None or voice == DEFAULT_VOICE or not self.voices or find_voice(voice, self.voices):
             return None
+        if is_neural(voice):
+            self.look_for_voices()
+            if find_voice(voice, self.voices):
+                return None
         return "unknown_voice", unknown_voice(voice, self.voices)
+
+    def look_for_voices(self) -> None:
+        """Find what neural voices were put there, or taken away, since the engine listed its voices.
+
+        It takes no more than to read some directories, and only where somebody asks.
+        """
+        if self.voices and self.ready and is_own(self.ready.driver):
+            from talkcli.engine.synthesizers import models
+
+            self.voices = (*(each for each in self.voices if not is_neural(each.id)), *models.voices())
 
     def for_silence(self, record: Record) -> Place:
         """Return where to wait until the active goal is silent, goes on after a pause, or its end has been told."""
