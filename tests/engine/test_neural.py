@@ -289,6 +289,41 @@ def test_a_real_voice_is_stopped_and_held_in_the_midst_of_a_long_sentence(
         assert engine.spoken(TEXT, "g2", voice=REAL_VOICE).outcome == protocol.COMPLETED
 
 
+def test_the_process_ends_well_in_the_midst_of_a_real_voices_inference(tmp_path: Path) -> None:
+    """A thread that is left in it would have the process abort, and the log tell of a crash."""
+    real_voice()
+    with _engine(tmp_path / "voices") as engine:
+        assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.COMPLETED
+        engine.say("word " * 500, "g1", voice=REAL_VOICE)
+        engine.until(protocol.Word)  # seconds of it are still to be made, ahead of what is heard
+        engine.hang_up()
+        assert engine.process.wait(20) == 0, engine.errors()
+
+
+def test_a_machine_that_is_too_slow_makes_gaps_and_leaves_nothing_out(place: Path) -> None:
+    """Words are told when they are heard, in the order of the text, however late that is."""
+    slow = """
+import time
+from talkcli.engine.synthesizers import inference
+decode = inference.Model.decode
+def slowly(model, frames, begin, *rest):
+    time.sleep(0.8 if begin else 0)
+    return decode(model, frames, begin, *rest)
+inference.Model.decode = slowly
+"""
+    text = "one two three four five six seven"
+    with _engine(place, before=slow) as engine:
+        engine.say(text, voice=VOICE)
+        late = []
+        while not isinstance(event := engine.event(), protocol.Ended):
+            if isinstance(event, protocol.Word):
+                late.append(time.monotonic() - event.time)
+    assert event.outcome == protocol.COMPLETED
+    assert [text[each.start : each.end] for each in engine.words()] == text.split()
+    assert late[-1] - late[0] > 0.5
+    assert all(after > before - 0.05 for before, after in itertools.pairwise(late))
+
+
 def test_a_real_voice_says_a_sentence_with_its_words_in_time(tmp_path: Path) -> None:
     """Each word begins where the sound comes up behind a pause of the sentence: at its stops."""
     real_voice()

@@ -330,6 +330,19 @@ def test_it_obeys_the_sound_of_this_sentence_or_refuses(synthesizer: Synthesizer
     _assert_alike(_spoken(synthesizer), usual)
 
 
+def test_libespeak_speaks_on_as_before_after_it_was_asked_how_another_language_sounds() -> None:
+    espeak = _espeak()
+    own = espeak.voice
+    try:
+        espeak.load("gmw/de")
+        before = _spoken(espeak, "zwanzig Züge", Sound(rate=300))
+        with espeak.spelling("en-us") as speller:
+            assert speller.places("twenty trains") == [(0, 6), (7, 6)]
+        _assert_alike(_spoken(espeak, "zwanzig Züge", Sound(rate=300)), before)
+    finally:
+        espeak.load(own)
+
+
 # -- one sentence after the other
 
 

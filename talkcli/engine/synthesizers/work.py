@@ -21,8 +21,8 @@ class Work(threading.Thread, Generic[_T]):
 
     def __init__(self, makes: Iterator[_T], room: int) -> None:
         """Begin with it. `room`: how many may lie there that nobody has taken."""
-        # It dies with the process, whatever it does.
-        super().__init__(daemon=True)
+        # None that is left behind at the process's end, in the midst of a library in C, which aborts then.
+        super().__init__(daemon=False)
         self._makes = makes
         self._room = threading.Semaphore(room)
         self._made: deque[_T] = deque()
