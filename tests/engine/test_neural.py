@@ -338,6 +338,8 @@ def test_a_real_voice_says_a_sentence_with_its_words_in_time(tmp_path: Path) -> 
     onsets = [loud[0], *(here for before, here in itertools.pairwise(loud) if here - before > 0.25)]
     assert len(onsets) == len(starts) == 3
     assert starts == pytest.approx(onsets, abs=0.12)
+    quiet = next(number for number, each in enumerate(reversed(samples)) if abs(each) > 330)
+    assert quiet / rate == pytest.approx(0.26, abs=0.01), "the pause at its end"
 
 
 def test_the_json_of_a_voice_is_read_again_with_each_load(place: Path) -> None:

@@ -38,8 +38,9 @@ _FIRST, _MOST = 20, 80
 _AHEAD = 8
 #: Pieces of text whose sounds are known before they are needed.
 _SPELLED = 2
-#: The seconds of silence behind a sentence, as libespeak-ng has it. A player may end no more than 0.25 s early.
-_PAUSE = 0.28
+#: Seconds from the last sound of a sentence that can be heard to its end, as libespeak-ng has it: 0.24 to 0.28. A
+#: player may end 0.25 early. What a model itself makes of it, 0.07 to 0.2, is fainter than this, of 1.0.
+_PAUSE, _FAINT = 0.26, 0.01
 #: Samples no louder than this, of 1.0, all through a piece, are no speech.
 _SILENT = 0.001
 #: Seconds of sound that are handed on at once.
@@ -181,7 +182,7 @@ class Piper:
 
 def _made(model: Model, given: queue.SimpleQueue[Piece | None], speaker: int, sound: Sound, run: Run) -> Iterator[Made]:
     """Yield the sound of the pieces that are given, up to None."""
-    pause = bytes(int(_PAUSE * model.description.rate) * SAMPLE)
+    pause = int(_PAUSE * model.description.rate)
     while (piece := given.get()) is not None:
         numbers, places = _numbered(piece.sounds, model.description.sounds)
         if not places:
@@ -192,17 +193,21 @@ def _made(model: Model, given: queue.SimpleQueue[Piece | None], speaker: int, so
             (start, length, model.seconds(begins[places[at]])) for at, start, length in piece.words if at in places
         )
         loudest = 0.0
+        faint = 0  # samples, up to here
         begin, many = 0, _FIRST
         while begin < frames.count:
             end = min(frames.count, begin + many)
             part = model.decode(frames, begin, end, run)
-            loudest = max(loudest, float(abs(part).max()))
+            heights = abs(part)
+            loudest = max(loudest, float(heights.max()))
+            heard = (heights > _FAINT).nonzero()[0]
+            faint = len(part) - 1 - int(heard[-1]) if len(heard) else faint + len(part)
             yield Made(_samples(part, sound.volume), words)
             words, begin, many = (), end, min(_MOST, 2 * many)
         if loudest < _SILENT:
             raise BadFile(f"{model.path} makes no sound of a text: get the voice anew")
-        if piece.ends:
-            yield Made(pause)
+        if piece.ends and faint < pause:
+            yield Made(bytes((pause - faint) * SAMPLE))
 
 
 def _samples(part: Any, volume: float) -> bytes:
