@@ -22,6 +22,7 @@ from talkcli.engine.synthesizers.base import Sound, UnknownVoice
 from talkcli.engine.synthesizers.choice import Choice
 from talkcli.engine.synthesizers.espeak import Espeak
 from talkcli.engine.synthesizers.inference import NEEDED
+from talkcli.engine.synthesizers.phonemes import pieces
 from talkcli.engine.synthesizers.piper import Piper
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_PACKAGE, real_voice, silence_noise
@@ -341,6 +342,23 @@ def test_libespeak_speaks_on_as_before_after_it_was_asked_how_another_language_s
         _assert_alike(_spoken(espeak, "zwanzig Züge", Sound(rate=300)), before)
     finally:
         espeak.load(own)
+
+
+@pytest.mark.parametrize(
+    ("language", "text", "ends"),
+    [
+        ("en-us", "Mr. Smith is at home. The battery is low.", ["at home.", "is low."]),
+        ("en-us", "Dr. Who and Mrs. Jones", ["Jones"]),
+        ("en-us", "Count to 5. Then go! I see.", ["to 5.", "go!", "see."]),
+        ("de", "Das ist Dr. Braun. Er hilft.", ["Dr.", "Braun.", "hilft."]),
+    ],
+)
+def test_a_sentence_ends_where_libespeak_makes_a_pause(language: str, text: str, ends: list[str]) -> None:
+    with _espeak().spelling(language) as speller:
+        found = list(pieces(speller, text))
+    starts = [each.words[0][1] for each in found]
+    sentences = [text[begin:end].rstrip() for begin, end in zip(starts, [*starts[1:], None], strict=True)]
+    assert [each.endswith(end) for each, end in zip(sentences, ends, strict=True)] == [True] * len(ends)
 
 
 # -- one sentence after the other

@@ -25,6 +25,9 @@ class Spelt:
     def places(self, clause: str) -> list[tuple[int, int]]:
         return [(each.start(), len(each[0])) for each in re.finditer(r"[^\s,.!?]+", clause)]
 
+    def abbreviates(self, clause: str) -> bool:
+        return clause.rstrip().endswith("mr.")
+
     def _sounds(self, clause: str) -> str:
         words = re.sub(r"[,.!?]", " ", clause).split()
         said = " ".join(self._said.get(each, each) for each in words)
@@ -52,6 +55,10 @@ def test_a_piece_is_a_sentence_with_its_stops() -> None:
 @pytest.mark.parametrize(("sign", "mark"), [("。", "."), ("？", "?"), ("，", ","), ("…", "."), ("؟", "?"), (";", ";")])
 def test_other_scripts_stops_are_those_that_voices_know(sign: str, mark: str) -> None:
     assert _shown(f"one{sign}", Spelt(said={f"one{sign}": "one"})) == [f"one{mark}"]
+
+
+def test_a_dot_that_belongs_to_its_word_ends_nothing_but_the_text() -> None:
+    assert _shown("one mr. two. mr.") == ["one mr two.", "mr."]
 
 
 def test_words_begin_where_they_stand_in_the_text() -> None:

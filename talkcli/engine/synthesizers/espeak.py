@@ -43,6 +43,11 @@ _DEFAULTS = ("gmw/en", "en")
 #: An event that pyttsx3's binding does not name: the sample rate, before the first samples.
 _EVENT_SAMPLERATE = 8
 
+#: Words per minute that the library sets itself.
+_USUAL = 175
+#: Samples of a pause behind a clause that are none: behind "Mr." it makes a hundred at most, behind a sentence 6,000.
+_NO_PAUSE = 2000
+
 #: How sounds are to be written: in IPA.
 _IPA = 2
 
@@ -129,7 +134,7 @@ class Espeak:
         self._listed: tuple[Voice, ...] = ()
         #: what its parameters were last set to; they are left alone where they need not be set, so that the first
         #: sentence of a fresh process is what the library alone would make
-        self._set = {espeak.RATE: 175, espeak.VOLUME: 100, espeak.PITCH: 50}
+        self._set = {espeak.RATE: _USUAL, espeak.VOLUME: 100, espeak.PITCH: 50}
         self._text = ""
         self._output: Output | None = None
         self._raised: BaseException | None = None
@@ -179,6 +184,7 @@ class Espeak:
         try:
             if voice is None or self._espeak.SetVoiceByName(voice.id.encode()) != self._espeak.EE_OK:
                 raise UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
+            self._espeak.SetParameter(self._espeak.RATE, _USUAL, 0)
             yield Spelling(self._espeak, voice.id)
         finally:
             self._espeak.SetSynthCallback(self._on_audio)
@@ -225,8 +231,9 @@ class Spelling:
         """`voice`: the id of the one in force."""
         self._espeak = espeak
         self._voice = voice
-        self._clause = ""
+        self._text = ""
         self._places: list[tuple[int, int]] = []
+        self._ends: list[int] = []
         self._to_phonemes = espeak.dll.espeak_TextToPhonemes
         self._to_phonemes.restype = ctypes.c_char_p
         espeak.SetSynthCallback(self._on_audio)
@@ -252,14 +259,27 @@ class Spelling:
 
     def places(self, clause: str) -> list[tuple[int, int]]:
         """Return where its words are, by having it spoken to nobody: 1 ms a second of sound."""
-        self._clause, self._places = guard.guarded(clause, self._voice), []
-        self._espeak.Synth(self._clause.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
+        self._speak(clause)
         return self._places
+
+    def abbreviates(self, clause: str) -> bool:
+        """Tell it by the pause that the library makes behind that word, where another one follows."""
+        word = clause.rsplit(maxsplit=1)[-1]
+        alone = self._speak(word)
+        return self._speak(f"{word} A") - alone < _NO_PAUSE
+
+    def _speak(self, text: str) -> int:
+        """Have a text spoken to nobody; return where the first clause of it ends, in samples, and keep its words."""
+        self._text, self._places, self._ends = guard.guarded(text, self._voice), [], []
+        self._espeak.Synth(self._text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
+        return self._ends[0] if self._ends else 0
 
     def _on_audio(self, _samples: Any, _count: int, events: Any) -> int:
         for event in itertools.takewhile(lambda each: each.type, events):
-            if event.type == self._espeak.EVENT_WORD and (word := _place(event, self._clause)):
+            if event.type == self._espeak.EVENT_WORD and (word := _place(event, self._text)):
                 self._places.append(word)
+            elif event.type == self._espeak.EVENT_END:
+                self._ends.append(event.sample)
         return 0
 
 

@@ -50,6 +50,9 @@ class Speller(Protocol):
     def places(self, clause: str) -> list[tuple[int, int]]:
         """Return where the words of a clause begin, and how long they are there, 1 or more."""
 
+    def abbreviates(self, clause: str) -> bool:
+        """Tell whether the dot at the end of a clause belongs to its last word, as that of "Mr."."""
+
 
 @frozen
 class Piece:
@@ -76,7 +79,8 @@ def pieces(speller: Speller, text: str) -> Iterator[Piece]:
                 yield begun.piece(ends=False)
             yield from begun.add(group, words)
         stop = _STOP.search(clause) if groups else None
-        if stop is not None:
+        last = offset + len(clause) == len(text)
+        if stop is not None and (last or stop.group() != "." or not speller.abbreviates(clause)):
             begun.sounds.append(_STOPS[stop.group()])
             if begun.sounds[-1] in _ENDS:
                 yield begun.piece(ends=True)
