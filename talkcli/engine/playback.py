@@ -270,6 +270,7 @@ class Playback:
         if self._session.held and not self._stay_silent(stream):
             return False
         self._tick(stream)
+        stream.player.ended()  # raises if it is gone; what it says wakes nobody again
         self._wait_for(stream, None, more)
         self._tick(stream)
         stream.progress_at = time.monotonic()  # what it was not given it could not take

@@ -31,11 +31,11 @@ VOICE = "piper/tiny"
 SLOW_TO_LOAD = """
 import time
 from talkcli.engine.synthesizers import inference
-loaded = inference._loaded
+take = inference.Model._take
 def slowly(*arguments):
     time.sleep({seconds})
-    return loaded(*arguments)
-inference._loaded = slowly
+    return take(*arguments)
+inference.Model._take = slowly
 """
 #: … and so that packages are not there.
 WITHOUT = """
@@ -350,3 +350,41 @@ def test_the_json_of_a_voice_is_read_again_with_each_load(place: Path) -> None:
         assert engine.spoken("a", "g2", voice="piper/other").outcome == protocol.COMPLETED
         (place / "tiny.onnx.json").write_text(json.dumps({"audio": {}}))
         assert "does not describe a voice" in _failed(engine.spoken("a", "g3", voice=VOICE))
+
+
+def test_sounds_that_it_does_not_know_are_left_out_and_a_text_of_nothing_else_says_so(place: Path) -> None:
+    """Several in a row: the thread that makes sound is handed the next piece for each of them."""
+    about = tiny_voice.description()
+    about["phoneme_id_map"] = {"_": [0], "^": [1], "$": [2], "a": [3], "\u00e6": [4]}
+    tiny_voice.put(place, "few", beside=about)
+    with _engine(place) as engine:
+        ended = engine.spoken("Cat! " + "See! " * 12 + "Cat!", "g1", voice="piper/few")
+        assert ended.outcome == protocol.COMPLETED
+        message = _failed(engine.spoken("See! " * 12, "g2", voice="piper/few"))
+        assert "few.onnx.json has no number for a sound of the text (" in message
+
+
+def test_one_model_is_loaded_at_a_time_and_those_that_nobody_waits_for_are_not(place: Path) -> None:
+    slow = """
+import threading
+from talkcli.engine.synthesizers import inference
+init, loading = inference.Model.__init__, []
+def counted(self, path, *rest):
+    loading.append(path)
+    assert len(loading) == 1, loading
+    time.sleep(0.3)
+    init(self, path, *rest)
+    loading.clear()
+    print("loaded", path.rpartition("/")[2], file=sys.stderr, flush=True)
+inference.Model.__init__ = counted
+"""
+    tiny_voice.put(place, "other")
+    with _engine(place, before=f"import sys, time\n{slow}") as engine:
+        for number in range(8):
+            engine.say("a", f"g{number}", voice=("piper/other", VOICE)[number % 2])
+            engine.send(protocol.Stop(f"g{number}"))
+            assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        assert engine.spoken("a", "g9", voice=VOICE).outcome == protocol.COMPLETED
+        engine.leave()
+        loaded = [each.split()[1] for each in engine.errors().splitlines() if each.startswith("loaded")]
+    assert loaded == ["other.onnx", "tiny.onnx"]

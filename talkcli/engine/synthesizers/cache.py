@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import stat
+import tempfile
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -51,14 +53,12 @@ class Cache:
 
         Where they can't be kept it is called with None.
         """
-        unfinished = self._place(key, f".{os.getpid()}{_UNFINISHED}")
         try:
-            made = self._written(key, unfinished, encoder, decoder)
+            # A directory of its own: another load of the same model may be at the same point.
+            with tempfile.TemporaryDirectory(_UNFINISHED, key, self._directory) as folder:
+                made = self._written(key, os.path.join(folder, "half"), encoder, decoder)
         except Exception:  # noqa: BLE001 - of whatever kind: if it was none of writing, it comes again
             made = encoder(None)
-        finally:
-            with contextlib.suppress(OSError):
-                os.unlink(unfinished)
         self._shrink()
         return made
 
@@ -86,5 +86,9 @@ class Cache:
             size = 0
             for status, path in newest:
                 size += status.st_size
-                if size > LARGEST:
+                if size <= LARGEST:
+                    continue
+                if stat.S_ISDIR(status.st_mode):  # of a writer that was killed
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
                     os.unlink(path)

@@ -32,6 +32,8 @@ AROUND = 14
 _LARGEST = 1 << 30
 #: Characters of what onnxruntime says that are handed on.
 _SHOWN = 200
+#: The number of the way in which `vits` cuts: to be raised with it, so that what was kept is made anew.
+_CUT = 1
 #: Names of the model's inputs; the last only where there are several speakers.
 _INPUTS, _SPEAKER = ("input", "input_lengths", "scales"), "sid"
 
@@ -81,8 +83,20 @@ class Model:
             content: bytes = file.read(_LARGEST + 1)
         if len(content) > _LARGEST:
             raise BadFile(f"{path} is larger than any of Piper's models: get the voice anew")
-        self._encoder, self._decoder = _loaded(path, content, cache)
-        del content
+        key = f"{hashlib.sha256(content).hexdigest()}-{_CUT}-{_version()}"
+        kept = cache.find(key) if cache is not None else None
+        if cache is not None and kept is not None:
+            try:
+                self._take(*_kept(*kept))
+                return
+            except Exception:  # noqa: BLE001 - cut short by a full disk, or whatever: it is made anew, and tells then
+                cache.forget(key)
+        self._take(*_cut(path, content, cache, key))
+
+    def _take(self, encoder: Any, decoder: Any) -> None:
+        """Take both halves, if they are what they should be and speak; BadFile."""
+        path, description = self.path, self.description
+        self._encoder, self._decoder = encoder, decoder
         self._several = _SPEAKER in {each.name for each in self._encoder.get_inputs()}
         names = {each.name for each in self._encoder.get_inputs()}
         if names - {_SPEAKER} != {*_INPUTS}:
@@ -164,18 +178,21 @@ class Model:
         )
 
 
-def _loaded(path: str, content: bytes, cache: Cache | None) -> tuple[Any, Any]:
-    """Return both halves' sessions, from the cache or by cutting the model."""
+def _version() -> str:
     import onnxruntime
 
-    level = onnxruntime.GraphOptimizationLevel
-    key = f"{hashlib.sha256(content).hexdigest()}-{onnxruntime.__version__}"
-    kept = cache.find(key) if cache is not None else None
-    if cache is not None and kept is not None:
-        try:
-            return _session(kept[0], level.ORT_DISABLE_ALL), _session(kept[1])
-        except Exception:  # noqa: BLE001 - cut short by a full disk, or whatever: it is made again
-            cache.forget(key)
+    return str(onnxruntime.__version__)
+
+
+def _kept(encoder: str, decoder: str) -> tuple[Any, Any]:
+    """Return both halves' sessions from the files of the cache; the first is optimised already."""
+    import onnxruntime
+
+    return _session(encoder, onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL), _session(decoder)
+
+
+def _cut(path: str, content: bytes, cache: Cache | None, key: str) -> tuple[Any, Any]:
+    """Return both halves' sessions by cutting the model, and keep the halves in the cache; BadFile."""
     try:
         cut = halves(content)
     except NotCut as error:

@@ -76,7 +76,10 @@ def describe(path: str) -> Description:
     """Read what stands beside a model; BadFile."""
     beside = path + _JSON
     with open_checked(beside, missing="it belongs to the model: get it from where that came from") as file:
-        raw = file.read(_LONGEST_JSON + 1)
+        try:
+            raw = file.read(_LONGEST_JSON + 1)
+        except OSError as error:
+            raise BadFile(f"{beside} cannot be read: {error.strerror}") from error
     try:
         if len(raw) > _LONGEST_JSON:
             raise ValueError("it is too long")

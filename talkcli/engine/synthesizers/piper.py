@@ -7,9 +7,10 @@ a pause go on. Libespeak-ng is asked in the calling thread alone. One model is k
 from __future__ import annotations
 
 import queue
+import threading
 import traceback
 
-from talkcli.engine.players.base import SAMPLE, CannotSpeak
+from talkcli.engine.players.base import SAMPLE, CannotSpeak, Stopped
 from talkcli.engine.synthesizers import models
 from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.engine.synthesizers.cache import Cache
@@ -78,6 +79,9 @@ class Piper:
         self._speaker = 0
         self._model: Model | None = None
         self._loading: Work[Model] | None = None
+        #: held while a model is loaded, as each takes 200 MB meanwhile; and which of all loads is still wanted
+        self._one_at_once = threading.Lock()
+        self._wanted = 0
 
     def voices(self) -> tuple[Voice, ...]:
         """Return the voices whose files are there now."""
@@ -124,10 +128,16 @@ class Piper:
 
     def _begin(self) -> None:
         path = self._path
+        self._wanted += 1
+        number = self._wanted
 
         def load() -> Iterator[Model]:
             try:
-                yield Model(path, models.describe(path), _cache())
+                with self._one_at_once:
+                    if number == self._wanted:
+                        yield Model(path, models.describe(path), _cache())
+            except OSError as error:
+                raise BadFile(f"{path} cannot be read: {error.strerror}") from error
             except ImportError as error:
                 raise BadFile(f"{path} cannot be loaded ({error}): {INSTALL}") from error
             except MemoryError as error:
@@ -140,15 +150,22 @@ class Piper:
             if self._loading is None:
                 self._begin()
             assert self._loading is not None
-            model = self._loading.take(output.wait)
+            try:
+                model = self._loading.take(output.wait)
+                assert model is not None
+            except (CannotSpeak, Stopped):  # the output's: it goes on being loaded
+                raise
+            except BaseException:
+                self._forget()
+                raise
             self._loading.close()
-            assert model is not None
             self._model, self._loading = model, None
         return self._model
 
     def _forget(self) -> None:
         if self._loading is not None:
             self._loading.close()
+            self._wanted += 1
         self._model = self._loading = None
 
     def _write(self, model: Model, spelled: Iterator[Piece], sound: Sound, output: Output) -> None:
@@ -183,10 +200,14 @@ class Piper:
 def _made(model: Model, given: queue.SimpleQueue[Piece | None], speaker: int, sound: Sound, run: Run) -> Iterator[Made]:
     """Yield the sound of the pieces that are given, up to None."""
     pause = int(_PAUSE * model.description.rate)
+    known, lacking = False, ""
     while (piece := given.get()) is not None:
         numbers, places = _numbered(piece.sounds, model.description.sounds)
         if not places:
+            lacking = lacking or "".join(piece.sounds)
+            yield Made(b"")  # who takes hands in the next piece after each
             continue
+        known = True
         frames = model.encode(numbers, speaker, _pace(sound.rate), run)
         begins = [0, *frames.ends]
         words = tuple(
@@ -208,6 +229,9 @@ def _made(model: Model, given: queue.SimpleQueue[Piece | None], speaker: int, so
             raise BadFile(f"{model.path} makes no sound of a text: get the voice anew")
         if piece.ends and faint < pause:
             yield Made(bytes((pause - faint) * SAMPLE))
+    if lacking and not known:
+        why = f"has no number for a sound of the text ({lacking[:20]})"
+        raise BadFile(f"{model.path}.json {why}: get both files from the same place")
 
 
 def _samples(part: Any, volume: float) -> bytes:
