@@ -105,6 +105,8 @@ class Goal:
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
+    #: id of the voice by which it is heard, which may be another than it asked for; None until it is ACTIVE
+    voice: str | None = None
     #: None where it can't be known
     output: Output | None = None
 
@@ -130,6 +132,7 @@ class Goal:
             "started_at": self.started_at,
             "ended_at": self.ended_at,
             "duration": self.duration,
+            "voice": self.voice,
             "output": None if self.output is None else self.output.to_json(),
         }
 

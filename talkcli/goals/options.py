@@ -49,6 +49,13 @@ MAX_KEY = 64
 MAX_LEAD_IN = 5000
 #: What stands for the driver's own voice, where a voice is named.
 DEFAULT_VOICE = "default"
+#: What stands between the id of a neural voice and its speaker, where it has several: "piper/NAME#3".
+SPEAKER = "#"
+
+
+def model_of(voice: str | None) -> str:
+    """Return what has to be loaded for a neural voice, by its id: that without the speaker; "" for no voice."""
+    return (voice or "").partition(SPEAKER)[0]
 
 
 def _bad_priority(value: int) -> str | None:
@@ -250,6 +257,16 @@ OPTIONS = (
         engine=True,
     ),
     Option(
+        "voice_only",
+        FLAG,
+        "whether it waits for its voice while that is loaded, and is ABORTED, `voice_failed`, where it can't be had; "
+        "else espeak speaks then",
+        default=False,
+        flags="--voice-only",
+        help="Take no other voice in its place: wait until it is loaded, or be aborted.",
+        engine=True,
+    ),
+    Option(
         "pitch",
         INTEGER,
         "50 is the voice's own; a neural voice has no other",
@@ -322,6 +339,7 @@ class Say:
     rate: int | None = None
     volume: float | None = None
     voice: str | None = None
+    voice_only: bool = False
     pitch: int | None = None
     lead_in: int | None = None
     audible: bool | None = None

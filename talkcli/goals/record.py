@@ -55,6 +55,8 @@ class Record:
     started_at: float | None = None
     ended_at: float | None = None
     duration: float | None = None
+    #: id of the voice by which it is heard
+    voice: str | None = None
     output: Output | None = None
     #: monotonic time of the first stop
     stop_since: float | None = None
@@ -105,6 +107,7 @@ class Record:
             started_at=None if accepted else self.started_at,
             ended_at=None if accepted else self.ended_at,
             duration=None if accepted else self.duration,
+            voice=None if accepted else self.voice,
             output=None if accepted else self.output,
             **{name: getattr(self.say, name) for name in SHOWN},
         )

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from math import inf
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import frozen, replace
 from talkcli.goals import text as texts
 from talkcli.goals.goal import By
 from talkcli.goals.history import EarlyCancels, History, Said
+from talkcli.goals.loading import Loading
 from talkcli.goals.option import is_clients_id
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option
 from talkcli.goals.queue import Queue
@@ -113,6 +115,8 @@ class Scheduler:
         self.paused = False
         #: whether there is an engine to start the next goal; without one they wait
         self.has_engine = True
+        #: the voices that its engine is loading
+        self.loading = Loading()
         #: whether it was told to end, and takes no goal any more
         self.closing = False
         self._queue = Queue()
@@ -241,12 +245,18 @@ class Scheduler:
     # -- what the engine says
 
     def engine_lost(self) -> None:
-        """Start no goal until there is an engine again."""
+        """Start no goal until there is an engine again, which has no voice loaded."""
         self.has_engine = False
+        self.loading.clear()
 
     def engine_ready(self, now: Now) -> list[Effect]:
         """Go on: there is an engine that takes the next goal."""
         self.has_engine = True
+        return self._start_next(now)
+
+    def loaded(self, voice: str, now: Now) -> list[Effect]:
+        """Go on: this voice is there now, or won't be."""
+        self.loading.end(voice)
         return self._start_next(now)
 
     def engine_missing(self, words: str, now: Now) -> list[Effect]:
@@ -261,6 +271,10 @@ class Scheduler:
         record = self._spoken(goal_id)
         record.spoken_end = max(record.spoken_end, end)
         return record
+
+    def spoken_by(self, goal_id: str, voice: str) -> None:
+        """Note by which voice the active goal is heard."""
+        self._spoken(goal_id).voice = voice
 
     def goes_to(self, goal_id: str, output: Output | None) -> None:
         """Note where the active goal's sound goes, as far as that is known."""
@@ -297,11 +311,11 @@ class Scheduler:
 
     def deadline(self) -> float | None:
         """Return the monotonic time at which `tick` has something to do."""
-        due = (self._active_deadline(), self._queue.next_expiry())
+        due = (self._active_deadline(), self._queue.next_expiry(), self._next_deadline())
         return min((each for each in due if each is not None), default=None)
 
     def tick(self, now: Now) -> list[Effect]:
-        """Do what is due: recall goals whose time is over; abort one that was stopped and isn't silent in time."""
+        """Do what is due: recall goals whose time is over, abort one that isn't silent in time, start one that waited."""
         effects: list[Effect] = []
         record, deadline = self.active, self._active_deadline()
         if record is not None and deadline is not None and now.monotonic >= deadline:
@@ -311,7 +325,7 @@ class Scheduler:
                 words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
                 effects = [Ordered(record, Order.GIVE_UP)]
                 effects += self._end(record, State.ABORTED, "not_silent", words, record.by, now)
-        return effects + self._expire(now)
+        return effects + self._expire(now) + self._start_next(now)
 
     # -- inside
 
@@ -420,6 +434,14 @@ class Scheduler:
             return goal.stop_since + SILENCE_LIMIT
         return None if self.has_engine or goal.spoken_end else goal.expires_at
 
+    def _next_deadline(self) -> float | None:
+        """Return when the goal whose turn it is waits no longer for its voice."""
+        record = self._queue.first()
+        if record is None or self.active or self.paused or not self.has_engine:
+            return None
+        begins_at = self.loading.begins_at(record, self.settings.voice)
+        return begins_at if begins_at < inf else None
+
     def _start_next(self, now: Now) -> list[Effect]:
         if not self.has_engine:
             return []
@@ -432,6 +454,8 @@ class Scheduler:
             return None, []
         effects = self._expire(now)
         record = self._queue.first()
+        if record and self.loading.begins_at(record, self.settings.voice) > now.monotonic:
+            record = None
         if record:
             record.become(State.ACTIVE)
             self._queue.remove(record)

@@ -22,6 +22,8 @@ OPTIONS: dict[str, list[Any]] = {
     "ttl": [0.5, 0.0, 3.0],
     "throttle": [10.0, 1.5, 0.0],
     "id": list(OWN_IDS),
+    "voice": ["piper/joe", "piper/amy#2"],
+    "voice_only": [True],
 }
 
 

@@ -60,7 +60,7 @@ class SideBySide:
 
     def submit(self, say: Say, sender: Sender, fault: str | None = None) -> str:
         self.begin()
-        wish = Wish(say.text, say.preempt, say.flush, say.priority, say.ttl, say.key, say.throttle, say.id)
+        wish = Wish(say.text, say.preempt, say.flush, say.priority, say.ttl, say.key, say.throttle, say.id, say.voice, say.voice_only)
         first = self.model.first_of(wish)
         refusals = self.model.refusals(wish, fault)
         before = list(self.real.pending()), self.real.unfinished()
@@ -156,6 +156,21 @@ class SideBySide:
         self.real.engine_lost()
         self.compare([])
 
+    def begins_to_load(self, voice: str) -> None:
+        self.begin()
+        self.model.begins_to_load(voice)
+        self.real.loading.begin(voice, self.now.monotonic)
+        self.compare([])
+
+    def has_loaded(self, voice: str) -> None:
+        self.begin()
+        self.model.has_loaded(voice)
+        self.compare(self.real.loaded(voice, self.now))
+
+    def change_voice(self, voice: str | None) -> None:
+        self.real.settings = replace(self.real.settings, voice=voice)
+        self.model.usual_voice = voice
+
     def engine_ready(self) -> None:
         self.begin()
         self.model.engine_ready()
@@ -235,14 +250,16 @@ class SideBySide:
         mortal = self.model.queue + self.model.unbegun()
         over = [each.accepted_at + each.ttl for each in mortal if each.ttl is not None]
         stopped = [each.stopped_at for each in self.model.voice if each.stopped_at is not None]
+        waiting = self.model.may_begin_at()
         deadline = self.real.deadline()
         if deadline is None:
             assert not over
             assert not stopped
+            assert not waiting
         else:
             in_silence = bool(stopped) and stopped[0] < deadline <= stopped[0] + 2.0
-            assert deadline in over or in_silence
-            assert deadline <= min([*over, *(each + 2.0 for each in stopped)])
+            assert deadline in over or deadline in waiting or in_silence
+            assert deadline <= min([*over, *waiting, *(each + 2.0 for each in stopped)])
 
     def all_has_ended_once(self) -> None:
         for path in self.witness.paths.values():

@@ -30,6 +30,8 @@ class Wish:
     key: str | None = None
     throttle: float | None = None
     id: str | None = None
+    voice: str | None = None
+    voice_only: bool = False
 
 
 @dataclass
@@ -42,6 +44,8 @@ class SlowGoal:
     priority: int = 0
     key: str | None = None
     ttl: float | None = None
+    voice: str | None = None
+    voice_only: bool = False
     state: str = "PENDING"
     reason: str | None = None
     by: str | None = None

@@ -13,6 +13,8 @@ from tests.unit.slow_goal import ENDS, Outcome, Selection, SlowGoal, Wish
 
 #: Seconds after the first stop by which silence is confirmed or given up.
 SILENCE = 2.0
+#: Seconds for which a goal waits for a voice that is being loaded, and of its time to live that it keeps for itself.
+PATIENCE, SPARE = 10.0, 0.5
 #: Seconds for which a cancel of an id that nobody knows yet is remembered.
 EARLY_CANCEL = 60.0
 
@@ -33,6 +35,8 @@ class SlowModel:
         self.preempt = preempt
         self.max_queue = max_queue
         self.ttl = ttl
+        self.usual_voice: str | None = None
+        self.loading: dict[str, float] = {}  # voices, without their speakers, and since when
         self.all: list[SlowGoal] = []  # in order of arrival
         self.queue: list[SlowGoal] = []  # in the order in which they will be spoken
         self.voice: list[SlowGoal] = []  # being spoken: none or one
@@ -127,6 +131,7 @@ class SlowModel:
         """Take a goal, or refuse it for a reason and its `by`, which are among the `refusals`."""
         goal = SlowGoal(goal_id, wish.text, self.preempts(wish), wish.priority, wish.key)
         goal.ttl = (self.ttl if wish.ttl is None else wish.ttl) or None
+        goal.voice, goal.voice_only = wish.voice, wish.voice_only
         goal.accepted_at, goal.times["queued"] = self.monotonic, self.wall
         self.all.append(goal)
         if refused is not None:
@@ -228,6 +233,15 @@ class SlowModel:
 
     def engine_lost(self) -> None:
         self.engine = False
+        self.loading = {}
+
+    def begins_to_load(self, voice: str) -> None:
+        if voice not in self.loading:
+            self.loading[voice] = self.monotonic
+
+    def has_loaded(self, voice: str) -> None:
+        self.loading = {name: since for name, since in self.loading.items() if name != voice}
+        self.speak_next()
 
     def engine_ready(self) -> None:
         self.engine = True
@@ -287,6 +301,7 @@ class SlowModel:
             if self.monotonic - goal.accepted_at >= (goal.ttl or 0):
                 self.stop(goal, "expired", None)
         self.recall_what_is_too_late()
+        self.speak_next()
 
     def unbegun(self) -> list[SlowGoal]:
         """Return the goal that has a time to live and lost its engine before any of it was heard: it may begin anew."""
@@ -306,9 +321,32 @@ class SlowModel:
         if self.voice or self.paused or not self.engine:
             return
         self.recall_what_is_too_late()
-        if self.queue:
+        if self.queue and not self.waits_for_its_voice(self.queue[0]):
             self.begin_with_the_first()
             self.orders.append(("start", self.voice[0].id))
+
+    def waits_for_its_voice(self, goal: SlowGoal) -> bool:
+        waits_until = self.waits_until(goal)
+        return waits_until is not None and self.monotonic < waits_until
+
+    def waits_until(self, goal: SlowGoal) -> float | None:
+        """Return until when it waits for its voice; None for not at all."""
+        name = (goal.voice or self.usual_voice or "").split("#")[0]
+        if name not in self.loading:
+            return None
+        if goal.voice_only:
+            return float("inf")
+        if goal.preempt or goal.priority > 0:
+            return None
+        patience = self.loading[name] + PATIENCE
+        return patience if goal.ttl is None else min(patience, goal.accepted_at + goal.ttl - SPARE)
+
+    def may_begin_at(self) -> list[float]:
+        """Return when the first of the queue begins if nothing else happens; nothing where something else must."""
+        if self.voice or self.paused or not self.engine or not self.queue:
+            return []
+        until = self.waits_until(self.queue[0])
+        return [] if until == float("inf") else [0.0 if until is None else until]
 
     def begin_with_the_first(self) -> None:
         goal, *self.queue = self.queue

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 NOBODYS_IDS = [f"{BOOT}-900", "9z9z-1", "17"]
 
 clients = st.sampled_from(["arm", "base", "door"]).map(lambda name: Sender(pid=len(name), uid=1000, name=name))
+voices = st.sampled_from(["piper/joe", "piper/amy"])
 keys = st.sampled_from(["battery", "door"])
 any_ids = st.sampled_from([*NOBODYS_IDS, *OWN_IDS])
 steps = st.sampled_from([0.0, 0.5, 1.0, 1.5, 2.0, 10.0, 59.5])
@@ -142,6 +143,10 @@ class SchedulerMachine(RuleBasedStateMachine):
     def set_ttl(self, ttl: float) -> None:
         self.both.change(ttl=ttl)
 
+    @rule(voice=st.none() | voices)
+    def set_voice(self, voice: str | None) -> None:
+        self.both.change_voice(voice)
+
     @rule()
     def pause(self) -> None:
         self.both.pause()
@@ -210,6 +215,31 @@ class SchedulerMachine(RuleBasedStateMachine):
         sent = [self.both.submit(Say(**each), sender) for each in says]
         self.time_goes_on_unseen(step, 0.0)
         self.both.engine_missing()
+        return multiple(*sent)
+
+    @rule(voice=voices)
+    def begins_to_load_a_voice(self, voice: str) -> None:
+        self.both.begins_to_load(voice)
+
+    @rule(voice=voices)
+    def has_loaded_a_voice(self, voice: str) -> None:
+        self.both.has_loaded(voice)
+
+    @precondition(lambda self: not (self.speaking or self.both.model.paused))
+    @rule(
+        target=goals,
+        voice=voices,
+        says=st.lists(says_with("voice", "voice_only", "ttl", "priority"), min_size=1, max_size=3),
+        times=st.lists(st.sampled_from([0.0, 0.5, 2.0, 2.5, 9.5, 10.0]), max_size=3),
+        sender=clients,
+    )
+    def waits_for_a_voice(
+        self, voice: str, says: list[Fields], times: list[float], sender: Sender
+    ) -> MultipleResults[str]:
+        self.both.begins_to_load(voice)
+        sent = [self.both.submit(Say(**each), sender) for each in says]
+        for step in times:
+            self.time_goes_on(step, 0.0)
         return multiple(*sent)
 
     @rule(event=st.sampled_from(["heard", "completed", "failed", "stopped"]), goal=goals | any_ids)
