@@ -5,6 +5,7 @@ It starts no goal. What is missing is an answer that says what to install, and n
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import types
@@ -14,7 +15,7 @@ from talkcli.engine.players.base import CannotSpeak, Stopped
 from talkcli.engine.protocol import Ready, StartFailed
 from talkcli.engine.synthesizers import SYNTHESIZERS, is_own
 from talkcli.engine.synthesizers.base import NotInstalled, Sound, UnknownVoice
-from talkcli.engine.synthesizers.voices import find_voice, list_voices, unknown_voice
+from talkcli.engine.synthesizers.voices import find_voice, is_neural, language_of, list_voices, unknown_voice
 from talkcli.frozen import TYPE_CHECKING, fields, replace
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from talkcli.engine.protocol import Configure, Say, Voice
     from talkcli.engine.session import Session
     from talkcli.engine.synthesizers.base import Synthesizer
+    from talkcli.engine.synthesizers.choice import Choice
     from talkcli.engine.words import TimedWord
 
 #: The drivers of macOS that speak in Apple's run loop, which somebody has to run.
@@ -48,7 +50,7 @@ def start(configure: Configure, session: Session) -> Ready:
     own = is_own(configure.driver)
     shown = configure.driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
     name = f"talk_{shown}" if own else shown
-    version = _register_own(shown, name, session) if own else None
+    made = _register_own(shown, name, session, configure.voice_memory) if own else None
     engine = _init(pyttsx3, name, named=configure.driver is not None)
     settings = Settings(engine, name)
     _start_loop(engine, name)
@@ -57,20 +59,20 @@ def start(configure: Configure, session: Session) -> Ready:
     except CannotSpeak as error:
         unknown = error.reason == "unknown_voice"
         raise CannotStart(str(error), error.reason, lasting=unknown, usage=unknown) from error
-    session.open(engine, settings.apply, None if own else _pump(name))
-    return Ready(shown, version, session.players.first() if own else None)
+    session.open(engine, settings.apply, None if own else _pump(name), made)
+    return Ready(shown, made.version if made else None, session.players.first() if own else None)
 
 
-def _register_own(synthesizer: str, driver: str, session: Session) -> str | None:
-    """Make a synthesizer, and put a driver for it among pyttsx3's; return its version, for people."""
+def _register_own(synthesizer: str, driver: str, session: Session, memory: int) -> Choice:
+    """Make a synthesizer, and put a driver for it among pyttsx3's."""
     try:
-        made = SYNTHESIZERS[synthesizer]()
+        made = SYNTHESIZERS[synthesizer](memory)
     except NotInstalled as error:
         raise CannotStart(str(error)) from error
     except UnknownVoice as error:  # not even its own: a part of it is missing
         raise CannotStart(_cannot_be_started(driver, error), lasting=False) from error
     register(driver, made, session)
-    return made.version
+    return made
 
 
 def register(name: str, synthesizer: Synthesizer, session: Session) -> None:
@@ -144,10 +146,21 @@ class Settings:
         engine.connect("error", self._note)
 
     def apply(self, say: Say) -> None:
-        """Set what the goal wants; CannotSpeak if that cannot be had."""
-        self.set_voice(say.voice)
-        for name, value in (("rate", say.rate), ("volume", say.volume), ("pitch", say.pitch)):
-            if self._set.get(name) != value:
+        """Set what the goal wants; CannotSpeak if that cannot be had.
+
+        A neural voice that is gone, since the goal was accepted or the server was told to speak by it, is no reason for
+        silence: the driver's own speaks then, in its language if it can.
+        """
+        try:
+            self.set_voice(say.voice)
+        except CannotSpeak:
+            if say.voice_only or not is_neural(say.voice or ""):
+                raise
+            self._set_language(language_of(say.voice or ""))
+        wanted = fields(say)
+        for name in self._set:
+            value = wanted[name]
+            if self._set[name] != value:
                 self._put(name, value, f"{name} to {value}")
                 self._set[name] = value
 
@@ -159,6 +172,13 @@ class Settings:
             self._default_voice = self._engine.getProperty("voice")
         self._put("voice", self._default_voice if wanted is None else self._driver_id(wanted), f"the voice {wanted}")
         self._voice = wanted
+
+    def _set_language(self, language: str) -> None:
+        for each in (language, language.partition("-")[0]):
+            with contextlib.suppress(CannotSpeak):
+                self.set_voice(each)
+                return
+        self.set_voice(None)
 
     def _driver_id(self, wanted: str) -> str:
         found = find_voice(wanted, self._voices)

@@ -39,6 +39,10 @@ def main() -> None:
     if configure is None or os.getppid() != configure.server:
         return
     _serve(channel, configure)
+    threading = sys.modules.get("threading")
+    if threading and threading.active_count() > 1:  # a voice is being loaded, or a model runs: nobody waits for that
+        sys.stderr.flush()
+        os._exit(0)
 
 
 def _die_with_parent() -> None:

@@ -97,7 +97,7 @@ class Playback:
         #: since when the player has been given nothing but silence, because the sentence is held
         self._silent_at: float | None = None
 
-    def begin(self, rate: int) -> None:
+    def begin(self, rate: int, voice: str, why: str | None = None) -> None:
         """Set the samples per second, and open a player for them: it needs 1 to 15 ms, the synthesis 2.
 
         What goes wrong with it is told by `write`.
@@ -105,6 +105,7 @@ class Playback:
         if self._stream is not None and rate != self._rate:
             self._let_go(0)  # it was started for another
         self._rate = rate
+        self._session.tell_voice(voice, why)
         if self._players.takes_time and not self._session.held:
             try:
                 self._try(lambda _: True)

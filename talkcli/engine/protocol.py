@@ -5,8 +5,9 @@ directions). This module holds only the form of the messages: it opens, reads an
 engine process can be written against it.
 
 Order, as the process must keep it: `Configure` comes in once, first. Then `Ready` goes out, or `StartFailed` and the
-process ends. After that each `Say` gets one `Started`, any number of `Word`, `Alive`, `Output` and `Paused`, and
-exactly one `Ended`. Where the server's half is closed, the sentence being spoken is stopped and the process ends.
+process ends. After that each `Say` gets one `Started`, any number of `Word`, `Alive`, `Output`, `Speaks` and `Paused`,
+and exactly one `Ended`; each `Load` gets a `Loaded`, at any time. Where the server's half is closed, the sentence being
+spoken is stopped and the process ends.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
 START_LIMIT = 10.0
 #: Seconds without a sign of life from a process that has a goal in hand; it sends one each `ALIVE_EVERY`.
 HANG_AFTER = 3.0
+#: Seconds after which a neural voice is given up that is being loaded: it takes three on a small machine.
+LOAD_LIMIT = 60.0
 #: Seconds after which a stop that isn't confirmed becomes a kill.
 STOP_LIMIT = 0.15
 #: Seconds after a kill in which process and player must be gone.
@@ -73,6 +76,8 @@ class Configure:
     output: int | None = None
     #: whether a sentence fails whose output is muted, where it doesn't say so itself.
     audible: bool = False
+    #: bytes of neural voices' models that are kept in memory beside the one that speaks.
+    voice_memory: int = 0
 
 
 @frozen
@@ -88,6 +93,7 @@ class Say:
     followed: bool = False  # whether another goal waits behind it
     lead_in: int | None = None  # milliseconds of silence before it, whatever the output did; None for `Configure`'s
     audible: bool | None = None  # whether it fails where its output is muted; None for `Configure`'s
+    voice_only: bool = False  # whether it waits for a neural voice that is not loaded, and fails without it
 
 
 @frozen
@@ -118,6 +124,13 @@ class Followed:
 
     id: str
     followed: bool
+
+
+@frozen
+class Load:
+    """Load a neural voice beside what is spoken; `Loaded` comes once for each."""
+
+    voice: str  # its id, without a speaker
 
 
 @frozen
@@ -156,6 +169,22 @@ class Voices:
 
 
 @frozen
+class Loaded:
+    """A neural voice can be spoken with from now on, or can't."""
+
+    voice: str  # its id, without a speaker
+    seconds: float  # that it took
+    error: str | None = None  # why it can't, for people
+
+
+@frozen
+class Unloaded:
+    """A neural voice was dropped, to make room for another."""
+
+    voice: str  # its id, without a speaker
+
+
+@frozen
 class Started:
     """The `Say` was taken in hand."""
 
@@ -189,6 +218,15 @@ class Output:
 
 
 @frozen
+class Speaks:
+    """The sentence is heard by this voice; once more where that changes before it begins."""
+
+    id: str
+    voice: str  # its id
+    why: str | None = None  # why it is another than was asked for, for people
+
+
+@frozen
 class Paused:
     """The sentence is held and silent, until `Resume` or `Stop`."""
 
@@ -207,10 +245,10 @@ class Ended:
     duration: float | None = None  # seconds of audio, where all of it was synthesised
 
 
-Command = Configure | Say | Stop | Pause | Resume | Followed
-Event = Ready | StartFailed | Voices | Started | Alive | Word | Output | Paused | Ended
+Command = Configure | Say | Stop | Pause | Resume | Followed | Load
+Event = Ready | StartFailed | Voices | Loaded | Unloaded | Started | Alive | Word | Output | Speaks | Paused | Ended
 #: The events that belong to a goal, by its `id`.
-OF_A_GOAL = (Started, Alive, Word, Output, Paused, Ended)
+OF_A_GOAL = (Started, Alive, Word, Output, Speaks, Paused, Ended)
 
 #: What goes in and what comes out; in a line a message is called as its class is.
 COMMANDS: dict[str, type[Command]] = {each.__name__: each for each in Command.__args__}

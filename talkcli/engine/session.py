@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from talkcli.engine.players.base import Interest
     from talkcli.engine.players.choice import Players
     from talkcli.engine.protocol import Command, Event
+    from talkcli.engine.synthesizers.choice import Choice
     from talkcli.goals.goal import Output
 
 #: Seconds between two steps of a driver that is not ours while it has a goal in hand: it has no way to wake us.
@@ -43,6 +44,10 @@ WORDS_A_CHARACTER = 3
 
 #: Bytes read in one go; the longest command, escaped, takes a few of them.
 _AT_ONCE = 65536
+
+
+#: What concerns the goal in hand.
+_OF_THE_GOAL = (protocol.Stop, protocol.Followed, protocol.Pause, protocol.Resume)
 
 
 class Channel:
@@ -119,11 +124,14 @@ class Session:
         self.players = players
         #: where the goal in hand goes, as the server was told
         self._told: Output | None = None
+        #: id of the voice by which it is heard, as the server was told
+        self._voice = ""
         self._backlog: deque[Command] = deque()
         self._goal: InHand | None = None
         self._engine: Any = None
         self._apply: Any = None
         self._pump: Callable[[], None] | None = None
+        self._synthesizer: Choice | None = None
         #: the number of the pause for which the sentence in hand is to be held, 0 for none: for the playback to obey,
         #: as pyttsx3 has no word for a pause; with a driver that is not ours the session itself goes by it
         self.held = 0
@@ -134,12 +142,20 @@ class Session:
         self.position: float | None = None
         self.duration: float | None = None
 
-    def open(self, engine: Any, apply: Callable[[protocol.Say], None], pump: Callable[[], None] | None) -> None:
+    def open(
+        self,
+        engine: Any,
+        apply: Callable[[protocol.Say], None],
+        pump: Callable[[], None] | None,
+        synthesizer: Choice | None = None,
+    ) -> None:
         """Take the engine, and what sets its properties for a goal or raises CannotSpeak.
 
-        `pump`: for a foreign driver, called about 20 times a second while it has a goal.
+        `pump`: for a foreign driver, called about 20 times a second while it has a goal; `synthesizer`: what loads
+        voices beside the speech, if anything does.
         """
         self._engine = engine
+        self._synthesizer = synthesizer
         self._apply = apply
         self._pump = pump
         engine.connect("started-word", _told(self._word))
@@ -158,7 +174,7 @@ class Session:
                 self._channel.send(protocol.Voices(found))
             while not self._channel.closed:
                 if not self._backlog:
-                    self._backlog.extend(self._channel.receive())
+                    self.wait((), None)
                     continue
                 command = self._backlog.popleft()
                 # What else comes out of a goal came too late; a second Configure has nothing to change.
@@ -177,7 +193,12 @@ class Session:
             poll.register(self._channel.descriptor, select.POLLIN)
         for descriptor, events in interests:
             poll.register(descriptor, events)
-        moments = [moment for moment in (until, self._alive_due()) if moment is not None]
+        loads = self._synthesizer
+        loading = loads.descriptor if loads else None
+        if loads and loading is not None:
+            poll.register(loading, select.POLLIN)
+        voice_due = loads.due if loads and loading is not None else None
+        moments = [moment for moment in (until, self._alive_due(), voice_due) if moment is not None]
         timeout = max(0.0, min(moments) - time.monotonic()) * 1000 if moments else None
         ready = [descriptor for descriptor, _ in poll.poll(timeout)]
         if self._channel.descriptor in ready:
@@ -185,6 +206,8 @@ class Session:
                 self._carry_out_now(command)
             if self._channel.closed:
                 self._silence()
+        for event in loads.news() if loads else ():
+            self._channel.send(event)
         self._tell_output()
         due = self._alive_due()
         if self._goal is not None and due is not None and time.monotonic() >= due:
@@ -193,9 +216,12 @@ class Session:
     def _carry_out_now(self, command: Command) -> None:
         """Carry out what concerns the goal in hand; the rest has to wait."""
         goal = self._goal
-        if not isinstance(command, protocol.Stop | protocol.Followed | protocol.Pause | protocol.Resume):
+        if isinstance(command, protocol.Load):
+            if self._synthesizer is not None:
+                self._synthesizer.begin(command.voice)
+        elif goal is None or not isinstance(command, _OF_THE_GOAL):
             self._backlog.append(command)
-        elif goal is None or goal.id != command.id:
+        elif goal.id != command.id:
             return  # it ended before this arrived
         elif isinstance(command, protocol.Stop):
             self._silence()
@@ -208,6 +234,12 @@ class Session:
             if self._pump is not None and goal.spoken and not goal.interrupted:
                 goal.interrupted = True
                 self._engine.stop()
+
+    def tell_voice(self, voice: str, why: str | None) -> None:
+        """Tell by which voice the goal in hand is heard, if that is not known; `why`: as in `Output.begin`."""
+        if self._goal is not None and voice != self._voice:
+            self._voice = voice
+            self._channel.send(protocol.Speaks(self._goal.id, voice, why))
 
     def _tell_output(self) -> None:
         output = self.players.output
@@ -234,7 +266,7 @@ class Session:
         self._goal = goal = InHand(say, time.monotonic())
         self.held = self._confirmed = 0
         self.players.begin(say)
-        self._told = None
+        self._told, self._voice = None, ""
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
         waiting, self._backlog = self._backlog, deque()

@@ -315,7 +315,7 @@ class Scheduler:
         return min((each for each in due if each is not None), default=None)
 
     def tick(self, now: Now) -> list[Effect]:
-        """Do what is due: recall goals whose time is over, abort one that isn't silent in time, start one that waited."""
+        """Do what is due: recall what is too late, abort what isn't silent in time, start what has waited."""
         effects: list[Effect] = []
         record, deadline = self.active, self._active_deadline()
         if record is not None and deadline is not None and now.monotonic >= deadline:

@@ -42,6 +42,7 @@ class Spawned:
         before: str = "",
         environment: Mapping[str, str] | None = None,
         lead_in: int = 0,
+        memory: int = 0,
         list_voices: bool = True,
         alive_every: float | None = None,
     ) -> None:
@@ -72,7 +73,10 @@ class Spawned:
                 start_new_session=True,
             )
         os.close(inherited)
-        self.send(protocol.Configure(server or os.getpid(), driver, player, device, voice, lead_in, list_voices))
+        asked = protocol.Configure(
+            server or os.getpid(), driver, player, device, voice, lead_in, list_voices, voice_memory=memory
+        )
+        self.send(asked)
 
     def __enter__(self) -> Spawned:
         return self
@@ -111,8 +115,10 @@ class Spawned:
         voice: str | None = None,
         pitch: int = 50,
         lead_in: int | None = None,
+        voice_only: bool = True,
     ) -> None:
-        self.send(protocol.Say(goal, text, rate or self._rate, 1.0, voice, pitch, lead_in=lead_in))
+        asked = protocol.Say(goal, text, rate or self._rate, 1.0, voice, pitch, lead_in=lead_in, voice_only=voice_only)
+        self.send(asked)
 
     def pause(self, goal: str = "g1") -> float:
         """Hold the sentence and return the seconds until the process said that it is silent."""
@@ -152,9 +158,10 @@ class Spawned:
         rate: int | None = None,
         voice: str | None = None,
         lead_in: int | None = None,
+        voice_only: bool = True,
     ) -> protocol.Ended:
         """Say a sentence and return how it ended."""
-        self.say(text, goal, rate=rate, voice=voice, lead_in=lead_in)
+        self.say(text, goal, rate=rate, voice=voice, lead_in=lead_in, voice_only=voice_only)
         return self.until(protocol.Ended)
 
     def words(self, goal: str = "g1") -> list[protocol.Word]:

@@ -46,6 +46,7 @@ class Told:
         self.position: float | None = None
         self.duration: float | None = None
         self.beside: list[tuple[float | None, float | None]] = []
+        self.voices: list[tuple[str, str | None]] = []
         #: what happens when a word is told, and in each wait
         self.at_word: Callable[[], None] = lambda: None
         self.at_wait: Callable[[], None] = lambda: None
@@ -71,6 +72,9 @@ class Told:
             poll.register(descriptor, events)
         poll.poll(None if until is None else max(0.0, until - time.monotonic()) * 1000)
         self.at_wait()
+
+    def tell_voice(self, voice: str, why: str | None) -> None:
+        self.voices.append((voice, why))
 
     def spoken(self, text: str, name: str) -> list[tuple[str, dict[str, Any]]]:
         """Speak as talk does, and return what was told of it."""
@@ -125,7 +129,7 @@ def test_a_sentence_that_is_stopped_is_not_completed_and_has_no_duration(told: T
 def test_a_synthesizer_that_has_nothing_to_write_yet_lets_in_a_stop() -> None:
     class Thinking(Scripted):
         def speak(self, text: str, sound: Sound, output: Output) -> None:
-            output.begin(80 * sound.rate)
+            output.begin(80 * sound.rate, "scripted")
             while text:
                 output.write(b"")
 
@@ -184,7 +188,7 @@ class Halting(Scripted):
     """Has a little, then nothing for long, then the rest: as what computes may."""
 
     def speak(self, text: str, sound: Sound, output: Output) -> None:  # noqa: ARG002 - what is said is of no interest
-        output.begin(_RATE)
+        output.begin(_RATE, "scripted")
         for start, seconds in ((0, 0.1), (2, 0.1)):
             output.word(start, 1, start / 20)
             output.write(_tone(seconds))

@@ -265,7 +265,7 @@ def test_it_is_held_while_it_is_loaded(place: Path) -> None:
         assert_within(engine.pause(), protocol.STOP_LIMIT, "a pause while the voice is loaded")
         held_until = time.monotonic() + 1.5  # past the loading
         while time.monotonic() < held_until:
-            assert isinstance(engine.event(), protocol.Alive)
+            assert isinstance(engine.event(), protocol.Alive | protocol.Loaded)
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
 
@@ -364,9 +364,8 @@ def test_sounds_that_it_does_not_know_are_left_out_and_a_text_of_nothing_else_sa
         assert "few.onnx.json has no number for a sound of the text (" in message
 
 
-def test_one_model_is_loaded_at_a_time_and_those_that_nobody_waits_for_are_not(place: Path) -> None:
+def test_voices_are_loaded_one_at_a_time_beside_the_speech_and_told_once_each(place: Path) -> None:
     slow = """
-import threading
 from talkcli.engine.synthesizers import inference
 init, loading = inference.Model.__init__, []
 def counted(self, path, *rest):
@@ -375,16 +374,105 @@ def counted(self, path, *rest):
     time.sleep(0.3)
     init(self, path, *rest)
     loading.clear()
-    print("loaded", path.rpartition("/")[2], file=sys.stderr, flush=True)
 inference.Model.__init__ = counted
 """
     tiny_voice.put(place, "other")
     with _engine(place, before=f"import sys, time\n{slow}") as engine:
-        for number in range(8):
-            engine.say("a", f"g{number}", voice=("piper/other", VOICE)[number % 2])
-            engine.send(protocol.Stop(f"g{number}"))
-            assert engine.until(protocol.Ended).outcome == protocol.STOPPED
-        assert engine.spoken("a", "g9", voice=VOICE).outcome == protocol.COMPLETED
+        for voice in ("piper/other", VOICE, "piper/other", "piper/nobody", VOICE):
+            engine.send(protocol.Load(voice))
+        assert engine.spoken(TEXT, voice="en", rate=150).outcome == protocol.COMPLETED
+        loaded = [engine.until(protocol.Loaded) for _ in range(3 - len(_loaded(engine)))]
+        assert len(loaded) < 3, "some came while it spoke"
+    assert [each.voice for each in _loaded(engine)] == ["piper/other", VOICE, "piper/nobody"]
+    assert [each.error for each in _loaded(engine)] == [None, None, "piper/nobody: its file is not there any more"]
+
+
+def test_a_voice_that_is_not_loaded_or_fails_is_spoken_by_espeak_in_its_language(place: Path) -> None:
+    about = tiny_voice.description()
+    about["espeak"] = {"voice": "de"}
+    tiny_voice.put(place, "deutsch", beside=about)
+    _put_wrong(place, "no number")
+    with _engine(place) as engine:
+        for number, (voice, speaker, why) in enumerate(
+            [
+                (VOICE, "gmw/en-US", f"{VOICE} is not loaded"),
+                ("piper/deutsch", "gmw/de", "piper/deutsch is not loaded"),
+                ("piper/wrong", "gmw/en-US", "piper/wrong is not loaded"),
+            ]
+        ):
+            ended = engine.spoken(TEXT, f"g{number}", voice=voice, voice_only=False)
+            assert ended.outcome == protocol.COMPLETED
+            assert _speaks(engine, f"g{number}") == [(speaker, why)]
+            assert len(engine.words(f"g{number}")) > 3
+        assert _loaded(engine) == [], "who speaks in its place loads nothing: that is the server's to decide"
+        engine.send(protocol.Load(VOICE))
+        assert engine.until(protocol.Loaded).error is None
+        assert engine.spoken(TEXT, "g8", voice=VOICE, voice_only=False).outcome == protocol.COMPLETED
+        assert _speaks(engine, "g8") == [(VOICE, None)]
+
+
+@pytest.mark.parametrize(("wrong", "instead"), [("silent", "gmw/en-US"), ("an unknown language", "gmw/en")])
+def test_a_voice_that_fails_before_anything_is_heard_is_no_reason_for_silence(
+    place: Path, wrong: str, instead: str
+) -> None:
+    """Nor is it given up for that: the next text may be another."""
+    _put_wrong(place, wrong)
+    with _engine(place) as engine:
+        engine.send(protocol.Load("piper/wrong"))
+        assert engine.until(protocol.Loaded).error is None
+        for goal in ("g1", "g2"):
+            assert engine.spoken(TEXT, goal, voice="piper/wrong", voice_only=False).outcome == protocol.COMPLETED
+            (first, why), (second, words) = _speaks(engine, goal)
+            assert (first, why, second) == ("piper/wrong", None, instead)
+            assert words is not None
+            assert str(place / "wrong.onnx") in words
+            assert [TEXT[each.start : each.end] for each in engine.words(goal)] == TEXT.replace(",", "").split()
+
+
+def test_what_is_kept_is_no_more_than_there_is_room_for(place: Path) -> None:
+    size = (place / "tiny.onnx").stat().st_size
+    for name in ("second", "third"):
+        tiny_voice.put(place, name)
+    with _spawned(place, memory=2 * size) as engine:
+        engine.until(protocol.Ready)
+        for name in ("tiny", "second"):
+            engine.send(protocol.Load(f"piper/{name}"))
+            engine.until(protocol.Loaded)
+        assert engine.spoken("a", voice=VOICE).outcome == protocol.COMPLETED
+        engine.send(protocol.Load("piper/third"))
+        assert engine.until(protocol.Loaded).voice == "piper/third"
+        assert [each for each in engine.events if isinstance(each, protocol.Unloaded)] == [
+            protocol.Unloaded("piper/second")
+        ], "the least used"
+
+
+def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path) -> None:
+    hangs = """
+import threading
+from talkcli.engine import protocol
+protocol.LOAD_LIMIT = 0.3
+from talkcli.engine.synthesizers import inference
+init = inference.Model.__init__
+def hang(self, path, *rest):
+    if "other" in path:
+        threading.Event().wait()
+    init(self, path, *rest)
+inference.Model.__init__ = hang
+"""
+    tiny_voice.put(place, "other")
+    with _engine(place, before=hangs) as engine:
+        engine.send(protocol.Load("piper/other"))
+        engine.send(protocol.Load(VOICE))
+        first, second = engine.until(protocol.Loaded), engine.until(protocol.Loaded)
+        assert first.error == "piper/other was not loaded within 0.3 s: are its files on a slow disk?"
+        assert (second.voice, second.error) == (VOICE, None)
         engine.leave()
-        loaded = [each.split()[1] for each in engine.errors().splitlines() if each.startswith("loaded")]
-    assert loaded == ["other.onnx", "tiny.onnx"]
+        assert engine.process.wait(5) == 0, "what hangs keeps no process"
+
+
+def _loaded(engine: Spawned) -> list[protocol.Loaded]:
+    return [each for each in engine.events if isinstance(each, protocol.Loaded)]
+
+
+def _speaks(engine: Spawned, goal: str) -> list[tuple[str, str | None]]:
+    return [(each.voice, each.why) for each in engine.events if isinstance(each, protocol.Speaks) and each.id == goal]

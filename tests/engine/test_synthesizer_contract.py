@@ -77,7 +77,7 @@ class Scripted:
         self.voice = voice
 
     def speak(self, text: str, sound: Sound, output: Output) -> None:
-        output.begin(self._RATE)
+        output.begin(self._RATE, self.voice)
         end = samples = 0
         for word in text.split():
             start = text.index(word, end)
@@ -183,10 +183,12 @@ class Tape:
     def loudest(self) -> int:
         return max(map(abs, array("h", bytes(self.samples))), default=0)
 
-    def begin(self, rate: int) -> None:
+    def begin(self, rate: int, voice: str, why: str | None = None) -> None:
         self._called("begin")
         assert not [*self.words, *self.samples], "the rate comes first"
         assert rate > 0
+        assert voice
+        assert why is None, "the voice that was asked for speaks"
         self.rate = rate
 
     def word(self, start: int, length: int, position: float) -> None:
@@ -221,7 +223,7 @@ class Tape:
 
 def _spoken(synthesizer: Synthesizer, text: str = TEXT, sound: Sound | None = None) -> Tape:
     tape = Tape()
-    synthesizer.speak(text, sound or Sound(), tape)
+    synthesizer.speak(text, sound or Sound(voice_only=True), tape)
     return tape
 
 

@@ -60,7 +60,18 @@ class SideBySide:
 
     def submit(self, say: Say, sender: Sender, fault: str | None = None) -> str:
         self.begin()
-        wish = Wish(say.text, say.preempt, say.flush, say.priority, say.ttl, say.key, say.throttle, say.id, say.voice, say.voice_only)
+        wish = Wish(
+            say.text,
+            say.preempt,
+            say.flush,
+            say.priority,
+            say.ttl,
+            say.key,
+            say.throttle,
+            say.id,
+            say.voice,
+            say.voice_only,
+        )
         first = self.model.first_of(wish)
         refusals = self.model.refusals(wish, fault)
         before = list(self.real.pending()), self.real.unfinished()

@@ -14,7 +14,7 @@ from talkcli.goals.states import State
 #: A goal always has all of these, null where unknown.
 KEYS = [
     "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "priority", "key", "ttl", "data",
-    "client", "paused", "queued_at", "started_at", "ended_at", "duration", "output",
+    "client", "paused", "queued_at", "started_at", "ended_at", "duration", "voice", "output",
 ]  # fmt: skip
 SENDER_KEYS = ["pid", "uid", "command", "parent", "name"]
 
@@ -51,6 +51,7 @@ goals = st.builds(
     started_at=seconds,
     ended_at=seconds,
     duration=seconds,
+    voice=st.none() | st.text(),
     output=st.none() | outputs,
 )
 

@@ -13,19 +13,19 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.engine.synthesizers.base import Synthesizer
+    from talkcli.engine.synthesizers.choice import Choice
 
 
-def _espeak() -> Synthesizer:
+def _espeak(memory: int) -> Choice:
     from talkcli.engine.synthesizers.choice import Choice
     from talkcli.engine.synthesizers.espeak import Espeak
 
-    return Choice(Espeak())
+    return Choice(Espeak(), memory)
 
 
-#: The synthesizers, the usual one first: what makes each, by what users call it. It stands in for a driver of pyttsx3's
-#: of that name.
-SYNTHESIZERS: dict[str, Callable[[], Synthesizer]] = {"espeak": _espeak}
+#: The synthesizers, the usual one first: what makes each, by what users call it, of the bytes of neural voices' models
+#: that are kept. It stands in for a driver of pyttsx3's of that name.
+SYNTHESIZERS: dict[str, Callable[[int], Choice]] = {"espeak": _espeak}
 
 
 def is_own(driver: str | None) -> bool:

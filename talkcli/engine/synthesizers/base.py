@@ -31,6 +31,7 @@ class Sound:
     rate: int = 200  # words per minute, 80 to 450
     volume: float = 1.0  # 0.0 to 1.0, of the voice's own
     pitch: int = 50  # 0 to 100; 50 is the voice's own
+    voice_only: bool = False  # whether it is the voice that was loaded, or none
 
 
 class Output(Protocol):
@@ -40,10 +41,11 @@ class Output(Protocol):
     CannotSpeak when it can't be played. It was told everything then, and is told no more.
     """
 
-    def begin(self, rate: int) -> None:
-        """Take note of the samples per second, before anything else: a player is started by it.
+    def begin(self, rate: int, voice: str, why: str | None = None) -> None:
+        """Take note of the samples per second, before anything else: a player is started by it; and of who speaks.
 
-        Once more with another rate, if that turns out to be wrong, while there are no words and no samples yet.
+        `voice`: its id; `why`: why that is another than was asked for, for people. Once more, if any of it turns out to
+        be wrong, while there are no words and no samples yet.
         """
 
     def word(self, start: int, length: int, position: float) -> None:
@@ -81,8 +83,8 @@ class Synthesizer(Protocol):
     def load(self, voice: str) -> None:
         """Speak with the voice of this id from now on; UnknownVoice leaves the one in force that was before.
 
-        It returns soon, as nothing can be stopped meanwhile, and no sign of life given: what takes seconds goes on
-        behind it, and `speak` waits for that.
+        It returns soon, as nothing can be stopped meanwhile, and no sign of life given: what takes seconds is for
+        `speak`, which waits in its output.
         """
 
     def speak(self, text: str, sound: Sound, output: Output) -> None:

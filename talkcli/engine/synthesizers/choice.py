@@ -1,25 +1,31 @@
 """The synthesizer that a voice needs: libespeak-ng's own, or a neural one's, whose id says so.
 
-To whoever speaks they are one. What neural voices take is imported when one is asked for, and never else.
+To whoever speaks they are one. What neural voices take is imported when one is asked for, and never else. A neural
+voice that is not loaded, or fails before anything of the sentence was heard, is no reason for silence: libespeak-ng
+speaks in its place, in the same language, unless the sentence is to be heard by that voice or by none.
 """
 
 from __future__ import annotations
 
+from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.synthesizers.voices import is_neural
+from talkcli.frozen import TYPE_CHECKING
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from talkcli.engine.protocol import Voice
+    from talkcli.engine.protocol import Loaded, Unloaded, Voice
     from talkcli.engine.synthesizers.base import Output, Sound, Synthesizer
     from talkcli.engine.synthesizers.espeak import Espeak
+    from talkcli.engine.synthesizers.piper import Piper
 
 
 class Choice:
     """Libespeak-ng, and behind it the neural voices."""
 
-    def __init__(self, espeak: Espeak) -> None:
+    def __init__(self, espeak: Espeak, memory: int = 0) -> None:
+        """`memory`: bytes of neural voices' models that are kept beside the one that speaks."""
         self._espeak = espeak
-        self._neural: Synthesizer | None = None
+        self._memory = memory
+        self._neural: Piper | None = None
         self._chosen: Synthesizer = espeak
         self.version = espeak.version
         self.voice = espeak.voice
@@ -37,12 +43,68 @@ class Choice:
         self._chosen, self.voice = chosen, chosen.voice
 
     def speak(self, text: str, sound: Sound, output: Output) -> None:
-        """Have the one that is chosen speak."""
-        self._chosen.speak(text, sound, output)
+        """Have the one that is chosen speak, or libespeak-ng in its place."""
+        neural = self._neural
+        if neural is None or self._chosen is not neural or sound.voice_only:
+            self._chosen.speak(text, sound, output)
+            return
+        why = f"{neural.voice} is not loaded"
+        if neural.ready:
+            first = _Given(output)
+            try:
+                neural.speak(text, sound, first)
+                return
+            except CannotSpeak as error:
+                if error.reason != "voice_failed" or first.anything:
+                    raise
+                why = str(error)
+        self._espeak.load_language(neural.language)
+        self._espeak.speak(text, sound, _Given(output, why))
 
-    def _piper(self) -> Synthesizer:
+    # -- what is loaded beside the speech
+
+    @property
+    def descriptor(self) -> int | None:
+        """What is readable when a voice has been loaded; None where none is being loaded."""
+        return self._neural.loader.descriptor if self._neural else None
+
+    @property
+    def due(self) -> float:
+        """The monotonic time at which the voice that is being loaded is given up."""
+        return self._piper().loader.due
+
+    def begin(self, voice: str) -> None:
+        """Load a neural voice, by its id without a speaker, beside what is spoken."""
+        self._piper().loader.begin(voice)
+
+    def news(self) -> list[Loaded | Unloaded]:
+        """Return what became of neural voices since this was asked last; never waits."""
+        return self._neural.loader.news() if self._neural else []
+
+    def _piper(self) -> Piper:
         if self._neural is None:
             from talkcli.engine.synthesizers.piper import Piper
 
-            self._neural = Piper(self._espeak)
+            self._neural = Piper(self._espeak, self._memory)
         return self._neural
+
+
+class _Given:
+    """An output that knows whether it was given anything of the sentence, and why another voice speaks."""
+
+    def __init__(self, output: Output, why: str | None = None) -> None:
+        self._output = output
+        self._why = why
+        self.anything = False
+        self.wait = output.wait
+
+    def begin(self, rate: int, voice: str, why: str | None = None) -> None:
+        self._output.begin(rate, voice, why or self._why)
+
+    def word(self, start: int, length: int, position: float) -> None:
+        self.anything = True
+        self._output.word(start, length, position)
+
+    def write(self, samples: bytes) -> None:
+        self.anything = self.anything or bool(samples)
+        self._output.write(samples)

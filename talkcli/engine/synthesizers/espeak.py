@@ -161,7 +161,7 @@ class Espeak:
 
     def speak(self, text: str, sound: Sound, output: Output) -> None:
         """Speak as `Synthesizer` says; with this library the samples differ a little each time."""
-        output.begin(self._rate)
+        output.begin(self._rate, self.voice)
         espeak = self._espeak
         self._obey(sound)
         self._text = guard.guarded(text, self.voice)
@@ -172,6 +172,13 @@ class Espeak:
             raise raised
         if status != espeak.EE_OK:
             raise CannotSpeak("engine_failed", f"espeak_Synth failed with {status}")
+
+    def load_language(self, language: str) -> None:
+        """Take a voice of this language, "de-at", or else of its first part, or else English."""
+        self._listed = self._listed or _listed(self._espeak, None)
+        words = (language, language.partition("-")[0], *_DEFAULTS)
+        found = (find_voice(each, self._listed) for each in words)
+        self.load(next((each.id for each in found if each), self.voice))
 
     @contextlib.contextmanager
     def spelling(self, language: str) -> Iterator[Spelling]:
@@ -215,7 +222,7 @@ class Espeak:
             if event.type == _EVENT_SAMPLERATE:
                 if event.id.number != self._rate:
                     self._rate = event.id.number
-                    output.begin(self._rate)
+                    output.begin(self._rate, self.voice)
             elif event.type == self._espeak.EVENT_WORD:
                 word = _place(event, self._text)
                 if word is not None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-_MODEL, _JSON = ".onnx", ".json"
+_MODEL, JSON = ".onnx", ".json"
 #: How packages with voices are called, and where in one they may be.
 _PACKAGE, _IN_PACKAGE = "_piper_voice", ("", "data")
 #: Bytes of the JSON beside a model: one with a thousand speakers has 30,000.
@@ -74,7 +74,7 @@ def voices() -> tuple[Voice, ...]:
 
 def describe(path: str) -> Description:
     """Read what stands beside a model; BadFile."""
-    beside = path + _JSON
+    beside = path + JSON
     with open_checked(beside, missing="it belongs to the model: get it from where that came from") as file:
         try:
             raw = file.read(_LONGEST_JSON + 1)

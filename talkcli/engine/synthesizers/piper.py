@@ -1,26 +1,24 @@
 """Piper's neural voices as a synthesizer: a text's sounds by libespeak-ng, and a model that speaks them.
 
-A model is loaded, and run, in a thread beside the one that calls, which waits in the output: signs of life, a stop and
-a pause go on. Libespeak-ng is asked in the calling thread alone. One model is kept, the last that was asked for.
+A model is loaded (`loader.py`), and run, in a thread beside the one that calls, which waits in the output: signs of
+life, a stop and a pause go on. Libespeak-ng is asked in the calling thread alone.
 """
 
 from __future__ import annotations
 
+import contextlib
 import queue
-import threading
-import traceback
 
-from talkcli.engine.players.base import SAMPLE, CannotSpeak, Stopped
+from talkcli.engine.players.base import SAMPLE, CannotSpeak
 from talkcli.engine.synthesizers import models
 from talkcli.engine.synthesizers.base import UnknownVoice
-from talkcli.engine.synthesizers.cache import Cache
-from talkcli.engine.synthesizers.inference import INSTALL, Model, Run, missing
+from talkcli.engine.synthesizers.inference import INSTALL, Run, missing
+from talkcli.engine.synthesizers.loader import Loader
 from talkcli.engine.synthesizers.models import BEGIN, END, PAD, BadFile
 from talkcli.engine.synthesizers.phonemes import pieces
-from talkcli.engine.synthesizers.voices import NEURAL, SPEAKER
+from talkcli.engine.synthesizers.voices import NEURAL, SPEAKER, language_of
 from talkcli.engine.synthesizers.work import Work
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.paths import cache_directory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -29,6 +27,7 @@ if TYPE_CHECKING:
     from talkcli.engine.protocol import Voice
     from talkcli.engine.synthesizers.base import Output, Sound
     from talkcli.engine.synthesizers.espeak import Espeak
+    from talkcli.engine.synthesizers.inference import Model
     from talkcli.engine.synthesizers.models import Description
     from talkcli.engine.synthesizers.phonemes import Piece
 
@@ -71,104 +70,86 @@ class Piper:
 
     version: str | None = None
 
-    def __init__(self, espeak: Espeak) -> None:
-        """`espeak` knows the sounds; it is used only while this one speaks."""
+    def __init__(self, espeak: Espeak, memory: int = 0) -> None:
+        """`espeak` knows the sounds, and is used only while this one speaks; `memory`: as in `Loader`."""
         self._espeak = espeak
+        self.loader = Loader(memory)
+        #: id of the voice in force, with its speaker
         self.voice = ""
-        self._path = ""
-        self._speaker = 0
-        self._model: Model | None = None
-        self._loading: Work[Model] | None = None
-        #: held while a model is loaded, as each takes 200 MB meanwhile; and which of all loads is still wanted
-        self._one_at_once = threading.Lock()
-        self._wanted = 0
+        self._model_id, self._speaker, self._path = "", "", ""
+
+    @property
+    def ready(self) -> bool:
+        """Whether the voice in force is loaded."""
+        return self.loader.model(self._model_id) is not None
+
+    @property
+    def language(self) -> str:
+        """The language of the voice in force, by libespeak-ng's name for it: its files say it, or else its name."""
+        try:
+            return models.describe(self._path).speller
+        except BadFile:
+            return language_of(self._model_id)
 
     def voices(self) -> tuple[Voice, ...]:
         """Return the voices whose files are there now."""
         return models.voices()
 
     def load(self, voice: str) -> None:
-        """Begin to load a voice of `voices`, with a speaker behind it or without; `speak` waits until it is there.
+        """Take a voice of `voices`, with a speaker behind it or without; `speak` waits for what takes seconds.
 
-        What is wrong with its files is said by `speak`, so that a goal says it, each time anew.
+        What is wrong with its files is said by `speak`, too, so that a goal says it, each time anew.
         """
         lacking = missing()
         if lacking is not None:
             raise UnknownVoice(f"{lacking} is missing: {INSTALL}, into the Python that serves")
-        name, _, speaker = voice.removeprefix(NEURAL).partition(SPEAKER)
-        path = models.found().get(name) if voice.startswith(NEURAL) else None
+        model, _, speaker = voice.partition(SPEAKER)
+        path = models.found().get(model.removeprefix(NEURAL)) if voice.startswith(NEURAL) else None
         if path is None:
             raise UnknownVoice("its file is not there")
-        try:
-            self._speaker = _speaker(models.describe(path), speaker)
-        except BadFile:  # it comes again where the model is loaded
-            self._speaker = 0
-        if path != self._path:
-            self._forget()
-        self.voice, self._path = voice, path
-        if self._model is None and self._loading is None:
-            self._begin()
+        with contextlib.suppress(BadFile):  # it comes again where the model is loaded
+            _speaker(models.describe(path), speaker)
+        self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
 
     def speak(self, text: str, sound: Sound, output: Output) -> None:
-        """Speak as `Synthesizer` says; the samples differ each time, as far as the voice's noise is not 0."""
+        """Speak as `Synthesizer` says; the samples differ each time, as far as the voice's noise is not 0.
+
+        Where the voice is not loaded yet, it waits until it is.
+        """
         if sound.pitch != _PITCH:
             words = f"the voice {self.voice} has no pitch but its own: leave --pitch out, or choose one of espeak's"
             raise CannotSpeak("bad_option", words)
+        voice = self._model_id
+        model = self._loaded(voice, output)
         try:
-            model = self._loaded(output)
-            output.begin(model.description.rate)
+            speaker = _speaker(model.description, self._speaker)
+        except UnknownVoice as error:
+            raise CannotSpeak("unknown_voice", f"{self.voice}: {error}") from error
+        try:
+            output.begin(model.description.rate, self.voice)
             with self._espeak.spelling(model.description.speller) as speller:
-                self._write(model, pieces(speller, text), sound, output)
+                self._write(model, speaker, pieces(speller, text), sound, output)
         except BadFile as error:
-            self._forget()  # the file may be another by the next time
+            self.loader.suspect(voice)
             raise CannotSpeak("voice_failed", str(error)) from error
         except UnknownVoice as error:
-            self._forget()
-            raise CannotSpeak("voice_failed", f"{self._path}.json: {error}: get the voice anew") from error
+            self.loader.suspect(voice)
+            raise CannotSpeak("voice_failed", f"{model.path}.json: {error}: get the voice anew") from error
 
-    def _begin(self) -> None:
-        path = self._path
-        self._wanted += 1
-        number = self._wanted
+    def _loaded(self, voice: str, output: Output) -> Model:
+        """Return the model of a voice, as soon as it is loaded."""
+        loader = self.loader
+        if loader.model(voice) is None:
+            loader.begin(voice)  # what was wrong with it may be mended
+        while (model := loader.model(voice)) is None:
+            why = loader.error(voice)
+            if why is not None:
+                raise CannotSpeak("voice_failed", why)
+            assert loader.descriptor is not None
+            output.wait(loader.descriptor)
+        return model
 
-        def load() -> Iterator[Model]:
-            try:
-                with self._one_at_once:
-                    if number == self._wanted:
-                        yield Model(path, models.describe(path), _cache())
-            except OSError as error:
-                raise BadFile(f"{path} cannot be read: {error.strerror}") from error
-            except ImportError as error:
-                raise BadFile(f"{path} cannot be loaded ({error}): {INSTALL}") from error
-            except MemoryError as error:
-                raise BadFile(f"{path} cannot be loaded: there is no memory for it; end another program") from error
-
-        self._loading = Work(load(), room=1)
-
-    def _loaded(self, output: Output) -> Model:
-        if self._model is None:
-            if self._loading is None:
-                self._begin()
-            assert self._loading is not None
-            try:
-                model = self._loading.take(output.wait)
-                assert model is not None
-            except (CannotSpeak, Stopped):  # the output's: it goes on being loaded
-                raise
-            except BaseException:
-                self._forget()
-                raise
-            self._loading.close()
-            self._model, self._loading = model, None
-        return self._model
-
-    def _forget(self) -> None:
-        if self._loading is not None:
-            self._loading.close()
-            self._wanted += 1
-        self._model = self._loading = None
-
-    def _write(self, model: Model, spelled: Iterator[Piece], sound: Sound, output: Output) -> None:
+    def _write(self, model: Model, speaker: int, spelled: Iterator[Piece], sound: Sound, output: Output) -> None:
         """Write what a thread makes of the pieces, which are spelled in this one as they are needed."""
         given: queue.SimpleQueue[Piece | None] = queue.SimpleQueue()
         run = Run()
@@ -176,7 +157,7 @@ class Piper:
         at_once = int(_AT_ONCE * rate) * SAMPLE
         seconds = 0.0
         over = False
-        work = Work(_made(model, given, self._speaker, sound, run), _AHEAD)
+        work = Work(_made(model, given, speaker, sound, run), _AHEAD)
         try:
             while True:
                 while not over and given.qsize() < _SPELLED:
@@ -216,6 +197,7 @@ def _made(model: Model, given: queue.SimpleQueue[Piece | None], speaker: int, so
         loudest = 0.0
         faint = 0  # samples, up to here
         begin, many = 0, _FIRST
+        silent: list[Made] = []  # all so far: what makes no sound can be spoken by another voice
         while begin < frames.count:
             end = min(frames.count, begin + many)
             part = model.decode(frames, begin, end, run)
@@ -223,7 +205,10 @@ def _made(model: Model, given: queue.SimpleQueue[Piece | None], speaker: int, so
             loudest = max(loudest, float(heights.max()))
             heard = (heights > _FAINT).nonzero()[0]
             faint = len(part) - 1 - int(heard[-1]) if len(heard) else faint + len(part)
-            yield Made(_samples(part, sound.volume), words)
+            silent.append(Made(_samples(part, sound.volume), words))
+            if loudest >= _SILENT:
+                yield from silent
+                silent.clear()
             words, begin, many = (), end, min(_MOST, 2 * many)
         if loudest < _SILENT:
             raise BadFile(f"{model.path} makes no sound of a text: get the voice anew")
@@ -271,12 +256,3 @@ def _speaker(about: Description, word: str) -> int:
         f"it has {about.speakers} speakers, 0 to {about.speakers - 1}" if about.speakers > 1 else "it has one speaker"
     )
     raise UnknownVoice(f'it has no speaker "{word[:40]}": {many}')
-
-
-def _cache() -> Cache | None:
-    """Return where halves are kept; None where that can't be had, which the log tells."""
-    try:
-        return Cache(cache_directory())
-    except OSError:
-        traceback.print_exc()
-        return None

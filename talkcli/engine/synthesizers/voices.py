@@ -67,6 +67,11 @@ def is_neural(voice: str) -> bool:
     return voice.casefold().startswith(NEURAL)
 
 
+def language_of(voice: str) -> str:
+    """Return the language with which the name of a neural voice begins, as espeak's: "en-us" of "piper/en_US-joe"."""
+    return voice.removeprefix(NEURAL).partition("-")[0].replace("_", "-").lower()
+
+
 def _neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
     name, mark, speaker = wanted.partition(SPEAKER)
     word = name.casefold()

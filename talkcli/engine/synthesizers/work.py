@@ -32,7 +32,8 @@ class Work(threading.Thread, Generic[_T]):
         #: held while the descriptors are used by the thread, so that they are not another's by then
         self._closing = threading.Lock()
         self._closed = False
-        self._readable, self._ring = os.pipe()
+        #: readable as long as something is there, and at the end
+        self.descriptor, self._ring = os.pipe()
         self.start()
 
     def run(self) -> None:
@@ -49,11 +50,16 @@ class Work(threading.Thread, Generic[_T]):
         self._over = True
         self._tell()
 
-    def take(self, wait: Callable[[int], None]) -> _T | None:
+    @property
+    def ready(self) -> bool:
+        """Whether `take` need not wait."""
+        return bool(self._made) or self._over
+
+    def take(self, wait: Callable[[int], None] | None = None) -> _T | None:
         """Return what was made next, None at the end; raises as the work did.
 
-        `wait`: waits for this descriptor, and may return before it is readable; what it raises comes out of here, and
-        nothing is lost.
+        `wait`: waits for the descriptor, and may return before it is readable; what it raises comes out of here, and
+        nothing is lost. It may be left out where it is `ready`.
         """
         while not self._made:
             if self._over:
@@ -63,8 +69,9 @@ class Work(threading.Thread, Generic[_T]):
                 if self._error is not None:
                     raise self._error
                 return None
-            wait(self._readable)
-        os.read(self._readable, 1)
+            assert wait is not None
+            wait(self.descriptor)
+        os.read(self.descriptor, 1)
         self._room.release()
         return self._made.popleft()
 
@@ -73,7 +80,7 @@ class Work(threading.Thread, Generic[_T]):
         with self._closing:
             if not self._closed:
                 self._closed = True
-                os.close(self._readable)
+                os.close(self.descriptor)
                 os.close(self._ring)
         self._room.release()
 

@@ -1,0 +1,204 @@
+"""Neural voices' models: loaded one at a time beside the speech, and kept in memory up to a limit.
+
+A load is a thread's, as it takes seconds; all else is done by the one thread that calls. What becomes of a load is
+told once, as an event for the server. A voice is named here by its id without a speaker.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import traceback
+from collections import deque
+
+from talkcli.engine.protocol import LOAD_LIMIT, Loaded, Unloaded
+from talkcli.engine.synthesizers import models
+from talkcli.engine.synthesizers.cache import Cache
+from talkcli.engine.synthesizers.inference import INSTALL, Model, missing
+from talkcli.engine.synthesizers.models import BadFile
+from talkcli.engine.synthesizers.voices import NEURAL
+from talkcli.engine.synthesizers.work import Work
+from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.paths import cache_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@frozen
+class Kept:
+    """A model that is loaded."""
+
+    model: Model
+    size: int  # bytes of its file
+    stamps: tuple[tuple[int, int, int], ...]  # of its files when it was loaded
+
+
+class Loader:
+    """The models that are in memory, and those that are to come."""
+
+    def __init__(self, limit: int) -> None:
+        """`limit`: bytes of models, as large as their files, that are kept beside the one that speaks."""
+        self._limit = limit
+        #: by voice, the one used last behind the others
+        self._models: dict[str, Kept] = {}
+        #: to be loaded after the one that is being loaded
+        self._waiting: deque[str] = deque()
+        self._work: Work[Kept] | None = None
+        self._voice = ""
+        self._began = 0.0
+        #: those of them that could not be spoken with
+        self._suspect: set[str] = set()
+        #: why the last attempt to load a voice failed
+        self._errors: dict[str, str] = {}
+        self._news: list[Loaded | Unloaded] = []
+
+    @property
+    def descriptor(self) -> int | None:
+        """What is readable when something has been loaded; None where nothing is being loaded."""
+        return self._work.descriptor if self._work else None
+
+    @property
+    def due(self) -> float:
+        """The monotonic time at which what is being loaded is given up."""
+        return self._began + LOAD_LIMIT
+
+    def begin(self, voice: str) -> None:
+        """Have a voice loaded, unless it is, or is about to be; what was wrong with it is forgotten."""
+        if voice in self._models:
+            self._news.append(Loaded(voice, 0.0))
+        elif voice not in self._waiting and not (self._work and voice == self._voice):
+            self._errors.pop(voice, None)
+            self._waiting.append(voice)
+            self._go_on()
+
+    def model(self, voice: str) -> Model | None:
+        """Return the model of a voice, if it is there; it counts as used."""
+        self._look()
+        found = self._models.pop(voice, None)
+        if found is None:
+            return None
+        if voice in self._suspect and found.stamps != _stamps(found.model.path):
+            self._drop(voice)
+            return None
+        self._models[voice] = found
+        return found.model
+
+    def error(self, voice: str) -> str | None:
+        """Return why a voice can't be had, by the last attempt to load it, or to speak with it."""
+        return self._errors.get(voice)
+
+    def suspect(self, voice: str) -> None:
+        """Take note that a voice that is loaded could not be spoken with: it is dropped once its files are others."""
+        self._suspect.add(voice)
+
+    def news(self) -> list[Loaded | Unloaded]:
+        """Return what became of voices since this was asked last."""
+        self._look()
+        news, self._news = self._news, []
+        return news
+
+    def _look(self) -> None:
+        """Take what has been loaded, or has failed to be; never waits."""
+        work, voice = self._work, self._voice
+        if work is None:
+            return
+        try:
+            if not work.ready:
+                if time.monotonic() < self.due:
+                    return
+                # Whatever its thread hangs in, a file of a server that is gone, may hang for ever.
+                raise BadFile(f"{voice} was not loaded within {LOAD_LIMIT:g} s: are its files on a slow disk?")
+            made = work.take()
+            assert made is not None
+        except BadFile as error:
+            self._end(voice, self._took(), str(error))
+        except Exception as error:  # noqa: BLE001 - of whatever kind: a voice costs no engine
+            traceback.print_exception(error)
+            self._end(voice, self._took(), f"{voice} cannot be loaded: {type(error).__name__}: {error}")
+        else:
+            self._models[voice] = made
+            self._news.append(Loaded(voice, self._took()))
+        work.close()
+        self._work = None
+        self._go_on()
+
+    def _took(self) -> float:
+        return round(time.monotonic() - self._began, 3)
+
+    def _end(self, voice: str, seconds: float, why: str) -> None:
+        self._errors[voice] = why
+        self._news.append(Loaded(voice, seconds, why))
+
+    def _go_on(self) -> None:
+        """Load the next, one at a time: each takes twice its memory, and a processor, meanwhile."""
+        if self._work or not self._waiting:
+            return
+        self._voice, self._began = self._waiting.popleft(), time.monotonic()
+        try:
+            path = _path(self._voice)
+        except BadFile as error:
+            self._end(self._voice, 0.0, str(error))
+            self._go_on()
+            return
+        self._make_room(_bytes(path))
+        self._work = Work(_load(path), room=1)
+
+    def _make_room(self, size: int) -> None:
+        """Drop the least used for one of this many bytes; the one that speaks is there until it has spoken."""
+        while self._models and sum(each.size for each in self._models.values()) + size > self._limit:
+            voice = next(iter(self._models))
+            del self._models[voice]
+            self._drop(voice)
+
+    def _drop(self, voice: str) -> None:
+        self._suspect.discard(voice)
+        self._news.append(Unloaded(voice))
+
+
+def _path(voice: str) -> str:
+    """Return the path of a voice's model; BadFile."""
+    lacking = missing()
+    if lacking is not None:
+        raise BadFile(f"{lacking} is missing: {INSTALL}, into the Python that serves")
+    path = models.found().get(voice.removeprefix(NEURAL))
+    if path is None:
+        raise BadFile(f"{voice}: its file is not there any more")
+    return path
+
+
+def _stamps(path: str) -> tuple[tuple[int, int, int], ...]:
+    """Return what tells that the files of a voice are others: none where they can't be looked at."""
+    try:
+        found = [os.stat(each) for each in (path, path + models.JSON)]
+    except OSError:
+        return ()
+    return tuple((each.st_ino, each.st_size, each.st_mtime_ns) for each in found)
+
+
+def _bytes(path: str) -> int:
+    try:
+        return os.path.getsize(path)
+    except OSError:  # the load tells why
+        return 0
+
+
+def _load(path: str) -> Iterator[Kept]:
+    try:
+        stamps = _stamps(path)
+        yield Kept(Model(path, models.describe(path), _cache()), _bytes(path), stamps)
+    except OSError as error:
+        raise BadFile(f"{path} cannot be read: {error.strerror}") from error
+    except ImportError as error:
+        raise BadFile(f"{path} cannot be loaded ({error}): {INSTALL}") from error
+    except MemoryError as error:
+        raise BadFile(f"{path} cannot be loaded: there is no memory for it; end another program") from error
+
+
+def _cache() -> Cache | None:
+    """Return where halves are kept; None where that can't be had, which the log tells."""
+    try:
+        return Cache(cache_directory())
+    except OSError:
+        traceback.print_exc()
+        return None
