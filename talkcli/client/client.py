@@ -96,6 +96,7 @@ class Client:
         rate: int | None = None,
         volume: float | None = None,
         voice: str | None = None,
+        voice_only: bool = False,
         pitch: int | None = None,
         lead_in: int | None = None,
         audible: bool | None = None,
@@ -114,9 +115,11 @@ class Client:
         again with the same id it is not spoken twice, the handle is `attached` to the first.
 
         `rate`: 80 to 450 words per minute; `volume`: 0 to 1; `voice`: id, name or language; `pitch`: 0 to 100; None is
-        the server's setting when it starts. `lead_in`: 0 to 5,000 milliseconds of silence before it, also where the
-        output was not idle; None is the server's, where it was. `audible`: whether it is ABORTED, `muted`, where its
-        output is muted; None leaves that to the server. `data`: an object of at most 1 KiB that travels with the goal.
+        the server's setting when it starts. `voice_only`: wait until a neural voice is loaded, and be ABORTED,
+        `voice_failed`, where it can't be; else espeak may speak in its place. `lead_in`: 0 to 5,000 milliseconds of
+        silence before it, also where the output was not idle; None is the server's, where it was. `audible`: whether it
+        is ABORTED, `muted`, where its output is muted; None leaves that to the server. `data`: an object of at most 1
+        KiB that travels with the goal.
 
         `follow`: have this connection told how it ends; `feedback`: and each word as it is heard, for
         `GoalHandle.feedback` and `events`; `patient`: where the queue is full, wait until there is room, any time.
@@ -140,6 +143,7 @@ class Client:
             rate=rate,
             volume=volume,
             voice=voice,
+            voice_only=voice_only,
             pitch=pitch,
             lead_in=lead_in,
             audible=audible,

@@ -50,7 +50,7 @@ def start(configure: Configure, session: Session) -> Ready:
     own = is_own(configure.driver)
     shown = configure.driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
     name = f"talk_{shown}" if own else shown
-    made = _register_own(shown, name, session, configure.voice_memory) if own else None
+    made = _register_own(shown, name, session) if own else None
     engine = _init(pyttsx3, name, named=configure.driver is not None)
     settings = Settings(engine, name)
     _start_loop(engine, name)
@@ -63,10 +63,10 @@ def start(configure: Configure, session: Session) -> Ready:
     return Ready(shown, made.version if made else None, session.players.first() if own else None)
 
 
-def _register_own(synthesizer: str, driver: str, session: Session, memory: int) -> Choice:
+def _register_own(synthesizer: str, driver: str, session: Session) -> Choice:
     """Make a synthesizer, and put a driver for it among pyttsx3's."""
     try:
-        made = SYNTHESIZERS[synthesizer](memory)
+        made = SYNTHESIZERS[synthesizer]()
     except NotInstalled as error:
         raise CannotStart(str(error)) from error
     except UnknownVoice as error:  # not even its own: a part of it is missing

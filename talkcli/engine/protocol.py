@@ -76,8 +76,6 @@ class Configure:
     output: int | None = None
     #: whether a sentence fails whose output is muted, where it doesn't say so itself.
     audible: bool = False
-    #: bytes of neural voices' models that are kept in memory beside the one that speaks.
-    voice_memory: int = 0
 
 
 @frozen
@@ -128,9 +126,10 @@ class Followed:
 
 @frozen
 class Load:
-    """Load a neural voice beside what is spoken; `Loaded` comes once for each."""
+    """Load a neural voice beside what is spoken; `Loaded` comes once for each. Voices by ids without a speaker."""
 
-    voice: str  # its id, without a speaker
+    voice: str
+    drop: tuple[str, ...] = ()  # those that make room for it
 
 
 @frozen
@@ -179,7 +178,7 @@ class Loaded:
 
 @frozen
 class Unloaded:
-    """A neural voice was dropped, to make room for another."""
+    """A neural voice is not loaded any more: its files are others than they were."""
 
     voice: str  # its id, without a speaker
 

@@ -82,7 +82,9 @@ def render(
     fault = texts.fault(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
-    says = (protocol.Say(f"{n}", each, rate, volume, voice, pitch) for n, each in enumerate(pieces(text), 1))
+    # A file has time, and another voice in it would be no use.
+    asked = (each for each in enumerate(pieces(text), 1))
+    says = (protocol.Say(f"{n}", each, rate, volume, voice, pitch, voice_only=True) for n, each in asked)
     if path not in STANDARD_OUTPUT and not _is_stream(path):
         with _replacing(path) as hidden:
             configure = protocol.Configure(os.getpid(), driver, f"file:{hidden}", None, None, list_voices=False)

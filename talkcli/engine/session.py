@@ -218,7 +218,7 @@ class Session:
         goal = self._goal
         if isinstance(command, protocol.Load):
             if self._synthesizer is not None:
-                self._synthesizer.begin(command.voice)
+                self._synthesizer.begin(command.voice, command.drop)
         elif goal is None or not isinstance(command, _OF_THE_GOAL):
             self._backlog.append(command)
         elif goal.id != command.id:

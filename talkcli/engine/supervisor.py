@@ -191,6 +191,12 @@ class Supervisor:
             # An engine that has no room for it at this moment is not hung for that, and little is lost.
             process.send(protocol.Followed(goal_id, followed))
 
+    def load(self, voice: str, drop: tuple[str, ...] = ()) -> None:
+        """Have the process load a neural voice, as `protocol.Load`; `Loaded` is posted if it lives so long."""
+        process = self._open
+        if process and not process.send(protocol.Load(voice, drop)):
+            self._inbox.call(lambda: self._refused(process))
+
     def give_up(self, goal_id: str) -> None:
         """Let go of a goal that didn't end in time: its process is left behind, there will be no `Ended`."""
         self._open = None
@@ -391,7 +397,7 @@ class Supervisor:
                 goal.started = True
             elif isinstance(event, protocol.Ended):
                 self._finish(event)
-            elif isinstance(event, protocol.Word | protocol.Output):
+            elif isinstance(event, protocol.Word | protocol.Output | protocol.Speaks):
                 self._post(event)
             elif isinstance(event, protocol.Paused) and event.number == goal.pause:
                 goal.pause_at = None

@@ -24,12 +24,16 @@ class Loading:
     """The voices that are being loaded."""
 
     def __init__(self) -> None:
-        #: since when, in monotonic seconds
+        #: since when, in monotonic seconds; inf for one that is yet to be begun with
         self._since: dict[str, float] = {}
 
+    def wait_for(self, voice: str) -> None:
+        """Have goals wait for a voice that will be loaded."""
+        self._since.setdefault(voice, inf)
+
     def begin(self, voice: str, now: float) -> None:
-        """Have goals wait for a voice from now on."""
-        self._since.setdefault(voice, now)
+        """Have goals wait for a voice that is being loaded from now on."""
+        self._since[voice] = now
 
     def end(self, voice: str) -> None:
         """Have none wait for it any more: it is there, or won't come."""
@@ -43,7 +47,8 @@ class Loading:
         """Return the monotonic time from which on a goal may begin whose turn it is; 0 for at once.
 
         `usual`: the voice of those that have none of their own. Who is urgent waits for no voice, nor who would expire
-        meanwhile; who insists on it waits until it is there, or it is known that it won't be.
+        meanwhile; who insists on it waits until it is there, or it is known that it won't be. It waits for so long
+        since its turn came, and no longer than since the voice was begun with.
         """
         since = self._since.get(model_of(record.say.voice or usual)) if self._since else None
         if since is None:
@@ -52,4 +57,5 @@ class Loading:
             return inf
         if record.preempt or record.priority > 0:
             return 0.0
-        return min(since + PATIENCE, inf if record.expires_at is None else record.expires_at - SPARE)
+        patience = min(since, record.turn_at) + PATIENCE
+        return patience if record.expires_at is None else min(patience, record.expires_at - SPARE)

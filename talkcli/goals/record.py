@@ -6,6 +6,7 @@ Slots and no dictionary: a queue of ten thousand goals has to stay small.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 from typing import TYPE_CHECKING
 
 from talkcli.frozen import replace
@@ -50,6 +51,8 @@ class Record:
     paused: bool = False
     #: how often that was asked for
     holds: int = 0
+    #: monotonic time at which its turn had come, whether its voice was there or not
+    turn_at: float = inf
     #: monotonic time at which it was handed to the engine
     began: float = 0.0
     started_at: float | None = None

@@ -115,7 +115,7 @@ class Scheduler:
         self.paused = False
         #: whether there is an engine to start the next goal; without one they wait
         self.has_engine = True
-        #: the voices that its engine is loading
+        #: what goals may have to wait for; `tick` looks whether they still do
         self.loading = Loading()
         #: whether it was told to end, and takes no goal any more
         self.closing = False
@@ -252,11 +252,6 @@ class Scheduler:
     def engine_ready(self, now: Now) -> list[Effect]:
         """Go on: there is an engine that takes the next goal."""
         self.has_engine = True
-        return self._start_next(now)
-
-    def loaded(self, voice: str, now: Now) -> list[Effect]:
-        """Go on: this voice is there now, or won't be."""
-        self.loading.end(voice)
         return self._start_next(now)
 
     def engine_missing(self, words: str, now: Now) -> list[Effect]:
@@ -436,10 +431,10 @@ class Scheduler:
 
     def _next_deadline(self) -> float | None:
         """Return when the goal whose turn it is waits no longer for its voice."""
-        record = self._queue.first()
-        if record is None or self.active or self.paused or not self.has_engine:
+        record = None if self.active or self.paused or not self.has_engine else self._queue.first()
+        if record is None:
             return None
-        begins_at = self.loading.begins_at(record, self.settings.voice)
+        begins_at = 0.0 if record.turn_at == inf else self.loading.begins_at(record, self.settings.voice)
         return begins_at if begins_at < inf else None
 
     def _start_next(self, now: Now) -> list[Effect]:
@@ -454,15 +449,15 @@ class Scheduler:
             return None, []
         effects = self._expire(now)
         record = self._queue.first()
-        if record and self.loading.begins_at(record, self.settings.voice) > now.monotonic:
-            record = None
         if record:
+            record.turn_at = min(record.turn_at, now.monotonic)
+        if record and self.loading.begins_at(record, self.settings.voice) <= now.monotonic:
             record.become(State.ACTIVE)
             self._queue.remove(record)
             record.started_at, record.began = now.wall, now.monotonic
             self.active = record
-            effects.append(Changed(record, State.ACTIVE))
-        return record, effects
+            return record, [*effects, Changed(record, State.ACTIVE)]
+        return None, effects
 
     def _recall(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
         self._queue.remove(record)

@@ -21,7 +21,7 @@ from talkcli.terminal.text import printable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from talkcli.engine.protocol import Ready
+    from talkcli.engine.protocol import Loaded, Ready
     from talkcli.goals.goal import By, Sender
     from talkcli.goals.record import Record
 
@@ -94,6 +94,14 @@ def ready(engine: Ready, for_player: Sequence[str]) -> None:
     if for_player and sound == _BY_ITSELF:
         words += f": {' and '.join(for_player)} {'has' if len(for_player) == 1 else 'have'} no effect"
     line(words)
+
+
+def loaded(voice: Loaded) -> None:
+    """Write the line of a neural voice that can be spoken with from now on, or can't."""
+    if voice.error is None:
+        line(f"voice {shown(voice.voice)} loaded in {voice.seconds:.1f} s")
+    else:
+        line(f"voice {shown(voice.voice)} cannot be loaded, espeak speaks in its place: {shown(voice.error)}")
 
 
 def sound_of(engine: Ready) -> str:

@@ -12,10 +12,11 @@ import sys
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals.goal import By
-from talkcli.goals.options import Cancel, Say, Set, as_shown, bad_option, given
+from talkcli.goals.options import INITIAL, Cancel, Say, Set, as_shown, bad_option, given
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
@@ -215,11 +216,15 @@ class Requests:
             if self._turn:  # a goal that comes now must not take the room of one that waits
                 self._turn.cancel()
                 self._let_go()
-            fault = call.fault or self._speech.voice_fault(say.voice)
+            fault = call.fault or self._speech.voices.fault(say.voice)
             if say.patient and self._scheduler.lacks_room(say, now, fault) and self._keep(call):
                 self._speech.subscribers.keep_alive()
                 await call.wait(self._speech.for_room)
-        now, fault = self._speech.now(), call.fault or self._speech.voice_fault(say.voice)
+        voices = self._speech.voices
+        now, fault = self._speech.now(), call.fault or voices.fault(say.voice) or _unpitched(say)
+        if not fault:
+            say = replace(say, voice=voices.identified(say.voice))
+            self._speech.want(say.voice or self._scheduler.settings.voice)
         submitted = self._scheduler.submit(say, sender, now, fault, call.by)
         record = submitted.record
         extra: JsonObject = {"paused": True} if self._scheduler.paused else {}
@@ -318,8 +323,8 @@ class Requests:
         call.answer(goals, server=self._describe(), active=now)
 
     async def _voices(self, call: Call, _: Voices) -> None:
-        self._speech.look_for_voices()
-        voices = self._speech.voices
+        self._speech.voices.look_for_files()
+        voices = self._speech.voices.listed
         if voices is None:
             words = f"the engine can't list its voices now: it is {self._speech.engine_words}"
             if self._scheduler.active:
@@ -335,13 +340,15 @@ class Requests:
         words = bad_option(request)
         if words:
             raise RequestRefused(words, "bad_option")
-        fault = self._speech.voice_fault(request.voice)
+        voices = self._speech.voices
+        fault = voices.fault(request.voice)
         if fault:
             code, words = fault
             raise RequestRefused(words, code)
-        changed = given(request)
+        changed = given(replace(request, voice=voices.identified(request.voice)))
         self._scheduler.settings = replace(self._scheduler.settings, **changed)
         self._look()  # what preempts may have room
+        self._speech.want(changed.get("voice"), anew=True)
         if changed:
             values = ", ".join(f"{name} {value}" for name, value in changed.items())
             log.line(f"set to {log.shown(values)} by {log.who(call.connection.sender)}")
@@ -356,6 +363,13 @@ class Requests:
 
 def _unknown(*ids: str) -> str:
     return f"no goal {', '.join(map(repr, ids))} is known: see `talk status`"
+
+
+def _unpitched(say: Say) -> tuple[str, str] | None:
+    """Return reason and words why a goal can't be had that wants a pitch of a voice that has none but its own."""
+    if say.pitch in {None, INITIAL.pitch} or not is_neural(say.voice or ""):
+        return None
+    return "bad_option", f"the voice {say.voice} has no pitch but its own: leave the pitch out, or take one of espeak's"
 
 
 def _listed(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:

@@ -16,8 +16,9 @@ from talkcli import __version__, peers
 from talkcli.engine import protocol
 from talkcli.engine.protocol import START_LIMIT
 from talkcli.engine.supervisor import Supervisor
-from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, limits
-from talkcli.frozen import frozen
+from talkcli.engine.synthesizers.voices import is_neural
+from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, limits
+from talkcli.frozen import frozen, replace
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, Say, Set, as_shown
 from talkcli.goals.scheduler import Scheduler
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
 MAX_CLIENTS = 256
 #: Goals that may wait: at two seconds a sentence, more than three minutes of speech that nobody can still want to hear.
 MAX_QUEUE = 100
+#: Megabytes of neural voices' models that are kept in memory: four of middle size, as Piper calls it.
+VOICE_MEMORY = 300
+MEGABYTE = 1_000_000
 #: Places at the door of a full server, for clients that want to know its status or to silence it.
 DOOR = 16
 #: Seconds between two looks whether clients find the socket. Nobody reaches the server meanwhile, and 30 s is what is
@@ -63,6 +67,7 @@ class Settings:
     lead_in: int = 0  # milliseconds of silence before a sentence, where the device has been idle
     audible: bool = False  # whether sentences are aborted whose output is muted, unless they say otherwise
     driver: str | None = None
+    voice_memory: int = VOICE_MEMORY
     socket: str | None = None
     socket_mode: int = 0o600
     greeting: str | None = None
@@ -102,8 +107,9 @@ class Server:
         self._scheduler = Scheduler(
             _boot(), max_queue=settings.max_queue, max_text=settings.max_text, settings=settings.goals
         )
-        self.speech = Speech(self._scheduler, settings.for_player)
+        self.speech = Speech(self._scheduler, settings.for_player, settings.voice_memory * MEGABYTE)
         self.speech.lost = self._end
+        self.speech.voices.driver = settings.driver
         self._systemd = Systemd(self._loop, self.speech.words)
         self.speech.changed = self._systemd.changed
         self._requests = Requests(self.speech, self._describe)
@@ -132,13 +138,14 @@ class Server:
             self._loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the voice along
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # whoever started this may have had some of them blocked
+        voice = self._voice()
         speech.engine = Supervisor(
             protocol.Configure(
                 os.getpid(),
                 settings.driver,
                 settings.player,
                 settings.device,
-                settings.goals.voice,
+                voice,
                 settings.lead_in,
                 audible=settings.audible,
             ),
@@ -151,7 +158,7 @@ class Server:
         try:
             self._acceptor.open(self._listener.socket)
             self._next_look = self._loop.call_later(LOOK_EVERY, self._look_after_socket)
-            if settings.goals.voice or settings.driver:
+            if voice or settings.driver:
                 # Who asked for what can't be had is told so, and nothing else.
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT)
@@ -171,6 +178,20 @@ class Server:
             self._systemd.close()
         if self._fatal:
             raise self._fatal
+
+    def _voice(self) -> str | None:
+        """Return the voice that the engine process is to know in its start; UsageError for a neural one nobody has.
+
+        A neural one is no part of its start: it is loaded beside the speech, and what is wrong with it costs nothing.
+        """
+        voice, voices = self._settings.goals.voice, self.speech.voices
+        if voice is None or not is_neural(voice):
+            return voice
+        fault = voices.fault(voice)
+        if fault:
+            raise UsageError(fault[1])
+        self._scheduler.settings = replace(self._scheduler.settings, voice=voices.identified(voice))
+        return None
 
     def _look_after_socket(self) -> None:
         """See whether clients find the socket, and bind it again where they don't; connections live on."""
@@ -246,6 +267,7 @@ class Server:
             "lead_in": settings.lead_in,
             "audible": settings.audible,
             **as_shown(scheduler.settings),
+            "neural_voices": speech.voices.to_json(),
             "paused": scheduler.paused,
             "pending": scheduler.pending_count,
             "max_queue": settings.max_queue,

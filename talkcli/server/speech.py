@@ -16,17 +16,18 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
-from talkcli.engine.synthesizers import is_own
-from talkcli.engine.synthesizers.voices import find_voice, is_neural, unknown_voice
+from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.errors import TalkError, UsageError
 from talkcli.goals.goal import Output
-from talkcli.goals.options import DEFAULT_VOICE, for_engine
+from talkcli.goals.options import INITIAL, for_engine, model_of
 from talkcli.goals.scheduler import Changed, Effect, Now, Order
 from talkcli.goals.states import State
 from talkcli.server import log
 from talkcli.server.call import go_on
 from talkcli.server.stream import Streams
 from talkcli.server.subscribers import News, Subscribers
+from talkcli.server.voices import State as Loading
+from talkcli.server.voices import Voices
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -44,6 +45,8 @@ _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 #: Seconds after which a timer looks at this clock again: the event loop's own timers stand still in a suspend, and what
 #: was due in it must not wait for as long again.
 LOOK_EVERY = 1.0
+#: How an engine is that takes goals.
+READY = "ready"
 #: Reports that are taken before the loop looks at the clients again: to tell fifty watchers of so many words takes it
 #: some milliseconds, on a busy machine a hundredth of a second or two.
 AT_ONCE = 8
@@ -57,8 +60,8 @@ def elapsed() -> float:
 class Speech:
     """The goals of one server and the engine that speaks them, for as long as it runs."""
 
-    def __init__(self, scheduler: Scheduler, for_player: Sequence[str] = ()) -> None:
-        """`for_player`: the server's options that were given for a player."""
+    def __init__(self, scheduler: Scheduler, for_player: Sequence[str] = (), voice_memory: int = 0) -> None:
+        """`for_player`: the server's options that were given for a player; `voice_memory`: as in `Voices`."""
         self.scheduler = scheduler
         self._for_player = for_player
         #: set before the first client is there
@@ -73,7 +76,7 @@ class Speech:
         #: set once everything has ended after `shut_down`
         self.finished = asyncio.Event()
         self.ready: protocol.Ready | None = None
-        self.voices: tuple[protocol.Voice, ...] | None = None
+        self.voices = Voices(voice_memory)
         #: requests that wait until the voices are known, or it is known that they won't be
         self.for_voices: Place = {}
         #: goals that wait for room in the queue; whoever hears of `queue_changed` lets them go
@@ -106,6 +109,9 @@ class Speech:
             protocol.Ready: self._ready,
             protocol.StartFailed: self._start_failed,
             protocol.Voices: self._voices_known,
+            protocol.Loaded: self._loaded,
+            protocol.Unloaded: self._unloaded,
+            protocol.Speaks: self._speaks,
             protocol.Word: self._word,
             protocol.Output: self._output,
             protocol.Paused: self._paused,
@@ -121,7 +127,7 @@ class Speech:
     def words(self) -> str:
         """Return what is done and how the engine is, for people; no goal's text: any user may read it."""
         scheduler, ready = self.scheduler, self.ready
-        if self.engine_words != "ready":
+        if self.engine_words != READY:
             doing = f"engine: {self.engine_words}"
         elif scheduler.paused:
             doing = "paused"
@@ -136,27 +142,68 @@ class Speech:
     @property
     def awaits_voices(self) -> bool:
         """Whether the voices will be known."""
-        return self.voices is None and self.engine_words in {"starting", "ready"}
+        return self.voices.listed is None and self.engine_words in {"starting", READY}
 
-    def voice_fault(self, voice: str | None) -> tuple[str, str] | None:
-        """Return reason and words why a voice can't be had; None also where the voices aren't known."""
-        if voice is None or voice == DEFAULT_VOICE or not self.voices or find_voice(voice, self.voices):
-            return None
-        if is_neural(voice):
-            self.look_for_voices()
-            if find_voice(voice, self.voices):
-                return None
-        return "unknown_voice", unknown_voice(voice, self.voices)
+    # -- neural voices, which have to be loaded
 
-    def look_for_voices(self) -> None:
-        """Find what neural voices were put there, or taken away, since the engine listed its voices.
+    def want(self, voice: str | None, *, anew: bool = False) -> None:
+        """Have a voice loaded beside the speech, if it is a neural one: a goal that needs it waits for that.
 
-        It takes no more than to read some directories, and only where somebody asks.
+        `anew`: whatever was wrong with it before.
         """
-        if self.voices and self.ready and is_own(self.ready.driver):
-            from talkcli.engine.synthesizers import models
+        model = model_of(voice)
+        if not is_neural(model):
+            return
+        if anew:
+            self.voices.forgive(model)
+        if self.voices.want(model, elapsed()) is Loading.WAITING:
+            self.scheduler.loading.wait_for(model)
+        self._load_next()
 
-            self.voices = (*(each for each in self.voices if not is_neural(each.id)), *models.voices())
+    def _load_next(self) -> None:
+        """Have the engine load what is needed next, if anything is, and there is room for it."""
+        if not self.voices.lacking or self.engine_words != READY:
+            return
+        found = self.voices.next(self._needed())
+        if found is None:
+            return
+        voice, drop = found
+        if self.voices.neural[voice].state is Loading.LOADING:
+            self.scheduler.loading.begin(voice, elapsed())
+        for each in drop:
+            log.line(f"voice {log.shown(each)} dropped, to make room for {log.shown(voice)}")
+            if each in self.voices.neural:
+                self.scheduler.loading.wait_for(each)
+        self.engine.load(voice, drop)
+
+    def _needed(self) -> list[str]:
+        """Return what has to be loaded for the goals in their order, and for those that bring no voice.
+
+        Not for one that is heard: its voice is there until it has spoken.
+        """
+        usual = self.scheduler.settings.voice
+        goals = (each.say.voice or usual for each in self.scheduler.unfinished() if each.voice is None)
+        return list(filter(is_neural, dict.fromkeys(map(model_of, (*goals, usual)))))
+
+    def _loaded(self, loaded: protocol.Loaded) -> None:
+        log.loaded(loaded)
+        self.voices.loaded(loaded.voice, loaded.error, elapsed())
+        self.scheduler.loading.end(loaded.voice)
+        self.apply(self.scheduler.tick(self._now()))
+
+    def _unloaded(self, unloaded: protocol.Unloaded) -> None:
+        self.voices.unloaded(unloaded.voice, self._needed())
+        if unloaded.voice in self.voices.neural:
+            self.scheduler.loading.wait_for(unloaded.voice)
+        self._load_next()
+
+    def _speaks(self, speaks: protocol.Speaks) -> None:
+        active = self.scheduler.active
+        if active is not None and active.id == speaks.id:
+            self.scheduler.spoken_by(speaks.id, speaks.voice)
+            if speaks.why:
+                log.line(log.shown(f"{speaks.id} is spoken by {speaks.voice}: {speaks.why}"))
+            self._load_next()  # its own may be dropped now
 
     def for_silence(self, record: Record) -> Place:
         """Return where to wait until the active goal is silent, goes on after a pause, or its end has been told."""
@@ -228,6 +275,7 @@ class Speech:
             self.queue_changed()
         self.news.tell(told)
         self._tell_followed()
+        self._load_next()  # a goal that has ended may have made room
         self._set_timer()
         self.changed()
         self.look_finished()
@@ -242,6 +290,10 @@ class Speech:
     def _start(self, record: Record) -> None:
         self._followed = self.scheduler.pending_count > 0
         chosen = for_engine(record.say, self.scheduler.settings)
+        if not is_neural(chosen["voice"] or ""):
+            chosen["voice_only"] = False
+        elif chosen["voice_only"] and record.say.pitch is None:
+            chosen["pitch"] = INITIAL.pitch  # the server's own is for voices that have one
         self.engine.say(protocol.Say(record.id, record.text or "", followed=self._followed, **chosen))
 
     def _tell_followed(self) -> None:
@@ -292,11 +344,12 @@ class Speech:
         self._loop.call_soon(self._take_reports)
 
     def _voices_known(self, voices: protocol.Voices) -> None:
-        self.voices = voices.voices
+        self.voices.listed = voices.voices
         go_on(self.for_voices)
 
     def _died(self, died: EngineDied) -> None:
         self.scheduler.engine_lost()
+        self.voices.engine_lost(elapsed())
         self._set_timer()
         self._engine_fails(died.words)
 
@@ -306,9 +359,12 @@ class Speech:
     def _ready(self, ready: protocol.Ready) -> None:
         if self.ready != ready:
             log.ready(ready, self._for_player)
-        self.ready, self.engine_words = ready, "ready"
+        self.ready, self.engine_words, self.voices.driver = ready, READY, ready.driver
         self.engine_known.set()
-        self.apply(self.scheduler.engine_ready(self.now()))
+        now = self.now()
+        for voice in self._needed():
+            self.want(voice)
+        self.apply(self.scheduler.engine_ready(now))
 
     def _start_failed(self, failed: protocol.StartFailed) -> None:
         if failed.usage and self.ready is None:

@@ -76,6 +76,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("started", _moment(goal.started_at)),
         ("ended at", _moment(goal.ended_at)),
         ("duration", None if goal.duration is None else f"{goal.duration:.2f} s of audio"),
+        ("voice", goal.voice and printable(goal.voice)),
         ("output", goal.output and _output(goal.output)),
     ]
     lines = []
@@ -100,6 +101,12 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
     lines = []
     for label, parts in (("server", about), ("engine", engine), ("settings", settings)):
         lines += folded([*(f"{each}," for each in parts[:-1]), parts[-1]], f"{label:<{_LABEL}}", screen)
+    neural = server.get("neural_voices")
+    for voice, found in neural.items() if isinstance(neural, dict) else ():
+        state, why = (found.get(each) for each in ("state", "why"))
+        lines += folded(
+            printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), f"{'voice':<{_LABEL}}", screen
+        )
     if server.get("paused"):
         lines.append(f"{'paused':<{_LABEL}}{screen.painted('speech is held', State.PREEMPTING)}: talk resume")
     active = [status.active] if status.active else []

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import time
 from typing import TYPE_CHECKING, Any
 
 from tests.support.compare import compare
+from tests.support.processes import children
 from tests.support.reference import render
 
 if TYPE_CHECKING:
@@ -114,15 +114,7 @@ def player_process(talk: Talk) -> int:
 
 def _only_child(parent: Callable[[], int], what: str) -> int:
     end = time.monotonic() + _PATIENCE
-    while len(found := _children(parent())) != 1:
+    while len(found := children(parent())) != 1:
         assert time.monotonic() < end, f"not one {what}: {found}"
         time.sleep(0.005)  # a child of a child is no event here
     return found[0]
-
-
-def _children(pid: int) -> list[int]:
-    found: list[int] = []
-    for thread in os.listdir(f"/proc/{pid}/task"):
-        with open(f"/proc/{pid}/task/{thread}/children", encoding="ascii") as file:
-            found += map(int, file.read().split())
-    return found

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 KEYS = {
     "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "priority", "key", "ttl", "data",
-    "client", "paused", "queued_at", "started_at", "ended_at", "duration", "output",
+    "client", "paused", "queued_at", "started_at", "ended_at", "duration", "voice", "output",
 }  # fmt: skip
 
 

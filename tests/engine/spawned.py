@@ -42,7 +42,6 @@ class Spawned:
         before: str = "",
         environment: Mapping[str, str] | None = None,
         lead_in: int = 0,
-        memory: int = 0,
         list_voices: bool = True,
         alive_every: float | None = None,
     ) -> None:
@@ -73,10 +72,7 @@ class Spawned:
                 start_new_session=True,
             )
         os.close(inherited)
-        asked = protocol.Configure(
-            server or os.getpid(), driver, player, device, voice, lead_in, list_voices, voice_memory=memory
-        )
-        self.send(asked)
+        self.send(protocol.Configure(server or os.getpid(), driver, player, device, voice, lead_in, list_voices))
 
     def __enter__(self) -> Spawned:
         return self
@@ -182,9 +178,3 @@ class Spawned:
             except BlockingIOError:
                 time.sleep(0.002)
         return False
-
-
-def children(pid: int) -> list[int]:
-    """Return the child processes of a process."""
-    with open(f"/proc/{pid}/task/{pid}/children") as file:
-        return [int(word) for word in file.read().split()]

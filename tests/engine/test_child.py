@@ -16,8 +16,9 @@ from talkcli.engine import protocol
 from talkcli.engine.players import Command
 from talkcli.engine.players.child import Child
 from talkcli.engine.players.program import ProgramPlayer
-from tests.engine.spawned import FAST, Spawned, children
+from tests.engine.spawned import FAST, Spawned
 from tests.engine.test_player_faults import Player
+from tests.support.processes import children
 from tests.support.reference import played, render
 
 if TYPE_CHECKING:

@@ -10,9 +10,10 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.players import choice
-from tests.engine.spawned import FAST, SOON, Spawned, children
+from tests.engine.spawned import FAST, SOON, Spawned
 from tests.engine.test_player_faults import Player, player
 from tests.support import compare
+from tests.support.processes import children
 from tests.support.reference import RATE, played, render
 from tests.support.timing import assert_within, limits
 

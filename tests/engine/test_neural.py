@@ -343,12 +343,12 @@ def test_a_real_voice_says_a_sentence_with_its_words_in_time(tmp_path: Path) -> 
 
 
 def test_the_json_of_a_voice_is_read_again_with_each_load(place: Path) -> None:
-    """It is no secret kept by the process: another rate of samples is taken when the voice is next loaded."""
+    """It is no secret kept by the process: what is dropped is another when it is loaded again."""
     with _engine(place) as engine:
         assert engine.spoken("a", "g1", voice=VOICE).outcome == protocol.COMPLETED
-        tiny_voice.put(place, "other")
-        assert engine.spoken("a", "g2", voice="piper/other").outcome == protocol.COMPLETED
         (place / "tiny.onnx.json").write_text(json.dumps({"audio": {}}))
+        assert engine.spoken("a", "g2", voice=VOICE).outcome == protocol.COMPLETED
+        engine.send(protocol.Load("piper/other", (VOICE,)))
         assert "does not describe a voice" in _failed(engine.spoken("a", "g3", voice=VOICE))
 
 
@@ -429,21 +429,16 @@ def test_a_voice_that_fails_before_anything_is_heard_is_no_reason_for_silence(
             assert [TEXT[each.start : each.end] for each in engine.words(goal)] == TEXT.replace(",", "").split()
 
 
-def test_what_is_kept_is_no_more_than_there_is_room_for(place: Path) -> None:
-    size = (place / "tiny.onnx").stat().st_size
-    for name in ("second", "third"):
-        tiny_voice.put(place, name)
-    with _spawned(place, memory=2 * size) as engine:
-        engine.until(protocol.Ready)
-        for name in ("tiny", "second"):
-            engine.send(protocol.Load(f"piper/{name}"))
-            engine.until(protocol.Loaded)
-        assert engine.spoken("a", voice=VOICE).outcome == protocol.COMPLETED
-        engine.send(protocol.Load("piper/third"))
-        assert engine.until(protocol.Loaded).voice == "piper/third"
-        assert [each for each in engine.events if isinstance(each, protocol.Unloaded)] == [
-            protocol.Unloaded("piper/second")
-        ], "the least used"
+def test_one_is_dropped_that_is_to_make_room(place: Path) -> None:
+    tiny_voice.put(place, "second")
+    with _engine(place) as engine:
+        for load in (protocol.Load(VOICE), protocol.Load("piper/second", (VOICE,))):
+            engine.send(load)
+            assert engine.until(protocol.Loaded).error is None
+        assert engine.spoken("a", "g1", voice=VOICE, voice_only=False).outcome == protocol.COMPLETED
+        assert _speaks(engine, "g1") == [("gmw/en-US", f"{VOICE} is not loaded")]
+        assert engine.spoken("a", "g2", voice="piper/second", voice_only=False).outcome == protocol.COMPLETED
+        assert _speaks(engine, "g2") == [("piper/second", None)]
 
 
 def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path) -> None:

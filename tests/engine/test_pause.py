@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import FAST, Spawned, children
+from tests.engine.spawned import FAST, Spawned
 from tests.support import compare
+from tests.support.processes import children
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, render
 from tests.support.timing import assert_within, limits

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import FAST, SOON, Spawned, children
+from tests.engine.spawned import FAST, SOON, Spawned
 from tests.engine.test_player_faults import Player, player
+from tests.support.processes import children
 from tests.support.reference import RATE, render
 from tests.support.surroundings import needs
 from tests.support.timing import assert_within, limits

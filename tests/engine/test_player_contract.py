@@ -24,7 +24,8 @@ from talkcli.engine.players.null import NullPlayer
 from talkcli.engine.players.program import ProgramPlayer
 from talkcli.engine.players.pulse import PulsePlayer
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
-from tests.engine.spawned import PATIENCE, children
+from tests.engine.spawned import PATIENCE
+from tests.support.processes import children
 from tests.support.surroundings import short_directory
 from tests.support.timing import assert_within, limits
 

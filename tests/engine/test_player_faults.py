@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import playback, protocol
-from tests.engine.spawned import SOON, Spawned, children
+from tests.engine.spawned import SOON, Spawned
+from tests.support.processes import children
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:

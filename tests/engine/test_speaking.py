@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import FAST, Spawned, children
+from tests.engine.spawned import FAST, Spawned
+from tests.support.processes import children
 from tests.support.surroundings import needs
 from tests.support.timing import assert_within, limits
 

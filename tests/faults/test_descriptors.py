@@ -16,6 +16,7 @@ import pytest
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support import processes
 from tests.support.connection import Wire
+from tests.support.processes import children
 from tests.support.surroundings import short_directory
 from tests.support.timing import assert_within, limits
 
@@ -46,12 +47,7 @@ def descriptors(pid: int) -> int:
 
 def engine_of(pid: int) -> int | None:
     """Return the process id of a server's engine, if it has one now."""
-    for task in os.listdir(f"/proc/{pid}/task"):
-        with open(f"/proc/{pid}/task/{task}/children", encoding="ascii") as file:
-            children = file.read().split()
-        if children:
-            return int(children[0])
-    return None
+    return next(iter(children(pid)), None)
 
 
 def kill_engine(pid: int) -> None:

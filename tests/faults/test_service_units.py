@@ -20,6 +20,7 @@ from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.faults.supervisor import Supervisor
 from tests.support import processes
 from tests.support.connection import Wire
+from tests.support.processes import children
 from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
@@ -298,11 +299,7 @@ def test_socket_that_is_passed_is_served_until_the_end_and_left(home: str) -> No
 
 def engine_of(pid: int) -> int:
     """Return the process id of a server's engine."""
-    found = []
-    for task in os.listdir(f"/proc/{pid}/task"):
-        with open(f"/proc/{pid}/task/{task}/children", encoding="ascii") as file:
-            found += file.read().split()
-    return int(found[0])
+    return children(pid)[0]
 
 
 def test_socket_that_cannot_be_served_is_refused_in_words(home: str) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
+from tests.support.processes import children
 from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
@@ -164,13 +165,7 @@ def test_clients_in_an_empty_environment_reach_the_server(home: str) -> None:
 
 
 def _engine(server: BareServe) -> int:
-    pid = server.process.pid
-    for task in os.listdir(f"/proc/{pid}/task"):
-        with open(f"/proc/{pid}/task/{task}/children", encoding="ascii") as file:
-            children = file.read().split()
-        if children:
-            return int(children[0])
-    pytest.fail("there is no engine")
+    return children(server.process.pid)[0]
 
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mounts and /proc as Linux has them")

@@ -22,6 +22,7 @@ sentences are spoken plainly:
 | `stale-pause` | answers each pause but the first at once, as if it were the one before, and then as it is |
 | `ignore-pause` | ignores pause and resume, and says nothing about it |
 | `volume=X` | tells that it plays to the device "card", at that volume |
+| `voice=ID` | tells that it speaks by that voice |
 | `muted` | … and that it is muted; fails for it, where the goal is to be audible |
 | `linger=SECONDS` | leaves a process that holds the pipe of `TALK_LIVENESS_FD` open so long, whatever happens |
 
@@ -44,7 +45,20 @@ _FLAGS = frozenset(
     {"silent-start", "crash", "exit", "hang", "never-ends", "ignore-stop", "stale-pause", "ignore-pause", "muted"}
 )
 _VALUED = frozenset(
-    {"length", "words", "at", "fail", "message", "exit", "slow-stop", "on-stop", "slow-pause", "linger", "volume"}
+    {
+        "length",
+        "words",
+        "at",
+        "fail",
+        "message",
+        "exit",
+        "slow-stop",
+        "on-stop",
+        "slow-pause",
+        "linger",
+        "volume",
+        "voice",
+    }
 )
 
 
@@ -69,6 +83,7 @@ class Script:
     ignore_pause: bool = False
     linger: float = 0.0
     volume: float | None = None
+    voice: str | None = None
     muted: bool = False
     words: tuple[tuple[int, int], ...] = ()
 
@@ -105,6 +120,7 @@ def parse(text: str) -> Script:
         stale_pause="stale-pause" in asked,
         ignore_pause="ignore-pause" in asked,
         linger=min(LONGEST, _number(asked, "linger", 0)),
+        voice=asked.get("voice"),
         volume=_number(asked, "volume", 1.0) if asked.keys() & {"volume", "muted"} else None,
         muted="muted" in asked,
         words=tuple(spans[:count]) if "silent-start" not in asked else (),

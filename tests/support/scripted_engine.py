@@ -120,6 +120,15 @@ class Engine:
         if voices:
             self._send(protocol.Voices((protocol.Voice("en", "en", "scripted"),)))
 
+    def _tell(self, goal: Goal) -> None:
+        """Tell by which voice it speaks, and where that goes."""
+        asked = goal.script
+        if asked.voice is not None:
+            self._send(protocol.Speaks(goal.id, asked.voice))
+        if asked.volume is not None:
+            output = {"player": "scripted", "device": "card", "volume": asked.volume, "muted": asked.muted}
+            self._send(protocol.Output(goal.id, output))
+
     def _say(self, say: protocol.Say) -> None:
         if self._goal:
             sys.exit(f"told to say {say.id} while {self._goal.id} is in hand")
@@ -132,9 +141,7 @@ class Engine:
             self._linger(asked.linger)
         if asked.started:
             self._send(protocol.Started(goal.id))
-        if asked.volume is not None:
-            output = {"player": "scripted", "device": "card", "volume": asked.volume, "muted": asked.muted}
-            self._send(protocol.Output(goal.id, output))
+        self._tell(goal)
         if asked.muted and say.audible:
             self._send(protocol.Ended(goal.id, protocol.FAILED, "muted", "the output is muted: card"))
             self._goal = None

@@ -167,6 +167,12 @@ class SideBySide:
         self.real.engine_lost()
         self.compare([])
 
+    def is_to_load(self, voice: str) -> None:
+        self.begin()
+        self.model.is_to_load(voice)
+        self.real.loading.wait_for(voice)
+        self.compare([])
+
     def begins_to_load(self, voice: str) -> None:
         self.begin()
         self.model.begins_to_load(voice)
@@ -176,7 +182,8 @@ class SideBySide:
     def has_loaded(self, voice: str) -> None:
         self.begin()
         self.model.has_loaded(voice)
-        self.compare(self.real.loaded(voice, self.now))
+        self.real.loading.end(voice)
+        self.compare(self.real.tick(self.now))
 
     def change_voice(self, voice: str | None) -> None:
         self.real.settings = replace(self.real.settings, voice=voice)

@@ -56,6 +56,8 @@ class SlowGoal:
     accepted_at: float = 0.0
     began_at: float | None = None
     stopped_at: float | None = None
+    #: when it was first seen to be its turn, where it waited then
+    turn_at: float | None = None
     #: on the clock on the wall
     times: dict[str, float] = field(default_factory=dict)
 

@@ -36,7 +36,7 @@ class SlowModel:
         self.max_queue = max_queue
         self.ttl = ttl
         self.usual_voice: str | None = None
-        self.loading: dict[str, float] = {}  # voices, without their speakers, and since when
+        self.loading: dict[str, float | None] = {}  # voices, without their speakers, and since when; None: not yet
         self.all: list[SlowGoal] = []  # in order of arrival
         self.queue: list[SlowGoal] = []  # in the order in which they will be spoken
         self.voice: list[SlowGoal] = []  # being spoken: none or one
@@ -235,13 +235,16 @@ class SlowModel:
         self.engine = False
         self.loading = {}
 
-    def begins_to_load(self, voice: str) -> None:
+    def is_to_load(self, voice: str) -> None:
         if voice not in self.loading:
-            self.loading[voice] = self.monotonic
+            self.loading[voice] = None
+
+    def begins_to_load(self, voice: str) -> None:
+        self.loading[voice] = self.monotonic
 
     def has_loaded(self, voice: str) -> None:
         self.loading = {name: since for name, since in self.loading.items() if name != voice}
-        self.speak_next()
+        self.tick()
 
     def engine_ready(self) -> None:
         self.engine = True
@@ -326,6 +329,8 @@ class SlowModel:
             self.orders.append(("start", self.voice[0].id))
 
     def waits_for_its_voice(self, goal: SlowGoal) -> bool:
+        if goal.turn_at is None:
+            goal.turn_at = self.monotonic
         waits_until = self.waits_until(goal)
         return waits_until is not None and self.monotonic < waits_until
 
@@ -338,13 +343,18 @@ class SlowModel:
             return float("inf")
         if goal.preempt or goal.priority > 0:
             return None
-        patience = self.loading[name] + PATIENCE
-        return patience if goal.ttl is None else min(patience, goal.accepted_at + goal.ttl - SPARE)
+        since = [each for each in (self.loading[name], goal.turn_at) if each is not None]
+        limits = [each + PATIENCE for each in since]
+        if goal.ttl is not None:
+            limits.append(goal.accepted_at + goal.ttl - SPARE)
+        return min(limits)
 
     def may_begin_at(self) -> list[float]:
         """Return when the first of the queue begins if nothing else happens; nothing where something else must."""
         if self.voice or self.paused or not self.engine or not self.queue:
             return []
+        if self.queue[0].turn_at is None:
+            return [0.0]  # nobody has looked at it yet
         until = self.waits_until(self.queue[0])
         return [] if until == float("inf") else [0.0 if until is None else until]
 

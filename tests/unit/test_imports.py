@@ -251,7 +251,7 @@ def test_the_server_is_imported_by_the_serve_command_alone() -> None:
 
 
 #: Who else may end the process on the spot: the server, on its second signal, in the handler.
-ENDING = {"server.run": {"os._exit"}}
+ENDING = {"server.run": {"os._exit"}, "engine.main": {"os._exit"}}
 #: Who else may write to standard error: the server's log, and the engine process, whose server reads it.
 COMPLAINING = {"server.log", "engine.main", "engine.session"}
 

@@ -209,9 +209,10 @@ def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_ther
 def test_the_engine_is_told_the_goal_s_own_value_else_the_server_s() -> None:
     settings = replace(INITIAL, voice="de", rate=150)
     general = {"rate": 150, "volume": 1.0, "voice": "de", "pitch": 50, "lead_in": None, "audible": None}
+    general["voice_only"] = False
     assert for_engine(Say("hi"), settings) == general
     own = Say("hi", rate=80, volume=0.0, voice=DEFAULT_VOICE, pitch=0, lead_in=0, audible=False)
-    asked = {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0, "lead_in": 0, "audible": False}
+    asked = {"rate": 80, "volume": 0.0, "voice": None, "pitch": 0, "lead_in": 0, "audible": False, "voice_only": False}
     assert for_engine(own, settings) == asked
     assert given(Set(preempt=False, ttl=0)) == {"preempt": False, "ttl": 0}
 

@@ -218,6 +218,10 @@ class SchedulerMachine(RuleBasedStateMachine):
         return multiple(*sent)
 
     @rule(voice=voices)
+    def is_to_load_a_voice(self, voice: str) -> None:
+        self.both.is_to_load(voice)
+
+    @rule(voice=voices)
     def begins_to_load_a_voice(self, voice: str) -> None:
         self.both.begins_to_load(voice)
 
@@ -229,14 +233,15 @@ class SchedulerMachine(RuleBasedStateMachine):
     @rule(
         target=goals,
         voice=voices,
+        begun=st.booleans(),
         says=st.lists(says_with("voice", "voice_only", "ttl", "priority"), min_size=1, max_size=3),
         times=st.lists(st.sampled_from([0.0, 0.5, 2.0, 2.5, 9.5, 10.0]), max_size=3),
         sender=clients,
     )
     def waits_for_a_voice(
-        self, voice: str, says: list[Fields], times: list[float], sender: Sender
+        self, voice: str, *, begun: bool, says: list[Fields], times: list[float], sender: Sender
     ) -> MultipleResults[str]:
-        self.both.begins_to_load(voice)
+        self.both.begins_to_load(voice) if begun else self.both.is_to_load(voice)
         sent = [self.both.submit(Say(**each), sender) for each in says]
         for step in times:
             self.time_goes_on(step, 0.0)

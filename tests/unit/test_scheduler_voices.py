@@ -17,7 +17,8 @@ def loads(robot: Robot, voice: str = JOE) -> None:
 
 
 def has_loaded(robot: Robot, voice: str = JOE) -> None:
-    robot.see(robot.scheduler.loaded(voice, robot.now))
+    robot.scheduler.loading.end(voice)
+    robot.waits(0)
 
 
 @pytest.mark.parametrize("voice", [JOE, f"{JOE}#3"])
@@ -50,13 +51,42 @@ def test_a_goal_waits_ten_seconds_from_when_its_voice_was_begun_with() -> None:
     robot = Robot()
     loads(robot)
     robot.waits(4)
-    loads(robot)  # nobody begins with it again
     goal = robot.asks(Say("battery low", voice=JOE))
     assert robot.scheduler.deadline() == 110
     robot.waits(5.9)
     assert goal.state.name == "PENDING"
     robot.waits(0.1)
     assert goal.state is State.ACTIVE
+
+
+def test_for_a_voice_that_is_not_begun_with_a_goal_waits_ten_seconds_from_its_turn() -> None:
+    robot = Robot()
+    first = robot.says()
+    robot.scheduler.loading.wait_for(JOE)
+    goal = robot.asks(Say("battery low", voice=JOE))
+    robot.waits(60)
+    robot.tells("completed", first.id)
+    assert robot.scheduler.deadline() == 170
+    robot.waits(4)
+    loads(robot)
+    robot.waits(5.9)
+    assert goal.state.name == "PENDING"
+    robot.waits(0.1)
+    assert goal.state is State.ACTIVE
+
+
+def test_a_goal_whose_turn_it_is_by_a_cancel_waits_from_then_on() -> None:
+    robot = Robot()
+    loads(robot)
+    robot.scheduler.loading.wait_for("piper/amy")
+    first, second = robot.asks(Say("x", voice=JOE)), robot.asks(Say("y", voice="piper/amy"))
+    robot.waits(3)
+    robot.cancels(first.id)
+    assert robot.scheduler.deadline() == 0, "it is to be looked at"
+    robot.waits(0)
+    assert robot.scheduler.deadline() == 113
+    robot.waits(10)
+    assert second.state is State.ACTIVE
 
 
 @pytest.mark.parametrize("urgent", [{"preempt": True}, {"flush": True}, {"priority": 1}])

@@ -34,6 +34,7 @@ NEVER_EDITED = {
     "protocol-1": "5a39d2af4e6c797d4d449d37623fd96d9f78ea4f33952ef545dc1e4e552212fd",
     "protocol-1-audible": "d027e998482272e961e2bebded96fb3d2d3dc4e2410b2d2fd6c0ea2076ce131a",
     "protocol-1-lead-in": "3f3263930adb3116d5329efa626e6eaefc47f16290d539d36e352152bc22067e",
+    "protocol-1-voice": "4053df5d6bb376af2403e923cb48468fdeb25a46323a63e47e472ab823ef457f",
 }
 #: What is another with every server, client or run: of these the type is compared.
 VARIES = {

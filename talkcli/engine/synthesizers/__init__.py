@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from talkcli.engine.synthesizers.choice import Choice
 
 
-def _espeak(memory: int) -> Choice:
+def _espeak() -> Choice:
     from talkcli.engine.synthesizers.choice import Choice
     from talkcli.engine.synthesizers.espeak import Espeak
 
-    return Choice(Espeak(), memory)
+    return Choice(Espeak())
 
 
-#: The synthesizers, the usual one first: what makes each, by what users call it, of the bytes of neural voices' models
-#: that are kept. It stands in for a driver of pyttsx3's of that name.
-SYNTHESIZERS: dict[str, Callable[[int], Choice]] = {"espeak": _espeak}
+#: The synthesizers, the usual one first: what makes each, by what users call it. It stands in for a driver of pyttsx3's
+#: of that name.
+SYNTHESIZERS: dict[str, Callable[[], Choice]] = {"espeak": _espeak}
 
 
 def is_own(driver: str | None) -> bool:

@@ -8,12 +8,15 @@ speaks in its place, in the same language, unless the sentence is to be heard by
 from __future__ import annotations
 
 from talkcli.engine.players.base import CannotSpeak
+from talkcli.engine.synthesizers.base import Sound
 from talkcli.engine.synthesizers.voices import is_neural
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from talkcli.engine.protocol import Loaded, Unloaded, Voice
-    from talkcli.engine.synthesizers.base import Output, Sound, Synthesizer
+    from talkcli.engine.synthesizers.base import Output, Synthesizer
     from talkcli.engine.synthesizers.espeak import Espeak
     from talkcli.engine.synthesizers.piper import Piper
 
@@ -21,10 +24,8 @@ if TYPE_CHECKING:
 class Choice:
     """Libespeak-ng, and behind it the neural voices."""
 
-    def __init__(self, espeak: Espeak, memory: int = 0) -> None:
-        """`memory`: bytes of neural voices' models that are kept beside the one that speaks."""
+    def __init__(self, espeak: Espeak) -> None:
         self._espeak = espeak
-        self._memory = memory
         self._neural: Piper | None = None
         self._chosen: Synthesizer = espeak
         self.version = espeak.version
@@ -52,7 +53,7 @@ class Choice:
         if neural.ready:
             first = _Given(output)
             try:
-                neural.speak(text, sound, first)
+                neural.speak(text, replace(sound, pitch=Sound().pitch), first)
                 return
             except CannotSpeak as error:
                 if error.reason != "voice_failed" or first.anything:
@@ -73,9 +74,12 @@ class Choice:
         """The monotonic time at which the voice that is being loaded is given up."""
         return self._piper().loader.due
 
-    def begin(self, voice: str) -> None:
-        """Load a neural voice, by its id without a speaker, beside what is spoken."""
-        self._piper().loader.begin(voice)
+    def begin(self, voice: str, drop: Iterable[str]) -> None:
+        """Load a neural voice, by its id without a speaker, beside what is spoken; before that drop others."""
+        loader = self._piper().loader
+        for each in drop:
+            loader.drop(each)
+        loader.begin(voice)
 
     def news(self) -> list[Loaded | Unloaded]:
         """Return what became of neural voices since this was asked last; never waits."""
@@ -85,7 +89,7 @@ class Choice:
         if self._neural is None:
             from talkcli.engine.synthesizers.piper import Piper
 
-            self._neural = Piper(self._espeak, self._memory)
+            self._neural = Piper(self._espeak)
         return self._neural
 
 

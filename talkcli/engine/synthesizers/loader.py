@@ -1,7 +1,8 @@
-"""Neural voices' models: loaded one at a time beside the speech, and kept in memory up to a limit.
+"""Neural voices' models: loaded one at a time beside the speech, and kept in memory until they are to be dropped.
 
 A load is a thread's, as it takes seconds; all else is done by the one thread that calls. What becomes of a load is
-told once, as an event for the server. A voice is named here by its id without a speaker.
+told once, as an event for the server, which decides what is loaded and what is dropped for it. A voice is named here
+by its id without a speaker.
 """
 
 from __future__ import annotations
@@ -30,17 +31,14 @@ class Kept:
     """A model that is loaded."""
 
     model: Model
-    size: int  # bytes of its file
     stamps: tuple[tuple[int, int, int], ...]  # of its files when it was loaded
 
 
 class Loader:
     """The models that are in memory, and those that are to come."""
 
-    def __init__(self, limit: int) -> None:
-        """`limit`: bytes of models, as large as their files, that are kept beside the one that speaks."""
-        self._limit = limit
-        #: by voice, the one used last behind the others
+    def __init__(self) -> None:
+        #: by voice
         self._models: dict[str, Kept] = {}
         #: to be loaded after the one that is being loaded
         self._waiting: deque[str] = deque()
@@ -63,6 +61,11 @@ class Loader:
         """The monotonic time at which what is being loaded is given up."""
         return self._began + LOAD_LIMIT
 
+    def drop(self, voice: str) -> None:
+        """Keep a voice no longer; one that speaks is there until it has spoken."""
+        self._models.pop(voice, None)
+        self._suspect.discard(voice)
+
     def begin(self, voice: str) -> None:
         """Have a voice loaded, unless it is, or is about to be; what was wrong with it is forgotten."""
         if voice in self._models:
@@ -73,16 +76,14 @@ class Loader:
             self._go_on()
 
     def model(self, voice: str) -> Model | None:
-        """Return the model of a voice, if it is there; it counts as used."""
+        """Return the model of a voice, if it is there."""
         self._look()
-        found = self._models.pop(voice, None)
-        if found is None:
+        found = self._models.get(voice)
+        if found and voice in self._suspect and found.stamps != _stamps(found.model.path):
+            self.drop(voice)
+            self._news.append(Unloaded(voice))
             return None
-        if voice in self._suspect and found.stamps != _stamps(found.model.path):
-            self._drop(voice)
-            return None
-        self._models[voice] = found
-        return found.model
+        return found.model if found else None
 
     def error(self, voice: str) -> str | None:
         """Return why a voice can't be had, by the last attempt to load it, or to speak with it."""
@@ -141,19 +142,7 @@ class Loader:
             self._end(self._voice, 0.0, str(error))
             self._go_on()
             return
-        self._make_room(_bytes(path))
         self._work = Work(_load(path), room=1)
-
-    def _make_room(self, size: int) -> None:
-        """Drop the least used for one of this many bytes; the one that speaks is there until it has spoken."""
-        while self._models and sum(each.size for each in self._models.values()) + size > self._limit:
-            voice = next(iter(self._models))
-            del self._models[voice]
-            self._drop(voice)
-
-    def _drop(self, voice: str) -> None:
-        self._suspect.discard(voice)
-        self._news.append(Unloaded(voice))
 
 
 def _path(voice: str) -> str:
@@ -176,17 +165,10 @@ def _stamps(path: str) -> tuple[tuple[int, int, int], ...]:
     return tuple((each.st_ino, each.st_size, each.st_mtime_ns) for each in found)
 
 
-def _bytes(path: str) -> int:
-    try:
-        return os.path.getsize(path)
-    except OSError:  # the load tells why
-        return 0
-
-
 def _load(path: str) -> Iterator[Kept]:
     try:
         stamps = _stamps(path)
-        yield Kept(Model(path, models.describe(path), _cache()), _bytes(path), stamps)
+        yield Kept(Model(path, models.describe(path), _cache()), stamps)
     except OSError as error:
         raise BadFile(f"{path} cannot be read: {error.strerror}") from error
     except ImportError as error:

@@ -70,10 +70,10 @@ class Piper:
 
     version: str | None = None
 
-    def __init__(self, espeak: Espeak, memory: int = 0) -> None:
-        """`espeak` knows the sounds, and is used only while this one speaks; `memory`: as in `Loader`."""
+    def __init__(self, espeak: Espeak) -> None:
+        """`espeak` knows the sounds; it is used only while this one speaks."""
         self._espeak = espeak
-        self.loader = Loader(memory)
+        self.loader = Loader()
         #: id of the voice in force, with its speaker
         self.voice = ""
         self._model_id, self._speaker, self._path = "", "", ""

@@ -1,0 +1,225 @@
+"""The voices that a server has: what their names mean, and what has become of the neural ones, which must be loaded.
+
+What is loaded is in the engine process, and gone with it; this is what the server knows of it. It loads nothing and
+tells nobody: that is for `speech`. It looks at no files but where somebody asks for a voice that it doesn't know.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from talkcli.engine.synthesizers import is_own
+from talkcli.engine.synthesizers.voices import NEURAL, find_voice, is_neural, unknown_voice
+from talkcli.goals.options import DEFAULT_VOICE
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from talkcli.engine.protocol import Voice
+    from talkcli.goals.goal import JsonObject
+
+#: Seconds after which a voice that failed may be loaded again, where a goal asks for it: twice as long each time, up to
+#: an hour, as one that can't be loaded costs a second of the processor, and one that kills the engine a sentence.
+RETRY_AFTER, RETRY_AT_LAST = 5.0, 3600.0
+#: Deaths of the engine while a voice is loaded, after which that voice is taken for the cause.
+DEATHS = 2
+
+
+class State(Enum):
+    """What has become of a neural voice that was asked for."""
+
+    WAITING = "waiting"  # to be loaded
+    LOADING = "loading"
+    LOADED = "loaded"
+    FAILED = "failed"  # another speaks in its place
+
+
+@dataclass(slots=True)
+class Neural:
+    """A neural voice that was asked for."""
+
+    #: bytes of its file; it takes as many in memory, and some more
+    size: int
+    state: State = State.WAITING
+    #: why it can't be had, for people
+    why: str | None = None
+    #: how often in a row it could not be loaded
+    failures: int = 0
+    #: whether it is to be loaded, for the first time or, where it failed, again
+    wanted: bool = True
+    #: the monotonic time from which on one that failed may be tried again
+    again_at: float = 0.0
+
+    def fail(self, why: str, now: float) -> None:
+        """Take note that it could not be loaded."""
+        self.failures += 1
+        self.again_at = now + min(RETRY_AT_LAST, RETRY_AFTER * 2 ** (self.failures - 1))
+        self.state, self.why = State.FAILED, why
+
+
+class Voices:
+    """The voices of one server."""
+
+    def __init__(self, memory: int) -> None:
+        """`memory`: bytes of neural voices that are kept loaded, beside the one that speaks."""
+        self._memory = memory
+        #: all that the engine lists; None before it has
+        self.listed: tuple[Voice, ...] | None = None
+        #: the driver that speaks; None for the usual one, before it is known
+        self.driver: str | None = None
+        #: by id, without a speaker; the one that was asked for last behind the others
+        self.neural: dict[str, Neural] = {}
+        #: the one that the engine is loading
+        self._loading: str | None = None
+
+    def fault(self, voice: str | None) -> tuple[str, str] | None:
+        """Return reason and words why a voice can't be had; None also where that is not known."""
+        if voice is None or voice == DEFAULT_VOICE:
+            return None
+        if is_neural(voice):
+            return self._neural_fault(voice)
+        if not self.listed or find_voice(voice, self.listed):
+            return None
+        return "unknown_voice", unknown_voice(voice, self.listed)
+
+    def identified(self, voice: str | None) -> str | None:
+        """Return a voice as it was asked for, a neural one by its id."""
+        found = find_voice(voice, self.listed or self._files()) if voice and is_neural(voice) else None
+        return found.id if found else voice
+
+    def look_for_files(self) -> None:
+        """Find what neural voices were put there, or taken away, since the engine listed its voices.
+
+        It takes no more than to read some directories, and only where somebody asks.
+        """
+        if self.listed and is_own(self.driver):
+            self.listed = (*(each for each in self.listed if not is_neural(each.id)), *self._files())
+
+    # -- what is loaded
+
+    def want(self, voice: str, now: float) -> State:
+        """Take note that a neural voice is asked for, and return how it is."""
+        found = self.neural.pop(voice, None) or Neural(self._size(voice))
+        self.neural[voice] = found
+        if found.state is State.FAILED and voice != self._loading and now >= found.again_at:
+            found.wanted = True
+        return found.state
+
+    @property
+    def lacking(self) -> bool:
+        """Whether one could be loaded now."""
+        return self._loading is None and any(each.wanted for each in self.neural.values())
+
+    def next(self, needed: Sequence[str]) -> tuple[str, tuple[str, ...]] | None:
+        """Return a voice to be loaded now, and those to be dropped for it; it is taken for begun with then.
+
+        `needed`: those of the goals that wait, in their order. One at a time, and none for which one would have to be
+        dropped that is needed before it: that would be loaded again, and so on.
+        """
+        if not self.lacking:
+            return None
+        before: dict[str, int] = {}
+        for voice in needed:
+            found = self.neural.get(voice)
+            if found and found.state is State.LOADED:
+                before[voice] = found.size
+            elif found and found.wanted:
+                if before and sum(before.values()) + found.size > self._memory:
+                    return None
+                drop = self._make_room(sum(before.values()) + found.size, before)
+                self._loading, found.wanted = voice, False
+                if found.state is State.WAITING:
+                    found.state = State.LOADING
+                for each in drop:
+                    self.unloaded(each, needed)
+                return voice, drop
+        return None
+
+    def loaded(self, voice: str, error: str | None, now: float) -> None:
+        """Take note of what came of loading a voice; `error`: why it can't be had."""
+        if voice == self._loading:  # one that a goal insists on is loaded by the engine itself
+            self._loading = None
+        found = self.neural.setdefault(voice, Neural(self._size(voice)))
+        found.wanted = False
+        if error is None:
+            found.state, found.why, found.failures = State.LOADED, None, 0
+        else:
+            found.fail(error, now)
+
+    def unloaded(self, voice: str, needed: Sequence[str]) -> None:
+        """Take note that a voice is loaded no more; it is to be again where it is needed."""
+        found = self.neural.pop(voice, None)
+        if found and voice in needed:
+            self.neural[voice] = Neural(found.size)
+
+    def engine_lost(self, now: float) -> None:
+        """Take note that nothing is loaded any more; a voice that was being loaded may be why."""
+        at, self._loading = self._loading, None
+        for voice, found in list(self.neural.items()):
+            if voice == at and found.failures + 1 >= DEATHS:
+                found.fail("the engine process ended while it was being loaded", now)
+            elif voice == at:
+                self.neural[voice] = Neural(found.size, failures=found.failures + 1)
+            elif found.state is not State.FAILED:
+                del self.neural[voice]
+
+    def forgive(self, voice: str) -> None:
+        """Forget what was wrong with a voice."""
+        found = self.neural.get(voice)
+        if found and found.state is State.FAILED and voice != self._loading:
+            del self.neural[voice]
+
+    def _make_room(self, size: int, keep: Collection[str]) -> tuple[str, ...]:
+        """Return what has to be dropped for so many bytes in all, the least asked for first."""
+        others = [
+            (voice, each.size)
+            for voice, each in self.neural.items()
+            if each.state is State.LOADED and voice not in keep
+        ]
+        total = size + sum(each for _, each in others)
+        drop = []
+        for voice, each in others:
+            if total > self._memory:
+                total -= each
+                drop.append(voice)
+        return tuple(drop)
+
+    @staticmethod
+    def _size(voice: str) -> int:
+        from talkcli.engine.synthesizers import models
+
+        try:
+            return os.path.getsize(models.found()[voice.removeprefix(NEURAL)])
+        except (KeyError, OSError):  # gone: the engine says so
+            return 0
+
+    def to_json(self) -> JsonObject:
+        """Return what has become of each neural voice that was asked for, as a server tells it of itself."""
+        return {voice: {"state": each.state.value, "why": each.why} for voice, each in self.neural.items()}
+
+    def _neural_fault(self, voice: str) -> tuple[str, str] | None:
+        if not is_own(self.driver):
+            words = f'"{voice[:60]}" is a voice of talk\'s own driver: leave --driver out, or choose another voice'
+            return "unknown_voice", words
+        from talkcli.engine.synthesizers.inference import INSTALL, missing
+
+        if self.listed and find_voice(voice, self.listed):
+            listed = self.listed
+        else:
+            self.look_for_files()
+            listed = self.listed or self._files()
+        if find_voice(voice, listed) is None:
+            return "unknown_voice", unknown_voice(voice, listed)
+        lacking = missing()
+        if lacking is not None:
+            return "unknown_voice", f'the voice "{voice[:60]}" needs {lacking}: {INSTALL}, into the Python that serves'
+        return None
+
+    @staticmethod
+    def _files() -> tuple[Voice, ...]:
+        from talkcli.engine.synthesizers import models
+
+        return models.voices()

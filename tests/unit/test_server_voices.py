@@ -1,0 +1,151 @@
+"""Which neural voice is loaded next, which are dropped for it, and what becomes of one that fails."""
+
+from __future__ import annotations
+
+import pytest
+
+from talkcli.server.voices import DEATHS, RETRY_AFTER, RETRY_AT_LAST, State, Voices
+
+A, B, C, D = (f"piper/{each}" for each in "abcd")
+
+
+class Asked(Voices):
+    """Voices of one megabyte each, of which two may be kept."""
+
+    def __init__(self, memory: int = 2) -> None:
+        super().__init__(memory)
+
+    @staticmethod
+    def _size(_: str) -> int:
+        return 1
+
+    def wants(self, *voices: str, now: float = 0.0) -> None:
+        for each in voices:
+            self.want(each, now)
+
+    def loads(self, *voices: str) -> None:
+        for each in voices:
+            self.wants(each)
+            assert self.next([each]) == (each, ())
+            self.loaded(each, None, 0.0)
+
+    def states(self) -> dict[str, str]:
+        return {voice: each.state.value for voice, each in self.neural.items()}
+
+
+def test_one_voice_is_loaded_at_a_time_in_the_order_of_the_goals() -> None:
+    voices = Asked()
+    voices.wants(B, A)
+    assert voices.next([A, B]) == (A, ())
+    assert voices.next([A, B]) is None
+    assert voices.states() == {B: "waiting", A: "loading"}
+    voices.loaded(A, None, 1.0)
+    assert voices.next([A, B]) == (B, ())
+    voices.loaded(B, None, 2.0)
+    assert (voices.lacking, voices.next([A, B])) == (False, None)
+    assert voices.to_json() == {each: {"state": "loaded", "why": None} for each in (B, A)}
+
+
+def test_what_nobody_needs_any_more_is_not_loaded() -> None:
+    voices = Asked()
+    voices.wants(A)
+    assert voices.next([]) is None
+    assert voices.next([A]) == (A, ())
+
+
+def test_the_one_asked_for_least_makes_room() -> None:
+    voices = Asked()
+    voices.loads(A, B)
+    voices.wants(A, C)
+    assert voices.next([C]) == (C, (B,))
+    assert voices.states() == {A: "loaded", C: "loading"}
+
+
+def test_no_voice_is_dropped_that_is_needed_before() -> None:
+    voices = Asked()
+    voices.loads(A, B)
+    voices.wants(C)
+    assert voices.next([A, B, C]) is None
+    assert voices.next([B, C]) == (C, (A,))
+
+
+def test_one_that_is_dropped_and_needed_later_is_to_be_loaded_again() -> None:
+    voices = Asked(1)
+    voices.loads(A)
+    voices.wants(B)
+    assert voices.next([B, A]) == (B, (A,))
+    voices.loaded(B, None, 0.0)
+    assert voices.states() == {B: "loaded", A: "waiting"}
+    assert voices.next([B, A]) is None
+    assert voices.next([A]) == (A, (B,))
+
+
+def test_what_is_larger_than_the_limit_is_loaded_alone() -> None:
+    voices = Asked(0)
+    voices.wants(A)
+    assert voices.next([A]) == (A, ())
+
+
+def test_one_that_fails_is_tried_again_where_it_is_asked_for_later_and_later() -> None:
+    voices = Asked()
+    now, waited = 100.0, []
+    for _ in range(14):
+        voices.wants(A, now=now)
+        assert voices.next([A]) == (A, ())
+        voices.loaded(A, "no json", now)
+        assert voices.to_json() == {A: {"state": "failed", "why": "no json"}}
+        again = voices.neural[A].again_at
+        voices.wants(A, now=again - 0.001)
+        assert voices.next([A]) is None
+        waited.append(again - now)
+        now = again
+    assert waited[:3] == pytest.approx([RETRY_AFTER, 2 * RETRY_AFTER, 4 * RETRY_AFTER])
+    assert waited[-1] == pytest.approx(RETRY_AT_LAST)
+    voices.forgive(A)
+    assert voices.want(A, now) is State.WAITING
+
+
+def test_while_it_is_tried_again_it_has_failed() -> None:
+    voices = Asked()
+    voices.wants(A)
+    voices.next([A])
+    voices.loaded(A, "no json", 0.0)
+    assert voices.want(A, RETRY_AFTER) is State.FAILED
+    assert voices.next([A]) == (A, ())
+    assert voices.want(A, 1000.0) is State.FAILED
+    assert not voices.lacking
+    voices.loaded(A, None, 1000.0)
+    assert voices.to_json() == {A: {"state": "loaded", "why": None}}
+
+
+def test_an_engine_that_is_lost_has_nothing_loaded_and_what_it_loaded_is_suspected() -> None:
+    voices = Asked()
+    voices.loads(A)
+    for death in range(1, DEATHS + 1):
+        voices.wants(B)
+        assert voices.next([B]) == (B, ())
+        voices.engine_lost(0.0)
+        assert voices.states() == {B: "waiting" if death < DEATHS else "failed"}
+    assert voices.to_json()[B] == {"state": "failed", "why": "the engine process ended while it was being loaded"}
+    voices.engine_lost(0.0)
+    assert voices.states() == {B: "failed"}, "it was not what was being loaded"
+
+
+def test_one_death_is_forgotten_once_it_is_loaded() -> None:
+    voices = Asked()
+    for _ in range(3):
+        voices.wants(A)
+        voices.next([A])
+        voices.engine_lost(0.0)
+        voices.loads(A)
+        voices.engine_lost(0.0)
+    assert voices.states() == {}
+
+
+def test_what_the_engine_loads_of_itself_is_known_and_stops_no_other() -> None:
+    voices = Asked()
+    voices.wants(A)
+    voices.next([A])
+    voices.loaded(D, None, 0.0)
+    assert voices.states() == {A: "loading", D: "loaded"}
+    assert not voices.lacking
