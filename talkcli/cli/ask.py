@@ -151,11 +151,17 @@ def _suggest_key(key: str, client: Client) -> None:
 
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     """Return what is said where no voice speaks a language, which may have been given by its name."""
+    from talkcli.engine.synthesizers.voices import is_neural
     from talkcli.terminal.text import printable
 
     codes = {_language(each): _language(each) for each in voices}
-    # "German", "English_(America)": all that speak it are listed by the first part of its code
-    names = {str(each.get("name") or "").partition(" ")[0]: _language(each).partition("-")[0] for each in voices}
+    # "German", "English_(America)": all that speak it are listed by the first part of its code. A neural voice's name
+    # is no language's.
+    names = {
+        str(each.get("name") or "").partition(" ")[0]: _language(each).partition("-")[0]
+        for each in voices
+        if not is_neural(str(each.get("id")))
+    }
     near = nearest(language, names) or nearest(language, codes)
     hint = f"did you mean '{printable({**codes, **names}[near])}'?" if near else "'talk voices' lists all"
     return f"no voice speaks '{printable(language)}': {hint}"

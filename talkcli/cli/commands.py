@@ -369,8 +369,9 @@ _ROWS = (
         about="""
         List the voices of the server's engine: id, language, name. Any of the three can be given as a voice.
 
-        Behind the voices are variants: each goes behind any of them. Neural voices come last, and go by their id alone,
-        as far as it takes to tell one from the others; where it has several speakers, one goes behind: "piper/NAME#3".
+        Behind the voices are variants: each goes behind any of them. Neural voices come last, and are given by their id
+        alone, as far as it takes to tell one from the others; where one has several speakers, a number or a name goes
+        behind: "piper/NAME#3". Where the server speaks with a neural voice, that one's language means it, too.
         """,
         runs="ask:voices",
         examples="""

@@ -19,6 +19,7 @@ import click
 from click.shell_completion import CompletionItem, ShellComplete, add_completion_class, split_arg_string
 
 from talkcli.cli.show import show
+from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.errors import TalkError
 from talkcli.protocol.events import ServerStatus, unfinished
 from talkcli.terminal.text import printable
@@ -191,10 +192,14 @@ def unfinished_keys(context: click.Context, _: click.Parameter, incomplete: str)
 
 
 def voices(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Return the languages of the engine's voices; their ids and names, once the word can't be a language."""
+    """Return the languages of the engine's voices; their ids and names, once the word can't be a language.
+
+    A neural voice is called by its id alone, which is offered with the languages: such voices are few.
+    """
     found = _ask(context, lambda client: client.voices()) or []
     for field in ("language", "id", "name"):
-        offered = {str(each.get(field) or ""): _voice_help(each, field) for each in reversed(found)}
+        fields = [("id" if is_neural(str(each.get("id"))) else field, each) for each in reversed(found)]
+        offered = {str(each.get(name) or ""): _voice_help(each, name) for name, each in fields}
         items = _items(reversed(offered.items()), incomplete)
         if items:
             return items

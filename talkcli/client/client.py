@@ -231,7 +231,11 @@ class Client:
         return list(goals(items, "goal"))
 
     def voices(self) -> list[JsonObject]:
-        """Return the voices of the server's engine: objects with id, language and name."""
+        """Return the voices of the server's engine: objects with id, language, name, quality and speakers.
+
+        The last two are a neural voice's: None, or how good its maker calls it, "medium"; and None, or what each of its
+        speakers is called, by number.
+        """
         _, items = self._connection.request(Voices())
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
 

@@ -52,7 +52,7 @@ def start(configure: Configure, session: Session) -> Ready:
     name = f"talk_{shown}" if own else shown
     made = _register_own(shown, name, session) if own else None
     engine = _init(pyttsx3, name, named=configure.driver is not None)
-    settings = Settings(engine, name)
+    settings = Settings(engine, shown)
     _start_loop(engine, name)
     try:
         settings.set_voice(configure.voice)
@@ -186,7 +186,8 @@ class Settings:
             self._voices = list_voices(self._engine)
             found = find_voice(wanted, self._voices)
         if found is None:
-            raise CannotSpeak("unknown_voice", unknown_voice(wanted, self._voices))
+            foreign = None if is_own(self._driver) else self._driver
+            raise CannotSpeak("unknown_voice", unknown_voice(wanted, self._voices, foreign))
         return found.id
 
     def _put(self, name: str, value: Any, shown: str) -> None:

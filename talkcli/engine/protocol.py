@@ -139,6 +139,10 @@ class Voice:
     id: str
     language: str | None
     name: str
+    quality: str | None = None  # of a neural one, as its maker calls it: "medium"
+    #: of a neural one that has several, what each is called, by its number; the engine process, which speaks by
+    #: pyttsx3's own list, doesn't tell them
+    speakers: tuple[str, ...] | None = None
 
 
 @frozen

@@ -223,7 +223,7 @@ class Requests:
         voices = self._speech.voices
         now, fault = self._speech.now(), call.fault or voices.fault(say.voice) or _unpitched(say)
         if not fault:
-            say = replace(say, voice=voices.identified(say.voice))
+            say = replace(say, voice=voices.meant(say.voice, self._scheduler.settings.voice))
             self._speech.want(say.voice or self._scheduler.settings.voice)
         submitted = self._scheduler.submit(say, sender, now, fault, call.by)
         record = submitted.record
@@ -345,7 +345,7 @@ class Requests:
         if fault:
             code, words = fault
             raise RequestRefused(words, code)
-        changed = given(replace(request, voice=voices.identified(request.voice)))
+        changed = given(replace(request, voice=voices.meant(request.voice)))
         self._scheduler.settings = replace(self._scheduler.settings, **changed)
         self._look()  # what preempts may have room
         self._speech.want(changed.get("voice"), anew=True)

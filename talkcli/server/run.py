@@ -190,7 +190,7 @@ class Server:
         fault = voices.fault(voice)
         if fault:
             raise UsageError(fault[1])
-        self._scheduler.settings = replace(self._scheduler.settings, voice=voices.identified(voice))
+        self._scheduler.settings = replace(self._scheduler.settings, voice=voices.meant(voice))
         return None
 
     def _look_after_socket(self) -> None:

@@ -77,18 +77,38 @@ class Voices:
 
     def fault(self, voice: str | None) -> tuple[str, str] | None:
         """Return reason and words why a voice can't be had; None also where that is not known."""
-        if voice is None or voice == DEFAULT_VOICE:
+        if voice is None or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice)):
             return None
-        if is_neural(voice):
-            return self._neural_fault(voice)
-        if not self.listed or find_voice(voice, self.listed):
-            return None
-        return "unknown_voice", unknown_voice(voice, self.listed)
+        if self._find(voice) is None:
+            return "unknown_voice", unknown_voice(voice, self.listed or (), self._foreign)
+        lacking = self._lacking() if is_neural(voice) else None
+        return ("unknown_voice", f"the voice {voice[:60]} cannot be spoken: {lacking}") if lacking else None
 
-    def identified(self, voice: str | None) -> str | None:
-        """Return a voice as it was asked for, a neural one by its id."""
-        found = find_voice(voice, self.listed or self._files()) if voice and is_neural(voice) else None
-        return found.id if found else voice
+    def meant(self, voice: str | None, usual: str | None = None) -> str | None:
+        """Return a voice as it was asked for, a neural one by its id; `usual`: the one that the server speaks with."""
+        if not voice or voice == DEFAULT_VOICE or not (is_neural(voice) or is_neural(usual or "")):
+            return voice
+        found = find_voice(voice, self.listed or self._files(), usual)
+        return found.id if found and is_neural(found.id) else voice
+
+    def _find(self, voice: str) -> Voice | None:
+        """Return a voice that there is; a neural one may have been put there just now."""
+        found = find_voice(voice, self.listed or ())
+        if found is None and is_neural(voice) and self._foreign is None:
+            self.look_for_files()
+            found = find_voice(voice, self.listed or self._files())
+        return found
+
+    @property
+    def _foreign(self) -> str | None:
+        """The driver, where it is none of `talk`'s own; on another system than Linux all are."""
+        return None if is_own(self.driver) else self.driver or "the system's own"
+
+    @staticmethod
+    def _lacking() -> str | None:
+        from talkcli.engine.synthesizers import models
+
+        return models.missing()
 
     def look_for_files(self) -> None:
         """Find what neural voices were put there, or taken away, since the engine listed its voices.
@@ -199,24 +219,6 @@ class Voices:
     def to_json(self) -> JsonObject:
         """Return what has become of each neural voice that was asked for, as a server tells it of itself."""
         return {voice: {"state": each.state.value, "why": each.why} for voice, each in self.neural.items()}
-
-    def _neural_fault(self, voice: str) -> tuple[str, str] | None:
-        if not is_own(self.driver):
-            words = f'"{voice[:60]}" is a voice of talk\'s own driver: leave --driver out, or choose another voice'
-            return "unknown_voice", words
-        from talkcli.engine.synthesizers.inference import INSTALL, missing
-
-        if self.listed and find_voice(voice, self.listed):
-            listed = self.listed
-        else:
-            self.look_for_files()
-            listed = self.listed or self._files()
-        if find_voice(voice, listed) is None:
-            return "unknown_voice", unknown_voice(voice, listed)
-        lacking = missing()
-        if lacking is not None:
-            return "unknown_voice", f'the voice "{voice[:60]}" needs {lacking}: {INSTALL}, into the Python that serves'
-        return None
 
     @staticmethod
     def _files() -> tuple[Voice, ...]:

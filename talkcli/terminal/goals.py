@@ -26,6 +26,8 @@ MAX_TEXT = 200
 _LABEL = 9
 #: Characters of a command line that are shown.
 MAX_COMMAND = 60
+#: Characters of a voice's name and of its language: of neural ones they stand in a stranger's file.
+_MAX_VOICE = 80
 #: Stands for the text of a goal that ended long ago.
 NOT_KEPT = "(text no longer kept)"
 
@@ -127,8 +129,9 @@ def setting_lines(settings: Mapping[str, object]) -> list[str]:
 
 
 def voice_lines(voices: list[JsonObject]) -> list[str]:
-    """Return the voices in columns: id, language, name."""
-    rows = [[printable(str(each.get(name) or "-")) for name in ("id", "language", "name")] for each in voices]
+    """Return the voices in columns: id, language, name, of which what is very long is cut."""
+    limits = {"id": None, "language": _MAX_VOICE, "name": _MAX_VOICE}
+    rows = [[printable(str(each.get(name) or "-"), limit) for name, limit in limits.items()] for each in voices]
     widths = [max((width(row[place]) for row in rows), default=0) for place in (0, 1)]
     return [GAP.join((pad(row[0], widths[0]), pad(row[1], widths[1]), row[2])) for row in rows]
 

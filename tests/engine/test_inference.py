@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.synthesizers.cache import Cache
-from talkcli.engine.synthesizers.inference import AROUND, NEEDED, Model, Run
-from talkcli.engine.synthesizers.models import BadFile, describe
+from talkcli.engine.synthesizers.inference import AROUND, Model, Run
+from talkcli.engine.synthesizers.models import NEEDED, BadFile, describe
 from tests.support import tiny_voice
 from tests.support.real_voice import real_voice, silence_noise
 from tests.support.surroundings import needs_packages

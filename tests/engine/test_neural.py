@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.synthesizers.inference import INSTALL, NEEDED
+from talkcli.engine.synthesizers.models import INSTALL, NEEDED
 from tests.engine.spawned import SOON, Spawned
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_VOICE, real_voice

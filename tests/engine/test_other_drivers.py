@@ -138,6 +138,16 @@ def test_an_unknown_voice_of_another_driver_fails() -> None:
         assert "'dummy.voice2'" in ended.message
 
 
+def test_a_neural_voice_of_another_driver_is_refused_as_one() -> None:
+    words = '"piper/en_US-joe-medium" is a neural voice, and the driver "dummy" has none: leave --driver out'
+    failed = _start_failure("dummy", "piper/en_US-joe-medium")
+    assert (failed.message, failed.reason, failed.usage) == (words, "unknown_voice", True)
+    with Spawned(driver="dummy") as engine:
+        engine.until(protocol.Ready)
+        ended = engine.spoken("yes", voice="piper/en_US-joe-medium")
+        assert (ended.reason, ended.message) == ("unknown_voice", words)
+
+
 def test_a_driver_that_speaks_by_itself_is_stepped_to_its_end() -> None:
     with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
         engine.until(protocol.Ready)

@@ -21,7 +21,7 @@ from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.base import Sound, UnknownVoice
 from talkcli.engine.synthesizers.choice import Choice
 from talkcli.engine.synthesizers.espeak import Espeak
-from talkcli.engine.synthesizers.inference import NEEDED
+from talkcli.engine.synthesizers.models import NEEDED
 from talkcli.engine.synthesizers.phonemes import pieces
 from talkcli.engine.synthesizers.piper import Piper
 from tests.support import tiny_voice

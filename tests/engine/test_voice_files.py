@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import errno
+import grp
 import json
 import os
+import pwd
 import stat
+import struct
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import cache as caches
+from talkcli.engine.synthesizers import models
 from talkcli.engine.synthesizers.cache import Cache
 from talkcli.engine.synthesizers.models import BadFile, describe, found, open_checked, voices
 from talkcli.paths import cache_directory, voice_directories
 from tests.support import tiny_voice
 
 SYS_PATH = list(sys.path)
+
+
+def beside(path: Path) -> Path:
+    """Return the JSON of a model."""
+    return path.parent / f"{path.name}.json"
 
 
 @pytest.fixture
@@ -74,7 +86,7 @@ def test_a_voice_is_found_in_any_of_its_places_and_the_first_has_it(
 
 def test_only_models_that_can_be_named_are_voices(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TALK_VOICES", str(home / "v"))
-    for name in (".hidden", "a#b", "good"):
+    for name in (".hidden", "a#b", "good", "a\nb", "\x1b[31mred", "\u202eleft", "ni\udcffce"):
         tiny_voice.put(home / "v", name)
     (home / "v" / ".onnx").touch()
     (home / "v" / "notes.txt").touch()
@@ -85,22 +97,143 @@ def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path, monkey
     monkeypatch.setenv("TALK_VOICES", str(home / "v"))
     tiny_voice.put(home / "v", "a", beside=tiny_voice.description(speakers=3, language="de_DE"))
     (home / "v" / "b.onnx").touch()
-    assert [(each.id, each.language, each.name) for each in voices()] == [
-        ("piper/a", "de-de", "tiny, low, 3 speakers"),
-        ("piper/b", None, "b"),
+    tiny_voice.put(home / "v", "c")
+    assert [*voices()] == [
+        Voice("piper/a", "de-de", "tiny, low, 3 speakers", "low", ("p0", "p1", "p2")),
+        Voice("piper/b", None, "b"),
+        Voice("piper/c", "en-us", "tiny, low", "low"),
     ]
 
 
-@pytest.mark.parametrize("mode", [0o666, 0o664])
-@pytest.mark.parametrize("what", ["model", "directory", "above"])
-def test_what_others_may_write_is_refused(home: Path, mode: int, what: str) -> None:
+def test_a_speaker_goes_by_its_number_where_its_name_cannot_be_typed(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TALK_VOICES", str(home / "v"))
+    names = {"amused": 0, "\x1b[31m": 1, "x" * 65: 2, "": 3, "calm": 5, "beyond": 6}
+    tiny_voice.put(home / "v", "a", beside=tiny_voice.description(num_speakers=6, speaker_id_map=names))
+    (voice,) = voices()
+    assert voice.speakers == ("amused", "1", "2", "3", "4", "calm")
+
+
+def test_what_is_very_long_in_a_json_is_cut_in_the_list(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TALK_VOICES", str(home / "v"))
+    told = tiny_voice.description(language="l" * 1000, dataset="d" * 1000)
+    told["audio"] = {"sample_rate": 8000, "quality": "q" * 1000}
+    tiny_voice.put(home / "v", "a", beside=told)
+    (voice,) = voices()
+    assert voice.name == f"{'d' * 40}…, {'q' * 40}…"
+    assert (voice.language, voice.quality) == (f"{'l' * 40}…", f"{'q' * 40}…")
+
+
+@pytest.mark.parametrize("what", ["model", "json", "directory", "above"])
+def test_what_everybody_may_write_is_refused(home: Path, what: str) -> None:
     path = tiny_voice.put(home / "up" / "v", "a")
-    wrong = {"model": path, "directory": path.parent, "above": path.parent.parent}[what]
-    wrong.chmod(mode if what == "model" else mode | 0o111)
-    with pytest.raises(BadFile, match=f"{wrong} can be written by others, .*: chmod go-w {wrong}"):
-        open_checked(str(path))
+    places = {"model": path, "json": beside(path), "directory": path.parent, "above": path.parent.parent}
+    wrong = places[what]
+    wrong.chmod(0o646 if what in {"model", "json"} else 0o757)
+    with pytest.raises(BadFile, match=f"^{wrong} can be written by others, .*: chmod go-w {wrong}$"):
+        open_checked(str(beside(path)), model=str(path))
     wrong.chmod(0o755)
+    open_checked(str(beside(path)), model=str(path)).close()
+
+
+def test_all_that_others_may_write_is_named_with_one_command_that_mends_it(home: Path) -> None:
+    path = tiny_voice.put(home / "up" / "my voices", "a")
+    wrong = [beside(path), path.parent, path]
+    for each in wrong:
+        each.chmod(0o777)
+    with pytest.raises(BadFile) as caught:
+        describe(str(path))
+    names, _, command = str(caught.value).partition(" can be written by others, who could change the voice: ")
+    assert names == f"{wrong[0]}, {wrong[1]} and {wrong[2]}"
+    subprocess.run(["/bin/sh", "-c", command], check=True)
+    assert describe(str(path)).rate == 22050
+
+
+#: A group that nobody has, and so a user's own that could be any.
+SHARED = 47110815
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file to any group")
+def test_what_a_group_may_write_is_refused(home: Path) -> None:
+    path = tiny_voice.put(home / "v", "a")
+    path.chmod(0o664)
+    os.chown(path, -1, SHARED)
+    with pytest.raises(BadFile, match=f"{path} can be written by others"):
+        open_checked(str(path))
+    path.chmod(0o644)
     open_checked(str(path)).close()
+
+
+ME = os.geteuid()
+
+
+@pytest.mark.parametrize(
+    ("user", "group", "others", "safe"),
+    [
+        (("anna", SHARED), ("anna", []), [], True),
+        (("anna", SHARED), ("anna", ["anna"]), [("carl", SHARED + 1)], True),
+        (("anna", SHARED), ("anna", ["bert"]), [], False),
+        (("anna", SHARED), ("users", []), [], False),
+        (("anna", SHARED), ("anna", []), [("bert", SHARED)], False),
+        (("anna", SHARED + 1), ("anna", []), [], False),
+        (("anna", SHARED), None, [], False),
+        (None, ("anna", []), [], False),
+    ],
+    ids=["own", "its member", "another member", "another name", "another's own", "not its own", "unknown", "nobody's"],
+)
+@pytest.mark.skipif(ME != 0, reason="only root may give a file to any group")
+def test_what_only_the_user_s_own_group_may_write_is_the_user_s(
+    home: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    user: tuple[str, int] | None,
+    group: tuple[str, list[str]] | None,
+    others: list[tuple[str, int]],
+    safe: bool,
+) -> None:
+    path = tiny_voice.put(home / "v", "a")
+    for each in (path, path.parent):
+        each.chmod(0o775)
+        os.chown(each, -1, SHARED)
+    users = [] if user is None else [SimpleNamespace(pw_name=user[0], pw_uid=ME, pw_gid=user[1])]
+    users += [SimpleNamespace(pw_name=name, pw_uid=ME + 7, pw_gid=gid) for name, gid in others]
+    groups = [] if group is None else [SimpleNamespace(gr_name=group[0], gr_gid=SHARED, gr_mem=group[1])]
+
+    def of(found: list[SimpleNamespace], field: str, number: int) -> SimpleNamespace:
+        result = next((each for each in found if getattr(each, field) == number), None)
+        if result is None:
+            raise KeyError(number)
+        return result
+
+    monkeypatch.setattr(pwd, "getpwuid", lambda uid: of(users, "pw_uid", uid))
+    monkeypatch.setattr(pwd, "getpwall", lambda: users)
+    monkeypatch.setattr(grp, "getgrgid", lambda gid: of(groups, "gr_gid", gid))
+    if safe:
+        open_checked(str(path)).close()
+    else:
+        with pytest.raises(BadFile, match=f"{path} and {path.parent} can be written by others"):
+            open_checked(str(path))
+
+
+@pytest.mark.skipif(not hasattr(os, "setxattr"), reason="access control lists are asked for on Linux alone")
+def test_a_list_of_others_who_may_write_is_seen_behind_the_user_s_own_group(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tiny_voice.put(home / "v", "a")
+    path.chmod(0o664)
+    monkeypatch.setattr(models, "_is_alone", lambda _user, _group: True)
+    open_checked(str(path)).close()
+    # version 2; the owner, user 4711, the group, the mask, others: read and write but for the last
+    entries = [(1, 6, 0xFFFFFFFF), (2, 6, 4711), (4, 6, 0xFFFFFFFF), (16, 6, 0xFFFFFFFF), (32, 4, 0xFFFFFFFF)]
+    raw = struct.pack("<I", 2) + b"".join(struct.pack("<HHI", *each) for each in entries)
+    try:
+        os.setxattr(path, "system.posix_acl_access", raw)
+    except OSError as error:
+        if error.errno != errno.ENOTSUP:
+            raise
+        pytest.skip("this file system has no access control lists")
+    with pytest.raises(BadFile, match=f"{path} can be written by others"):
+        open_checked(str(path))
 
 
 def test_a_directory_that_is_everybodys_may_be_above_if_it_is_sticky_but_not_hold_the_voice(home: Path) -> None:

@@ -162,6 +162,49 @@ def test_a_neural_voice_goes_by_its_id_and_a_language_is_espeaks(wanted: str, ex
 
 
 @pytest.mark.parametrize(
+    ("wanted", "preferred", "expected"),
+    [
+        ("en-us", "piper/en", "piper/en_US-joe-medium"),
+        ("EN-us", "Piper/EN_us-joe#2", "piper/en_US-joe-medium#2"),
+        ("en", "piper/en", "piper/en_US-joe-medium"),
+        ("de", "piper/de_DE-eva", "piper/de_DE-eva"),
+        ("de-de", "piper/de_DE-eva", "piper/de_DE-eva"),
+        ("de-de", None, None),
+        ("en-gb", "piper/en", "gmw/en"),
+        ("en-us+f3", "piper/en", "gmw/en-US+f3"),
+        ("English (America)", "piper/en", "gmw/en-US"),
+        ("gmw/en-US", "piper/en", "gmw/en-US"),
+        ("gmw/en", "piper/en", "gmw/en"),
+        ("fr", "piper/en", "roa/fr"),
+        ("e", "piper/en", None),
+        ("en-us", "piper/none", "gmw/en-US"),
+        ("en-us", "piper/de", "gmw/en-US"),
+        ("en-us", "de", "gmw/en-US"),
+        ("piper/de_DE-eva-low", "piper/en", "piper/de_DE-eva-low"),
+    ],
+)
+def test_the_language_of_the_neural_voice_that_a_server_speaks_with_means_that_one(
+    wanted: str, preferred: str | None, expected: str | None
+) -> None:
+    found = find_voice(wanted, (*listed(), *NEURAL), preferred)
+    assert (found.id if found else None) == expected
+
+
+def test_a_voice_without_a_language_is_no_languages() -> None:
+    voices = (*listed(), Voice("piper/broken", None, "broken"))
+    assert find_voice("", voices, "piper/broken") is None
+
+
+def test_of_another_driver_and_another_system_no_neural_voice_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = unknown_voice("piper/en", (*listed(), *NEURAL), "dummy")
+    assert told == '"piper/en" is a neural voice, and the driver "dummy" has none: leave --driver out'
+    monkeypatch.setattr(sys, "platform", "darwin")
+    told = unknown_voice("piper/en", (), "nsss")
+    assert told == '"piper/en" is a neural voice, which only talk on Linux has: choose one that "talk voices" lists'
+    assert "unknown voice" in unknown_voice("anna", (), "nsss")
+
+
+@pytest.mark.parametrize(
     ("wanted", "words"),
     [
         ("piper/de", "2 begin so, as piper/de_DE-eva-low and piper/de_DE-eva"),

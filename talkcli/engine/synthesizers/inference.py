@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from talkcli.engine.synthesizers.cache import Cache
     from talkcli.engine.synthesizers.models import Description
 
-#: What has to be installed, and how.
-NEEDED = ("onnxruntime", "numpy")
-INSTALL = "pip install 'talkcli[neural]'"
 #: Frames on either side of some that their samples depend on. Reckoned for the largest of Piper's decoders ("high"),
 #: 13.4; of a "medium" one the samples with 10 are those of the whole to a part in 400,000.
 AROUND = 14
@@ -36,13 +33,6 @@ _SHOWN = 200
 _CUT = 1
 #: Names of the model's inputs; the last only where there are several speakers.
 _INPUTS, _SPEAKER = ("input", "input_lengths", "scales"), "sid"
-
-
-def missing() -> str | None:
-    """Return the name of a package that is needed and not installed; nothing is imported."""
-    from importlib.util import find_spec
-
-    return next((each for each in NEEDED if find_spec(each) is None), None)
 
 
 @frozen

@@ -15,8 +15,8 @@ from collections import deque
 from talkcli.engine.protocol import LOAD_LIMIT, Loaded, Unloaded
 from talkcli.engine.synthesizers import models
 from talkcli.engine.synthesizers.cache import Cache
-from talkcli.engine.synthesizers.inference import INSTALL, Model, missing
-from talkcli.engine.synthesizers.models import BadFile
+from talkcli.engine.synthesizers.inference import Model
+from talkcli.engine.synthesizers.models import INSTALL, BadFile
 from talkcli.engine.synthesizers.voices import NEURAL
 from talkcli.engine.synthesizers.work import Work
 from talkcli.frozen import TYPE_CHECKING, frozen
@@ -147,9 +147,9 @@ class Loader:
 
 def _path(voice: str) -> str:
     """Return the path of a voice's model; BadFile."""
-    lacking = missing()
+    lacking = models.missing()
     if lacking is not None:
-        raise BadFile(f"{lacking} is missing: {INSTALL}, into the Python that serves")
+        raise BadFile(lacking)
     path = models.found().get(voice.removeprefix(NEURAL))
     if path is None:
         raise BadFile(f"{voice}: its file is not there any more")

@@ -7,8 +7,10 @@ have any file read. No model is run here, and nothing is kept: what is put there
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shlex
 import stat
 import sys
 
@@ -21,11 +23,19 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
+#: What has to be installed besides, and how.
+NEEDED = ("onnxruntime", "numpy")
+INSTALL = "pip install 'talkcli[neural]'"
+
 _MODEL, JSON = ".onnx", ".json"
 #: How packages with voices are called, and where in one they may be.
 _PACKAGE, _IN_PACKAGE = "_piper_voice", ("", "data")
 #: Bytes of the JSON beside a model: one with a thousand speakers has 30,000.
 _LONGEST_JSON = 1 << 20
+#: Speakers of one model: the largest of Piper's has 904.
+_MOST_SPEAKERS = 4096
+#: Characters of what a JSON calls something that are shown, and the longest name that a speaker is called by.
+_SHOWN, _LONGEST_NAME = 40, 64
 #: Samples per second that a player can be asked for.
 _RATES = range(4000, 192001)
 #: What a model takes between two sounds, before the first and behind the last, by its names in `phoneme_id_map`.
@@ -42,8 +52,11 @@ class Description:
 
     rate: int  # samples per second
     speller: str  # libespeak-ng's voice that knows the sounds
-    language: str | None  # as libespeak-ng writes it: "en-us"
-    name: str  # for people: "joe, medium"
+    #: what the voice's maker calls it, written as libespeak-ng writes languages: "en-us". Libespeak-ng may know the
+    #: language by another code, as "cmn" for "zh-cn": what it has of the same language is `speller`.
+    language: str
+    name: str  # for people: "joe, medium", "thorsten, medium, 8 speakers"
+    quality: str | None  # "medium"
     speakers: int
     speaker_names: Mapping[str, int]
     sounds: Mapping[str, tuple[int, ...]]  # the model's numbers for each character of IPA
@@ -52,8 +65,19 @@ class Description:
     pace: float  # what durations are multiplied with, for the voice's own pace
 
 
+def missing() -> str | None:
+    """Return what is to be said where a package that is needed is not installed; nothing is imported."""
+    from importlib.util import find_spec
+
+    lacking = next((each for each in NEEDED if find_spec(each) is None), None)
+    return None if lacking is None else f"{lacking} is missing: {INSTALL}, into the Python that serves"
+
+
 def found() -> dict[str, str]:
-    """Return the models that there are: the path of each by its name, the first directory's where two have it."""
+    """Return the models that there are: the path of each by its name, the first directory's where two have it.
+
+    None whose name has what nobody can type, or what a terminal would obey.
+    """
     result: dict[str, str] = {}
     for place in _places():
         try:
@@ -62,7 +86,7 @@ def found() -> dict[str, str]:
             continue
         for each in names:
             name = each.removesuffix(_MODEL)
-            if name != each and name and not name.startswith(".") and SPEAKER not in name:
+            if name != each and name and not name.startswith(".") and SPEAKER not in name and name.isprintable():
                 result.setdefault(name, os.path.join(place, each))
     return result
 
@@ -75,7 +99,7 @@ def voices() -> tuple[Voice, ...]:
 def describe(path: str) -> Description:
     """Read what stands beside a model; BadFile."""
     beside = path + JSON
-    with open_checked(beside, missing="it belongs to the model: get it from where that came from") as file:
+    with open_checked(beside, missing="it belongs to the model: get it from where that came from", model=path) as file:
         try:
             raw = file.read(_LONGEST_JSON + 1)
         except OSError as error:
@@ -89,10 +113,13 @@ def describe(path: str) -> Description:
         raise BadFile(f"{beside} does not describe a voice of Piper's ({why[:200]}): get it anew") from error
 
 
-def open_checked(path: str, missing: str = "put it there again") -> Any:
-    """Open a file to read its bytes, if nobody but root and this user can have written it; BadFile."""
+def open_checked(path: str, missing: str = "put it there again", model: str | None = None) -> Any:
+    """Open a file to read its bytes, if nobody but root and this user can have written it; BadFile.
+
+    `model`: the one that it belongs to, so that what is to be changed of both is said at once.
+    """
     try:
-        _check_way(path)
+        _look_at(path, *([] if model is None else [model]))
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as error:
         raise BadFile(f"{path} is not there: {missing}") from error
@@ -102,34 +129,80 @@ def open_checked(path: str, missing: str = "put it there again") -> Any:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise BadFile(f"{path} is no file: put the voice's there")
-        _check(path, status)
+        if _is_others(path, status, descriptor):
+            raise _writable(path)
         return open(descriptor, "rb", closefd=True)
     except BaseException:
         os.close(descriptor)
         raise
 
 
-def _check_way(path: str) -> None:
-    """Look at the directories on the way to a file, and where it is a link, on the way to what that points to.
+def _look_at(*paths: str) -> None:
+    """Look at files, and the directories on the way to each, and to what it points to where it is a link; BadFile.
 
     Above the file's own a directory may be everybody's that has the sticky bit, as /tmp has: what is in it can be
     replaced by nobody but its owner.
     """
-    for each in {os.path.abspath(path), os.path.realpath(path)}:
-        directory = os.path.dirname(each)
-        _check(directory, os.stat(directory))
-        while (parent := os.path.dirname(directory)) != directory:
-            directory = parent
-            _check(directory, os.stat(directory), sticky=True)
+    ways: dict[str, bool] = {}  # whether it may be everybody's so
+    for path in paths:
+        for each in (os.path.abspath(path), os.path.realpath(path)):
+            ways[each] = ways[os.path.dirname(each)] = False
+            directory = os.path.dirname(each)
+            while (parent := os.path.dirname(directory)) != directory:
+                directory = parent
+                ways.setdefault(directory, True)
+    wrong = []
+    for each, may_be_sticky in ways.items():
+        try:
+            status = os.stat(each)
+        except FileNotFoundError:  # whoever opens it says so
+            continue
+        if _is_others(each, status, each) and not (may_be_sticky and status.st_mode & stat.S_ISVTX):
+            wrong.append(each)
+    if wrong:
+        raise _writable(*wrong)
 
 
-def _check(path: str, status: os.stat_result, *, sticky: bool = False) -> None:
+def _is_others(path: str, status: os.stat_result, file: str | int) -> bool:
+    """Tell whether others than root and this user may write a file, which is called `path`; BadFile if it is theirs."""
     if status.st_uid not in {0, os.geteuid()}:
         words = f"{path} is another user's (#{status.st_uid}), who could change the voice"
         raise BadFile(f"{words}: put it into a directory of your own")
-    writable = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    if writable and not (sticky and status.st_mode & stat.S_ISVTX):
-        raise BadFile(f"{path} can be written by others, who could change the voice: chmod go-w {path}")
+    if status.st_mode & stat.S_IWOTH:
+        return True
+    if not status.st_mode & stat.S_IWGRP:
+        return False
+    return _has_list(file) or not any(_is_alone(each, status.st_gid) for each in {0, os.geteuid()})
+
+
+def _has_list(file: str | int) -> bool:
+    """Tell whether there is an access control list: the group's bits are the most then that anybody of it may do."""
+    try:
+        return hasattr(os, "listxattr") and "system.posix_acl_access" in os.listxattr(file)
+    except OSError as error:
+        return error.errno != errno.ENOTSUP
+
+
+def _is_alone(user: int, group: int) -> bool:
+    """Tell whether a user is alone in a group: in the one that Debian, Ubuntu and Fedora give each, by its name."""
+    import grp
+    import pwd
+
+    try:
+        itself, whole = pwd.getpwuid(user), grp.getgrgid(group)
+    except KeyError:
+        return False
+    if itself.pw_gid != group or whole.gr_name != itself.pw_name or {*whole.gr_mem} - {itself.pw_name}:
+        return False
+    return all(each.pw_uid == user for each in pwd.getpwall() if each.pw_gid == group)
+
+
+def _writable(*paths: str) -> BadFile:
+    """Return the refusal of what others may write, with the one command that mends all of it."""
+    names = f"{', '.join(paths[:-1])} and {paths[-1]}" if len(paths) > 1 else paths[0]
+    roots = os.geteuid() != 0 and any(os.stat(each).st_uid == 0 for each in paths)
+    command = f"{'sudo ' if roots else ''}chmod go-w {shlex.join(paths)}"
+    return BadFile(f"{names} can be written by others, who could change the voice: {command}")
 
 
 def _places() -> Iterator[str]:
@@ -148,7 +221,13 @@ def _voice(name: str, path: str) -> Voice:
         found = describe(path)
     except BadFile:
         return Voice(NEURAL + name, None, name)
-    return Voice(NEURAL + name, found.language, found.name)
+    names = {number: each for each, number in found.speaker_names.items()}
+    speakers = [names.get(number, "") for number in range(found.speakers if found.speakers > 1 else 0)]
+    called = (
+        each if each.isprintable() and 0 < len(each) <= _LONGEST_NAME else str(number)
+        for number, each in enumerate(speakers)
+    )
+    return Voice(NEURAL + name, found.language, found.name, found.quality, tuple(called) or None)
 
 
 def _described(found: Any) -> Description:
@@ -164,15 +243,18 @@ def _described(found: Any) -> Description:
         raise ValueError(f"{rate} samples a second")
     inference = found.get("inference", {})
     names = found.get("speaker_id_map") or {}
-    parts = [found.get("dataset"), found["audio"].get("quality")]
+    quality = _cut(found["audio"].get("quality") or "")
     speakers = _number(found.get("num_speakers", 1))
-    shown = [str(each) for each in parts if each] + ([f"{speakers} speakers"] if speakers > 1 else [])
+    if speakers > _MOST_SPEAKERS:
+        raise ValueError(f"{speakers} speakers")
+    parts = [_cut(found.get("dataset") or ""), quality, f"{speakers} speakers" if speakers > 1 else ""]
     code = found.get("language", {}).get("code") or found["espeak"]["voice"]
     return Description(
         rate=rate,
         speller=str(found["espeak"]["voice"]),
-        language=str(code).replace("_", "-").lower(),
-        name=", ".join(shown) or "Piper",
+        language=_cut(code).replace("_", "-").lower(),
+        name=", ".join(filter(None, parts)) or "Piper",
+        quality=quality or None,
         speakers=speakers,
         speaker_names={str(key): _number(value) for key, value in names.items()},
         sounds=sounds,
@@ -180,6 +262,12 @@ def _described(found: Any) -> Description:
         noise_of_durations=_factor(inference.get("noise_w", 0.8)),
         pace=_factor(inference.get("length_scale", 1.0), least=0.1),
     )
+
+
+def _cut(value: object) -> str:
+    """Return what something is called, in a length that can be shown."""
+    words = str(value)
+    return words if len(words) <= _SHOWN else f"{words[:_SHOWN]}…"
 
 
 def _number(value: object) -> int:

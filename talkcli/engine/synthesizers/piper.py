@@ -12,7 +12,7 @@ import queue
 from talkcli.engine.players.base import SAMPLE, CannotSpeak
 from talkcli.engine.synthesizers import models
 from talkcli.engine.synthesizers.base import UnknownVoice
-from talkcli.engine.synthesizers.inference import INSTALL, Run, missing
+from talkcli.engine.synthesizers.inference import Run
 from talkcli.engine.synthesizers.loader import Loader
 from talkcli.engine.synthesizers.models import BEGIN, END, PAD, BadFile
 from talkcli.engine.synthesizers.phonemes import pieces
@@ -100,9 +100,9 @@ class Piper:
 
         What is wrong with its files is said by `speak`, too, so that a goal says it, each time anew.
         """
-        lacking = missing()
+        lacking = models.missing()
         if lacking is not None:
-            raise UnknownVoice(f"{lacking} is missing: {INSTALL}, into the Python that serves")
+            raise UnknownVoice(lacking)
         model, _, speaker = voice.partition(SPEAKER)
         path = models.found().get(model.removeprefix(NEURAL)) if voice.startswith(NEURAL) else None
         if path is None:

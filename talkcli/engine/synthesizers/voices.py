@@ -5,10 +5,13 @@ that it doesn't know without a word, and copies any into 40 bytes. So what it is
 its own lists, found here. This module asks the driver and sets nothing.
 
 A neural voice is called by its id alone, so that a language means one of espeak's: "piper/NAME", NAME as far as it
-takes to tell one from the others, and the speaker behind it where it has several: "piper/NAME#3".
+takes to tell one from the others, and the speaker behind it where it has several: "piper/NAME#3". Only where a server
+speaks with a neural voice, that one's language means it, too.
 """
 
 from __future__ import annotations
+
+import sys
 
 from talkcli.engine.protocol import Voice
 
@@ -43,13 +46,20 @@ def list_voices(engine: Any) -> tuple[Voice, ...]:
     return tuple(_voice(each) for each in engine.getProperty("voices") or ())
 
 
-def find_voice(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
+def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
     """Return the voice with this id, last part of an id, name or language, in this order; case does not count.
 
-    Each may have a variant of espeak's behind it, "en-us+f3"; the id of what is returned has it, too.
+    Each may have a variant of espeak's behind it, "en-us+f3"; the id of what is returned has it, too. `preferred`: the
+    voice that a server speaks with, as its user wrote it. Where that is a neural one, its language comes first: of one
+    of en-us "en-us" and, as `talk voices --language` has it, "en"; espeak's are called by their ids then, or by names.
     """
     if is_neural(wanted):
         return _neural(wanted, voices)
+    if preferred is not None and is_neural(preferred):
+        own = _neural(preferred, voices)
+        language = (own.language or "").casefold() if own is not None else ""
+        if language and wanted.casefold() in {language, language.partition("-")[0]}:
+            return own
     plain, variants = _parted(voices)
     found = _named(wanted, plain)
     if found is not None or not variants:
@@ -83,13 +93,16 @@ def _neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
     return Voice(found[0].id + mark + speaker, found[0].language, found[0].name)
 
 
-def unknown_voice(wanted: str, voices: tuple[Voice, ...]) -> str:
-    """Return the message for a voice that is not there: what comes near, and the next step."""
+def unknown_voice(wanted: str, voices: tuple[Voice, ...], foreign: str | None = None) -> str:
+    """Return the message for a voice that is not there: what comes near, and the next step.
+
+    `foreign`: the driver's name, where it is none of `talk`'s own.
+    """
+    shown = wanted if len(wanted) <= _SHOWN else f"{wanted[:_SHOWN]}…"
     if is_neural(wanted):
-        return _unknown_neural(wanted, voices)
+        return _unknown_neural(wanted, shown, voices) if foreign is None else _not_neural(shown, foreign)
     plain, variants = _parted(voices)
     name, plus, suffix = wanted.partition(VARIANT)
-    shown = wanted if len(wanted) <= _SHOWN else f"{wanted[:_SHOWN]}…"
     if plus and variants and (not name or _named(name, plain)):
         words = {each.id.removeprefix(VARIANT): each for each in variants}
         near = [f"{name}{VARIANT}{each}" for each in _near(suffix, words)]
@@ -104,12 +117,17 @@ def unknown_voice(wanted: str, voices: tuple[Voice, ...]) -> str:
     return f'unknown voice "{shown}": {hint}"talk voices" lists them'
 
 
-def _unknown_neural(wanted: str, voices: tuple[Voice, ...]) -> str:
+def _not_neural(shown: str, driver: str) -> str:
+    if sys.platform.startswith("linux"):
+        return f'"{shown}" is a neural voice, and the driver "{driver}" has none: leave --driver out'
+    return f'"{shown}" is a neural voice, which only talk on Linux has: choose one that "talk voices" lists'
+
+
+def _unknown_neural(wanted: str, shown: str, voices: tuple[Voice, ...]) -> str:
     words = {each.id: each for each in voices if is_neural(each.id)}
     name = wanted.partition(SPEAKER)[0]
     begun = [each for each in words if each.casefold().startswith(name.casefold())]
     near = begun[:_NEAR] or _near(name, words)
-    shown = wanted if len(wanted) <= _SHOWN else f"{wanted[:_SHOWN]}…"
     if len(begun) > 1:
         return f'unknown voice "{shown}": {len(begun)} begin so, as {" and ".join(begun[:_NEAR])}'
     hint = f"did you mean {' or '.join(repr(word) for word in near)}?" if near else _GET_NEURAL
