@@ -285,6 +285,7 @@ def test_what_is_no_file_is_refused_and_not_waited_for(home: Path) -> None:
         ({"phoneme_id_map": {"_": [0], "^": [-1], "$": [2]}}, "-1 is no number"),
         ({"audio": {"sample_rate": 0}}, "0 samples a second"),
         ({"audio": {"sample_rate": "22050"}}, "is no number"),
+        ({"num_speakers": 1 << 20}, "1048576 speakers"),
         ({"inference": {"noise_scale": float("nan")}}, "nan is no factor"),
         ({"inference": {"length_scale": 1e9}}, "is no factor"),
     ],
