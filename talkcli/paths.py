@@ -121,7 +121,7 @@ def cache_directory() -> str:
     """Return where what can be made again is kept; it need not be there. Platformdirs' place, but for systemd's."""
     given = os.environ.get("CACHE_DIRECTORY")
     if given:
-        return given.split(":")[0]
+        return os.path.realpath(given.split(":")[0])  # a link, for a service with a user of its own (DynamicUser=)
     return os.path.join(_own(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
 
 

@@ -103,6 +103,9 @@ DynamicUser=yes
 Group={group}
 # Without this line where there is a talk.socket: the directory would go with the service, and the socket with it.
 RuntimeDirectory=talk
+# What is kept of neural voices, so that they are loaded faster.
+CacheDirectory=talk
+CacheDirectoryMode=0700
 UMask=0077
 
 # It needs its program, the sound devices and Unix sockets, and nothing else of the machine.

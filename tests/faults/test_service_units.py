@@ -12,16 +12,18 @@ import socket
 import stat
 import subprocess
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.engine.synthesizers.models import NEEDED
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.faults.supervisor import Supervisor
-from tests.support import processes
+from tests.support import processes, tiny_voice
 from tests.support.connection import Wire
 from tests.support.processes import children
-from tests.support.surroundings import needs, short_directory
+from tests.support.surroundings import needs, needs_packages, short_directory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -89,6 +91,7 @@ def test_system_s_service_runs_as_nobody_special_and_lets_the_audio_group_in(hom
     assert values(unit, "DynamicUser") == ["yes"]
     assert values(unit, "Group") == ["audio"]
     assert values(unit, "RuntimeDirectory") == ["talk"]
+    assert (values(unit, "CacheDirectory"), values(unit, "CacheDirectoryMode")) == (["talk"], ["0700"])
     assert values(unit, "DeviceAllow") == ["char-alsa rw"]
     assert "--socket-mode=0660" in command_of(unit)
     assert "PrivateDevices" not in re.sub("#.*", "", unit)
@@ -254,6 +257,23 @@ def test_command_serves_in_the_environment_that_systemd_gives_it(home: str) -> N
             supervisor.wait_for("STATUS", "idle; ")
             assert server.end(signal.SIGTERM) == 0
         supervisor.wait_for("STOPPING", "1")
+
+
+def test_user_s_service_keeps_what_it_keeps_in_the_user_s_own_directories(home: str) -> None:
+    assert "Directory=" not in printed(home, "user")
+
+
+def test_system_s_service_keeps_what_loads_a_voice_faster_where_systemd_says(home: str) -> None:
+    needs_packages(*NEEDED)
+    tiny_voice.put(Path(home) / "voices", "tiny")
+    # As for each service whose user is its own: the directory is elsewhere, and what the variable names leads there.
+    os.makedirs(f"{home}/private/talk", 0o700)
+    os.symlink("private/talk", f"{home}/talk")
+    command = [*command_of(printed(home, "system", "--player", "null", "--rate", "450"))]
+    env = environment(home, CACHE_DIRECTORY=f"{home}/talk", TALK_VOICES=f"{home}/voices", TALK_SOCKET=f"{home}/s")
+    with serving(env, command=command):
+        assert run([*TALK, "say", "--wait", "--voice", "piper/tiny", "hello"], env).code == 0
+    assert len(os.listdir(f"{home}/private/talk")) == 2
 
 
 def test_engine_and_player_run_without_new_privileges(home: str) -> None:
