@@ -12,6 +12,10 @@ import os
 import stat
 import sys
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 #: The name of the socket in its directory.
 SOCKET = "talk.sock"
 #: That of a server for the whole machine, in the directory that systemd makes for `RuntimeDirectory=talk`.
@@ -104,15 +108,17 @@ def server_socket(named: str | None) -> str:
             raise AddressInUse(f"no directory for the socket: {error}; name a socket with --socket PATH") from error
 
 
-def voice_directories() -> list[str]:
+def voice_directories(environment: Mapping[str, str] | None = None) -> list[str]:
     """Return where neural voices are looked for, besides installed packages: in this order, whether there or not.
 
     What TALK_VOICES names, a list like PATH, then the user's own data and the system's. They are platformdirs' places
-    on Linux (a test compares), written down here, as the engine process looks in each of its starts.
+    on Linux (a test compares), written down here, as the engine process looks in each of its starts. `environment`:
+    the variables, if not this process's.
     """
-    named = os.environ.get("TALK_VOICES", "").split(os.pathsep)
-    system = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
-    data = [_own(os.environ.get("XDG_DATA_HOME"), "~/.local/share"), *system.split(os.pathsep)]
+    environment = os.environ if environment is None else environment
+    named = environment.get("TALK_VOICES", "").split(os.pathsep)
+    system = environment.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
+    data = [_own(environment.get("XDG_DATA_HOME"), "~/.local/share"), *system.split(os.pathsep)]
     places = [*named, *(os.path.join(each, "talk", "voices") for each in data if os.path.isabs(each))]
     return list(dict.fromkeys(os.path.abspath(each) for each in places if each))
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from functools import partial
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import pytest
@@ -21,6 +22,7 @@ from talkcli.goals.states import State
 from tests.faults.broken import write
 from tests.support.compare import assert_silent, extent
 from tests.support.processes import run_talk
+from tests.support.real_voice import REAL_PACKAGE
 from tests.support.surroundings import clean_environment, needs
 from tests.test_doctor_alone import within
 
@@ -33,10 +35,12 @@ if TYPE_CHECKING:
     from tests.support.processes import Finished, Talk
     from tests.support.sink import Sink
 
+#: What is looked at besides where there is a neural voice, as there is in CI.
+NEURAL = ["neural", "voice files"] if find_spec(REAL_PACKAGE) else []
 #: The checks, in the order of a sentence's way.
 CHECKS = [
-    "python", "pyttsx3", "libespeak-ng", "voices", "session", "player", "device", "cards", "group", "sound server",
-    "loudness", "socket", "server", "settings", "failures", "sentence",
+    "python", "pyttsx3", "libespeak-ng", "voices", *NEURAL, "session", "player", "device", "cards", "group",
+    "sound server", "loudness", "socket", "server", "settings", "failures", "sentence",
 ]  # fmt: skip
 #: Seconds in which it ends, whatever it finds.
 LIMIT = 60.0

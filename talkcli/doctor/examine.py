@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from talkcli.doctor import machine, sentence, server, sound, voice
 from talkcli.engine.players import PLAYERS, is_silent
 from talkcli.engine.synthesizers import is_own
+from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
 from talkcli.goals.states import State
@@ -67,6 +68,8 @@ class Examination:
         yield from voice.judge(voice.pyttsx3(), engine, server=client is not None)
         process = self._process = server.process_here(client) if client else None
         here, env = machine.surroundings(process)
+        used = self._told("voice") if self._server else named
+        yield from self._neural(used, engine, here, env, running=client is not None)
         if client is not None and process is None:
             yield machine.ELSEWHERE
             yield from sound.judge_silent(self._player(), running=True)
@@ -76,6 +79,19 @@ class Examination:
         yield server.judge_places(found)
         yield from itself
         yield self._sentence(client, engine, here, env)
+
+    def _neural(
+        self, used: str | None, engine: voice.Engine, here: machine.Session, env: Mapping[str, str], *, running: bool
+    ) -> Iterator[Finding]:
+        """Look at neural voices, where something asks for one, or any is there."""
+        used = used if used and is_neural(used) else None
+        if not is_own(self._told("driver")) or not (used or engine.neural or env.get("TALK_VOICES")):
+            return
+        if running and here.server is None:
+            return  # its files and its Python are another machine's or another user's
+        from talkcli.doctor import neural
+
+        yield from neural.judge(neural.look(used, env, LIMIT, self._interrupt), server=running)
 
     def _player(self) -> str | None:
         """Return the player that is set, by the server or for this process."""

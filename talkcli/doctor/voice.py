@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 from talkcli.doctor.report import Finding, done, failed, warning
 from talkcli.engine import protocol
 from talkcli.engine.process import Conversation, EngineFailed
+from talkcli.engine.synthesizers.models import INSTALL
+from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
@@ -36,6 +38,8 @@ class Engine:
     synthesizer: str | None = None
     #: None where it didn't come to list them
     voices: int | None = None
+    #: how many of these are neural
+    neural: int = 0
     #: why it didn't start, for programs and in its own words; None where it did
     reason: str | None = None
     words: str = ""
@@ -74,7 +78,8 @@ def look(setting: Setting) -> Engine:
         with conversation(setting) as engine:
             ready = engine.until(protocol.Ready)
             found = Engine(ready.driver, ready.version)
-            return Engine(ready.driver, ready.version, len(engine.until(protocol.Voices).voices))
+            voices = engine.until(protocol.Voices).voices
+            return Engine(ready.driver, ready.version, len(voices), sum(is_neural(each.id) for each in voices))
     except EngineFailed as error:
         if found.driver is None or error.reason == "engine_crashed":
             reason, words = fault(error)
@@ -110,6 +115,8 @@ def judge(pyttsx3: str | None, engine: Engine, *, server: bool) -> list[Finding]
     found = done("pyttsx3", pyttsx3)
     if engine.reason == "unknown_voice":
         step = "choose one that 'talk voices' lists, in TALK_VOICE or --voice"
+        if INSTALL in words:
+            step = f"{INSTALL}, into the Python that serves"
         return [found, done("libespeak-ng", "loaded"), broken("voices", words, step)]
     step = "talk serve logs the engine's own words"
     if "data" in words and "espeak" in words:

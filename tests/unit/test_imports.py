@@ -292,7 +292,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 
 
 #: The doctor's modules that judge; each gathers what it judges, too, but for the last.
-JUDGING = ["machine", "voice", "sound", "server", "sentence", "report"]
+JUDGING = ["machine", "voice", "neural", "sound", "server", "sentence", "report"]
 #: What the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
     "talkcli.engine.players",

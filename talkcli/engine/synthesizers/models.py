@@ -73,13 +73,13 @@ def missing() -> str | None:
     return None if lacking is None else f"{lacking} is missing: {INSTALL}, into the Python that serves"
 
 
-def found() -> dict[str, str]:
+def found(environment: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the models that there are: the path of each by its name, the first directory's where two have it.
 
-    None whose name has what nobody can type, or what a terminal would obey.
+    None whose name has what nobody can type, or what a terminal would obey. `environment`: as in `voice_directories`.
     """
     result: dict[str, str] = {}
-    for place in _places():
+    for place in _places(environment):
         try:
             names = sorted(os.listdir(place))
         except OSError:  # not there, as most of them, or not to be read
@@ -205,8 +205,8 @@ def _writable(*paths: str) -> BadFile:
     return BadFile(f"{names} can be written by others, who could change the voice: {command}")
 
 
-def _places() -> Iterator[str]:
-    yield from voice_directories()
+def _places(environment: Mapping[str, str] | None) -> Iterator[str]:
+    yield from voice_directories(environment)
     for directory in sys.path:
         try:
             packages = sorted(each for each in os.listdir(directory) if each.endswith(_PACKAGE))

@@ -1,0 +1,174 @@
+"""Neural voices: the packages that they take, their files, and the one that is spoken with, loaded and timed.
+
+Where nothing neural is there and nothing asks for it, nothing is done, and nothing said. Voices that are not in use are
+looked at, and not loaded. That takes memory and some seconds, in an engine process of the doctor's own: what a model
+does to that is a fact here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
+
+from talkcli.doctor.report import Finding, done, failed, some, warning
+from talkcli.doctor.voice import fault
+from talkcli.engine import protocol
+from talkcli.engine.process import Conversation, EngineFailed
+from talkcli.engine.synthesizers import models
+from talkcli.engine.synthesizers.voices import NEURAL
+from talkcli.frozen import frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+#: What is said to see how fast a voice is made: short, and longer than a word.
+_TEXT = "If you hear this, talk works."
+_RATE = 200
+#: How many times as fast as it is heard a sentence must be made: below, any other work on the machine makes gaps.
+_FAST_ENOUGH = 1.3
+_RUNTIME, _FILES, _VOICE = "neural", "voice files", "neural voice"
+_CHOOSE = "choose one of espeak's: talk set --voice en, or talk serve --voice en"
+
+
+@frozen
+class Tried:
+    """How it went with the voice that is spoken with."""
+
+    #: seconds that loading took; None where it wasn't loaded
+    loaded: float | None = None
+    #: seconds of a sentence for each that it took to make
+    speed: float | None = None
+    #: bytes that the engine process had then
+    memory: int | None = None
+    #: why it can't be spoken with, and the next step, where that is known
+    words: str | None = None
+    step: str | None = None
+
+
+@frozen
+class Neural:
+    """Facts about neural voices."""
+
+    #: what is needed and not installed, in words
+    missing: str | None
+    #: versions of what is: "onnxruntime 1.23.2"
+    installed: tuple[str, ...] = ()
+    #: ids of the voices whose files are as they should be, as far as that shows without loading them
+    good: tuple[str, ...] = ()
+    #: of the others, why not, and the next step
+    bad: tuple[tuple[str, str, str], ...] = ()
+    #: the voice that is spoken with, as its user wrote it; how it went with it, if it was tried
+    used: str | None = None
+    tried: Tried | None = None
+
+
+def look(
+    used: str | None, env: Mapping[str, str] | None, limit: float, interrupt: Mapping[int, int] | None = None
+) -> Neural:
+    """Look at all voices, and try the one that is in use, in at most `limit` seconds; Interrupted.
+
+    `used`: that voice, as its user wrote it; `env`, `interrupt`: as in `voice.Setting`.
+    """
+    missing = models.missing()
+    good, bad = [], []
+    for name, path in models.found(env).items():
+        try:
+            models.describe(path)
+            models.open_checked(path).close()
+            good.append(NEURAL + name)
+        except models.BadFile as error:
+            bad.append((NEURAL + name, *_parted(str(error))))
+    tried = None if used is None or missing else _try(used, env, limit, interrupt)
+    return Neural(missing, tuple(map(_installed, models.NEEDED)), tuple(good), tuple(bad), used, tried)
+
+
+def _installed(package: str) -> str:
+    with contextlib.suppress(PackageNotFoundError):
+        return f"{package} {version(package)}"
+    return f"{package} of an unknown version"
+
+
+def _parted(words: str) -> tuple[str, str]:
+    """Return what is wrong and the next step, of a text that ends with that behind a colon, as those of voices do."""
+    what, colon, step = words.rpartition(": ")
+    return (what, step) if colon else (words, _CHOOSE)
+
+
+def _try(used: str, env: Mapping[str, str] | None, limit: float, interrupt: Mapping[int, int] | None) -> Tried:
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        configure = protocol.Configure(os.getpid(), None, None, None, None, list_voices=False, output=nowhere)
+        with Conversation(configure, env=env, deadline=time.monotonic() + limit, interrupt=interrupt) as engine:
+            engine.until(protocol.Ready)
+            return _timed(engine, used)
+    except EngineFailed as error:
+        return Tried(words=fault(error)[1], step=_CHOOSE)
+    except TimeoutError:
+        return Tried(words=f"it was not loaded, and had not spoken, after {limit:g} s", step=_CHOOSE)
+    finally:
+        os.close(nowhere)
+
+
+def _timed(engine: Conversation, used: str) -> Tried:
+    """Have a sound spoken, for which the voice is loaded, then a sentence; nobody hears them."""
+    ended, loaded = _spoken(engine, used, "a")
+    began = time.monotonic()
+    if ended.outcome == protocol.COMPLETED:
+        ended, _ = _spoken(engine, used, _TEXT)
+    if ended.outcome != protocol.COMPLETED or ended.duration is None:
+        return Tried(None, None, None, *_parted(ended.message or f"the sentence ended {ended.outcome}"))
+    speed = ended.duration / (time.monotonic() - began)
+    return Tried(loaded, speed, _memory(engine._process.pid))
+
+
+def _spoken(engine: Conversation, used: str, text: str) -> tuple[protocol.Ended, float | None]:
+    """Have a text spoken, and return how that ended, and the seconds for which the voice was loaded before it."""
+    loaded = None
+    # It insists on the voice, so that espeak does not speak in its place.
+    engine.say(protocol.Say(text, text, _RATE, 1.0, used, 50, voice_only=True))
+    while True:
+        event = next(engine.events)
+        if isinstance(event, protocol.Loaded):
+            loaded = event.seconds
+        elif isinstance(event, protocol.Ended):
+            return event, loaded
+
+
+def _memory(process: int) -> int | None:
+    """Return the bytes of memory that a process has; None where that can't be known."""
+    with contextlib.suppress(OSError, ValueError, IndexError), open(f"/proc/{process}/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return None
+
+
+def judge(neural: Neural, *, server: bool) -> list[Finding]:
+    """Judge neural voices; `server`: whether one runs, which speaks by espeak where a voice can't be had."""
+    tried = neural.tried
+    broken = warning if server or neural.used is None else failed
+    found = [done(_RUNTIME, ", ".join(neural.installed))]
+    if neural.missing is not None:
+        found = [broken(_RUNTIME, *_parted(neural.missing))]
+    if neural.bad:
+        (voice, words, step), *others = neural.bad
+        more = f"; and something is wrong with {some(tuple(each[0] for each in others))}" if others else ""
+        found.append(warning(_FILES, f"{voice}: {words}{more}", step))
+    elif neural.good:
+        found.append(done(_FILES, f"as they should be: {some(neural.good)}"))
+    return found if tried is None else [*found, _tried(neural.used or "", tried, broken)]
+
+
+def _tried(used: str, tried: Tried, broken: Callable[[str, str, str], Finding]) -> Finding:
+    if tried.speed is None:
+        words = tried.words or "it was not spoken with"
+        return broken(_VOICE, f"{used} is in use: {words}", tried.step or _CHOOSE)
+    facts = [] if tried.loaded is None else [f"loaded in {tried.loaded:.1f} s"]
+    facts.append(f"makes a sentence {tried.speed:.1f} times as fast as it is heard")
+    facts += [] if tried.memory is None else [f"takes {tried.memory / 1e6:.0f} MB with its engine"]
+    words = f"{used} is in use: {', '.join(facts)}"
+    if tried.speed < _FAST_ENOUGH:
+        step = "choose a voice whose quality is low or x_low, or one of espeak's: talk set --voice en"
+        return warning(_VOICE, f"{words}: this machine is too slow for it, or too busy", step)
+    return done(_VOICE, words)
