@@ -117,7 +117,7 @@ def test_scripts_have_no_syntax_error(shell: str, name: str) -> None:
         ("talk ", set(COMMANDS)),
         ("talk sta", {"status"}),
         ("talk say --pre", {"--preempt"}),
-        ("talk serve --vo", {"--volume", "--voice"}),
+        ("talk serve --vo", {"--volume", "--voice", "--voice-memory"}),
         ("talk serve --player ", {"pulse", "aplay", "pacat", "pw-cat", "null"}),
         ("talk serve --player=p", {"--player=pulse", "--player=pacat", "--player=pw-cat"}),
         ("talk --socket /etc/pa", {"file"}),

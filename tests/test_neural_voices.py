@@ -36,7 +36,7 @@ def env(tmp_path: Path) -> Iterator[dict[str, str]]:
 def test_goals_are_spoken_with_one_and_end_in_words_where_it_is_broken(env: dict[str, str], tmp_path: Path) -> None:
     with serving(env, "--rate", "450"):
         assert run([*TALK, "say", "--wait", "--voice", "piper/tiny", "hello"], env).code == 0
-        done = run([*TALK, "say", "--wait", "--voice", "piper/broken", "hello"], env)
+        done = run([*TALK, "say", "--wait", "--voice", "piper/broken", "--voice-only", "hello"], env)
         assert done.code == 4
         assert f"{tmp_path}/voices/broken.onnx is no ONNX model: get the voice anew" in done.err
         goal = json.loads(run([*TALK, "--json", "log", "-n", "1"], env).out)
@@ -109,8 +109,8 @@ def test_what_a_stranger_wrote_never_reaches_the_terminal_raw(env: dict[str, str
         shown = [
             run([*TALK, "voices"], env),
             run([*TALK, "voices", "--language", "evil"], env),
-            run([*TALK, "say", "--wait", "--voice", "piper/evil", "hello"], env),
-            run([*TALK, "say", "--wait", "--voice", "piper/type", "hello"], env),
+            run([*TALK, "say", "--wait", "--voice", "piper/evil", "--voice-only", "hello"], env),
+            run([*TALK, "say", "--wait", "--voice", "piper/type", "--voice-only", "hello"], env),
             run([*TALK, "say", "--wait", "--voice", f"piper/{evil}", "hello"], env),
             run([*TALK, "status"], env),
             run([*TALK, "log"], env),
@@ -167,3 +167,19 @@ def test_without_the_extra_they_are_listed_and_refused_with_what_to_install(
         done = run([*TALK, "set", "--voice", "piper/tiny"], env)
         assert (done.code, words in done.err) == (2, True), done
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
+
+
+def test_the_language_of_the_server_s_neural_voice_means_that_one(env: dict[str, str]) -> None:
+    def heard(voice: str) -> object:
+        goal = run([*TALK, "say", "--wait", "--voice", voice, "--voice-only", "hello"], env).out.strip()
+        return json.loads(run([*TALK, "--json", "status", goal], env).out)["voice"]
+
+    with serving(env, "--rate", "450"):
+        assert heard("en-us") == "gmw/en-US"
+        assert run([*TALK, "set", "--voice", "piper/tiny"], env).code == 0
+        assert [heard(each) for each in ("en-us", "EN", "de", "gmw/en-US")] == [
+            *("piper/tiny", "piper/tiny"),
+            *("gmw/de", "gmw/en-US"),
+        ]
+    with serving(env, "--rate", "450", "--voice", "piper/tiny"):
+        assert heard("en") == "piper/tiny"

@@ -263,7 +263,7 @@ OPTIONS = (
         "else espeak speaks then",
         default=False,
         flags="--voice-only",
-        help="Take no other voice in its place: wait until it is loaded, or be aborted.",
+        help="Insist on the voice: wait until it is loaded, or be aborted.",
         engine=True,
     ),
     Option(
