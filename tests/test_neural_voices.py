@@ -183,3 +183,21 @@ def test_the_language_of_the_server_s_neural_voice_means_that_one(env: dict[str,
         ]
     with serving(env, "--rate", "450", "--voice", "piper/tiny"):
         assert heard("en") == "piper/tiny"
+
+
+def test_a_speaker_that_a_voice_lacks_is_refused(env: dict[str, str], tmp_path: Path) -> None:
+    several = tiny_voice.description(speakers=2)
+    tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
+    with serving(env, "--rate", "450"):
+        for voice, words in (
+            ("piper/tiny#1", 'it has no speaker "1": it has one speaker'),
+            ("piper/two#2", 'it has no speaker "2": it has 2 speakers, 0 to 1'),
+            ("piper/two#nobody", 'it has no speaker "nobody"'),
+        ):
+            done = run([*TALK, "say", "--voice", voice, "hello"], env)
+            assert (done.code, words in done.err) == (5, True), done
+        for voice in ("piper/tiny#0", "piper/two#1", "piper/two#p1"):
+            goal = run([*TALK, "say", "--wait", "--voice", voice, "--voice-only", "hello"], env).out.strip()
+            assert json.loads(run([*TALK, "--json", "status", goal], env).out)["voice"] == voice
+    done = run([*TALK, "serve", "--player", "null", "--voice", "piper/tiny#4"], env)
+    assert (done.code, "it has one speaker" in done.err) == (2, True), done

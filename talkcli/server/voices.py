@@ -12,8 +12,9 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from talkcli.engine.synthesizers import is_own
-from talkcli.engine.synthesizers.voices import NEURAL, find_voice, is_neural, unknown_voice
-from talkcli.goals.options import DEFAULT_VOICE
+from talkcli.engine.synthesizers.base import UnknownVoice
+from talkcli.engine.synthesizers.voices import NEURAL, find_voice, is_neural, speaker_number, unknown_voice
+from talkcli.goals.options import DEFAULT_VOICE, SPEAKER
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -79,9 +80,10 @@ class Voices:
         """Return reason and words why a voice can't be had; None also where that is not known."""
         if voice is None or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice)):
             return None
-        if self._find(voice) is None:
+        found = self._find(voice)
+        if found is None:
             return "unknown_voice", unknown_voice(voice, self.listed or (), self._foreign)
-        lacking = self._lacking() if is_neural(voice) else None
+        lacking = self._lacking(found.id) if is_neural(voice) else None
         return ("unknown_voice", f"the voice {voice[:60]} cannot be spoken: {lacking}") if lacking else None
 
     def meant(self, voice: str | None, usual: str | None = None) -> str | None:
@@ -104,10 +106,18 @@ class Voices:
         """The driver, where it is none of `talk`'s own; on another system than Linux all are."""
         return None if is_own(self.driver) else self.driver or "the system's own"
 
-    @staticmethod
-    def _lacking() -> str | None:
+    def _lacking(self, voice: str) -> str | None:
+        """Return what a neural voice lacks, by its id: a package, or the speaker that is asked for."""
         from talkcli.engine.synthesizers import models
 
+        model, mark, speaker = voice.partition(SPEAKER)
+        if mark:
+            # The engine's list has no speakers.
+            speakers = next((each.speakers for each in self._files() if each.id == model), None) or ("",)
+            try:
+                speaker_number(speaker, {name: number for number, name in enumerate(speakers)}, len(speakers))
+            except UnknownVoice as error:
+                return str(error)
         return models.missing()
 
     def look_for_files(self) -> None:

@@ -15,8 +15,9 @@ import stat
 import sys
 
 from talkcli.engine.protocol import Voice
-from talkcli.engine.synthesizers.voices import NEURAL, SPEAKER
+from talkcli.engine.synthesizers.voices import NEURAL
 from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.goals.options import SPEAKER
 from talkcli.paths import voice_directories
 
 if TYPE_CHECKING:

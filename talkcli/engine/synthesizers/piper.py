@@ -16,9 +16,10 @@ from talkcli.engine.synthesizers.inference import Run
 from talkcli.engine.synthesizers.loader import Loader
 from talkcli.engine.synthesizers.models import BEGIN, END, PAD, BadFile
 from talkcli.engine.synthesizers.phonemes import pieces
-from talkcli.engine.synthesizers.voices import NEURAL, SPEAKER, language_of
+from talkcli.engine.synthesizers.voices import NEURAL, language_of, speaker_number
 from talkcli.engine.synthesizers.work import Work
 from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.goals.options import SPEAKER
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -108,7 +109,7 @@ class Piper:
         if path is None:
             raise UnknownVoice("its file is not there")
         with contextlib.suppress(BadFile):  # it comes again where the model is loaded
-            _speaker(models.describe(path), speaker)
+            _number(models.describe(path), speaker)
         self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
 
     def speak(self, text: str, sound: Sound, output: Output) -> None:
@@ -122,7 +123,7 @@ class Piper:
         voice = self._model_id
         model = self._loaded(voice, output)
         try:
-            speaker = _speaker(model.description, self._speaker)
+            speaker = _number(model.description, self._speaker)
         except UnknownVoice as error:
             raise CannotSpeak("unknown_voice", f"{self.voice}: {error}") from error
         try:
@@ -243,16 +244,5 @@ def _pace(rate: int) -> float:
     return max(_LEAST_PACE, (_NATURAL / rate - _ROUNDED) / (1 - _ROUNDED))
 
 
-def _speaker(about: Description, word: str) -> int:
-    """Return the number of a speaker, which may be given by its name; UnknownVoice."""
-    number = about.speaker_names.get(word, -1)
-    if not word:
-        number = 0
-    elif number < 0 and word.isascii() and word.isdecimal():
-        number = int(word[:9])
-    if 0 <= number < about.speakers:
-        return number
-    many = (
-        f"it has {about.speakers} speakers, 0 to {about.speakers - 1}" if about.speakers > 1 else "it has one speaker"
-    )
-    raise UnknownVoice(f'it has no speaker "{word[:40]}": {many}')
+def _number(about: Description, speaker: str) -> int:
+    return speaker_number(speaker, about.speaker_names, about.speakers)

