@@ -168,6 +168,11 @@ class Spawned:
         assert self.process.stderr is not None
         return self.process.stderr.read().decode()
 
+    def errors_line(self) -> str:
+        """Return the next line that the process writes to standard error; waits for it."""
+        assert self.process.stderr is not None
+        return self.process.stderr.readline().decode().strip()
+
     def all_gone(self, seconds: float = 2.0) -> bool:
         """Return whether the process and its player are gone within that time."""
         os.set_blocking(self.liveness, False)

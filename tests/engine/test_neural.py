@@ -37,6 +37,18 @@ def slowly(*arguments):
     return take(*arguments)
 inference.Model._take = slowly
 """
+#: … and so that it says when libespeak-ng is asked for something, once a text.
+TELLS_OF_SPELLING = """
+import sys
+from talkcli.engine.synthesizers.espeak import Spelling
+method, told = Spelling.{asked}, []
+def telling(self, *arguments):
+    if self not in told:
+        told.append(self)
+        print("{asked}", file=sys.stderr, flush=True)
+    return method(self, *arguments)
+Spelling.{asked} = telling
+"""
 #: … and so that packages are not there.
 WITHOUT = """
 import sys, importlib.abc
@@ -268,6 +280,27 @@ def test_it_is_held_while_it_is_loaded(place: Path) -> None:
             assert isinstance(engine.event(), protocol.Alive | protocol.Loaded)
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+
+
+@limits()
+@pytest.mark.parametrize("asked", ["clauses", "places", "abbreviates"])
+def test_it_is_stopped_and_held_while_the_sounds_of_a_text_are_looked_up(place: Path, asked: str) -> None:
+    """Libespeak-ng needs a tenth of a second at once for a clause of 800 bytes of a script that isn't the voice's."""
+    text = "Go. Dr. Who. " + "电池电量低正在返回充电站" * 800
+    with _engine(place, before=TELLS_OF_SPELLING.format(asked=asked)) as engine:
+        assert engine.spoken("Go. Go", "g0", voice=VOICE).outcome == protocol.COMPLETED
+        assert engine.errors_line() == asked
+        for number in range(1, 11):
+            goal = f"g{number}"
+            engine.say(text, goal, voice=VOICE)
+            assert engine.errors_line() == asked
+            if number % 2:
+                assert_within(engine.pause(goal), 0.1, "a pause while sounds are looked up")
+            at = time.monotonic()
+            engine.send(protocol.Stop(goal))
+            assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+            assert_within(time.monotonic() - at, 0.02, "a stop while sounds are looked up")
+        assert engine.spoken("espeak", "g20").outcome == protocol.COMPLETED
 
 
 @limits()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import time
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.engine.synthesizers.phonemes import LONGEST, Piece, pieces
+from tests.support.timing import assert_within, limits
 
 
 class Spelt:
@@ -67,6 +69,28 @@ def test_words_begin_where_they_stand_in_the_text() -> None:
 
 def test_words_that_are_spoken_as_one_begin_inside_of_it() -> None:
     assert _words("go in the red", Spelt("in the")) == [("go", "go "), ("in", "int"), ("the", "the"), ("red", "red")]
+
+
+def test_a_word_that_is_spelled_begins_once_and_those_behind_it_where_they_are() -> None:
+    """The library tells the place of a word for each of its letters, and lengths that reach over the next one."""
+
+    class Spelling(Spelt):
+        def places(self, clause: str) -> list[tuple[int, int]]:
+            assert clause == "go abc bye now"
+            return [(0, 7), *[(3, 6)] * 40, (0, 2), (7, 9), (11, 3)]
+
+    words = [("go abc ", "go "), ("abc by", "ay "), ("bye now", "bye"), ("now", "now")]
+    assert _words("go abc bye now", Spelling(said={"abc": "ay bee see"})) == words
+
+
+@limits()
+def test_sounds_without_number_are_laid_side_by_side_soon_in_order() -> None:
+    """A number of 800 digits has ten times as many; to compare each with each would take seconds."""
+    said = {"1": "one tausend " * 800, "a": "a tausend"}
+    began = time.monotonic()
+    found = _words("1 a a a", Spelt(said=said))
+    assert_within(time.monotonic() - began, 0.3, "10,000 sounds")
+    assert [word for word, _ in found] == ["1", "a", "a", "a"]
 
 
 def test_a_word_that_is_spoken_as_several_begins_with_the_first() -> None:

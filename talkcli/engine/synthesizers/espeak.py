@@ -14,7 +14,7 @@ import itertools
 import os
 
 from talkcli.engine.players import on_path
-from talkcli.engine.players.base import SAMPLE, CannotSpeak
+from talkcli.engine.players.base import SAMPLE, CannotSpeak, Stopped
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import guard
 from talkcli.engine.synthesizers.base import NotInstalled, UnknownVoice
@@ -184,16 +184,21 @@ class Espeak:
     def spelling(self, language: str) -> Iterator[Spelling]:
         """Lend the library, for what it knows of the sounds of a language, by one of its voices; UnknownVoice.
 
-        Until the end of the `with` it speaks nothing else.
+        Until the end of the `with` it speaks nothing else. It may be asked in another thread, in one at a time; what it
+        is asked later ends there with Stopped.
         """
+        speller = None
         self._listed = self._listed or _listed(self._espeak, None)
         voice = find_voice(language, self._listed)
         try:
             if voice is None or self._espeak.SetVoiceByName(voice.id.encode()) != self._espeak.EE_OK:
                 raise UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
             self._espeak.SetParameter(self._espeak.RATE, _USUAL, 0)
-            yield Spelling(self._espeak, voice.id)
+            speller = Spelling(self._espeak, voice.id)
+            yield speller
         finally:
+            if speller is not None:
+                speller.end()
             self._espeak.SetSynthCallback(self._on_audio)
             self._espeak.SetVoiceByName(self.voice.encode())
             self._set.clear()
@@ -236,8 +241,13 @@ class Spelling:
 
     def __init__(self, espeak: Any, voice: str) -> None:
         """`voice`: the id of the one in force."""
+        import threading
+
         self._espeak = espeak
         self._voice = voice
+        #: held while the library is at work, and whether it is nobody's any more
+        self._at_work = threading.Lock()
+        self._over = False
         self._text = ""
         self._places: list[tuple[int, int]] = []
         self._ends: list[int] = []
@@ -253,7 +263,7 @@ class Spelling:
         found: list[tuple[str, str]] = []
         begin = begin_character = 0
         while at.value:
-            said = self._to_phonemes(ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
+            said = self._asked(self._to_phonemes, ctypes.byref(at), self._espeak.CHARS_UTF8, _IPA) or b""
             end = len(raw) - 1 if at.value is None else at.value - base
             clause = raw.raw[begin:end].decode("utf-8", "replace")
             if at.value and clause and not clause[-1].isspace():  # it has read the first character of the next
@@ -275,13 +285,27 @@ class Spelling:
         alone = self._speak(word)
         return self._speak(f"{word} A") - alone < _NO_PAUSE
 
+    def end(self) -> None:
+        """Leave the library alone: what it does now for another thread ends within a millisecond or two."""
+        self._over = True
+        with self._at_work:
+            pass
+
+    def _asked(self, function: Any, *arguments: Any, **more: Any) -> Any:
+        with self._at_work:
+            if self._over:
+                raise Stopped
+            return function(*arguments, **more)
+
     def _speak(self, text: str) -> int:
         """Have a text spoken to nobody; return where the first clause of it ends, in samples, and keep its words."""
         self._text, self._places, self._ends = guard.guarded(text, self._voice), [], []
-        self._espeak.Synth(self._text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
+        self._asked(self._espeak.Synth, self._text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
         return self._ends[0] if self._ends else 0
 
     def _on_audio(self, _samples: Any, _count: int, events: Any) -> int:
+        if self._over:
+            return 1  # ends the synthesis
         for event in itertools.takewhile(lambda each: each.type, events):
             if event.type == self._espeak.EVENT_WORD and (word := _place(event, self._text)):
                 self._places.append(word)

@@ -23,6 +23,10 @@ else:
 #: The most sounds of a piece. What a model needs for them grows with their square: on a PC 250 take 0.25 s and 60 MB
 #: beside the model, 800 take 2 s and 450 MB.
 LONGEST = 250
+#: The most pairs of sounds that are compared to lay two strings side by side, which takes up to 50 ms: those of a
+#: clause of 1,000 sounds, as the library never makes a clause of more than 800 bytes. In a number of 800 digits, which
+#: has ten times as many, nobody can tell where a word begins.
+_COMPARED = 1 << 20
 #: Sounds after which a piece may end at a comma, too.
 _LONG = 150
 #: What ends a clause, by what Piper's voices know of it: theirs are these six. Behind the last three ends a sentence.
@@ -138,11 +142,28 @@ def _beginnings(speller: Speller, clause: str, groups: Sequence[str]) -> list[tu
     starts = [0, *itertools.accumulate(map(len, groups))]
     if len(places) == len(groups):
         return [(start, *place) for start, place in zip(starts, places, strict=False)]
-    alone = [_alone(speller, clause[start : start + length]) for start, length in places]
+    places = _forward(places)
+    nexts = [*(start for start, _ in places[1:]), len(clause)]
+    alone = [
+        _alone(speller, clause[start : min(start + length, after)])
+        for (start, length), after in zip(places, nexts, strict=True)
+    ]
     ends = [0, *itertools.accumulate(map(len, alone))]
     found = _side_by_side("".join(alone), "".join(groups), ends[:-1])
     last = max(0, starts[-1] - 1)
     return [(min(start, last), *place) for start, place in zip(found, places, strict=True)]
+
+
+def _forward(places: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the places that are behind those before: of a word that it spells the library tells one for each letter.
+
+    It is the word's, again and again.
+    """
+    found: list[tuple[int, int]] = []
+    for place in places:
+        if not found or place[0] > found[-1][0]:
+            found.append(place)
+    return found
 
 
 def _alone(speller: Speller, word: str) -> str:
@@ -151,6 +172,8 @@ def _alone(speller: Speller, word: str) -> str:
 
 def _side_by_side(first: str, second: str, places: Sequence[int]) -> list[int]:
     """Return where in the second string is what is at these places of the first, which is much like it."""
+    if len(first) * len(second) > _COMPARED:
+        return [place * len(second) // len(first) for place in places]
     import difflib
 
     blocks = difflib.SequenceMatcher(None, first, second, autojunk=False).get_matching_blocks()

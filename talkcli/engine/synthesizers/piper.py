@@ -1,13 +1,13 @@
 """Piper's neural voices as a synthesizer: a text's sounds by libespeak-ng, and a model that speaks them.
 
 A model is loaded (`loader.py`), and run, in a thread beside the one that calls, which waits in the output: signs of
-life, a stop and a pause go on. Libespeak-ng is asked in the calling thread alone.
+life, a stop and a pause go on, and so does what is being heard. Libespeak-ng is asked for sounds in that thread, too,
+and by nobody else meanwhile.
 """
 
 from __future__ import annotations
 
 import contextlib
-import queue
 
 from talkcli.engine.players.base import SAMPLE, CannotSpeak
 from talkcli.engine.synthesizers import models
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 _FIRST, _MOST = 20, 80
 #: How many of these may lie ready, so that a slow moment of the machine is not heard: seven seconds.
 _AHEAD = 8
-#: Pieces of text whose sounds are known before they are needed.
-_SPELLED = 2
 #: Seconds from the last sound of a sentence that can be heard to its end, as libespeak-ng has it: 0.24 to 0.28. A
 #: player may end 0.25 early. What a model itself makes of it, 0.07 to 0.2, is fainter than this, of 1.0.
 _PAUSE, _FAINT = 0.26, 0.01
@@ -151,23 +149,14 @@ class Piper:
         return model
 
     def _write(self, model: Model, speaker: int, spelled: Iterator[Piece], sound: Sound, output: Output) -> None:
-        """Write what a thread makes of the pieces, which are spelled in this one as they are needed."""
-        given: queue.SimpleQueue[Piece | None] = queue.SimpleQueue()
+        """Write what a thread makes of the pieces, which are spelled there, too, as they are needed."""
         run = Run()
         rate = model.description.rate
         at_once = int(_AT_ONCE * rate) * SAMPLE
         seconds = 0.0
-        over = False
-        work = Work(_made(model, given, speaker, sound, run), _AHEAD)
+        work = Work(_made(model, spelled, speaker, sound, run), _AHEAD)
         try:
-            while True:
-                while not over and given.qsize() < _SPELLED:
-                    piece = next(spelled, None)
-                    over = piece is None
-                    given.put(piece)
-                made = work.take(output.wait)
-                if made is None:
-                    return
+            while (made := work.take(output.wait)) is not None:
                 for start, length, position in made.words:
                     output.word(start, length, seconds + position)
                 for at in range(0, len(made.samples), at_once):
@@ -176,18 +165,16 @@ class Piper:
         finally:
             run.end()
             work.close()
-            given.put(None)
 
 
-def _made(model: Model, given: queue.SimpleQueue[Piece | None], speaker: int, sound: Sound, run: Run) -> Iterator[Made]:
-    """Yield the sound of the pieces that are given, up to None."""
+def _made(model: Model, spelled: Iterator[Piece], speaker: int, sound: Sound, run: Run) -> Iterator[Made]:
+    """Yield the sound of the pieces."""
     pause = int(_PAUSE * model.description.rate)
     known, lacking = False, ""
-    while (piece := given.get()) is not None:
+    for piece in spelled:
         numbers, places = _numbered(piece.sounds, model.description.sounds)
         if not places:
             lacking = lacking or "".join(piece.sounds)
-            yield Made(b"")  # who takes hands in the next piece after each
             continue
         known = True
         frames = model.encode(numbers, speaker, _pace(sound.rate), run)
