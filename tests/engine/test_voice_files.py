@@ -280,6 +280,7 @@ def test_what_is_no_file_is_refused_and_not_waited_for(home: Path) -> None:
         (b"[]", "does not describe"),
         (b"{}", "it has no 'phoneme_id_map'"),
         (b" " * (1 << 20) + b"{}", "it is too long"),
+        ({"phoneme_id_map": {"_": [0], "^": [1], "$": [2], "a": [3] * 5}}, "more than 4 numbers for a sound"),
         ({"phoneme_type": "text"}, "its sounds are not libespeak-ng's, but 'text'"),
         ({"phoneme_id_map": {"a": [1]}}, "phoneme_id_map has no _"),
         ({"phoneme_id_map": {"_": [0], "^": [-1], "$": [2]}}, "-1 is no number"),
@@ -312,6 +313,13 @@ def test_a_model_without_a_json_says_where_to_get_it(home: Path) -> None:
 # -- what is kept
 
 
+def _key(letter: str) -> str:
+    return f"{letter * 64}-1-1.23.4"
+
+
+KEY = _key("0")
+
+
 def _kept(directory: Path) -> list[str]:
     return sorted(each.name for each in directory.iterdir())
 
@@ -332,42 +340,60 @@ def _keep(cache: Cache, key: str, content: bytes = b"encoder") -> str | None:
 
 def test_what_is_kept_is_found_again_by_its_key(home: Path) -> None:
     cache = Cache(str(home / "c"))
-    assert cache.find("k") is None
-    _keep(cache, "k")
-    paths = cache.find("k")
+    assert cache.find(KEY) is None
+    _keep(cache, KEY)
+    paths = cache.find(KEY)
     assert paths is not None
     assert [Path(each).read_bytes() for each in paths] == [b"encoder", b"decoder"]
     assert stat.S_IMODE((home / "c").stat().st_mode) == 0o700
-    assert _kept(home / "c") == ["k.decoder.onnx", "k.encoder.onnx"]
-    cache.forget("k")
-    assert cache.find("k") is None
+    assert _kept(home / "c") == [f"{KEY}.decoder.onnx", f"{KEY}.encoder.onnx"]
+    cache.forget(KEY)
+    assert cache.find(KEY) is None
 
 
 def test_half_of_it_is_nothing(home: Path) -> None:
     cache = Cache(str(home / "c"))
-    _keep(cache, "k")
-    (home / "c" / "k.encoder.onnx").unlink()
-    assert cache.find("k") is None
+    _keep(cache, KEY)
+    (home / "c" / f"{KEY}.encoder.onnx").unlink()
+    assert cache.find(KEY) is None
 
 
-def test_the_oldest_go_past_the_limit_and_what_was_left_unfinished(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_oldest_go_past_the_limit_and_nothing_but_what_is_the_caches_own(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(caches, "LARGEST", 85)
     cache = Cache(str(home / "c"))
-    (home / "c" / "x.1.new").write_bytes(bytes(20))
-    os.utime(home / "c" / "x.1.new", (1, 1))
-    for number, key in enumerate("abc"):
-        _keep(cache, key, bytes(20))
-        for each in (home / "c").glob(f"{key}.*"):
-            os.utime(each, (1000 + number, 1000 + number))
-    cache.find("a")  # it is used, and so the newest but for the next
-    _keep(cache, "d", bytes(20))
-    assert _kept(home / "c") == [f"{each}.{half}coder.onnx" for each in "acd" for half in ("de", "en")]
+    others = ["joe.onnx", "notes.new", "x.encoder.onnx", f"{KEY}.txt", "settings"]
+    for each in others:
+        (home / "c" / each).write_bytes(bytes(200))
+        os.utime(home / "c" / each, (1, 1))
+    (home / "c" / "folder.new").mkdir()
+    os.utime(home / "c" / "folder.new", (1, 1))
+    for number, letter in enumerate("abc"):
+        _keep(cache, _key(letter), bytes(20))
+        for path in (home / "c").glob(f"{letter}*"):
+            os.utime(path, (1000 + number, 1000 + number))
+    cache.find(_key("a"))  # it is used, and so the newest but for the next
+    _keep(cache, _key("d"), bytes(20))
+    own = [f"{_key(each)}.{half}coder.onnx" for each in "acd" for half in ("de", "en")]
+    assert _kept(home / "c") == sorted([*own, *others, "folder.new"])
+
+
+@pytest.mark.parametrize(("hours", "left"), [(0.9, 1), (1.1, 0)])
+def test_what_a_writer_left_unfinished_goes_after_an_hour(home: Path, hours: float, left: int) -> None:
+    cache = Cache(str(home / "c"))
+    folder = home / "c" / f"{_key('b')}x7f3.new"
+    folder.mkdir()
+    (folder / "half").write_bytes(bytes(20))
+    os.utime(folder, (time.time() - hours * 3600,) * 2)
+    _keep(cache, KEY)
+    assert len([each for each in _kept(home / "c") if each.endswith(".new")]) == left
 
 
 def test_where_it_cannot_be_written_it_is_made_without(home: Path) -> None:
     cache = Cache(str(home / "c"))
     os.rename(home / "c", home / "gone")
-    assert _keep(cache, "k") is None
+    assert _keep(cache, KEY) is None
 
 
 def test_what_fails_of_itself_fails_without_being_kept_too(home: Path) -> None:
@@ -376,8 +402,8 @@ def test_what_fails_of_itself_fails_without_being_kept_too(home: Path) -> None:
 
     cache = Cache(str(home / "c"))
     with pytest.raises(ValueError, match="broken"):
-        cache.keep("k", fails, b"")
-    assert cache.find("k") is None
+        cache.keep(KEY, fails, b"")
+    assert cache.find(KEY) is None
     assert not [each for each in _kept(home / "c") if each.endswith(".new")]
 
 
@@ -391,7 +417,7 @@ def test_a_cache_that_others_may_read_or_write_is_none(home: Path, mode: int) ->
 
 def test_what_is_used_is_marked_so(home: Path) -> None:
     cache = Cache(str(home / "c"))
-    _keep(cache, "k")
-    os.utime(home / "c" / "k.encoder.onnx", (1, 1))
-    cache.find("k")
-    assert time.time() - (home / "c" / "k.encoder.onnx").stat().st_mtime < 60
+    _keep(cache, KEY)
+    os.utime(home / "c" / f"{KEY}.encoder.onnx", (1, 1))
+    cache.find(KEY)
+    assert time.time() - (home / "c" / f"{KEY}.encoder.onnx").stat().st_mtime < 60

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import stat
 import tempfile
+import time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from typing import TypeVar
 
     _T = TypeVar("_T")
@@ -22,12 +24,14 @@ if TYPE_CHECKING:
 #: Bytes that are kept, of eight voices or so; past that the oldest go.
 LARGEST = 500_000_000
 _ENCODER, _DECODER = ".encoder.onnx", ".decoder.onnx"
-#: How a file ends that is being written: one whose writer was killed is removed in its turn.
-_UNFINISHED = ".new"
+#: How a directory ends in which one is being written, which takes seconds, and those after which its writer was killed.
+_UNFINISHED, _KILLED = ".new", 3600.0
+#: The names of what is kept: nothing else is ever removed.
+_NAME = re.compile(rf"[0-9a-f]{{64}}-.*(?:{re.escape(_ENCODER)}|{re.escape(_DECODER)}|{re.escape(_UNFINISHED)})")
 
 
 class Cache:
-    """The cache in a directory; OSError where it can't be had."""
+    """The cache in a directory; OSError where it can't be had. A key begins with 64 hexadecimal digits and a hyphen."""
 
     def __init__(self, directory: str) -> None:
         os.makedirs(os.path.dirname(directory), exist_ok=True)
@@ -80,15 +84,22 @@ class Cache:
         return os.path.join(self._directory, key + end)
 
     def _shrink(self) -> None:
-        """Remove the oldest files past the limit."""
-        with contextlib.suppress(OSError), os.scandir(self._directory) as entries:
-            newest = sorted(((each.stat(), each.path) for each in entries), key=lambda each: -each[0].st_mtime_ns)
-            size = 0
-            for status, path in newest:
-                size += status.st_size
-                if size <= LARGEST:
-                    continue
-                if stat.S_ISDIR(status.st_mode):  # of a writer that was killed
+        """Remove the oldest files past the limit, and what writers left that were killed."""
+        size = 0
+        for changed, path in sorted(self._own(), reverse=True):
+            if path.endswith(_UNFINISHED):
+                if time.time() - changed > _KILLED:
                     shutil.rmtree(path, ignore_errors=True)
-                else:
+                continue
+            with contextlib.suppress(OSError):  # another process was quicker
+                size += os.lstat(path).st_size
+                if size > LARGEST:
                     os.unlink(path)
+
+    def _own(self) -> Iterator[tuple[float, str]]:
+        """Yield what is the cache's own, with the time of its last change or use."""
+        with contextlib.suppress(OSError), os.scandir(self._directory) as entries:
+            for each in entries:
+                if _NAME.fullmatch(each.name):
+                    with contextlib.suppress(OSError):
+                        yield each.stat(follow_symlinks=False).st_mtime, each.path
