@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import resource
+import subprocess
+import sys
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -118,6 +122,9 @@ def test_what_was_kept_and_is_damaged_is_made_anew(tmp_path: Path, damage: bytes
         (b"", {}, "is no ONNX model"),
         (tiny_voice.model()[:-200], {}, "is cut short"),
         (tiny_voice.model(loud=float("nan")), {}, "what is no number"),
+        (tiny_voice.model(lasting=1e4), {}, "more than 200 frames of 5 sounds"),
+        (tiny_voice.model(lasting=1e12), {}, "there is no memory for it; end another program"),
+        (tiny_voice.model(hop=5000), {}, "none of Piper's models .it makes [0-9]+ samples of"),
         (tiny_voice.model(sounds=5), {}, "do not belong together"),
         (tiny_voice.model(speakers=3), {}, "do not belong together .one has several speakers"),
         (tiny_voice.model(), {"speakers": 3}, "do not belong together .one has several speakers"),
@@ -132,8 +139,59 @@ def test_a_model_that_is_not_to_be_used_says_why_and_what_to_do(
     with pytest.raises(BadFile, match=why) as caught:
         _loaded(path)
     assert str(path) in str(caught.value)
-    assert "get" in str(caught.value)
+    assert "get" in str(caught.value) or "end another program" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_larger_than_any_model_is_not_read(tmp_path: Path) -> None:
+    path = tiny_voice.put(tmp_path / "v", "a")
+    os.truncate(path, 1 << 40)  # a hole: it takes no room on the disk
+    with pytest.raises(BadFile, match="larger than any of Piper's models: get the voice anew"):
+        _loaded(path)
+
+
+def test_no_model_gets_more_than_half_of_the_machines_memory(tmp_path: Path) -> None:
+    """Or a billion bytes, where that is more; and less where somebody has set less."""
+    path = tiny_voice.put(tmp_path / "v", "a")
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    try:
+        _loaded(path)
+        soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        assert (soft, hard) == (max(1 << 30, machine // 2), before[1])
+        resource.setrlimit(resource.RLIMIT_DATA, (soft - 1, hard))
+        _loaded(path)
+        assert resource.getrlimit(resource.RLIMIT_DATA) == (soft - 1, hard)
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
+#: Encodes far more sounds than a piece has, with 20 MB left, and then some.
+_WITH_LITTLE_MEMORY = """
+import resource, sys
+from talkcli.engine.synthesizers.inference import Model, Run
+from talkcli.engine.synthesizers.models import BadFile, describe
+sys.argv[1:] = {arguments!r}
+model = Model(sys.argv[1], describe(sys.argv[1]))
+before = resource.getrlimit(resource.RLIMIT_AS)
+with open("/proc/self/statm") as file:
+    used = int(file.read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 20_000_000, before[1]))
+try:
+    model.encode([1, 0, *[14, 0] * 500, 2], 0, 1.0, Run())
+except BadFile as error:
+    print(error)
+resource.setrlimit(resource.RLIMIT_AS, before)
+print(len(model.encode([1, 0, *[14, 0] * 500, 2], 0, 1.0, Run()).ends))
+"""
+
+
+def test_inference_without_memory_says_so_and_the_model_can_be_run_again() -> None:
+    path = str(real_voice())
+    code = _WITH_LITTLE_MEMORY.format(arguments=[path])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    words = f"{path} cannot be spoken with: there is no memory for it; end another program"
+    assert done.stdout.splitlines() == [words, "1003"]
 
 
 @limits()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import resource
 import time
 import wave
 from array import array
@@ -239,6 +240,55 @@ def test_what_is_wrong_with_its_files_ends_one_goal_in_words(
         assert engine.spoken(TEXT, "g4", voice="piper/wrong").outcome == protocol.COMPLETED
 
 
+def test_a_machine_without_memory_for_a_model_says_so_and_speaks_on(tmp_path: Path) -> None:
+    """With espeak at once, and with the voice when there is memory again; what was kept of it is kept."""
+    real_voice()
+    with _engine(tmp_path / "voices", f"file:{tmp_path / 'out.wav'}") as engine:
+        assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.COMPLETED
+        kept = sorted((each.name, each.stat().st_ino) for each in (tmp_path / "cache" / "talk").iterdir())
+    with _engine(tmp_path / "voices", f"file:{tmp_path / 'out.wav'}") as engine:
+        with _little_memory(engine, 350 << 20):
+            message = _failed(engine.spoken(TEXT, "g1", voice=REAL_VOICE))
+            assert "there is no memory for it; end another program" in message
+            assert "en_US-joe-medium.onnx" in message
+            assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
+        assert engine.spoken(TEXT, "g3", voice=REAL_VOICE).outcome == protocol.COMPLETED
+    assert kept == sorted((each.name, each.stat().st_ino) for each in (tmp_path / "cache" / "talk").iterdir())
+
+
+@contextlib.contextmanager
+def _little_memory(engine: Spawned, most: int) -> Iterator[None]:
+    """Let the process have no more than so many bytes of address space."""
+    before = resource.prlimit(engine.process.pid, resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
+    try:
+        yield
+    finally:
+        resource.prlimit(engine.process.pid, resource.RLIMIT_AS, before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("megabytes", range(80, 480, 40))
+def test_whatever_memory_there_is_a_sentence_has_one_end_and_the_next_is_espeaks(
+    tmp_path: Path, megabytes: int
+) -> None:
+    """The process may die of it, in numpy's own libraries: they end it where they get none as they are loaded.
+
+    Or an import fails in its midst, and says whatever is missing then.
+    """
+    real_voice()
+    limit = f"import resource\nresource.setrlimit(resource.RLIMIT_AS, ({megabytes} << 20, -1))"
+    with _engine(tmp_path / "voices", f"file:{tmp_path / 'out.wav'}", before=limit) as engine:
+        engine.say("word " * 100, "g1", voice=REAL_VOICE)
+        try:
+            ended = engine.until(protocol.Ended)
+        except AssertionError:
+            engine.process.wait(20)
+            return
+        message = _failed(ended)
+        assert "there is no memory for it; end another program" in message or INSTALL in message
+        assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
+
+
 @pytest.mark.parametrize("text", ["日本語", "😀 привет", "\ud800 a", "x" * 10_000, "a.b " * 2_500, "word " * 2_000])
 def test_any_text_comes_to_an_end(place: Path, tmp_path: Path, text: str) -> None:
     with _engine(place, f"file:{tmp_path / 'out.wav'}") as engine:
@@ -391,8 +441,15 @@ def test_sounds_that_it_does_not_know_are_left_out_and_a_text_of_nothing_else_sa
     about["phoneme_id_map"] = {"_": [0], "^": [1], "$": [2], "a": [3], "\u00e6": [4]}
     tiny_voice.put(place, "few", beside=about)
     with _engine(place) as engine:
-        ended = engine.spoken("Cat! " + "See! " * 12 + "Cat!", "g1", voice="piper/few")
+        text = "Cat! " + "See! " * 12 + "Cat!"
+        ended = engine.spoken(text, "g1", voice="piper/few")
         assert ended.outcome == protocol.COMPLETED
+        # The first sound of "cat", and of "see" all: who hears a part of a sentence is told of all of its words.
+        assert [text[each.start : each.end] for each in engine.words("g1")] == ["Cat", "Cat"]
+        assert engine.spoken("See a cat see.", "g3", voice="piper/few").outcome == protocol.COMPLETED
+        told = [each.time for each in engine.words("g3")]
+        assert len(told) == 4
+        assert told == sorted(told)
         message = _failed(engine.spoken("See! " * 12, "g2", voice="piper/few"))
         assert "few.onnx.json has no number for a sound of the text (" in message
 

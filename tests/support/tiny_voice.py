@@ -72,6 +72,7 @@ def model(
     hop: int = 256,
     period: int = 100,
     loud: float = 0.5,
+    lasting: float = SOUND_FRAMES,
     speakers: int = 1,
     sounds: int = len(SOUNDS),
     nodes: bytes = b"",
@@ -81,10 +82,11 @@ def model(
 ) -> bytes:
     """Return a model: `hop` samples a frame, each period of so many samples half up and half down.
 
-    `loud` is of full scale, NaN for no number; each further speaker is a little louder. The last four are for what a
-    model must not be: nodes and weights that are added to its graph, fields to the whole, and the name of its cut.
+    `loud` is of full scale, NaN for no number; each further speaker is a little louder. `lasting`: the frames of each
+    sound. The last four are for what a model must not be: nodes and weights that are added to its graph, fields to the
+    whole, and the name of its cut.
     """
-    frames = [BLANK_FRAMES, *([SOUND_FRAMES] * (sounds - 1))]
+    frames = [BLANK_FRAMES, *([lasting] * (sounds - 1))]
     wave = [loud if place % period < period / 2 else -loud for place in range(hop)]
     several = speakers > 1
     graph = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
@@ -11,6 +12,9 @@ from hypothesis import strategies as st
 from talkcli.engine.synthesizers.vits import NotCut, halves
 from tests.support import tiny_voice
 from tests.support.tiny_voice import field, node, tensor, weight
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 MODEL = tiny_voice.model()
 #: An attribute of a node: a graph, and one with a tensor.
@@ -73,6 +77,7 @@ def test_a_graph_inside_of_another_keeps_what_it_needs() -> None:
         (tiny_voice.model(nodes=_inside(node("Evil", [], "x", domain="evil"), 2)), "operators of its own (evil:Evil)"),
         (tiny_voice.model(nodes=_inside(weight("w", [1], 1, more=field(14, 1)), 2)), "in another file"),
         (tiny_voice.model(nodes=_inside(b"", 50)), "graphs inside of graphs"),
+        (tiny_voice.model(nodes=node("Add", ["n" * 1001], "x")), "is none of Piper's models: it has names that are"),
         (
             tiny_voice.model(
                 nodes=node(
@@ -89,6 +94,26 @@ def test_a_graph_inside_of_another_keeps_what_it_needs() -> None:
 def test_what_is_not_to_be_run_is_refused_in_words(model: bytes, why: str) -> None:
     with pytest.raises(NotCut, match=why.replace("(", r"\(").replace(")", r"\)").replace(".", r"\.")):
         halves(model)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        lambda many: tiny_voice.model(fields=many),
+        lambda many: tiny_voice.model(nodes=many),
+        lambda many: tiny_voice.model(nodes=node("Add", [], "x", many)),
+        lambda many: tiny_voice.model(nodes=node("Add", [], "x", field(5, many))),
+        lambda many: tiny_voice.model(weights=weight("w", [1], 1, more=many)),
+        lambda many: tiny_voice.model(fields=field(8, many)),
+        lambda many: tiny_voice.model(nodes=field(1, b"") * (len(many) // 2)),
+    ],
+    ids=["model", "graph", "attribute", "tensor", "weight", "operators", "nodes"],
+)
+def test_a_model_of_too_many_parts_is_refused_wherever_they_are(where: Callable[[bytes], bytes]) -> None:
+    """A file of as many bytes as a model may have could hold 100 million: minutes, and 30 GB."""
+    halves(where(field(3, 1) * 100))
+    with pytest.raises(NotCut, match="it has too many parts"):
+        halves(where(field(3, 1) * 300_000))
 
 
 @given(st.integers(0, len(MODEL) - 1), st.binary(min_size=1, max_size=8))

@@ -8,8 +8,10 @@ BadFile, with words that name its file.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import resource
 
 from talkcli.engine.synthesizers.models import BEGIN, END, PAD, BadFile, open_checked
 from talkcli.engine.synthesizers.vits import NotCut, halves
@@ -25,8 +27,17 @@ if TYPE_CHECKING:
 #: Frames on either side of some that their samples depend on. Reckoned for the largest of Piper's decoders ("high"),
 #: 13.4; of a "medium" one the samples with 10 are those of the whole to a part in 400,000.
 AROUND = 14
-#: Bytes of a model: Piper's have 15 to 120 million, and no half may have 2^31.
-_LARGEST = 1 << 30
+#: Bytes of a model: Piper's have 15 to 120 million.
+_LARGEST = 1 << 28
+#: Frames that a sound may last on the average, the blanks between them counted as sounds, and the samples of one: of
+#: en_US-joe-medium's they are 4 at most at its own pace, 35 a single one, and each of Piper's has 256 samples. More
+#: would be minutes of one sentence, and gigabytes.
+_MOST_FRAMES, _MOST_SAMPLES = 40, 4096
+#: Bytes that the process may have at least, whatever the machine has: one with a voice of 63 MB has 0.4 billion.
+_LEAST_MEMORY = 1 << 30
+#: What onnxruntime says, in the midst of much else, where it got no memory, and what is said of libraries.
+_NO_MEMORY = ("bad_alloc", "bad allocation", "Failed to allocate memory", os.strerror(errno.ENOMEM))
+_NO_MEMORY_FOR_LIBRARIES = "failed to map segment from shared object"
 #: Characters of what onnxruntime says that are handed on.
 _SHOWN = 200
 #: The number of the way in which `vits` cuts: to be raised with it, so that what was kept is made anew.
@@ -69,18 +80,23 @@ class Model:
         """Load it, in 0.3 to 3 s; BadFile. What takes the most of it is kept in the cache."""
         self.path = path
         self.description = description
+        _import(path)
+        _spare_machine()
         with open_checked(path) as file:
-            content: bytes = file.read(_LARGEST + 1)
-        if len(content) > _LARGEST:
-            raise BadFile(f"{path} is larger than any of Piper's models: get the voice anew")
+            size = os.fstat(file.fileno()).st_size
+            if size > _LARGEST:
+                raise BadFile(f"{path} is larger than any of Piper's models: get the voice anew")
+            content: bytes = file.read(size)
         key = f"{hashlib.sha256(content).hexdigest()}-{_CUT}-{_version()}"
         kept = cache.find(key) if cache is not None else None
         if cache is not None and kept is not None:
             try:
                 self._take(*_kept(*kept))
                 return
-            except Exception:  # noqa: BLE001 - cut short by a full disk, or whatever: it is made anew, and tells then
-                cache.forget(key)
+            except Exception as error:
+                if _lacks_memory(error):
+                    raise _no_memory(path) from error
+                cache.forget(key)  # cut short by a full disk, or whatever: it is made anew, and tells then
         self._take(*_cut(path, content, cache, key))
 
     def _take(self, encoder: Any, decoder: Any) -> None:
@@ -90,7 +106,10 @@ class Model:
         self._several = _SPEAKER in {each.name for each in self._encoder.get_inputs()}
         names = {each.name for each in self._encoder.get_inputs()}
         if names - {_SPEAKER} != {*_INPUTS}:
-            raise BadFile(f"{path} is none of Piper's models: it takes {', '.join(sorted(names))[:_SHOWN]}")
+            takes = ", ".join(sorted(names))[:_SHOWN]
+            raise BadFile(f"{path} is none of Piper's models (it takes {takes}): get the voice anew")
+        if [each.type for each in decoder.get_outputs()] != ["tensor(float)"]:
+            raise BadFile(f"{path} is none of Piper's models (it makes no samples): get the voice anew")
         if self._several != (description.speakers > 1):
             raise self._foreign("one has several speakers, the other has one")
         self._frames = [each.name for each in self._decoder.get_inputs()]
@@ -115,6 +134,9 @@ class Model:
         durations = durations.reshape(-1)
         if len(durations) != len(numbers) or not np.isfinite(durations).all() or (durations < 0).any():
             raise BadFile(f"{self.path} does not tell how long each sound lasts: get the voice anew")
+        most = _MOST_FRAMES * len(numbers) * max(1.0, about.pace * pace)
+        if durations.sum() > most:
+            raise BadFile(f"{self.path} makes more than {most:.0f} frames of {len(numbers)} sounds: get the voice anew")
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: Run) -> Any:
@@ -124,13 +146,14 @@ class Model:
         low, high = max(0, begin - AROUND), min(frames.count, end + AROUND)
         # What goes for the whole, as who speaks, has no frames.
         parts = {
-            name: each[..., low:high] if each.shape[-1] == frames.count else each
+            name: each[..., low:high] if each.shape[-1:] == (frames.count,) else each
             for name, each in zip(self._frames, frames.values, strict=True)
         }
         samples = self._outputs(self._decoder, parts, run)[0].reshape(-1)
         hop, rest = divmod(len(samples), high - low)
-        if rest or not hop:
-            raise BadFile(f"{self.path} is none of Piper's models: its frames are of no whole number of samples")
+        if rest or not 0 < hop <= _MOST_SAMPLES:
+            made = f"it makes {len(samples)} samples of {high - low} frames"
+            raise BadFile(f"{self.path} is none of Piper's models ({made}): get the voice anew")
         part = samples[(begin - low) * hop : (end - low) * hop]
         if not np.isfinite(part).all():
             raise BadFile(f"{self.path} makes no sound, but what is no number: get the voice anew")
@@ -144,7 +167,7 @@ class Model:
         try:
             found: list[Any] = half.run(None, feed, run.options)
         except Exception as error:
-            raise BadFile(f"{self.path} cannot be run ({_first_line(error)}): get the voice anew") from error
+            raise _told(self.path, "cannot be run", error) from error
         return found
 
     def _try_out(self) -> int:
@@ -156,6 +179,8 @@ class Model:
         try:
             frames = self.encode(numbers, 0, 1.0, run)
         except BadFile as error:
+            if _lacks_memory(error.__cause__):
+                raise
             raise self._foreign(str(error.__cause__ or error)) from error
         if not frames.count:
             raise BadFile(f"{self.path} speaks nothing: get the voice anew")
@@ -193,7 +218,7 @@ def _cut(path: str, content: bytes, cache: Cache | None, key: str) -> tuple[Any,
             return _session(cut.encoder), decoder
         return cache.keep(key, lambda place: _session(cut.encoder, kept=place), cut.decoder), decoder
     except Exception as error:
-        raise BadFile(f"{path} cannot be loaded ({_first_line(error)}): get the voice anew") from error
+        raise _told(path, "cannot be loaded", error) from error
 
 
 def _session(model: str | bytes, level: Any = None, kept: str | None = None) -> Any:
@@ -211,6 +236,42 @@ def _session(model: str | bytes, level: Any = None, kept: str | None = None) -> 
     if kept is not None:
         options.optimized_model_filepath = kept
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
+def _import(path: str) -> None:
+    try:
+        import numpy as np  # noqa: F401 - before onnxruntime, which doesn't say why it fails
+        import onnxruntime  # noqa: F401
+    except Exception as error:
+        if _lacks_memory(error):
+            raise _no_memory(path) from error
+        raise ImportError(_first_line(error)) from error
+
+
+def _spare_machine() -> None:
+    """Have what needs most of the machine's memory fail, as a model can ask for any amount, and the machine live.
+
+    What the library can't have it says; without a limit the machine would stand still, and end whatever it chooses.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    most = max(_LEAST_MEMORY, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
+    if soft == resource.RLIM_INFINITY or soft > most:
+        resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
+
+
+def _told(path: str, what: str, error: Exception) -> BadFile:
+    """Return what is said of a model that onnxruntime does not take."""
+    if _lacks_memory(error):
+        return _no_memory(path)
+    return BadFile(f"{path} {what} ({_first_line(error)}): get the voice anew")
+
+
+def _no_memory(path: str) -> BadFile:
+    return BadFile(f"{path} cannot be spoken with: there is no memory for it; end another program")
+
+
+def _lacks_memory(error: BaseException | None) -> bool:
+    return isinstance(error, MemoryError) or any(each in str(error) for each in (*_NO_MEMORY, _NO_MEMORY_FOR_LIBRARIES))
 
 
 def _first_line(error: Exception) -> str:

@@ -39,6 +39,8 @@ _MOST_SPEAKERS = 4096
 _SHOWN, _LONGEST_NAME = 40, 64
 #: Samples per second that a player can be asked for.
 _RATES = range(4000, 192001)
+#: Numbers of a sound: Piper's voices have one. What a model needs grows with the square of all in a sentence.
+_MOST_NUMBERS = 4
 #: What a model takes between two sounds, before the first and behind the last, by its names in `phoneme_id_map`.
 PAD, BEGIN, END = "_", "^", "$"
 
@@ -236,6 +238,8 @@ def _described(found: Any) -> Description:
     if found.get("phoneme_type", "espeak") != "espeak":
         raise ValueError(f"its sounds are not libespeak-ng's, but {found['phoneme_type']!r}")
     sounds = {str(key): tuple(map(_number, value)) for key, value in found["phoneme_id_map"].items()}
+    if max(map(len, sounds.values()), default=0) > _MOST_NUMBERS:
+        raise ValueError(f"phoneme_id_map has more than {_MOST_NUMBERS} numbers for a sound")
     for each in (PAD, BEGIN, END):
         if not sounds.get(each):
             raise ValueError(f"phoneme_id_map has no {each}")

@@ -131,6 +131,9 @@ class Piper:
         except BadFile as error:
             self.loader.suspect(voice)
             raise CannotSpeak("voice_failed", str(error)) from error
+        except MemoryError as error:
+            words = f"{self._path} cannot be spoken with: there is no memory for it; end another program"
+            raise CannotSpeak("voice_failed", words) from error
         except UnknownVoice as error:
             self.loader.suspect(voice)
             raise CannotSpeak("voice_failed", f"{model.path}.json: {error}: get the voice anew") from error
@@ -179,9 +182,7 @@ def _made(model: Model, spelled: Iterator[Piece], speaker: int, sound: Sound, ru
         known = True
         frames = model.encode(numbers, speaker, _pace(sound.rate), run)
         begins = [0, *frames.ends]
-        words = tuple(
-            (start, length, model.seconds(begins[places[at]])) for at, start, length in piece.words if at in places
-        )
+        words = tuple((start, length, model.seconds(begins[places[at]])) for at, start, length in piece.words)
         loudest = 0.0
         faint = 0  # samples, up to here
         begin, many = 0, _FIRST
@@ -212,15 +213,19 @@ def _samples(part: Any, volume: float) -> bytes:
     return made
 
 
-def _numbered(sounds: Sequence[str], numbers: Mapping[str, tuple[int, ...]]) -> tuple[list[int], dict[int, int]]:
-    """Return the model's numbers for some sounds, and where among them each sound is that the model knows."""
+def _numbered(sounds: Sequence[str], numbers: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
+    """Return the model's numbers for some sounds, and where among them each sound begins; no places if it knows none.
+
+    One that it doesn't know begins where the next one does that it knows, or the end.
+    """
     result = [*numbers[BEGIN], *numbers[PAD]]
-    places = {}
-    for at, sound in enumerate(sounds):
-        if sound in numbers:
-            places[at] = len(result)
+    places = []
+    for sound in sounds:
+        places.append(len(result))
+        if numbers.get(sound):
             result += [*numbers[sound], *numbers[PAD]]
-    return [*result, *numbers[END]], places
+    known = any(numbers.get(each) for each in sounds)
+    return [*result, *numbers[END]], places if known else []
 
 
 def _pace(rate: int) -> float:

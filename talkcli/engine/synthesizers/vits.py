@@ -10,6 +10,8 @@ anything outside of the file, is refused here, and nothing is handed on but what
 
 from __future__ import annotations
 
+import itertools
+
 from talkcli.frozen import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
@@ -40,6 +42,9 @@ _RANDOM = "Random"
 _FLOATS = b"\x12\x04\x0a\x02\x08\x01"
 #: Graphs inside of graphs that are looked at: Piper's have none, and PyTorch writes one for a condition.
 _DEEPEST = 4
+#: Fields that are read of a model, 300 bytes and a microsecond or three each: Piper's have 30,000. And the characters
+#: of a name: theirs have 52 at most.
+_MOST_FIELDS, _LONGEST_NAME = 300_000, 1000
 #: Bits of the longest integer.
 _LONGEST = 64
 
@@ -60,13 +65,14 @@ class Halves:
 
 def halves(model: Buffer) -> Halves:
     """Cut a model; NotCut."""
-    fields = list(_fields(memoryview(model)))
+    reader = _Reader()
+    fields = reader.fields(memoryview(model))
     graphs = [value for number, kind, value in fields if (number, kind) == (_GRAPH, _BYTES)]
     if len(graphs) != 1:
         raise NotCut("is no ONNX model")
     if any(number == _FUNCTIONS for number, _, _ in fields):
         raise NotCut("has operators of its own")
-    graph = _Graph(graphs[0])
+    graph = _Graph(reader, graphs[0])
     decoder = graph.behind(_CUT)
     if not decoder:
         raise NotCut(f"is none of Piper's models: it has no {_CUT}")
@@ -81,7 +87,7 @@ def halves(model: Buffer) -> Halves:
     if not handed or len(durations) != 1:
         raise NotCut("is none of Piper's models: it does not tell how long each sound lasts")
     second = [*graph.needed(takes & constants), *decoder]
-    head = [each for each in fields if _is_head(each)]
+    head = [each for each in fields if _is_head(reader, each)]
     ends = [(_OUTPUT, _BYTES, _value(name)) for name in [*handed, *durations]]
     begins = [(_INPUT, _BYTES, _value(name)) for name in handed]
     return Halves(
@@ -90,11 +96,26 @@ def halves(model: Buffer) -> Halves:
     )
 
 
+class _Reader:
+    """Reads messages, of one model and no more of them than a model of Piper's may have."""
+
+    def __init__(self) -> None:
+        self._left = _MOST_FIELDS
+
+    def fields(self, raw: Buffer) -> list[Field]:
+        """Return the fields of a message; NotCut where it isn't one."""
+        found = list(itertools.islice(_fields(raw), self._left + 1))
+        self._left -= len(found)
+        if self._left < 0:
+            raise NotCut("is none of Piper's models: it has too many parts")
+        return found
+
+
 class _Node:
     """An operation: what it needs, what it makes; what graphs inside of it need, it needs, too."""
 
-    def __init__(self, raw: Buffer, depth: int) -> None:
-        fields = list(_fields(raw))
+    def __init__(self, reader: _Reader, raw: Buffer, depth: int) -> None:
+        fields = reader.fields(raw)
         self.raw = raw
         self.inputs = _names(fields, _NODE_INPUT)
         self.outputs = _names(fields, _NODE_OUTPUT)
@@ -103,26 +124,26 @@ class _Node:
         if domain not in _STANDARD:
             raise NotCut(f"has operators of its own ({domain[:40]}:{self.operator[:40]})")
         for attribute in _messages(fields, _ATTRIBUTE):
-            parts = list(_fields(attribute))
+            parts = reader.fields(attribute)
             if any(number in {_SPARSE_TENSOR, _SPARSE_TENSORS} for number, _, _ in parts):
                 raise NotCut("has sparse weights, which none of Piper's has")
             for tensor in (*_messages(parts, _TENSOR), *_messages(parts, _TENSORS)):
-                _tensor_name(tensor)
+                _tensor_name(reader, tensor)
             for inner in (*_messages(parts, _SUBGRAPH), *_messages(parts, _SUBGRAPHS)):
-                self.inputs += [name for each in _Graph(inner, depth + 1).nodes for name in each.inputs]
+                self.inputs += [name for each in _Graph(reader, inner, depth + 1).nodes for name in each.inputs]
 
 
 class _Graph:
     """The nodes of a graph, in the order in which they run, with their weights."""
 
-    def __init__(self, raw: Buffer, depth: int = 0) -> None:
+    def __init__(self, reader: _Reader, raw: Buffer, depth: int = 0) -> None:
         if depth > _DEEPEST:
             raise NotCut(f"has graphs inside of graphs, more than {_DEEPEST} deep")
-        fields = list(_fields(raw))
+        fields = reader.fields(raw)
         if any(number == _SPARSE_INITIALIZER for number, _, _ in fields):
             raise NotCut("has sparse weights, which none of Piper's has")
-        self.nodes = [_Node(each, depth) for each in _messages(fields, _NODE)]
-        self._weights = {_tensor_name(each): each for each in _messages(fields, _INITIALIZER)}
+        self.nodes = [_Node(reader, each, depth) for each in _messages(fields, _NODE)]
+        self._weights = {_tensor_name(reader, each): each for each in _messages(fields, _INITIALIZER)}
         self.inputs = [each for each in fields if each[:2] == (_INPUT, _BYTES)]
         self.outputs = [each for each in fields if each[:2] == (_OUTPUT, _BYTES)]
 
@@ -161,17 +182,17 @@ class _Graph:
         return [*((_NODE, _BYTES, each.raw) for each in nodes), (_GRAPH_NAME, _BYTES, b"half"), *kept]
 
 
-def _is_head(field: Field) -> bool:
+def _is_head(reader: _Reader, field: Field) -> bool:
     """Tell whether a field of the model belongs to both halves: what version it is of, of which standard operators."""
     number, kind, value = field
     if (number, kind) == (_OPERATORS, _BYTES):
-        return "".join(_names(_fields(value), _DOMAIN)) in _STANDARD
+        return "".join(_names(reader.fields(value), _DOMAIN)) in _STANDARD
     return number == _IR_VERSION
 
 
-def _tensor_name(raw: Buffer) -> str:
+def _tensor_name(reader: _Reader, raw: Buffer) -> str:
     """Return the name of a tensor; NotCut if its numbers are not in it."""
-    fields = list(_fields(raw))
+    fields = reader.fields(raw)
     outside = (value for number, _, value in fields if number in {_EXTERNAL_DATA, _DATA_LOCATION})
     if any(bytes(value) != b"\0" for value in outside):
         raise NotCut("has its weights in another file")
@@ -183,8 +204,11 @@ def _messages(fields: Iterable[Field], wanted: int) -> list[Buffer]:
 
 
 def _names(fields: Iterable[Field], wanted: int) -> list[str]:
+    found = _messages(fields, wanted)
+    if any(len(value) > _LONGEST_NAME for value in found):
+        raise NotCut("is none of Piper's models: it has names that are too long")
     try:
-        return [bytes(value).decode() for value in _messages(fields, wanted)]
+        return [bytes(value).decode() for value in found]
     except UnicodeDecodeError as error:
         raise NotCut("is no ONNX model: it has names that are no text") from error
 
