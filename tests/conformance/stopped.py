@@ -1,4 +1,4 @@
-"""What libespeak-ng itself makes of sentences after one that it was told to stop: a program, and what runs it.
+"""What is heard of sentences after one that was stopped; and what libespeak-ng itself makes of them: a program.
 
 A sentence that follows a stopped one differs from the same sentence in any other place, but it depends on nothing but
 where the synthesis was stopped, which is between two of the pieces that the library hands over. So there are as many
@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tests.conformance.hearing import QUICK
+from tests.conformance.voices import ESPEAK
 from tests.support.compare import assert_begun, assert_heard, assert_silent, extent
 from tests.support.espeak import _Callback, load
 from tests.support.recording import LOUD
-from tests.support.reference import render
 from tests.support.surroundings import clean_environment
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from tests.conformance.voices import Voice
     from tests.support.compare import Comparison
     from tests.support.espeak import _Event
     from tests.support.recording import Recording
@@ -53,7 +54,13 @@ _RATE = 1
 
 
 def assert_heard_after_stop(
-    heard: Recording | Samples, stopped: str, following: Sequence[str], *, begun: bool = True, rate: int = QUICK
+    heard: Recording | Samples,
+    stopped: str,
+    following: Sequence[str],
+    *,
+    begun: bool = True,
+    rate: int = QUICK,
+    voice: Voice = ESPEAK,
 ) -> list[Comparison]:
     """Assert that a beginning of a fresh engine's first sentence was heard, then the following ones whole.
 
@@ -62,10 +69,11 @@ def assert_heard_after_stop(
     """
     samples = heard if isinstance(heard, np.ndarray) else heard.samples
     wrong: AssertionError | None = None
-    for start, references in likeliest(samples, _render_after_stop((stopped, *following), rate)):
+    turns = [voice.render(following, rate)] if voice.repeats else _render_after_stop((stopped, *following), rate)
+    for start, references in likeliest(samples, turns):
         try:
             if begun:
-                assert_begun(samples[:start], render([stopped], rate=rate)[0])
+                assert_begun(samples[:start], voice.render([stopped], rate)[0])
             elif start:  # else it is the first that was recorded
                 assert_silent(samples[:start])
             return assert_heard(samples[start:], references)

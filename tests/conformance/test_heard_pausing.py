@@ -18,8 +18,6 @@ from tests.conformance.hearing import (
     await_word,
     begin,
     heard,
-    quick_talk,
-    render_quick,
     send,
 )
 from tests.conformance.told import assert_recalled, assert_told_in_order, submit
@@ -30,6 +28,7 @@ from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from tests.conformance.hearing import Samples
+    from tests.conformance.voices import Voice
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
     from tests.support.processes import Talk
@@ -48,8 +47,8 @@ SLACK = 256
 
 
 @pytest.fixture
-def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
-    return quick_talk(make_talk, sink)
+def talk(make_talk: MakeTalk, sink: Sink, voice: Voice) -> Talk:
+    return voice.serve(make_talk, sink)
 
 
 def pause(talk: Talk) -> Message:
@@ -85,12 +84,12 @@ def assert_silent_since(talk: Talk, moment: float, seconds: float) -> None:
     ],
 )
 def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
-    make_talk: MakeTalk, sink: Sink, player: str, word: int, seconds: float
+    make_talk: MakeTalk, sink: Sink, player: str, word: int, seconds: float, voice: Voice
 ) -> None:
-    (reference,) = render_quick([LONG])
+    (reference,) = voice.render([LONG])
 
     with limits():
-        talk = quick_talk(make_talk, sink, "--player", player)
+        talk = voice.serve(make_talk, sink, "--player", player)
         goal = send(talk, LONG)
         await_word(talk, goal, word)
         asked = time.monotonic()
@@ -113,7 +112,7 @@ def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
         assert_within(silent - asked, SILENT, f"the silence after a pause at word {word}")
 
 
-def test_row_43_a_sentence_that_is_held_twice_is_heard_whole(talk: Talk) -> None:
+def test_row_43_a_sentence_that_is_held_twice_is_heard_whole(talk: Talk, voice: Voice) -> None:
     goal = begin(talk, LONG)
     pause(talk)
     assert_silent_since(talk, time.monotonic(), 0.5)
@@ -126,13 +125,13 @@ def test_row_43_a_sentence_that_is_held_twice_is_heard_whole(talk: Talk) -> None
     resume(talk)
     assert resume(talk)["goal"]["id"] == goal
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-    _assert_held_twice(heard(talk), render_quick([LONG])[0])
+    _assert_held_twice(heard(talk), voice.render([LONG])[0])
     words = talk.watcher.words(goal)
     assert [each["number"] for each in words] == list(range(1, len(words) + 1))
     assert [each["word"] for each in words] == LONG.split()
 
 
-def test_row_43_nothing_starts_while_paused_and_the_sender_is_told(talk: Talk) -> None:
+def test_row_43_nothing_starts_while_paused_and_the_sender_is_told(talk: Talk, voice: Voice) -> None:
     assert pause(talk)["goal"] is None
     reply = talk.request("say", text=HOME)
     assert (reply["paused"], reply["goal"]["state"]) == (True, "PENDING")
@@ -142,13 +141,15 @@ def test_row_43_nothing_starts_while_paused_and_the_sender_is_told(talk: Talk) -
     assert talk.request("status")["server"]["paused"] is True
     resume(talk)
     assert talk.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
-    assert_heard(heard(talk), render_quick([LOW, HOME]))
+    assert_heard(heard(talk), voice.render([LOW, HOME]))
     assert "paused" not in talk.request("say", text=LOW)
     heard(talk)
 
 
 @pytest.mark.parametrize("selection", [{}, {"current": True}, {"before": "held"}], ids=["all", "current", "before"])
-def test_row_43_a_held_goal_is_cancelled_and_is_never_heard_again(talk: Talk, selection: dict[str, Any]) -> None:
+def test_row_43_a_held_goal_is_cancelled_and_is_never_heard_again(
+    talk: Talk, selection: dict[str, Any], voice: Voice
+) -> None:
     goal = begin(talk, LONG, id="held")
     pause(talk)
     assert talk.request("cancel", **selection)["count"] == 1
@@ -159,7 +160,7 @@ def test_row_43_a_held_goal_is_cancelled_and_is_never_heard_again(talk: Talk, se
     assert_silent_since(talk, time.monotonic(), 0.3)
     resume(talk)
     assert talk.watcher.wait_for_terminal(after) == "SUCCEEDED"
-    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
 
 
 def test_row_43_the_cancel_of_a_held_goal_is_answered_in_time(talk: Talk) -> None:
@@ -206,7 +207,7 @@ def test_row_43_the_timeout_of_a_client_runs_out_while_paused(talk: Talk) -> Non
 
 
 @pytest.mark.parametrize("how", ["preempt", "flush"])
-def test_row_43_a_goal_that_preempts_ends_the_held_one_and_waits(talk: Talk, how: str) -> None:
+def test_row_43_a_goal_that_preempts_ends_the_held_one_and_waits(talk: Talk, how: str, voice: Voice) -> None:
     held = begin(talk, LONG)
     pause(talk)
     newcomer = send(talk, LOW, **{how: True})
@@ -216,7 +217,7 @@ def test_row_43_a_goal_that_preempts_ends_the_held_one_and_waits(talk: Talk, how
     assert talk.goal(newcomer)["state"] == "PENDING"
     resume(talk)
     assert talk.watcher.wait_for_terminal(newcomer) == "SUCCEEDED"
-    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
     assert_told_in_order(talk)
 
 
@@ -232,14 +233,16 @@ def test_row_43_a_lower_priority_leaves_the_held_one(talk: Talk) -> None:
 
 
 @pytest.mark.slow
-def test_row_43_the_watchdog_leaves_a_sentence_alone_that_is_held_for_longer_than_its_limits(talk: Talk) -> None:
+def test_row_43_the_watchdog_leaves_a_sentence_alone_that_is_held_for_longer_than_its_limits(
+    talk: Talk, voice: Voice
+) -> None:
     goal = begin(talk, LONG)
     pause(talk)
     assert_silent_since(talk, time.monotonic(), 5)
     assert talk.goal(goal)["paused"] is True
     resume(talk)
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-    assert_resumed(heard(talk), render_quick([LONG])[0], pause=5, twice=TWICE)
+    assert_resumed(heard(talk), voice.render([LONG])[0], pause=5, twice=TWICE)
 
 
 def test_row_43_all_who_listen_are_told_who_paused(talk: Talk) -> None:
@@ -257,14 +260,14 @@ def test_row_43_all_who_listen_are_told_who_paused(talk: Talk) -> None:
     assert_told_in_order(talk)
 
 
-def test_a_server_that_is_terminated_while_paused_ends_all(talk: Talk) -> None:
+def test_a_server_that_is_terminated_while_paused_ends_all(talk: Talk, voice: Voice) -> None:
     held = begin(talk, LONG)
     pause(talk)
     waiting = send(talk, LOW)
     talk.stop(timeout=2)
     assert talk.watcher.states(held) == STOPPED
     assert talk.watcher.states(waiting) == ["PENDING", "RECALLED"]
-    assert_begun(heard(talk), render_quick([LONG])[0])
+    assert_begun(heard(talk), voice.render([LONG])[0])
 
 
 def _assert_held_twice(samples: Samples, reference: Samples) -> None:

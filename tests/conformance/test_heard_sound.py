@@ -15,12 +15,9 @@ from tests.conformance.hearing import (
     HOME,
     LONG,
     LOW,
-    QUICK,
     assert_aborted,
     begin_with_client,
     heard,
-    quick_talk,
-    render_quick,
 )
 from tests.support.compare import assert_begun, assert_silent
 from tests.support.sink import Sink
@@ -30,6 +27,7 @@ if TYPE_CHECKING:
     import pathlib
     from collections.abc import Callable, Iterator
 
+    from tests.conformance.voices import Voice
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
     from tests.support.processes import Finished, Process, Talk
@@ -68,10 +66,10 @@ def breakable(broken: list[Sink]) -> Sink:
 
 
 def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
-    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path
+    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, voice: Voice
 ) -> None:
     env = {"PATH": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"}  # which aplay does not go by here
-    talk = make_talk("--rate", str(QUICK), sink=sink, env=env)
+    talk = voice.serve(make_talk, sink, env=env)
     goal = _aborted(talk, talk.run("say", "--wait", "--", LOW))
     assert_aborted(goal, "no_player", "no player found: install alsa-utils (aplay)", "pulseaudio-utils (pacat)")
     assert goal["spoken"] == ""
@@ -79,25 +77,25 @@ def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
     assert aplay
     (tmp_path / "aplay").symlink_to(aplay)
     assert talk.run("say", "--wait", "--", HOME).code == 0
-    stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False)
+    stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False, voice=voice)
 
 
 def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
-    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path
+    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, voice: Voice
 ) -> None:
     configuration = tmp_path / ".asoundrc"
 
     with limits():
         configuration.write_text(NO_CARD)
         env = {"HOME": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"}
-        talk = make_talk("--rate", str(QUICK), sink=sink, env=env)
+        talk = voice.serve(make_talk, sink, env=env)
         done = talk.run("say", "--wait", "--", LOW)
         goal = _aborted(talk, done)
         assert_aborted(goal, "audio_device", "aplay: audio open error: No such file or directory")
         assert goal["spoken"] == ""
         shutil.copy(os.path.join(sink.directory, ".asoundrc"), configuration)
         assert talk.run("say", "--wait", "--", HOME).code == 0
-        stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False)
+        stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False, voice=voice)
         assert_within(done.seconds, 1, "`say --wait` without a device")
 
 
@@ -109,39 +107,43 @@ def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
         ("pulse", 'the sound server has no sink "nonesuch": see pactl list short sinks'),
     ],
 )
-def test_row_41_a_device_of_another_name_is_told(make_talk: MakeTalk, sink: Sink, player: str, line: str) -> None:
-    talk = make_talk("--player", player, "--device", "nonesuch", sink=sink)
+def test_row_41_a_device_of_another_name_is_told(
+    make_talk: MakeTalk, sink: Sink, player: str, line: str, voice: Voice
+) -> None:
+    talk = voice.serve(make_talk, sink, "--player", player, "--device", "nonesuch")
     assert_aborted(_aborted(talk, talk.run("say", "--wait", "--", LOW)), "audio_device", line)
     assert_silent(heard(talk))
 
 
 @each_player
-def test_row_41_a_device_that_is_lost_in_mid_sentence(make_talk: MakeTalk, breakable: Sink, player: str) -> None:
+def test_row_41_a_device_that_is_lost_in_mid_sentence(
+    make_talk: MakeTalk, breakable: Sink, player: str, voice: Voice
+) -> None:
     sink = breakable
-    talk = quick_talk(make_talk, sink, "--player", player)
+    talk = voice.serve(make_talk, sink, "--player", player)
     _, client = begin_with_client(talk, LONG, number=5)
     sink.unload()
-    _lost(talk, client, *LOST[player])
+    _lost(talk, client, *LOST[player], voice=voice)
     sink.reload()
-    _heard_again(talk, sink, LONG)
+    _heard_again(talk, sink, LONG, voice)
 
 
 @pytest.mark.slow
 @each_player
 def test_row_41_a_sound_server_that_is_killed_in_mid_sentence(
-    make_talk: MakeTalk, breakable: Sink, player: str
+    make_talk: MakeTalk, breakable: Sink, player: str, voice: Voice
 ) -> None:
     sink = breakable
-    talk = quick_talk(make_talk, sink, "--player", player)
+    talk = voice.serve(make_talk, sink, "--player", player)
     _, client = begin_with_client(talk, LONG, number=5)
     sink.kill_server()
-    _lost(talk, client, *LOST[player])
-    without = quick_talk(make_talk, sink)
+    _lost(talk, client, *LOST[player], voice=voice)
+    without = voice.serve(make_talk, sink)
     goal = _aborted(without, without.run("say", "--wait", "--", LOW))
     assert_aborted(goal, "audio_device", "aplay: audio open error: Connection refused")
     sink.start_server()
-    _heard_again(talk, sink, LONG)
-    _heard_again(without, sink, LOW)
+    _heard_again(talk, sink, LONG, voice)
+    _heard_again(without, sink, LOW, voice)
 
 
 @each_player
@@ -158,11 +160,12 @@ def test_row_41_a_sink_that_takes_no_sound_in_mid_sentence(
     hold: Callable[[Sink], None],
     let_go: Callable[[Sink], None],
     player: str,
+    voice: Voice,
 ) -> None:
     sink = breakable
 
     with limits():
-        talk = quick_talk(make_talk, sink, "--player", player)
+        talk = voice.serve(make_talk, sink, "--player", player)
         _, client = begin_with_client(talk, LONG, number=5)
         hold(sink)
         held = time.monotonic()
@@ -176,7 +179,7 @@ def test_row_41_a_sink_that_takes_no_sound_in_mid_sentence(
         assert goal["spoken"] != LONG
         assert talk.run("say", "--wait", "--", HOME).code == 0
         # What the sound server had when it was frozen is heard when it goes on, so all of it is looked at here.
-        stopped.assert_heard_after_stop(heard(talk), LONG, [HOME])
+        stopped.assert_heard_after_stop(heard(talk), LONG, [HOME], voice=voice)
         # 3 s after it took something the last time, which the engine sees within a tenth; and the end of the client.
         # A sound server that suspends its sink says so to its own clients.
         limit = SUSPENDED_FOR + 0.3 if told else 3.3
@@ -191,17 +194,17 @@ def _aborted(talk: Talk, done: Finished) -> Message:
     return goal
 
 
-def _lost(talk: Talk, client: Process, *words: str) -> None:
+def _lost(talk: Talk, client: Process, *words: str, voice: Voice) -> None:
     """Assert of a client whose goal, the server's first, was LONG: it ended in mid-sentence, as the sound did."""
     goal = _aborted(talk, talk.finish(client))
     assert_aborted(goal, "audio_lost", *words)
     assert goal["spoken"].startswith("two three")
     assert goal["spoken"] != LONG
-    assert_begun(talk.recording, render_quick([LONG])[0], shortest=0.2)
+    assert_begun(talk.recording, voice.render([LONG])[0], shortest=0.2)
 
 
-def _heard_again(talk: Talk, sink: Sink, failed: str) -> None:
+def _heard_again(talk: Talk, sink: Sink, failed: str, voice: Voice) -> None:
     """Assert that the next goal is heard whole, after the first one of a server failed."""
     with sink.record() as recording:
         assert talk.run("say", "--wait", "--", HOME).code == 0
-    stopped.assert_heard_after_stop(recording, failed, [HOME], begun=False)
+    stopped.assert_heard_after_stop(recording, failed, [HOME], begun=False, voice=voice)

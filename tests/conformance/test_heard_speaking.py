@@ -17,6 +17,7 @@ from tests.support.reference import RATE, played, render
 if TYPE_CHECKING:
     import pathlib
 
+    from tests.conformance.voices import Voice
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
     from tests.support.sink import Sink
@@ -24,14 +25,15 @@ if TYPE_CHECKING:
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 
 
-def test_row_01_a_goal_is_spoken_and_its_end_is_told(talk: Talk) -> None:
+def test_row_01_a_goal_is_spoken_and_its_end_is_told(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+    talk = voice.serve(make_talk, sink, rate=200)
     done = talk.run("say", "--wait", "--", LOW)
     assert (done.code, done.err) == (0, "")
     goal = talk.goal(done.id)
     assert (goal["state"], goal["message"]) == ("SUCCEEDED", "Talk completed successfully")
     assert (goal["reason"], goal["spoken"]) == (None, LOW)
     assert talk.watcher.states(done.id) == SPOKEN
-    (reference,) = render([LOW])
+    (reference,) = voice.render([LOW], 200)
     assert goal["duration"] == pytest.approx(len(played(reference)) / RATE, abs=0.001)
     assert_heard(heard(talk), [reference])
 
@@ -44,19 +46,19 @@ def test_done_when_the_first_sentence_of_a_server_is_espeak_ngs_own(talk: Talk) 
     assert abs(compared.heard - compared.expected) <= EXTENT
 
 
-def test_row_23_goals_are_spoken_in_the_order_in_which_they_came(make_talk: MakeTalk, sink: Sink) -> None:
-    talk = quick_talk(make_talk, sink)
+def test_row_23_goals_are_spoken_in_the_order_in_which_they_came(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+    talk = voice.serve(make_talk, sink)
     texts = [HELP, LOW, HOME]
     sent = [talk.run("say", "--", text).id for text in texts]
     done = talk.run("wait", *sent)
     assert (done.code, done.err) == (0, "")
     for each in sent:
         assert talk.watcher.states(each) == SPOKEN
-    assert_heard(heard(talk), render_quick(texts))
+    assert_heard(heard(talk), voice.render(texts))
 
 
-def test_row_18_a_pending_goal_that_is_cancelled_is_never_spoken(make_talk: MakeTalk, sink: Sink) -> None:
-    talk = quick_talk(make_talk, sink)
+def test_row_18_a_pending_goal_that_is_cancelled_is_never_spoken(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+    talk = voice.serve(make_talk, sink)
     texts = [LONG, LOW, "never to be heard", HOME]
     active, first, second, third = [send(talk, text) for text in texts]
     talk.watcher.wait_for_word(active)
@@ -69,7 +71,7 @@ def test_row_18_a_pending_goal_that_is_cancelled_is_never_spoken(make_talk: Make
     assert talk.watcher.wait_for_terminal(third, 10) == "SUCCEEDED"
     assert talk.watcher.states(active) == talk.watcher.states(first) == SPOKEN
     del texts[2]
-    assert_heard(heard(talk), render_quick(texts))
+    assert_heard(heard(talk), voice.render(texts))
 
 
 @pytest.fixture
@@ -79,7 +81,9 @@ def empty(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathlib.Pa
     return tmp_path
 
 
-def test_row_30_a_text_is_spoken_and_never_executed(make_talk: MakeTalk, sink: Sink, empty: pathlib.Path) -> None:
+def test_row_30_a_text_is_spoken_and_never_executed(
+    make_talk: MakeTalk, sink: Sink, empty: pathlib.Path, voice: Voice
+) -> None:
     texts = [
         "$(touch x)",
         "`touch x`",
@@ -90,21 +94,24 @@ def test_row_30_a_text_is_spoken_and_never_executed(make_talk: MakeTalk, sink: S
         "hello \U0001f600 %s %n \\n",
         "-5",
     ]
-    talk = quick_talk(make_talk, sink)
+    talk = voice.serve(make_talk, sink)
     said = [talk.run("say", "--", text) for text in texts]
     assert [(each.code, each.err) for each in said] == [(0, "")] * len(texts)
     assert talk.run("wait", *(each.id for each in said)).code == 0
     assert [talk.goal(each.id)["text"] for each in said] == texts
-    assert_heard(heard(talk), render_quick(texts))
+    assert_heard(heard(talk), voice.render(texts))
     assert os.listdir(empty) == []
 
 
-def test_row_30_words_are_joined_and_a_misspelt_option_is_not_spoken(talk: Talk) -> None:
+def test_row_30_words_are_joined_and_a_misspelt_option_is_not_spoken(
+    make_talk: MakeTalk, sink: Sink, voice: Voice
+) -> None:
+    talk = voice.serve(make_talk, sink)
     refused = talk.run("say", "--wiat", LOW)
     assert (refused.code, refused.out) == (2, "")
     assert "talk say -- " in refused.err
     assert talk.run("say", "--wait", *LOW.split()).code == 0
-    assert_heard(heard(talk), render([LOW]))
+    assert_heard(heard(talk), voice.render([LOW]))
 
 
 def test_the_wheels_library_speaks_where_the_system_has_none(

@@ -20,14 +20,13 @@ from tests.conformance.hearing import (
     begin,
     begin_with_client,
     heard,
-    quick_talk,
-    render_quick,
     send,
 )
 from tests.support.compare import assert_begun, assert_silent
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
+    from tests.conformance.voices import Voice
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
     from tests.support.processes import Talk
@@ -38,11 +37,11 @@ SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 
 
 @pytest.fixture
-def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
-    return quick_talk(make_talk, sink)
+def talk(make_talk: MakeTalk, sink: Sink, voice: Voice) -> Talk:
+    return voice.serve(make_talk, sink)
 
 
-def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk) -> None:
+def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk, voice: Voice) -> None:
     goal = begin(talk, LONG)
     canceled = talk.run("cancel", goal)
     returned = time.monotonic()
@@ -51,7 +50,7 @@ def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk) -> None:
     last = talk.recording.last_sound()
     assert last is not None
     assert last < returned + PRECISION
-    assert_begun(samples, render_quick([LONG])[0])
+    assert_begun(samples, voice.render([LONG])[0])
     assert talk.watcher.states(goal) == STOPPED
     ended = talk.goal(goal)
     assert (ended["reason"], ended["message"]) == ("canceled", "Talk preempted")
@@ -75,7 +74,7 @@ def test_row_03_the_reply_to_a_cancel_comes_when_it_is_silent(talk: Talk) -> Non
             assert_within(replied - asked, 0.15, f"the cancel after {number} words")
 
 
-def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk) -> None:
+def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk, voice: Voice) -> None:
     texts = [LONG, LOW, HOME, HELP]
     waiters = []
     for number, text in enumerate(texts, 1):
@@ -94,14 +93,16 @@ def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk) -> 
     assert {each["reason"] for each in told} == {"shutdown"}
     assert talk.watcher.states(goals[0]) == STOPPED
     assert [talk.watcher.states(each) for each in goals[1:]] == [["PENDING", "RECALLED"]] * 3
-    assert_begun(heard(talk), render_quick([LONG])[0])
+    assert_begun(heard(talk), voice.render([LONG])[0])
     last = talk.recording.last_sound()
     assert last is not None
     assert last < ended + PRECISION
 
 
-def test_row_24_a_newcomer_is_heard_when_the_one_before_it_is_silent(make_talk: MakeTalk, sink: Sink) -> None:
-    talk = quick_talk(make_talk, sink, "--preempt")
+def test_row_24_a_newcomer_is_heard_when_the_one_before_it_is_silent(
+    make_talk: MakeTalk, sink: Sink, voice: Voice
+) -> None:
+    talk = voice.serve(make_talk, sink, "--preempt")
     goal, first = begin_with_client(talk, LONG)
     second = talk.run("say", "--wait", "--", LOW)
     preempted = talk.finish(first)
@@ -114,10 +115,10 @@ def test_row_24_a_newcomer_is_heard_when_the_one_before_it_is_silent(make_talk: 
     assert silent["n"] < talk.watcher.wait_for(second.id, "ACTIVE")["n"]
     ended = talk.goal(goal)
     assert (ended["reason"], ended["by"]) == ("preempted", {"goal": second.id})
-    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
 
 
-def test_row_25_a_goal_that_preempts_goes_before_those_that_wait(talk: Talk) -> None:
+def test_row_25_a_goal_that_preempts_goes_before_those_that_wait(talk: Talk, voice: Voice) -> None:
     first, *waiting = [send(talk, text) for text in (LONG, LOW, HOME)]
     await_word(talk, first)
     newcomer = talk.run("say", "--preempt", "--wait", "--", HELP)
@@ -125,11 +126,11 @@ def test_row_25_a_goal_that_preempts_goes_before_those_that_wait(talk: Talk) -> 
     assert talk.run("wait", *waiting).code == 0
     assert talk.watcher.states(first) == STOPPED
     assert all(talk.watcher.states(each) == SPOKEN for each in waiting)
-    stopped.assert_heard_after_stop(heard(talk), LONG, [HELP, LOW, HOME])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [HELP, LOW, HOME], voice=voice)
 
 
 @pytest.mark.parametrize("selection", [[], ["--current"]])
-def test_row_27_a_goal_is_cancelled_without_preempt(talk: Talk, selection: list[str]) -> None:
+def test_row_27_a_goal_is_cancelled_without_preempt(talk: Talk, selection: list[str], voice: Voice) -> None:
     goal, waiter = begin_with_client(talk, LONG, "--queue")
     canceled = talk.run("cancel", *selection)
     assert (canceled.code, canceled.id) == (0, goal)
@@ -138,7 +139,7 @@ def test_row_27_a_goal_is_cancelled_without_preempt(talk: Talk, selection: list[
     assert "Talk preempted" in done.err
     assert talk.watcher.states(goal) == STOPPED
     assert talk.run("say", "--wait", "--", LOW).code == 0
-    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
 
 
 def _has_goals(talk: Talk, number: int, _: Message) -> bool:

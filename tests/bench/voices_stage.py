@@ -1,0 +1,81 @@
+"""What the rows of neural voices are measured with: a sink, and servers that have such a voice loaded."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from tests.bench.ear import fine_blocks
+from tests.support.census import descendants
+from tests.support.loaded import await_loaded
+from tests.support.processes import Talk
+from tests.support.real_voice import REAL_VOICE
+from tests.support.sink import Sink
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+ESPEAK = "en"
+#: The voices that take turns, by what they are called in the table.
+VOICES = {"joe": REAL_VOICE, "espeak": ESPEAK}
+
+
+@dataclass(frozen=True, slots=True)
+class VoiceOptions:
+    """How much is measured."""
+
+    rounds: int = 15
+    kills: int = 20
+    texts: int = 10
+    idle: float = 10.0  # seconds
+
+
+class VoiceStage(contextlib.AbstractContextManager["VoiceStage"]):
+    """Gives what a row needs; `with` ends all of it."""
+
+    def __init__(self, options: VoiceOptions) -> None:
+        self.options = options
+        self._chance = random.Random(18)
+        self._stack = contextlib.ExitStack()
+        self._home = self._stack.enter_context(short_directory("voices-"))
+
+    def __exit__(self, *_error: object) -> None:
+        self._stack.close()
+
+    @cached_property
+    def sink(self) -> Sink:
+        """A sound server with one null sink, listened to from its start."""
+        found = self._stack.enter_context(Sink())
+        self._stack.enter_context(fine_blocks(found))
+        return found
+
+    @contextlib.contextmanager
+    def server(self, *options: str, heard: bool = True, env: dict[str, str] | None = None) -> Iterator[Talk]:
+        """Run a server that has the voice loaded and speaks with it; one that is not `heard` needs no sink."""
+        places = {"XDG_CACHE_HOME": f"{self._home}/cache", **(env or {})}
+        sink = self.sink if heard else None
+        talk = Talk(("--voice", REAL_VOICE, *options), sink=sink, env=places, forked=False)
+        try:
+            await_loaded(talk.socket, REAL_VOICE)
+            yield talk
+            talk.stop()
+        finally:
+            talk.close()
+
+    def jitter(self, most: float = 0.02) -> float:
+        """Return some seconds: so that no row is measured at always the same moment of a block."""
+        return self._chance.random() * most
+
+    def shuffled(self, names: Sequence[str]) -> list[str]:
+        """Return the names in another order each time, and in the same ones each run."""
+        return self._chance.sample(names, len(names))
+
+
+def engine_of(talk: Talk) -> int:
+    """Return the process id of a server's engine, which must be there."""
+    (found,) = descendants(talk.pid)
+    return found

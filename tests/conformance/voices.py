@@ -1,0 +1,121 @@
+"""The voices that conformance is held with: how a server speaks with each, and what its sentences sound like.
+
+Libespeak-ng makes other samples of a sentence that it has said before, a neural voice without noise the same ones each
+time. So what it was to be is rendered by `say -o`, in an engine process of its own, without a server and a player.
+"""
+
+from __future__ import annotations
+
+import functools
+import wave
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from tests.conformance.hearing import QUICK
+from tests.support.loaded import serve_with
+from tests.support.processes import run_talk
+from tests.support.real_voice import REAL_VOICE
+from tests.support.reference import Sentence, render
+from tests.support.surroundings import clean_environment
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import numpy.typing as npt
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+    Samples = npt.NDArray[np.int16]
+
+#: Seconds in which a sentence must be rendered, its voice's load included.
+_PATIENCE = 30.0
+
+
+class Voice(Protocol):
+    """A voice that servers speak with."""
+
+    @property
+    def repeats(self) -> bool:
+        """Whether a sentence is the same each time, whatever was said before it."""
+        ...
+
+    def serve(
+        self,
+        make_talk: MakeTalk,
+        sink: Sink,
+        *options: str,
+        rate: int = QUICK,
+        env: Mapping[str, str] | None = None,
+    ) -> Talk:
+        """Start a server that speaks with it at a recorded sink, and return it when it can."""
+        ...
+
+    def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
+        """Return the samples of each sentence, as the first ones of a server; the voice of a `Sentence` is this."""
+        ...
+
+
+class Espeak:
+    """Libespeak-ng's."""
+
+    repeats = False
+
+    def serve(
+        self,
+        make_talk: MakeTalk,
+        sink: Sink,
+        *options: str,
+        rate: int = QUICK,
+        env: Mapping[str, str] | None = None,
+    ) -> Talk:
+        return make_talk("--rate", str(rate), *options, sink=sink, env=env)
+
+    def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
+        return render(sentences, rate=rate)
+
+
+ESPEAK = Espeak()
+
+
+@dataclass(frozen=True)
+class Joe:
+    """A real neural voice, without noise."""
+
+    #: where it is without noise, and where its halves are kept
+    voices: str
+    cache: str
+    repeats = True
+
+    def serve(
+        self,
+        make_talk: MakeTalk,
+        sink: Sink,
+        *options: str,
+        rate: int = QUICK,
+        env: Mapping[str, str] | None = None,
+    ) -> Talk:
+        env = {**self.places, **(env or {})}
+        return serve_with(make_talk, REAL_VOICE, "--rate", str(rate), *options, sink=sink, env=env)
+
+    def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
+        return [self._rendered(each if isinstance(each, Sentence) else Sentence(each, rate)) for each in sentences]
+
+    @property
+    def places(self) -> dict[str, str]:
+        return {"TALK_VOICES": self.voices, "XDG_CACHE_HOME": self.cache}
+
+    @functools.cache  # noqa: B019 - there is one of it
+    def _rendered(self, sentence: Sentence) -> Samples:
+        path = f"{self.cache}/rendered.wav"
+        words = ["--rate", str(sentence.rate), "--volume", str(sentence.volume), "--voice", REAL_VOICE]
+        env = clean_environment(self.cache, self.places)
+        code, _, error = run_talk(["say", "-o", path, *words, "--", sentence.text], env, _PATIENCE)
+        assert code == 0, error
+        with wave.open(path) as file:
+            samples = np.frombuffer(file.readframes(file.getnframes()), "<i2").astype(np.int16)
+        samples.flags.writeable = False
+        return samples
