@@ -16,7 +16,7 @@ from tests.bench.table import Limit, Row
 from tests.bench.voices_heard import HEARD
 from tests.bench.voices_stage import VOICES
 from tests.support.espeak import RATE
-from tests.support.listener import align
+from tests.support.listener import WORD, align
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -98,7 +98,7 @@ def _onsets(recording: Recording, text: str) -> dict[int, float]:
 
 def _aligned(recording: Recording, text: str) -> dict[int, float]:
     """Return when each word began to be heard, by where it is in the text, as the recognizer has it."""
-    begins = [each.start() for each in re.finditer(r"[a-z']+", text.lower())]
+    begins = [each.start() for each in WORD.finditer(text.lower())]
     found = align(recording.samples, text)
     return {
         start: recording.time_of(max(0, round(each.begin * RATE))) for start, each in zip(begins, found, strict=True)

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from tests.conformance.hearing import QUICK
+from tests.support.listener import WORD, align
 from tests.support.loaded import serve_with
 from tests.support.processes import run_talk
 from tests.support.real_voice import REAL_VOICE
-from tests.support.reference import Sentence, render
+from tests.support.reference import Rendering, Sentence, render, render_with_words
 from tests.support.surroundings import clean_environment
 
 if TYPE_CHECKING:
@@ -58,6 +59,10 @@ class Voice(Protocol):
         """Return the samples of each sentence, as the first ones of a server; the voice of a `Sentence` is this."""
         ...
 
+    def render_with_words(self, sentence: Sentence) -> Rendering:
+        """Return the samples of a server's first sentence, with its words; of English words alone."""
+        ...
+
 
 class Espeak:
     """Libespeak-ng's."""
@@ -76,6 +81,9 @@ class Espeak:
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
         return render(sentences, rate=rate)
+
+    def render_with_words(self, sentence: Sentence) -> Rendering:
+        return render_with_words([sentence])[0]
 
 
 ESPEAK = Espeak()
@@ -103,6 +111,13 @@ class Joe:
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
         return [self._rendered(each if isinstance(each, Sentence) else Sentence(each, rate)) for each in sentences]
+
+    def render_with_words(self, sentence: Sentence) -> Rendering:
+        """Its words are where a recognizer of speech hears them."""
+        samples = self._rendered(sentence)
+        words = WORD.finditer(sentence.text.lower())
+        heard = align(samples, sentence.text)
+        return Rendering(samples, tuple((*at.span(), each.begin) for at, each in zip(words, heard, strict=True)))
 
     @property
     def places(self) -> dict[str, str]:

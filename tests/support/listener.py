@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     Samples = npt.NDArray[np.int16]
 
 PACKAGE = "pocketsphinx"
+#: What it takes for a word, in small letters.
+WORD = re.compile(r"[a-z']+")
 #: Samples per second that it hears, and how many of its frames are a second.
 _HEARS, _FRAMES = 16000, 100
 #: Seconds of silence put on either side of what it hears: its model wants some.
@@ -32,6 +34,9 @@ _BESIDE = 0.3
 _ROOM = 20
 #: How unlikely what it has heard so far may be until it is given up: much, as it has few sentences to choose from.
 _BEAMS = {"beam": 1e-80, "pbeam": 1e-80, "wbeam": 1e-60}
+#: Samples no louder than this, for so many seconds, are silence: a hundredth of full scale; and longer than a closure
+#: within a word.
+_FAINT, _SILENCE = 327, 0.1
 _RANGE = (-32768, 32767)
 #: What is told between words.
 _NO_WORD = re.compile(r"[<\[]")
@@ -57,13 +62,20 @@ def understand(samples: Samples, sentences: Iterable[str], rate: int = RATE) -> 
 
 
 def align(samples: Samples, text: str, rate: int = RATE) -> list[Heard]:
-    """Return when each word of a sentence was said; AssertionError where it was not, as far as it can be heard."""
-    words = re.findall(r"[a-z']+", text.lower())
+    """Return when each word of a sentence was said; AssertionError where it was not, as far as it can be heard.
+
+    What is silent before a word counts as a part of it, to the recognizer; here it doesn't.
+    """
+    words = WORD.findall(text.lower())
     listener = _listener()
     listener.set_align_text(" ".join(words))
     _hear(listener, samples, rate)
     found = [
-        Heard(re.sub(r"\(\d+\)$", "", each.word), _seconds(each.start_frame), _seconds(each.end_frame + 1))
+        Heard(
+            re.sub(r"\(\d+\)$", "", each.word),
+            _behind_silence(samples, _seconds(each.start_frame), rate),
+            _seconds(each.end_frame + 1),
+        )
         for each in listener.seg() or ()
         if not _NO_WORD.match(each.word)
     ]
@@ -87,6 +99,16 @@ def _hear(listener: Any, samples: Samples, rate: int) -> None:
     listener.start_utt()
     listener.process_raw(np.clip(sound + room, *_RANGE).astype("<i2").tobytes(), full_utt=True)
     listener.end_utt()
+
+
+def _behind_silence(samples: Samples, begin: float, rate: int) -> float:
+    """Return when the silence is over in which something begins; if there is none, when it begins."""
+    loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > _FAINT)
+    place = int(np.searchsorted(loud, begin * rate))
+    if place == len(loud):
+        return begin
+    before = loud[place - 1] if place else -len(samples)
+    return float(loud[place]) / rate if loud[place] - before > _SILENCE * rate else begin
 
 
 def _seconds(frame: int) -> float:
