@@ -221,10 +221,12 @@ class Requests:
                 self._speech.subscribers.keep_alive()
                 await call.wait(self._speech.for_room)
         voices = self._speech.voices
-        now, fault = self._speech.now(), call.fault or voices.fault(say.voice) or _unpitched(say)
+        now, fault, usual = self._speech.now(), call.fault or voices.fault(say.voice), self._scheduler.settings.voice
         if not fault:
-            say = replace(say, voice=voices.meant(say.voice, self._scheduler.settings.voice))
-            self._speech.want(say.voice or self._scheduler.settings.voice)
+            say = replace(say, voice=voices.meant(say.voice, usual))
+            fault = _unpitched(say)
+        if not fault:
+            self._speech.want(say.voice or usual)
         submitted = self._scheduler.submit(say, sender, now, fault, call.by)
         record = submitted.record
         extra: JsonObject = {"paused": True} if self._scheduler.paused else {}
