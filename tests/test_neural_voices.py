@@ -169,7 +169,7 @@ def test_without_the_extra_they_are_listed_and_refused_with_what_to_install(
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
 
 
-def test_the_language_of_the_server_s_neural_voice_means_that_one(env: dict[str, str]) -> None:
+def test_the_language_of_the_server_s_neural_voice_means_that_one(env: dict[str, str], tmp_path: Path) -> None:
     def heard(voice: str) -> object:
         goal = run([*TALK, "say", "--wait", "--voice", voice, "--voice-only", "hello"], env).out.strip()
         return json.loads(run([*TALK, "--json", "status", goal], env).out)["voice"]
@@ -181,8 +181,15 @@ def test_the_language_of_the_server_s_neural_voice_means_that_one(env: dict[str,
             *("piper/tiny", "piper/tiny"),
             *("gmw/de", "gmw/en-US"),
         ]
-    with serving(env, "--rate", "450", "--voice", "piper/tiny"):
-        assert heard("en") == "piper/tiny"
+        done = run([*TALK, "say", "--voice", "en-us", "--pitch", "70", "hello"], env)
+        assert (done.code, "has no pitch but its own" in done.err) == (5, True), done
+    tiny_voice.put(tmp_path / "voices", "two", beside=tiny_voice.description(language="de_DE", voice="de"))
+    with serving(env, "--rate", "450", "--voice", "piper/two"):
+        assert [heard(each) for each in ("de", "de-de", "en-us")] == ["piper/two", "piper/two", "gmw/en-US"]
+        done = run([*TALK, "set", "--voice", "de-de"], env)
+        assert (done.code, 'unknown voice "de-de"' in done.err) == (2, True), "it would mean nothing from then on"
+        assert run([*TALK, "set", "--voice", "de"], env).code == 0
+        assert heard("de") == "gmw/de"
 
 
 def test_a_speaker_that_a_voice_lacks_is_refused(env: dict[str, str], tmp_path: Path) -> None:

@@ -216,12 +216,12 @@ class Requests:
             if self._turn:  # a goal that comes now must not take the room of one that waits
                 self._turn.cancel()
                 self._let_go()
-            fault = call.fault or self._speech.voices.fault(say.voice)
+            fault = call.fault or self._speech.voices.fault(say.voice, self._scheduler.settings.voice)
             if say.patient and self._scheduler.lacks_room(say, now, fault) and self._keep(call):
                 self._speech.subscribers.keep_alive()
                 await call.wait(self._speech.for_room)
-        voices = self._speech.voices
-        now, fault, usual = self._speech.now(), call.fault or voices.fault(say.voice), self._scheduler.settings.voice
+        voices, usual = self._speech.voices, self._scheduler.settings.voice
+        now, fault = self._speech.now(), call.fault or voices.fault(say.voice, usual)
         if not fault:
             say = replace(say, voice=voices.meant(say.voice, usual))
             fault = _unpitched(say)

@@ -76,11 +76,14 @@ class Voices:
         #: the one that the engine is loading
         self._loading: str | None = None
 
-    def fault(self, voice: str | None) -> tuple[str, str] | None:
-        """Return reason and words why a voice can't be had; None also where that is not known."""
+    def fault(self, voice: str | None, usual: str | None = None) -> tuple[str, str] | None:
+        """Return reason and words why a voice can't be had; None also where that is not known.
+
+        `usual`: the one that the server speaks with, where a goal is looked at.
+        """
         if voice is None or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice)):
             return None
-        found = self._find(voice)
+        found = self._find(voice, usual)
         if found is None:
             return "unknown_voice", unknown_voice(voice, self.listed or (), self._foreign)
         lacking = self._lacking(found.id) if is_neural(voice) else None
@@ -93,9 +96,9 @@ class Voices:
         found = find_voice(voice, self.listed or self._files(), usual)
         return found.id if found and is_neural(found.id) else voice
 
-    def _find(self, voice: str) -> Voice | None:
+    def _find(self, voice: str, usual: str | None) -> Voice | None:
         """Return a voice that there is; a neural one may have been put there just now."""
-        found = find_voice(voice, self.listed or ())
+        found = find_voice(voice, self.listed or (), usual)
         if found is None and is_neural(voice) and self._foreign is None:
             self.look_for_files()
             found = find_voice(voice, self.listed or self._files())
