@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
     from tests.support.recording import Samples
     from tests.support.sink import Sink
 
@@ -49,7 +50,8 @@ SENTENCES = [
 ]
 #: Of twenty, how many are understood at least.
 AT_LEAST = 19
-ESPEAK = "en"
+#: By its id: "en" is the language, and in such a server the neural voice of it.
+ESPEAK = "gmw/en"
 
 
 def misunderstood(heard: Callable[[str, str], Samples]) -> dict[str, list[tuple[str, str]]]:
@@ -64,6 +66,11 @@ def misunderstood(heard: Callable[[str, str], Samples]) -> dict[str, list[tuple[
             if found != sentence:
                 told.append((sentence, found))
     return wrong
+
+
+def say(talk: Talk, sentence: str, voice: str) -> None:
+    done = talk.run("say", "--wait", "--voice", voice, "--", sentence)
+    assert (done.code, talk.goal(done.id)["voice"]) == (0, voice), done
 
 
 def assert_understood(wrong: dict[str, list[tuple[str, str]]]) -> None:
@@ -82,7 +89,7 @@ def test_what_a_neural_voice_writes_into_a_file_is_understood(make_talk: MakeTal
 
     def written(sentence: str, voice: str) -> Samples:
         nonlocal before
-        assert talk.run("say", "--wait", "--voice", voice, "--", sentence).code == 0
+        say(talk, sentence, voice)
         with wave.open(str(path)) as file:
             samples = np.frombuffer(file.readframes(file.getnframes()), "<i2").astype(np.int16)
         begin, before = before, len(samples)
@@ -100,7 +107,7 @@ def test_what_is_heard_of_a_neural_voice_is_understood(make_talk: MakeTalk, sink
 
     def heard(sentence: str, voice: str) -> Samples:
         with sink.record() as recording:
-            assert talk.run("say", "--wait", "--voice", voice, "--", sentence).code == 0
+            say(talk, sentence, voice)
         return recording.samples
 
     assert_understood(misunderstood(heard))

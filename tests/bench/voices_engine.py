@@ -20,7 +20,7 @@ from tests.conformance.hearing import await_word, send
 from tests.conformance.voices import Joe
 from tests.support.compare import compare
 from tests.support.espeak import RATE
-from tests.support.real_voice import real_voice, silence_noise
+from tests.support.real_voice import REAL_VOICE, real_voice, silence_noise
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 _LONG = "I am returning to the charging station in the kitchen now, please leave the door open and wait for me there"
 #: What follows: as soon as it is known that the engine is dead, and behind that, in the voice that is loaded again.
 _URGENT, _NEXT = "ready", "moving along"
+#: What libespeak-ng speaks in the place of the voice, in its language.
+_INSTEAD = "gmw/en-US"
 _BETWEEN = int(0.12 * RATE)
 #: Milliseconds from the kill until the urgent goal is heard, at worst; and until the voice is, in the median and so.
 _SOON, _BACK, _BACK_AT_WORST = 400, 2500, 4000
@@ -121,6 +123,9 @@ def _kill(stage: VoiceStage, talk: Talk, word: int, reference: Samples) -> tuple
         ends = [state, *(talk.watcher.wait_for_terminal(each, 30) for each in (urgent, waiting))]
     if ends != ["ABORTED", "SUCCEEDED", "SUCCEEDED"]:
         raise FailedError(f"the goal in hand, the urgent one and the next ended {', '.join(ends)}")
+    spoken = [talk.goal(each)["voice"] for each in (goal, urgent, waiting)]
+    if spoken != [REAL_VOICE, _INSTEAD, REAL_VOICE]:
+        raise FailedError(f"the goal in hand, the urgent one and the next were spoken with {', '.join(spoken)}")
     return _heard(recording, hit, reference)
 
 

@@ -19,6 +19,7 @@ from tests.support.espeak import RATE
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from talkcli import Goal
     from tests.bench.ear import Action
     from tests.bench.voices_stage import VoiceStage
 
@@ -100,8 +101,8 @@ def between(stage: VoiceStage) -> list[Row]:
             with stage.sink.record() as recording:
                 texts = [_SENTENCES[(number + each) % len(_SENTENCES)] for each in range(len(_CHAIN))]
                 goals = [client.say(text, voice=VOICES[each]) for text, each in zip(texts, _CHAIN, strict=True)]
-                for each in goals:
-                    each.wait(20)
+                for each, voice in zip(goals, _CHAIN, strict=True):
+                    _spoken_with(VOICES[voice], each.wait(20))
                 recording.wait_until_quiet(0.3)
             gaps = silences(recording.samples, _PAUSE, HEARD)
             if len(gaps) != len(pairs):
@@ -134,12 +135,18 @@ def _beside(group: str, name: str, found: dict[str, tuple[float, ...]], *limits:
 
 def _until_sound(stage: VoiceStage, client: Client, text: str, voice: str) -> float:
     """Say a text, and stop it when it is heard."""
-    return until_sound(stage.sink, lambda: client.say(text, voice=voice).cancel)
+
+    def begin() -> Callable[[], object]:
+        goal = client.say(text, voice=voice)
+        return lambda: _spoken_with(voice, goal.cancel())
+
+    return until_sound(stage.sink, begin)
 
 
 def _until_silence(stage: VoiceStage, client: Client, voice: str, stop: Action) -> float:
     def begin() -> Callable[[], object]:
-        return partial(client.say(VOICED, voice=voice).wait, 10)
+        goal = client.say(VOICED, voice=voice)
+        return lambda: _spoken_with(voice, goal.wait(10))
 
     return until_silence(stage.sink, begin, stop, stage.jitter())
 
@@ -154,8 +161,13 @@ def _resumed(stage: VoiceStage, client: Client, voice: str) -> float:
         held, asked = len(recording), time.monotonic()
         client.resume()
         recording.wait_for_sound()
-        goal.cancel()
+        _spoken_with(voice, goal.cancel())
         recording.wait_until_quiet(_HELD)
         again = first_sound(recording.samples[held:])
         assert again is not None
         return recording.time_of(held + again) - asked
+
+
+def _spoken_with(voice: str, ended: Goal) -> None:
+    if ended.voice != voice:
+        raise FailedError(f"{voice} was asked for, and {ended.voice} was heard")

@@ -19,7 +19,8 @@ from tests.support.surroundings import short_directory
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-ESPEAK = "en"
+#: By its id: "en" is the language, and in such a server the neural voice of it.
+ESPEAK = "gmw/en"
 #: The voices that take turns, by what they are called in the table.
 VOICES = {"joe": REAL_VOICE, "espeak": ESPEAK}
 

@@ -76,7 +76,7 @@ def _measured(
     """Speak a text, and return by how many seconds each word was told after it was heard."""
     with stage.sink.record() as recording:
         done = talk.run("say", "--wait", "--voice", voice, "--", text, timeout=60)
-        assert done.code == 0, done
+        assert (done.code, talk.goal(done.id)["voice"]) == (0, voice), done
     told = talk.watcher.words(done.id)
     found = heard(recording, text)
     # Words that a voice says as one have one event: the others are not told.

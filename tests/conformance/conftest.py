@@ -22,10 +22,11 @@ def joe(tmp_path_factory: pytest.TempPathFactory) -> Joe:
     return Joe(str(place), str(tmp_path_factory.mktemp("cache")))
 
 
-#: Most of what is heard is tested with a neural voice, too, by the slow tests: each of its servers loads the voice.
+#: Most of what is heard is tested with a neural voice by the slow tests alone, as each of its servers loads the voice,
+#: for a second: four minutes of tests. Each kind of thing, spoken, stopped, preempted, queued, held, has one each time.
 @pytest.fixture(params=["espeak", pytest.param("joe", marks=pytest.mark.slow)])
 def voice(request: pytest.FixtureRequest) -> Voice:
-    """The voice of a test's servers; those that `with_both` name are tested with both of them each time."""
+    """The voice of a test's servers; those that have `with_both` are tested with both of them each time."""
     if request.param == "espeak":
         return ESPEAK
     found: Joe = request.getfixturevalue("joe")

@@ -21,6 +21,7 @@ from tests.conformance.hearing import (
     send,
 )
 from tests.conformance.told import assert_recalled, assert_told_in_order, submit
+from tests.conformance.voices import with_both
 from tests.support.compare import SAME, assert_begun, assert_heard, assert_resumed, assert_silent, compare, extent
 from tests.support.recording import LOUD
 from tests.support.reference import RATE
@@ -112,6 +113,7 @@ def test_row_43_a_sentence_that_is_held_goes_on_where_it_was(
         assert_within(silent - asked, SILENT, f"the silence after a pause at word {word}")
 
 
+@with_both
 def test_row_43_a_sentence_that_is_held_twice_is_heard_whole(talk: Talk, voice: Voice) -> None:
     goal = begin(talk, LONG)
     pause(talk)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_same, heard, quick_talk, render_quick, send
+from tests.conformance.voices import with_both
 from tests.support.compare import EXTENT, assert_heard, assert_silent
 from tests.support.reference import RATE, played, render
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 
 
+@with_both
 def test_row_01_a_goal_is_spoken_and_its_end_is_told(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
     talk = voice.serve(make_talk, sink, rate=200)
     done = talk.run("say", "--wait", "--", LOW)
@@ -46,6 +48,7 @@ def test_done_when_the_first_sentence_of_a_server_is_espeak_ngs_own(talk: Talk) 
     assert abs(compared.heard - compared.expected) <= EXTENT
 
 
+@with_both
 def test_row_23_goals_are_spoken_in_the_order_in_which_they_came(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
     talk = voice.serve(make_talk, sink)
     texts = [HELP, LOW, HOME]

@@ -22,6 +22,7 @@ from tests.conformance.hearing import (
     heard,
     send,
 )
+from tests.conformance.voices import with_both
 from tests.support.compare import assert_begun, assert_silent
 from tests.support.timing import assert_within, limits
 
@@ -41,6 +42,7 @@ def talk(make_talk: MakeTalk, sink: Sink, voice: Voice) -> Talk:
     return voice.serve(make_talk, sink)
 
 
+@with_both
 def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk, voice: Voice) -> None:
     goal = begin(talk, LONG)
     canceled = talk.run("cancel", goal)
@@ -58,6 +60,7 @@ def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk, voice: Voice)
     assert "two" in ended["spoken"] != LONG
 
 
+@with_both
 def test_row_03_the_reply_to_a_cancel_comes_when_it_is_silent(talk: Talk) -> None:
     """Within 150 ms of the request, wherever in the sentence it comes."""
 
@@ -99,6 +102,7 @@ def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk, voi
     assert last < ended + PRECISION
 
 
+@with_both
 def test_row_24_a_newcomer_is_heard_when_the_one_before_it_is_silent(
     make_talk: MakeTalk, sink: Sink, voice: Voice
 ) -> None:

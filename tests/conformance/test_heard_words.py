@@ -141,6 +141,7 @@ def test_row_42_ten_words_of_any_script_are_told_once_each_in_their_place(make_t
         measured = measure(talk, TEN, 200)
         talk.stop()
         _assert_ten(measured.words)
+        assert measured.words[0]["time"] == 0
         print(measured)
         measured.assert_in_time()
 
@@ -163,7 +164,6 @@ def _assert_ten(words: list[Message]) -> None:
     assert [each["number"] for each in words] == list(range(1, 9))
     times = [each["time"] for each in words]
     assert times == sorted(times)
-    assert 0 <= times[0] < 0.1  # of libespeak-ng 0
 
 
 @pytest.mark.parametrize("number", [2, pytest.param(5, marks=pytest.mark.slow), 8])

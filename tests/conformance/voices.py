@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+import pytest
 
 from tests.conformance.hearing import QUICK
 from tests.support.listener import WORD, align
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
     from tests.support.sink import Sink
 
     Samples = npt.NDArray[np.int16]
+
+#: Has a test run with both voices each time, not by the slow tests alone.
+with_both = pytest.mark.parametrize("voice", ["espeak", "joe"], indirect=True)
 
 #: Seconds in which a sentence must be rendered, its voice's load included.
 _PATIENCE = 30.0
