@@ -121,7 +121,8 @@ def test_status_goal_voices_and_follow(client: Client, scripted: Talk) -> None:
     assert [each.id for each in status.pending] == [pending.id]
     assert status.recent == (said,)
     assert status.server["pid"] == scripted.pid
-    assert client.voices() == [{"id": "en", "language": "en", "name": "scripted"}]
+    voice = {"id": "en", "language": "en", "name": "scripted", "quality": None, "speakers": None}
+    assert client.voices() == [voice]
     with pytest.raises(UnknownGoal):
         client.goal("none-1")
     with pytest.raises(UnknownGoal):

@@ -134,7 +134,7 @@ def test_json_shapes(scripted: Talk) -> None:
     rejected = json.loads(scripted.run("--json", "say", "").out)
     assert (rejected.keys(), rejected["state"]) == (GOAL, "REJECTED")
     voice = json.loads(scripted.run("--json", "voices").out)
-    assert voice == {"id": "en", "language": "en", "name": "scripted"}
+    assert voice == {"id": "en", "language": "en", "name": "scripted", "quality": None, "speakers": None}
     unknown = scripted.run("--json", "wait", "none-1")
     assert error_of(unknown.err) == {"code": "unknown_goal", "exit": 8, "message": error_of(unknown.err)["message"]}
     assert unknown.out == ""

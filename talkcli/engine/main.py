@@ -17,6 +17,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from talkcli.engine.session import Channel
 
+#: Bytes that the process may have at least, whatever the machine has: one with a voice of 63 MB has 0.4 billion.
+_LEAST_MEMORY = 1 << 30
 #: Linux's: have this process killed when the thread that started it is gone. For what it starts, see `players.child`.
 _PR_SET_PDEATHSIG = 1
 
@@ -25,6 +27,7 @@ def main() -> None:
     """Run the engine process to its end."""
     _die_with_parent()
     _leave_no_core()
+    _spare_machine()
     # Ctrl-C in the server's terminal and the terminal's end are the server's business. A server or a player that stops
     # reading is seen by the write that fails.
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
@@ -66,6 +69,17 @@ def _leave_no_core() -> None:
     """
     _, hard = resource.getrlimit(resource.RLIMIT_CORE)
     resource.setrlimit(resource.RLIMIT_CORE, (1 if hard else 0, hard))
+
+
+def _spare_machine() -> None:
+    """Have what needs most of the machine's memory fail, as a voice's model can ask for any amount.
+
+    What a library can't have it says; without a limit the machine would stand still, and end whatever it chooses.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    most = max(_LEAST_MEMORY, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
+    if soft == resource.RLIM_INFINITY or soft > most:
+        resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
 
 
 def _configuration(channel: Channel) -> protocol.Configure | None:

@@ -10,6 +10,7 @@ import time
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.engine import protocol
+from talkcli.engine.synthesizers.voices import is_neural
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -111,8 +112,10 @@ class Spawned:
         voice: str | None = None,
         pitch: int = 50,
         lead_in: int | None = None,
-        voice_only: bool = True,
+        voice_only: bool | None = None,
     ) -> None:
+        if voice_only is None:
+            voice_only = voice is not None and is_neural(voice)  # what is asked for is heard, or it fails
         asked = protocol.Say(goal, text, rate or self._rate, 1.0, voice, pitch, lead_in=lead_in, voice_only=voice_only)
         self.send(asked)
 
@@ -154,7 +157,7 @@ class Spawned:
         rate: int | None = None,
         voice: str | None = None,
         lead_in: int | None = None,
-        voice_only: bool = True,
+        voice_only: bool | None = None,
     ) -> protocol.Ended:
         """Say a sentence and return how it ended."""
         self.say(text, goal, rate=rate, voice=voice, lead_in=lead_in, voice_only=voice_only)

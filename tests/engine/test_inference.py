@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import threading
@@ -148,22 +147,6 @@ def test_a_file_that_is_larger_than_any_model_is_not_read(tmp_path: Path) -> Non
     os.truncate(path, 1 << 40)  # a hole: it takes no room on the disk
     with pytest.raises(BadFile, match="larger than any of Piper's models: get the voice anew"):
         _loaded(path)
-
-
-def test_no_model_gets_more_than_half_of_the_machines_memory(tmp_path: Path) -> None:
-    """Or a billion bytes, where that is more; and less where somebody has set less."""
-    path = tiny_voice.put(tmp_path / "v", "a")
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    try:
-        _loaded(path)
-        soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        assert (soft, hard) == (max(1 << 30, machine // 2), before[1])
-        resource.setrlimit(resource.RLIMIT_DATA, (soft - 1, hard))
-        _loaded(path)
-        assert resource.getrlimit(resource.RLIMIT_DATA) == (soft - 1, hard)
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
 #: Encodes far more sounds than a piece has, with 20 MB left, and then some.

@@ -11,7 +11,6 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import resource
 
 from talkcli.engine.synthesizers.models import BEGIN, END, PAD, BadFile, open_checked
 from talkcli.engine.synthesizers.vits import NotCut, halves
@@ -33,8 +32,6 @@ _LARGEST = 1 << 28
 #: en_US-joe-medium's they are 4 at most at its own pace, 35 a single one, and each of Piper's has 256 samples. More
 #: would be minutes of one sentence, and gigabytes.
 _MOST_FRAMES, _MOST_SAMPLES = 40, 4096
-#: Bytes that the process may have at least, whatever the machine has: one with a voice of 63 MB has 0.4 billion.
-_LEAST_MEMORY = 1 << 30
 #: What onnxruntime says, in the midst of much else, where it got no memory, and what is said of libraries.
 _NO_MEMORY = ("bad_alloc", "bad allocation", "Failed to allocate memory", os.strerror(errno.ENOMEM))
 _NO_MEMORY_FOR_LIBRARIES = "failed to map segment from shared object"
@@ -81,7 +78,6 @@ class Model:
         self.path = path
         self.description = description
         _import(path)
-        _spare_machine()
         with open_checked(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > _LARGEST:
@@ -246,17 +242,6 @@ def _import(path: str) -> None:
         if _lacks_memory(error):
             raise _no_memory(path) from error
         raise ImportError(_first_line(error)) from error
-
-
-def _spare_machine() -> None:
-    """Have what needs most of the machine's memory fail, as a model can ask for any amount, and the machine live.
-
-    What the library can't have it says; without a limit the machine would stand still, and end whatever it chooses.
-    """
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    most = max(_LEAST_MEMORY, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
-    if soft == resource.RLIM_INFINITY or soft > most:
-        resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
 
 
 def _told(path: str, what: str, error: Exception) -> BadFile:
