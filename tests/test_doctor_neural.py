@@ -6,18 +6,20 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import Client
 from talkcli.client.connect import Interrupted
 from talkcli.doctor import neural, voice
 from talkcli.doctor.neural import Neural, Tried
 from talkcli.doctor.report import DONE, FAILED, WARNING
 from talkcli.doctor.voice import Engine
 from talkcli.engine.synthesizers.models import INSTALL, NEEDED
-from tests.conformance.bareserve import environment
+from tests.conformance.bareserve import environment, serving
 from tests.engine.test_neural import WITHOUT
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_PACKAGE, REAL_VOICE, real_voice
@@ -158,6 +160,53 @@ assert found == [], found
 assert not {"talkcli.doctor.neural", "onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+# -- beside a server
+
+
+def _beside(env: dict[str, str], *options: str) -> dict[str, dict[str, str]]:
+    """Return what it finds beside a server of these options, whose voice is loaded, or has failed to be."""
+    silent = {name: value for name, value in env.items() if name != "TALK_PLAYER"}
+    with serving(silent, *options), Client(env["TALK_SOCKET"]) as client:
+        limit = time.monotonic() + 20
+        while not re.search("loaded|failed", str(client.status().server["neural_voices"])):
+            assert time.monotonic() < limit
+            time.sleep(0.02)
+        # Where its voices are, the server alone was told.
+        return doctor({name: value for name, value in silent.items() if name != "TALK_VOICES"}, "--silent", code=4)
+
+
+def test_the_server_s_voice_is_tried_in_its_surroundings(alone: dict[str, str]) -> None:
+    needs_packages(*NEEDED)
+    found = _beside(alone, "--voice", "piper/ti")
+    assert re.match(f"piper/tiny {TRIED}", found["neural voice"]["message"]), found
+
+
+def test_a_voice_that_the_server_has_given_up_is_a_warning(alone: dict[str, str], home: str) -> None:
+    needs_packages(*NEEDED)
+    tiny_voice.put(Path(home) / "v", "bad", b"no model")
+    found = _beside(alone, "--voice", "piper/bad")["neural voice"]
+    assert found["state"] == "warning"
+    assert found["message"].startswith("piper/bad is in use: ")
+
+
+FAILED_THEN = {"piper/a": {"state": "loaded", "why": None}, "piper/b": {"state": "failed", "why": "x is no model"}}
+
+
+def test_what_the_server_says_of_its_voices_is_told_where_they_cannot_be_looked_at() -> None:
+    (found,) = neural.judge_told(FAILED_THEN)
+    assert (found.state, found.message) == (WARNING, "the server cannot speak by piper/b: x is no model")
+    assert found.next == "see whether it still is so: talk set --voice piper/b"
+    (found,) = neural.judge_told({"piper/a": FAILED_THEN["piper/a"]})
+    assert (found.state, found.message) == (DONE, "of the server: piper/a")
+    assert neural.judge_told({}) == neural.judge_told(None) == []
+
+
+def test_a_voice_that_speaks_here_and_that_the_server_has_given_up_is_told_so() -> None:
+    facts = Neural(None, used="piper/b", tried=Tried(loaded=0.5, speed=9.0))
+    assert neural.judge(facts, server=True, told=FAILED_THEN)[-1].state == WARNING
+    assert neural.judge(facts, server=True, told={})[-1].state == DONE
 
 
 # -- the one that is tried, and what is made of it

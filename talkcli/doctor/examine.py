@@ -84,14 +84,15 @@ class Examination:
         self, used: str | None, engine: voice.Engine, here: machine.Session, env: Mapping[str, str], *, running: bool
     ) -> Iterator[Finding]:
         """Look at neural voices, where something asks for one, or any is there."""
-        used = used if used and is_neural(used) else None
-        if not is_own(self._told("driver")) or not (used or engine.neural or env.get("TALK_VOICES")):
+        used, told = used if used and is_neural(used) else None, self._server.get("neural_voices")
+        if not is_own(self._told("driver")) or not (used or told or engine.neural or env.get("TALK_VOICES")):
             return
-        if running and here.server is None:
-            return  # its files and its Python are another machine's or another user's
         from talkcli.doctor import neural
 
-        yield from neural.judge(neural.look(used, env, LIMIT, self._interrupt), server=running)
+        if running and here.server is None:  # its files and its Python are another machine's or another user's
+            yield from neural.judge_told(told)
+            return
+        yield from neural.judge(neural.look(used, env, LIMIT, self._interrupt), server=running, told=told)
 
     def _player(self) -> str | None:
         """Return the player that is set, by the server or for this process."""

@@ -30,6 +30,8 @@ _RATE = 200
 #: How many times as fast as it is heard a sentence must be made: below, any other work on the machine makes gaps.
 _FAST_ENOUGH = 1.3
 _RUNTIME, _FILES, _VOICE = "neural", "voice files", "neural voice"
+#: What has a server load a voice that it has given up.
+_AGAIN = "see whether it still is so: talk set --voice "
 _CHOOSE = "choose one of espeak's: talk set --voice en, or talk serve --voice en"
 
 
@@ -144,8 +146,27 @@ def _memory(process: int) -> int | None:
     return None
 
 
-def judge(neural: Neural, *, server: bool) -> list[Finding]:
-    """Judge neural voices; `server`: whether one runs, which speaks by espeak where a voice can't be had."""
+def judge_told(voices: object) -> list[Finding]:
+    """Judge neural voices by what a server says of itself, where its files can't be looked at: its `neural_voices`."""
+    failed = _given_up(voices)
+    loaded = tuple(each for each in voices if each not in failed) if isinstance(voices, dict) else ()
+    if failed:
+        voice, why = next(iter(failed.items()))
+        return [warning(_VOICE, f"the server cannot speak by {voice}: {why}", f"{_AGAIN}{voice}")]
+    return [done(_VOICE, f"of the server: {some(loaded)}")] if loaded else []
+
+
+def _given_up(voices: object) -> dict[str, str]:
+    """Return the voices that a server has given up, and why."""
+    found = voices.items() if isinstance(voices, dict) else ()
+    return {voice: str(each.get("why")) for voice, each in found if each.get("state") == "failed"}
+
+
+def judge(neural: Neural, *, server: bool, told: object = None) -> list[Finding]:
+    """Judge neural voices; `server`: whether one runs, which speaks by espeak where a voice can't be had.
+
+    `told`: what that says of them, as of `judge_told`.
+    """
     tried = neural.tried
     broken = warning if server or neural.used is None else failed
     found = [done(_RUNTIME, ", ".join(neural.installed))]
@@ -157,6 +178,8 @@ def judge(neural: Neural, *, server: bool) -> list[Finding]:
         found.append(warning(_FILES, f"{voice}: {words}{more}", step))
     elif neural.good:
         found.append(done(_FILES, f"as they should be: {some(neural.good)}"))
+    if tried is not None and tried.speed is not None and _given_up(told):
+        return [*found, *judge_told(told)]  # as it was then, and is no more
     return found if tried is None else [*found, _tried(neural.used or "", tried, broken)]
 
 
