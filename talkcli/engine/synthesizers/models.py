@@ -10,7 +10,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shlex
 import stat
 import sys
 
@@ -202,6 +201,8 @@ def _is_alone(user: int, group: int) -> bool:
 
 def _writable(*paths: str) -> BadFile:
     """Return the refusal of what others may write, with the one command that mends all of it."""
+    import shlex  # for this alone: an engine process looks at voices at each of its starts
+
     names = f"{', '.join(paths[:-1])} and {paths[-1]}" if len(paths) > 1 else paths[0]
     roots = os.geteuid() != 0 and any(os.stat(each).st_uid == 0 for each in paths)
     command = f"{'sudo ' if roots else ''}chmod go-w {shlex.join(paths)}"
