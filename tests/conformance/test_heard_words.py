@@ -120,6 +120,11 @@ def test_done_when_thirty_words_of_a_neural_voice_are_told_as_they_are_heard(
         talk.stop()
         assert [THIRTY[each["start"] : each["end"]] for each in measured.words] == TOLD
         print(f"rate {rate}: {measured}")
+        # Where in the sound a word is said to be is no matter of how busy the machine is.
+        reference = joe.render_with_words(Sentence(THIRTY, rate))
+        beside = [abs(each["time"] - position(reference, each["start"])) for each in measured.words]
+        assert statistics.median(beside) <= MEDIAN, beside
+        assert max(beside) <= WORST, beside
         measured.assert_in_time()
 
 
