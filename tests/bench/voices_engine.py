@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from talkcli import Client, State
-from tests.bench.arithmetic import first_sound, silences
+from tests.bench.arithmetic import first_sound
 from tests.bench.failure import FailedError
 from tests.bench.idle import settle, taken
 from tests.bench.onset import milliseconds
 from tests.bench.table import Limit, Row
-from tests.bench.voices_heard import HEARD
+from tests.bench.voices_heard import HEARD, pauses
 from tests.bench.voices_stage import engine_of
 from tests.conformance.hearing import await_word, send
 from tests.conformance.voices import Joe
 from tests.support.compare import compare
-from tests.support.espeak import RATE
 from tests.support.real_voice import REAL_VOICE, real_voice, silence_noise
 from tests.support.surroundings import short_directory
 
@@ -34,10 +33,9 @@ _LONG = "I am returning to the charging station in the kitchen now, please leave
 _URGENT, _NEXT = "ready", "moving along"
 #: What libespeak-ng speaks in the place of the voice, in its language.
 _INSTEAD = "gmw/en-US"
-_BETWEEN = int(0.12 * RATE)
 #: Milliseconds from the kill until the urgent goal is heard, at worst; and until the voice is, in the median and so.
 _SOON, _BACK, _BACK_AT_WORST = 400, 2500, 4000
-_TEN_THOUSAND = ("I am ready to go. We are leaving now. Please follow me. " * 200)[:10_000]
+LONG_TEXT = ("I am ready to go. We are leaving now. Please follow me. " * 200)[:10_000]
 _PATIENCE = 600.0
 #: Megabytes of the engine process once the voice is loaded, after long texts, and by which these may have it grow when
 #: all that grows by being used once has grown.
@@ -100,7 +98,7 @@ def memory(stage: VoiceStage) -> list[Row]:
         after = []
         with Client(talk.socket) as client:
             for _ in range(stage.options.texts):
-                ended = client.say(_TEN_THOUSAND).wait(_PATIENCE)
+                ended = client.say(LONG_TEXT).wait(_PATIENCE)
                 if ended.state is not State.SUCCEEDED:
                     raise FailedError(f"{ended.state}: {ended.message}")
                 after.append(_megabytes(engine, "Pss"))
@@ -131,10 +129,8 @@ def _kill(stage: VoiceStage, talk: Talk, word: int, reference: Samples) -> tuple
 
 def _heard(recording: Recording, hit: float, reference: Samples) -> tuple[float, float]:
     samples = recording.samples
-    first, gaps = first_sound(samples, HEARD), silences(samples, _BETWEEN, HEARD)
-    if first is None or len(gaps) != 1:
-        raise FailedError(f"{len(gaps) + 1} sentences are heard behind the kill, not two")
-    quiet_from, again = gaps[0]
+    first, ((quiet_from, again),) = first_sound(samples, HEARD), pauses(samples, 1)
+    assert first is not None
     compared = compare(samples[(quiet_from + again) // 2 :], reference)
     if not compared.same:
         raise FailedError(f"what is heard again is not the neural voice: {compared}")

@@ -10,10 +10,9 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from tests.bench.arithmetic import first_sound, silences
-from tests.bench.failure import FailedError
+from tests.bench.arithmetic import first_sound
 from tests.bench.table import Limit, Row
-from tests.bench.voices_heard import HEARD
+from tests.bench.voices_heard import HEARD, pauses
 from tests.bench.voices_stage import VOICES
 from tests.support.espeak import RATE
 from tests.support.listener import WORD, align
@@ -26,21 +25,19 @@ if TYPE_CHECKING:
     from tests.support.recording import Recording
 
 #: Twenty words each, a pause before each; none begins so softly that its beginning is a matter of opinion.
-_APART = (
+APART = (
     "One, two, three, four, five, six, seven, eight, nine, ten, eleven, twelve, thirteen, fourteen, fifteen, sixteen, "
     "seventeen, eighteen, nineteen, twenty.",
     "Battery. Door. Table. Kitchen. Garden. Charger. Camera. Gripper. Doctor. Teacher. Paper. Basket. Button. Corner. "
     "Carpet. Bottle. Pocket. Ticket. Dinner. Breakfast.",
 )
 #: Running text, as a robot speaks it: 25 or so words each.
-_RUNNING = (
+RUNNING = (
     "I have found the small red box on the table in the kitchen and will bring it to you now, so keep the door open",
     "Please step aside because I am carrying a heavy package to the second floor and cannot see what is before me",
     "My battery is low and I will return to the charging station in five minutes, but the last delivery comes first",
     "Good morning and welcome to the museum, my name is Joe and I will show you the paintings in the next three rooms",
 )
-#: Samples of quiet that may be a pause between words.
-_QUIET = int(0.06 * RATE)
 _MEDIAN = 30
 
 
@@ -50,8 +47,8 @@ def words(stage: VoiceStage) -> list[Row]:
     rounds = max(1, stage.options.rounds // 5)
     with stage.server() as talk:
         for texts, heard, what in (
-            (_APART, _onsets, "of words behind a pause, told against where the sound comes up"),
-            (_RUNNING, _aligned, "of words in running text, told against a recognizer"),
+            (APART, _onsets, "of words behind a pause, told against where the sound comes up"),
+            (RUNNING, _aligned, "of words in running text, told against a recognizer"),
         ):
             found: dict[str, list[float]] = {each: [] for each in VOICES}
             for _ in range(rounds):
@@ -87,12 +84,9 @@ def _onsets(recording: Recording, text: str) -> dict[int, float]:
     """Return when each word began to be heard, by where it is in the text: where it is loud again behind a pause."""
     samples = recording.samples
     first = first_sound(samples, HEARD)
+    assert first is not None
     begins = [each.start() for each in re.finditer(r"\w+", text)]
-    # A closure within a word is quiet, too, but not for as long as a pause.
-    pauses = sorted(silences(samples, _QUIET, HEARD), key=lambda each: each[0] - each[1])[: len(begins) - 1]
-    if first is None or len(pauses) < len(begins) - 1:
-        raise FailedError(f"{len(pauses) + 1} words are heard apart, {len(begins)} were said")
-    loud = [first, *sorted(end for _, end in pauses)]
+    loud = [first, *(end for _, end in pauses(samples, len(begins) - 1))]
     return {start: recording.time_of(sample) for start, sample in zip(begins, loud, strict=True)}
 
 
