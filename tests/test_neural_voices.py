@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from typing import TYPE_CHECKING
 
 import pytest
@@ -12,7 +13,7 @@ from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.models import INSTALL, NEEDED
 from talkcli.engine.synthesizers.voices import find_voice
 from tests.conformance.bareserve import TALK, environment, run, serving
-from tests.engine.test_neural import WITHOUT
+from tests.engine.test_neural import SLOW_TO_SPEAK, WITHOUT
 from tests.support import tiny_voice
 from tests.support.surroundings import needs_packages, short_directory
 from tests.test_completion import offered
@@ -44,13 +45,33 @@ def test_goals_are_spoken_with_one_and_end_in_words_where_it_is_broken(env: dict
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
 
 
+def test_a_machine_that_is_too_slow_for_one_is_told(env: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(SLOW_TO_SPEAK)
+    slow = {**env, "PYTHONPATH": f"{tmp_path / 'site'}:{env.get('PYTHONPATH', '')}"}
+    with serving(slow):
+        assert (
+            run([*TALK, "say", "--wait", "--voice", "piper/tiny", "--voice-only", "one two three four"], env).code == 0
+        )
+        assert run([*TALK, "say", "--wait", "hello"], env).code == 0
+        espeak, goal = (json.loads(each) for each in run([*TALK, "--json", "log", "-n", "2"], env).out.splitlines())
+    if goal["text"] == "hello":
+        espeak, goal = goal, espeak
+    assert espeak["message"] == "Talk completed successfully"
+    assert (goal["state"], goal["voice"]) == ("SUCCEEDED", "piper/tiny")
+    assert re.fullmatch(
+        r"Talk completed successfully, but with \d gaps? of \d\.\d s in all: this machine is too slow for the voice",
+        goal["message"],
+    )
+
+
 def test_one_that_is_put_there_later_is_listed_and_can_be_asked_for(env: dict[str, str], tmp_path: Path) -> None:
     with serving(env, "--rate", "450"):
         listed = run([*TALK, "voices"], env).out
         assert "piper/tiny" in listed
-        for command in (["say", "--voice", "piper/late", "hello"], ["set", "--voice", "piper/late"]):
+        for command, code in ((["say", "--voice", "piper/late", "hello"], 5), (["set", "--voice", "piper/late"], 2)):
             done = run([*TALK, *command], env)
-            assert done.code in {2, 5}
+            assert done.code == code
             assert 'unknown voice "piper/late"' in done.err
         tiny_voice.put(tmp_path / "voices", "late")
         assert run([*TALK, "set", "--voice", "piper/late"], env).code == 0

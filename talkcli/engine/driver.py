@@ -277,6 +277,7 @@ class Driver:
         try:
             self._synthesizer.speak(text, self._sound, playback)
             session.duration = playback.finish()
+            session.gaps = playback.gaps
         except Stopped:
             pass
         except Exception as error:  # noqa: BLE001 - whatever it is, pyttsx3 would swallow it: it is told instead

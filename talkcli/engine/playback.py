@@ -56,6 +56,10 @@ SILENT_WITHIN = 0.15
 #: Seconds by which the word clock may be ahead of what is heard: 4 to 8 ms were measured.
 CLOCK_AHEAD = 0.01
 
+#: Seconds of silence in the midst of a sentence, as its sound did not come in time, that are no gap: clocks are no
+#: better, and nobody hears them.
+GAP = 0.05
+
 #: Seconds that are said again where a player had to be ended before all it held was heard: the clock is no better than
 #: this, and nothing may be lost.
 SAID_AGAIN = 0.03
@@ -94,6 +98,10 @@ class Playback:
         self._left_out = 0
         #: until when a device that is busy is tried again; 0 before it was found so
         self._busy_until = 0.0
+        #: whether the samples are made beside this, so that they may not be there in time
+        self._beside = False
+        #: the seconds of each gap that is heard because they were not
+        self.gaps: list[float] = []
         #: since when the player has been given nothing but silence, because the sentence is held
         self._silent_at: float | None = None
 
@@ -130,6 +138,7 @@ class Playback:
 
         The player may be empty meanwhile, which is no fault of its own.
         """
+        self._beside = True
         more = (descriptor, select.POLLIN)
         if self._stream is not None:
             self._try(lambda stream: self._go_on_without(stream, more))
@@ -324,7 +333,10 @@ class Playback:
             stream.lead_in -= taken
             return taken
         with self._samples.part(self._sent, min(self._audible_end(stream), self._sent + stream.piece)) as part:
+            silent = stream.silent_for(time.monotonic())
             taken = stream.offer(part)
+        if taken and silent > GAP and self._beside and stream.player.real_time:
+            self.gaps.append(silent)
         self._sent += taken
         return taken
 

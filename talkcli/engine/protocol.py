@@ -246,6 +246,8 @@ class Ended:
     reason: str | None = None  # of FAILED: audio_device, audio_lost, audio_stalled, no_player, nothing_to_say, …
     message: str | None = None  # of FAILED: the player's or engine's own words
     duration: float | None = None  # seconds of audio, where all of it was synthesised
+    gaps: int = 0  # times that it was silent in its midst, as its sound was not made in time
+    gap_seconds: float = 0.0  # for so long in all
 
 
 Command = Configure | Say | Stop | Pause | Resume | Followed | Load

@@ -141,6 +141,8 @@ class Session:
         #: if not all of it was heard. None where another speaks, which doesn't know.
         self.position: float | None = None
         self.duration: float | None = None
+        #: the seconds of each gap in that sentence
+        self.gaps: list[float] = []
 
     def open(
         self,
@@ -265,6 +267,7 @@ class Session:
         """Speak a goal to its end."""
         self._goal = goal = InHand(say, time.monotonic())
         self.held = self._confirmed = 0
+        self.gaps = []
         self.players.begin(say)
         self._told, self._voice = None, ""
         self._channel.send(protocol.Started(say.id))
@@ -357,7 +360,8 @@ class Session:
         assert self._goal is not None
         self._tell_output()
         goal, self._goal = self._goal, None
-        self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration))
+        gaps = len(self.gaps), round(sum(self.gaps), 3)
+        self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration, *gaps))
 
     def _alive_due(self) -> float | None:
         if self._goal is None or self._lost(self._goal):

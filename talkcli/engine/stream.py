@@ -89,6 +89,8 @@ class Stream:
         self._zeros = bytes(self.piece)
         self._clock = clock
         self._first_write = 0.0
+        #: when all of it will have been heard
+        self._over_at = 0.0
         #: bytes of silence that are to be written before the first sample
         self.lead_in = int(lead_in * rate) * SAMPLE if player.real_time else 0
         self.begin(begin)
@@ -107,6 +109,7 @@ class Stream:
                 self._clock.start(now)
             self.written += taken
             self.progress_at = now
+            self._over_at = now + self.ahead(now)
         return taken
 
     def offer_silence(self, position: float, most: int | None = None) -> int:
@@ -138,6 +141,12 @@ class Stream:
     def unheard(self, mark: int, now: float) -> float:
         """Return the seconds until the stream up to that byte is heard; negative if it has been."""
         return self._seconds(mark) - self._clock.elapsed(now)
+
+    def silent_for(self, now: float) -> float:
+        """Return the seconds since all that was written has been heard; 0 before that."""
+        if self.written == 0 or self.unheard(self.written, now) > PLAYER_HOLDS:
+            return 0.0
+        return max(0.0, now - self._over_at)
 
     def missing(self, now: float) -> float:
         """Return by how many seconds it would be too early for the stream to be over."""

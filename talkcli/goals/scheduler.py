@@ -275,14 +275,17 @@ class Scheduler:
         """Note where the active goal's sound goes, as far as that is known."""
         self._spoken(goal_id).output = output
 
-    def completed(self, goal_id: str, duration: float | None, now: Now) -> list[Effect]:
-        """End the active goal: all of it was played."""
+    def completed(self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, late: float = 0) -> list[Effect]:
+        """End the active goal: all of it was played, with so many gaps, so many seconds `late` by them."""
         record = self._spoken(goal_id)
         record.duration = duration
         record.spoken_end = len(record.text or "")
         words = "Talk completed successfully"
         if record.output and record.output.muted:
             words += f", but the output was muted: {record.output.device}"
+        if gaps:
+            many = f"{gaps} gap{'s' if gaps > 1 else ''} of {late:.1f} s in all"
+            words += f", but with {many}: this machine is too slow for the voice"
         # A stop that came too late ended nothing: its reason goes.
         return self._end(record, State.SUCCEEDED, None, words, None, now)
 

@@ -396,7 +396,7 @@ class Speech:
         if active is None or active.id != ended.id:
             return  # it was given up before the engine came to its end, perhaps just now
         if ended.outcome == protocol.COMPLETED:
-            effects = self.scheduler.completed(ended.id, ended.duration, now)
+            effects = self.scheduler.completed(ended.id, ended.duration, now, ended.gaps, ended.gap_seconds)
         elif ended.outcome == protocol.STOPPED and active.stop_since is not None:
             effects = self.scheduler.stopped(ended.id, now)
         else:

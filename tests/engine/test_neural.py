@@ -6,6 +6,8 @@ import contextlib
 import itertools
 import json
 import resource
+import signal
+import threading
 import time
 import wave
 from array import array
@@ -17,6 +19,7 @@ from talkcli.engine import protocol
 from talkcli.engine.synthesizers.models import INSTALL, NEEDED
 from tests.engine.spawned import SOON, Spawned
 from tests.support import tiny_voice
+from tests.support.espeak import RATE
 from tests.support.real_voice import REAL_VOICE, real_voice
 from tests.support.surroundings import needs_packages
 from tests.support.timing import assert_within, limits
@@ -25,6 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
     from typing import Any
+
+    from tests.support.sink import Sink
 
 TEXT = "battery low, please come home"
 VOICE = "piper/tiny"
@@ -49,6 +54,16 @@ def telling(self, *arguments):
         print("{asked}", file=sys.stderr, flush=True)
     return method(self, *arguments)
 Spelling.{asked} = telling
+"""
+#: … and so that all but the first sound of a sentence is made too late.
+SLOW_TO_SPEAK = """
+import time
+from talkcli.engine.synthesizers import inference
+decode = inference.Model.decode
+def slowly(model, frames, begin, *rest):
+    time.sleep(0.8 if begin else 0)
+    return decode(model, frames, begin, *rest)
+inference.Model.decode = slowly
 """
 #: … and so that packages are not there.
 WITHOUT = """
@@ -384,27 +399,95 @@ def test_the_process_ends_well_in_the_midst_of_a_real_voices_inference(tmp_path:
 
 
 def test_a_machine_that_is_too_slow_makes_gaps_and_leaves_nothing_out(place: Path) -> None:
-    """Words are told when they are heard, in the order of the text, however late that is."""
-    slow = """
-import time
-from talkcli.engine.synthesizers import inference
-decode = inference.Model.decode
-def slowly(model, frames, begin, *rest):
-    time.sleep(0.8 if begin else 0)
-    return decode(model, frames, begin, *rest)
-inference.Model.decode = slowly
-"""
+    """Words are told when they are heard, in the order of the text, however late that is; the gaps are counted."""
     text = "one two three four five six seven"
-    with _engine(place, before=slow) as engine:
+    with _engine(place, before=SLOW_TO_SPEAK) as engine:
+        assert engine.spoken("espeak", "g0").gaps == 0
         engine.say(text, voice=VOICE)
         late = []
         while not isinstance(event := engine.event(), protocol.Ended):
             if isinstance(event, protocol.Word):
                 late.append(time.monotonic() - event.time)
+    assert event is not None
     assert event.outcome == protocol.COMPLETED
     assert [text[each.start : each.end] for each in engine.words()] == text.split()
-    assert late[-1] - late[0] > 0.5
     assert all(after > before - 0.05 for before, after in itertools.pairwise(late))
+    assert event.gaps >= 1
+    assert event.gap_seconds > 0.5
+    assert event.gap_seconds == pytest.approx(late[-1] - late[0], abs=0.1)
+
+
+@pytest.mark.parametrize("player", ["pulse", "pacat", "aplay"])
+def test_gaps_are_those_that_are_heard_and_words_are_told_when_they_are(place: Path, sink: Sink, player: str) -> None:
+    text = "one two three four five six seven"
+    environment = {"TALK_VOICES": str(place), "XDG_CACHE_HOME": str(place.parent / "cache"), **sink.env}
+    with sink.record() as recording, Spawned(player, environment=environment, before=SLOW_TO_SPEAK) as engine:
+        engine.until(protocol.Ready)
+        engine.say(text, voice=VOICE)
+        told = []
+        while not isinstance(event := engine.event(), protocol.Ended):
+            if isinstance(event, protocol.Word):
+                told.append((time.monotonic(), event.time))
+        assert event is not None
+        assert event.outcome == protocol.COMPLETED
+        recording.wait_until_quiet(0.3)
+        # It hums all the time: where it doesn't, there is a gap.
+        loud = [at for at, each in enumerate(recording.samples) if abs(int(each)) > 1000]
+    silent = [(here - before) / RATE for before, here in itertools.pairwise(loud) if here - before > 0.05 * RATE]
+    assert event.gaps == len(silent) >= 1
+    assert event.gap_seconds == pytest.approx(sum(silent), abs=0.1 * len(silent))
+    assert event.duration is not None
+    assert event.duration - 0.26 == pytest.approx(len(loud) / RATE, abs=0.05), "less the pause at its end"
+    for at, position in told:
+        # A monitor drops some samples where a player ran dry: what is near a gap may be on either side of it.
+        near = (int((position + each) * RATE) for each in (-0.03, 0, 0.03))
+        heard = [recording.time_of(loud[min(len(loud) - 1, max(0, each))]) for each in near]
+        assert heard[0] - 0.1 < at < heard[-1] + 0.1
+
+
+@pytest.mark.parametrize("player", [pytest.param("null", marks=pytest.mark.slow), "pulse"])
+def test_a_processor_that_runs_a_fifth_of_the_time_speaks_all_of_it_with_gaps(
+    tmp_path: Path, sink: Sink, player: str
+) -> None:
+    """It stands still for a sixth of a second again and again, as under a limit of the kernel's, and its player too."""
+    real_voice()
+    text = "Please step aside, the robot is about to turn."
+    environment = {"XDG_CACHE_HOME": str(tmp_path / "cache"), **sink.env}
+    with Spawned(player, environment=environment) as engine:
+        engine.until(protocol.Ready)
+        assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.COMPLETED
+        with _slowed(engine, running=0.04, standing=0.16):
+            began = time.monotonic()
+            ended = engine.spoken(text, voice=REAL_VOICE, rate=200)
+            took = time.monotonic() - began
+        assert ended.outcome == protocol.COMPLETED
+        assert ended.duration is not None
+        words = [text[each.start : each.end] for each in engine.words()]
+        assert words == text.replace(",", "").rstrip(".").split()
+        assert ended.gaps > 2
+        first = next(each for each in engine.words()).time
+        assert 0.5 < ended.gap_seconds < took - ended.duration + first
+        assert engine.spoken("espeak", "g2").outcome == protocol.COMPLETED
+
+
+@contextlib.contextmanager
+def _slowed(engine: Spawned, running: float, standing: float) -> Iterator[None]:
+    """Have the process stand still and go on in turn, for so many seconds each."""
+    over = threading.Event()
+
+    def limit() -> None:
+        while not over.wait(running):
+            engine.process.send_signal(signal.SIGSTOP)
+            over.wait(standing)
+            engine.process.send_signal(signal.SIGCONT)
+
+    limiting = threading.Thread(target=limit)
+    limiting.start()
+    try:
+        yield
+    finally:
+        over.set()
+        limiting.join()
 
 
 def test_a_real_voice_says_a_sentence_with_its_words_in_time(tmp_path: Path) -> None:

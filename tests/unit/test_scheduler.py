@@ -34,6 +34,16 @@ def test_a_goal_that_succeeded_says_so() -> None:
     assert told.ended_at == 1.7e9 + 103
 
 
+@pytest.mark.parametrize(("gaps", "words"), [(1, "1 gap of 2.0 s in all"), (3, "3 gaps of 2.0 s in all")])
+def test_a_goal_with_gaps_succeeded_and_says_so(gaps: int, words: str) -> None:
+    robot = Robot()
+    goal = robot.says("door open")
+    robot.see(robot.scheduler.completed(goal.id, 1.5, robot.now, gaps, 2.04))
+    told = goal.snapshot()
+    message = f"Talk completed successfully, but with {words}: this machine is too slow for the voice"
+    assert (told.state, told.message) == (State.SUCCEEDED, message)
+
+
 def test_a_goal_that_failed_says_why_and_how_far_it_came_and_the_next_one_starts() -> None:
     robot = Robot()
     goal = robot.says("door open")
