@@ -192,8 +192,11 @@ def test_a_run_that_is_ended_raises_at_once() -> None:
 
     thread = threading.Thread(target=encode)
     thread.start()
-    time.sleep(0.2)
-    assert thread.is_alive()
+    assert thread.ident is not None
+    clock = time.pthread_getcpuclockid(thread.ident)
+    while time.clock_gettime(clock) < 0.1:  # it is in the midst of computing
+        thread.join(0.005)
+        assert thread.is_alive()
     asked = time.monotonic()
     run.end()
     thread.join()

@@ -18,8 +18,11 @@ import pytest
 from talkcli.engine import protocol
 from talkcli.engine.synthesizers.models import INSTALL, NEEDED
 from tests.engine.spawned import SOON, Spawned
+from tests.engine.test_pausing_players import without_silence
+from tests.engine.test_player_faults import Player, player
 from tests.support import tiny_voice
 from tests.support.espeak import RATE
+from tests.support.processes import children
 from tests.support.real_voice import REAL_VOICE, real_voice
 from tests.support.surroundings import needs_packages
 from tests.support.timing import assert_within, limits
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
     from typing import Any
 
     from tests.support.sink import Sink
+
+__all__ = ["player"]
 
 TEXT = "battery low, please come home"
 VOICE = "piper/tiny"
@@ -188,8 +193,7 @@ def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package:
     with _engine(tmp_path / "voices", before=WITHOUT.format(names=[package])) as engine:
         message = _failed(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
         assert f"{VOICE} is listed, but it cannot be loaded" in message
-        if package in NEEDED:
-            assert INSTALL in message
+        assert INSTALL in message
         assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
     with _spawned(tmp_path / "voices", before=WITHOUT.format(names=[package]), voice=VOICE) as engine:
         failed = engine.until(protocol.StartFailed)
@@ -385,6 +389,44 @@ def test_a_real_voice_is_stopped_and_held_in_the_midst_of_a_long_sentence(
         assert engine.until(protocol.Ended).outcome == protocol.STOPPED
         assert_within(time.monotonic() - asked, protocol.STOP_LIMIT, "a stop")
         assert engine.spoken(TEXT, "g2", voice=REAL_VOICE).outcome == protocol.COMPLETED
+
+
+def test_a_program_that_plays_gets_each_sample_once_whether_it_is_held_or_not(
+    place: Path, tmp_path: Path, player: Player
+) -> None:
+    """And silence while it is held; it is gone with a sentence that is stopped."""
+    text = "one two three four five six seven eight nine ten"
+    with _engine(place, f"file:{tmp_path / 'out.wav'}") as engine:
+        assert engine.spoken(text, voice=VOICE).outcome == protocol.COMPLETED
+    with wave.open(str(tmp_path / "out.wav")) as file:
+        sentence = file.readframes(file.getnframes())
+    with _engine(place, player.plays()) as engine:
+        engine.say(text, "g1", voice=VOICE)
+        while engine.until(protocol.Word).number < 4:
+            pass
+        assert engine.pause("g1") < 0.2
+        assert children(engine.process.pid), "it plays silence"
+        for _ in range(2):
+            engine.until(protocol.Alive)
+        engine.resume("g1")
+        ended = engine.until(protocol.Ended)
+        assert ended.outcome == protocol.COMPLETED
+        assert ended.gap_seconds < protocol.ALIVE_EVERY, "it was held, and that is no gap"
+        assert [each.number for each in engine.words()] == [*range(1, 11)]
+        heard = player.heard.read_bytes()
+        assert len(heard) > len(sentence)
+        assert without_silence(heard, sentence) == sentence
+        player.heard.unlink()
+        engine.say(text, "g2", voice=VOICE)
+        while engine.until(protocol.Word).number < 4:
+            pass
+        engine.send(protocol.Stop("g2"))
+        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        assert children(engine.process.pid) == []
+        part = player.heard.read_bytes()
+        assert 0 < len(part) < len(sentence)
+        assert sentence.startswith(part)
+        assert engine.spoken(text, "g3", voice=VOICE).outcome == protocol.COMPLETED
 
 
 def test_the_process_ends_well_in_the_midst_of_a_real_voices_inference(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def _bytes(text: str) -> bytes:
     return render([text], rate=FAST)[0].astype("<i2").tobytes()
 
 
-def _without_silence(heard: bytes, sentence: bytes) -> bytes:
+def without_silence(heard: bytes, sentence: bytes) -> bytes:
     """Return what was heard without the longest run of zeros."""
     same = (pair[0] == pair[1] for pair in zip(heard, sentence, strict=False))
     begin = next((at for at, each in enumerate(same) if not each), len(sentence)) // 2 * 2
@@ -133,7 +133,7 @@ def test_a_player_gets_silence_in_a_pause_and_then_the_next_sample(player: Playe
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     heard, sentence = player.heard.read_bytes(), _bytes(TEXT)
     assert len(heard) > len(sentence) + alive_every * 0.8 * RATE * 2
-    assert _without_silence(heard, sentence) == sentence
+    assert without_silence(heard, sentence) == sentence
 
 
 def test_a_player_that_dies_in_a_pause_is_replaced(player: Player) -> None:
@@ -148,7 +148,7 @@ def test_a_player_that_dies_in_a_pause_is_replaced(player: Player) -> None:
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     sentence = _bytes(TEXT)
-    assert _without_silence(player.heard.read_bytes(), sentence) == sentence
+    assert without_silence(player.heard.read_bytes(), sentence) == sentence
 
 
 def test_a_player_that_dies_in_a_pause_and_cannot_be_replaced_fails_the_sentence_when_it_goes_on(

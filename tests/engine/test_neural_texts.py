@@ -1,0 +1,152 @@
+"""Odd texts through a real neural voice: each has one end, its words in order, and as much sound as it may have.
+
+200 in the slow tests, some in the others; by hand as many as one likes: `TALK_TEST_NEURAL_TEXTS=2000 pytest -m slow -s
+tests/engine/test_neural_texts.py`, with `TALK_TEST_SEED=N` for others. What a process dies of is printed.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine import protocol
+from tests.engine.spawned import Spawned
+from tests.faults.fuzz_texts_generator import made
+from tests.faults.test_text_bad import ENDLESS, LONGEST_WORDS, MARKUP, RIGHT_TO_LEFT
+from tests.support.real_voice import REAL_VOICE, real_voice
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from pathlib import Path
+
+MANY = int(os.environ.get("TALK_TEST_NEURAL_TEXTS") or 200)
+SEED = int(os.environ.get("TALK_TEST_SEED") or 18)
+#: Those of a default run.
+FEW = 10
+#: Seconds of sound that a character may make at 450 words per minute, and a text beside that: the name of a picture, or
+#: of a letter of another script, is a sentence.
+A_CHARACTER, BESIDE = 2.5, 1.0
+#: Texts that are odd in a way of their own.
+ODD = [
+    *MARKUP,
+    *LONGEST_WORDS.values(),
+    *RIGHT_TO_LEFT.values(),
+    *(
+        "\ud800 a",
+        "a\udfff",
+        "\ud83d",
+        "\x00",
+        "...",
+        "\u0301" * 50,
+        "a" + "\u0301" * 200,
+        "😀" * 20,
+        "\x01s\x01100A b",
+    ),
+    *(
+        "1,000,000.5",
+        "7" * 60,
+        "IV. XIX. 1/2 3°",
+        "e.g. i.e. U.S.A. Dr. Mr. 5.",
+        "\ufffe\uffff",
+        "\u202ea\u202c\u2067b\u2069",
+    ),
+]
+#: … and those that are long.
+LONG = {**ENDLESS, "one word": "x" * 10_000, "words of a letter": "a " * 5_000, "words": "word " * 2_000}
+
+
+@dataclass
+class Tally:
+    """What became of the texts."""
+
+    outcomes: Counter[str] = field(default_factory=Counter)
+    deaths: list[str] = field(default_factory=list)  # how a process ended, and of which text
+    faults: list[str] = field(default_factory=list)  # what must not be at all
+    seconds: float = 0.0  # of sound
+    most: tuple[float, str] = (0.0, "")  # seconds of sound a character, and of which text
+
+    def __str__(self) -> str:
+        ended = ", ".join(f"{count} {name}" for name, count in sorted(self.outcomes.items()))
+        most = f"{self.most[0]:.2f} s of sound a character at most, of {self.most[1][:60]!a}"
+        return f"{ended}; {len(self.deaths)} deaths; {self.seconds:.0f} s of sound, {most}"
+
+
+def _spoken(texts: Iterable[str], place: Path) -> Tally:
+    """Speak texts into a file, which takes no time but that of computing, each in an engine process that may die."""
+    tally = Tally()
+    left: Iterator[str] = iter(texts)
+    text: str | None = next(left, None)
+    while text is not None:
+        with Spawned(f"file:{place / 'out.wav'}", environment={"XDG_CACHE_HOME": str(place)}) as engine:
+            engine.until(protocol.Ready)
+            while text is not None:
+                try:
+                    ended = engine.spoken(text, voice=REAL_VOICE)
+                except AssertionError as died:
+                    engine.process.wait(20)
+                    tally.deaths.append(f"{engine.process.returncode} {died}: {text!a}")
+                    text = next(left, None)
+                    break
+                _count(tally, text, ended, engine.words())
+                engine.events.clear()
+                text = next(left, None)
+    return tally
+
+
+def _count(tally: Tally, text: str, ended: protocol.Ended, words: list[protocol.Word]) -> None:
+    shown = f"{text[:200]!a} ({len(text)})"
+    tally.outcomes[ended.reason or ended.outcome] += 1
+    if ended.outcome == protocol.FAILED:
+        if ended.reason != "nothing_to_say" or words:
+            tally.faults.append(f"{ended.reason}: {ended.message}: {shown}")
+        return
+    seconds = ended.duration or 0.0
+    tally.seconds += seconds
+    tally.most = max(tally.most, (seconds / len(text), text))
+    if not words:
+        tally.faults.append(f"no words: {shown}")
+    for before, here in pairwise(words):
+        if not (before.end <= here.start and before.time <= here.time and here.number == before.number + 1):
+            tally.faults.append(f"words out of order, {before} {here}: {shown}")
+    if any(not 0 <= each.start < each.end <= len(text) or not 0 <= each.time <= seconds for each in words):
+        tally.faults.append(f"words outside of the text: {shown}")
+    if not 0 < seconds <= BESIDE + A_CHARACTER * len(text):
+        tally.faults.append(f"{seconds} s: {shown}")
+
+
+def _assert_well(tally: Tally, texts: int) -> None:
+    print(tally, *tally.deaths, *tally.faults, sep="\n")
+    assert not tally.faults, tally.faults
+    assert not tally.deaths, tally.deaths
+    assert tally.outcomes.total() == texts
+    assert tally.outcomes[protocol.COMPLETED] > texts // 2
+
+
+def test_odd_texts_have_one_end_each(tmp_path: Path) -> None:
+    real_voice()
+    source = random.Random(SEED)
+    texts = [*ODD[::5], *(made(source)[:100] for _ in range(FEW))]
+    _assert_well(_spoken(texts, tmp_path), len(texts))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600 + 3 * MANY)
+def test_many_odd_texts_have_one_end_each(tmp_path: Path) -> None:
+    real_voice()
+    source = random.Random(SEED)
+    texts = [*ODD, *(made(source) for _ in range(MANY - len(ODD)))]
+    _assert_well(_spoken(texts, tmp_path), len(texts))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", LONG)
+def test_texts_of_thousands_of_characters_have_one_end_each(tmp_path: Path, name: str) -> None:
+    real_voice()
+    _assert_well(_spoken([LONG[name]], tmp_path), 1)
