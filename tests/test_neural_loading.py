@@ -188,8 +188,12 @@ def test_who_insists_waits_for_the_voice_or_expires(env: dict[str, str], hold: P
         assert robot.heard(urgent) == ("SUCCEEDED", TINY)
 
 
-def test_a_voice_is_loaded_beside_the_speech(env: dict[str, str], hold: Path) -> None:
-    with _robot(env) as robot:
+def test_a_voice_is_loaded_beside_the_speech(env: dict[str, str], hold: Path, tmp_path: Path) -> None:
+    tiny_voice.put(tmp_path / "voices", "second")
+    hold.unlink()
+    with _robot(env, "--voice", "piper/second") as robot:
+        robot.loads("piper/second")
+        hold.touch()
         active = robot.say("this goes on and on " * 30, None, feedback=True)
         robot.until(lambda: robot.state(active) == "ACTIVE")
         goal = robot.say()
@@ -201,6 +205,19 @@ def test_a_voice_is_loaded_beside_the_speech(env: dict[str, str], hold: Path) ->
         assert robot.state(active) == "ACTIVE"
         robot.client.cancel([active.id])
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
+
+
+def test_the_first_voice_is_loaded_while_nothing_is_heard(env: dict[str, str]) -> None:
+    """Its libraries stop the whole process for a moment, which would be heard."""
+    with _robot(env) as robot:
+        active = robot.say("this goes on and on " * 30, None)
+        robot.until(lambda: robot.state(active) == "ACTIVE")
+        goal = robot.say()
+        assert robot.neural()["state"] == "waiting"
+        robot.client.cancel([active.id])
+        assert robot.heard(goal) == ("SUCCEEDED", TINY)
+    ended, loaded = (robot.server.log.index(each) for each in (f"{active.id} PREEMPTED", "voice piper/tiny loaded"))
+    assert ended < loaded
 
 
 # -- a voice that can't be loaded

@@ -73,6 +73,8 @@ class Voices:
         self.driver: str | None = None
         #: by id, without a speaker; the one that was asked for last behind the others
         self.neural: dict[str, Neural] = {}
+        #: whether the engine process has the libraries, as one was loaded, or failed in that
+        self.warm = False
         #: the one that the engine is loading
         self._loading: str | None = None
 
@@ -190,7 +192,7 @@ class Voices:
 
     def engine_lost(self, now: float) -> None:
         """Take note that nothing is loaded any more; a voice that was being loaded may be why."""
-        at, self._loading = self._loading, None
+        at, self._loading, self.warm = self._loading, None, False
         for voice, found in list(self.neural.items()):
             if voice == at and found.failures + 1 >= DEATHS:
                 found.fail("the engine process ended while it was being loaded", now)

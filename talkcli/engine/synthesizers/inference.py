@@ -77,7 +77,6 @@ class Model:
         """Load it, in 0.3 to 3 s; BadFile. What takes the most of it is kept in the cache."""
         self.path = path
         self.description = description
-        _import(path)
         with open_checked(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > _LARGEST:
@@ -234,7 +233,11 @@ def _session(model: str | bytes, level: Any = None, kept: str | None = None) -> 
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
-def _import(path: str) -> None:
+def load_libraries(path: str) -> None:
+    """Import what runs a model, the one at `path`; BadFile where there is no memory, ImportError.
+
+    It takes a quarter of a second, for a tenth of which no other thread of the process runs.
+    """
     try:
         import numpy as np  # noqa: F401 - before onnxruntime, which doesn't say why it fails
         import onnxruntime  # noqa: F401

@@ -15,7 +15,7 @@ from collections import deque
 from talkcli.engine.protocol import LOAD_LIMIT, Loaded, Unloaded
 from talkcli.engine.synthesizers import models
 from talkcli.engine.synthesizers.cache import Cache
-from talkcli.engine.synthesizers.inference import Model
+from talkcli.engine.synthesizers.inference import Model, load_libraries
 from talkcli.engine.synthesizers.models import INSTALL, BadFile
 from talkcli.engine.synthesizers.voices import NEURAL
 from talkcli.engine.synthesizers.work import Work
@@ -167,6 +167,7 @@ def _stamps(path: str) -> tuple[tuple[int, int, int], ...]:
 
 def _load(path: str) -> Iterator[Kept]:
     try:
+        load_libraries(path)  # first, so that it is known of any load that took time
         stamps = _stamps(path)
         yield Kept(Model(path, models.describe(path), _cache()), stamps)
     except OSError as error:
