@@ -6,6 +6,7 @@ import json
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+from talkcli.engine.synthesizers.models import NEEDED
 from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
@@ -17,10 +18,10 @@ REAL_VOICE = "piper/en_US-joe-medium"
 
 
 def real_voice() -> Path:
-    """Return its model's path; the test is skipped where it is not installed."""
+    """Return its model's path; the test is skipped where it, or what it takes, is not installed."""
     from pathlib import Path
 
-    needs_packages(REAL_PACKAGE)
+    needs_packages(*NEEDED, REAL_PACKAGE)
     spec = find_spec(REAL_PACKAGE)
     assert spec is not None
     assert spec.origin is not None
