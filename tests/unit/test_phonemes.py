@@ -83,6 +83,18 @@ def test_a_word_that_is_spelled_begins_once_and_those_behind_it_where_they_are()
     assert _words("go abc bye now", Spelling(said={"abc": "ay bee see"})) == words
 
 
+def test_sounds_of_no_word_are_spoken() -> None:
+    """Of some scripts the library names the letters, and tells no place."""
+
+    class Placeless(Spelt):
+        def places(self, clause: str) -> list[tuple[int, int]]:
+            assert clause == "go on"
+            return []
+
+    assert _shown("go on", Placeless()) == ["go on"]
+    assert _words("go on", Placeless()) == []
+
+
 @limits()
 def test_sounds_without_number_are_laid_side_by_side_soon_in_order() -> None:
     """A number of 800 digits has ten times as many; to compare each with each would take seconds."""

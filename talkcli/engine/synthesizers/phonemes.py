@@ -142,6 +142,8 @@ def _beginnings(speller: Speller, clause: str, groups: Sequence[str]) -> list[tu
     starts = [0, *itertools.accumulate(map(len, groups))]
     if len(places) == len(groups):
         return [(start, *place) for start, place in zip(starts, places, strict=False)]
+    if not places:  # it has sounds, and nobody says of which word
+        return []
     places = _forward(places)
     nexts = [*(start for start, _ in places[1:]), len(clause)]
     alone = [
