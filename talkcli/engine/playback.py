@@ -358,7 +358,7 @@ class Playback:
         self._players.tell(player)
         if stream.taken and not self._began:
             self._began = True
-            self._players.gap.began(player.name, now - self._clock.elapsed(now))
+            self._players.gap.began(player.name, now - self._clock.elapsed(now), neural=self._beside)
         self._samples.forget(self._unheard() if player.real_time else self._sent)
         self._tell(self._clock.due(now) if player.real_time else self._clock.rest())
 

@@ -89,6 +89,7 @@ class Say:
     voice: str | None  # id, name or language
     pitch: int  # 0 to 100, 50 is the voice's own
     followed: bool = False  # whether another goal waits behind it
+    by_neural: bool = False  # whether that one asks for a neural voice
     lead_in: int | None = None  # milliseconds of silence before it, whatever the output did; None for `Configure`'s
     audible: bool | None = None  # whether it fails where its output is muted; None for `Configure`'s
     voice_only: bool = False  # whether it waits for a neural voice that is not loaded, and fails without it
@@ -122,6 +123,7 @@ class Followed:
 
     id: str
     followed: bool
+    by_neural: bool = False  # whether that one asks for a neural voice
 
 
 @frozen

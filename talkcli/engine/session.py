@@ -228,7 +228,7 @@ class Session:
         elif isinstance(command, protocol.Stop):
             self._silence()
         elif isinstance(command, protocol.Followed):
-            self.players.gap.followed = command.followed
+            self.players.gap.followed, self.players.gap.by_neural = command.followed, command.by_neural
         elif isinstance(command, protocol.Resume):
             self.held = 0
         elif not goal.stop_asked:

@@ -184,12 +184,15 @@ class Supervisor:
         """Let the goal go on."""
         self._inbox.call(lambda: self._hold(goal_id, None))
 
-    def follow(self, goal_id: str, followed: bool) -> None:
-        """Tell whether another goal waits behind this one: the silence between them may be made shorter then."""
+    def follow(self, goal_id: str, followed: bool, by_neural: bool) -> None:
+        """Tell whether another goal waits behind this one: the silence between them may be made shorter then.
+
+        `by_neural`: whether that one asks for a neural voice.
+        """
         process = self._open
         if process:
             # An engine that has no room for it at this moment is not hung for that, and little is lost.
-            process.send(protocol.Followed(goal_id, followed))
+            process.send(protocol.Followed(goal_id, followed, by_neural))
 
     def load(self, voice: str, drop: tuple[str, ...] = ()) -> None:
         """Have the process load a neural voice, as `protocol.Load`; `Loaded` is posted if it lives so long."""

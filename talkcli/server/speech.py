@@ -121,8 +121,8 @@ class Speech:
             EngineMissing: self._missing,
             ThreadDied: self._thread_died,
         }
-        #: whether the engine was told that a goal waits behind the one it has in hand
-        self._followed = False
+        #: whether the engine was told that a goal waits behind the one it has in hand, and whether by a neural voice
+        self._followed = False, False
 
     def words(self) -> str:
         """Return what is done and how the engine is, for people; no goal's text: any user may read it."""
@@ -191,9 +191,8 @@ class Speech:
 
         Not for one that is heard: its voice is there until it has spoken.
         """
-        usual = self.scheduler.settings.voice
-        goals = (each.say.voice or usual for each in self.scheduler.unfinished() if each.voice is None)
-        return list(filter(is_neural, dict.fromkeys(map(model_of, (*goals, usual)))))
+        goals = (self._asked(each) for each in self.scheduler.unfinished() if each.voice is None)
+        return list(filter(is_neural, dict.fromkeys(map(model_of, (*goals, self.scheduler.settings.voice)))))
 
     def _loaded(self, loaded: protocol.Loaded) -> None:
         log.loaded(loaded)
@@ -299,20 +298,29 @@ class Speech:
             self.look_finished()
 
     def _start(self, record: Record) -> None:
-        self._followed = self.scheduler.pending_count > 0
+        self._followed = followed, by_neural = self._following()
         chosen = for_engine(record.say, self.scheduler.settings)
         if not is_neural(chosen["voice"] or ""):
             chosen["voice_only"] = False
         elif chosen["voice_only"] and record.say.pitch is None:
             chosen["pitch"] = INITIAL.pitch  # the server's own is for voices that have one
-        self.engine.say(protocol.Say(record.id, record.text or "", followed=self._followed, **chosen))
+        self.engine.say(protocol.Say(record.id, record.text or "", followed=followed, by_neural=by_neural, **chosen))
 
     def _tell_followed(self) -> None:
         """Have the engine know that a goal waits behind the one it speaks: it makes good what the change will take."""
-        active, followed = self.scheduler.active, self.scheduler.pending_count > 0
-        if active and followed is not self._followed:
-            self._followed = followed
-            self.engine.follow(active.id, followed)
+        active, following = self.scheduler.active, self._following()
+        if active and following != self._followed:
+            self._followed = following
+            self.engine.follow(active.id, *following)
+
+    def _following(self) -> tuple[bool, bool]:
+        """Return whether a goal waits, and whether it asks for a neural voice."""
+        following = next(self.scheduler.pending(), None)
+        return following is not None, following is not None and is_neural(self._asked(following))
+
+    def _asked(self, record: Record) -> str:
+        """Return the voice that a goal asks for: its own, or the server's; "" for the engine's."""
+        return record.say.voice or self.scheduler.settings.voice or ""
 
     def _set_timer(self) -> None:
         if self._timer:

@@ -39,11 +39,11 @@ def _sentences(rate: int = FAST) -> list[bytes]:
     return [each.tobytes() for each in (played(first), *others)]
 
 
-def _changed(gap: Gap, took: float, player: str = "aplay") -> None:
+def _changed(gap: Gap, took: float, player: str = "aplay", *, neural: bool = False) -> None:
     """Have one sentence follow another after so many seconds."""
     gap.followed = True
     gap.ended(player, 100.0)
-    gap.began(player, 100.0 + took)
+    gap.began(player, 100.0 + took, neural=neural)
 
 
 # -- how much
@@ -73,6 +73,15 @@ def test_each_player_has_its_own() -> None:
     gap.began("pacat", 200.1)
     assert gap.allowance("aplay") == pytest.approx(0.03)
     assert gap.allowance("pacat") == 0.0
+
+
+def test_a_neural_voice_takes_longer_and_that_is_left_out_before_one_alone() -> None:
+    gap = Gap()
+    _changed(gap, 0.03)
+    _changed(gap, 0.1, neural=True)
+    assert gap.allowance("aplay") == pytest.approx(0.03)
+    gap.by_neural = True
+    assert gap.allowance("aplay") == pytest.approx(0.1)
 
 
 def test_it_is_never_more_than_half_of_the_pause_between_sentences() -> None:

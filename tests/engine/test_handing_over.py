@@ -52,7 +52,8 @@ for line in os.fdopen(0, "rb"):
     elif isinstance(command, protocol.Say):
         os.write(0, protocol.encode(protocol.Started(command.id)))
     elif isinstance(command, protocol.Followed):
-        os.write(0, protocol.encode(protocol.Ended(command.id, protocol.COMPLETED, str(command.followed))))
+        told = f"{{command.followed}} {{command.by_neural}}"
+        os.write(0, protocol.encode(protocol.Ended(command.id, protocol.COMPLETED, told)))
 """
 
 
@@ -65,11 +66,11 @@ def test_the_process_is_told_what_becomes_of_the_goals_behind(
     monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, str(program)])
     thread = Thread()
     try:
-        thread.engine.follow("g1", followed)  # there is none yet that could be told
+        thread.engine.follow("g1", followed, by_neural=True)  # there is none yet that could be told
         thread.until(protocol.Ready)
         thread.say("battery low")
-        thread.engine.follow("g1", followed)
-        assert thread.until(protocol.Ended) == protocol.Ended("g1", protocol.COMPLETED, str(followed))
+        thread.engine.follow("g1", followed, by_neural=True)
+        assert thread.until(protocol.Ended) == protocol.Ended("g1", protocol.COMPLETED, f"{followed} True")
     finally:
         thread.close()
 

@@ -40,7 +40,9 @@ LONGEST = 0.5
 
 
 class Gap:
-    """How long it takes from one sentence to the next, by the players' names, and what is left out for it.
+    """How long it takes from one sentence to the next, and what is left out for it.
+
+    By the players' names, and by whether the next is a neural voice's, which takes some 0.1 s to its first sound.
 
     A sentence ends in a pause of its own. Behind that its player drains and ends, the server is told, and the next one
     is started: 25 to 40 ms by which a queue would be slower than it should sound. So where another goal waits, as much
@@ -52,9 +54,9 @@ class Gap:
     """
 
     def __init__(self) -> None:
-        #: whether another goal waits behind the one in hand
-        self.followed = False
-        self._took: dict[str, deque[float]] = {}
+        #: whether another goal waits behind the one in hand, and whether by a neural voice
+        self.followed = self.by_neural = False
+        self._took: dict[tuple[str, bool], deque[float]] = {}
         #: the player of the sentence before, and when its last sample was to be heard; None if nothing waited behind it
         self._before: tuple[str, float] | None = None
 
@@ -65,18 +67,18 @@ class Gap:
 
     def allowance(self, player: str) -> float:
         """Return the seconds of silence that can be left out at the end of a sentence by this player."""
-        took = sorted(self._took.get(player, ()))
+        took = sorted(self._took.get((player, self.by_neural), ()))
         return min(MOST, took[len(took) // 2]) if took else 0.0
 
     def ended(self, player: str, over_at: float) -> None:
         """Take note that a sentence was played to its end, and when the last of its samples was to be heard."""
         self._before = (player, over_at) if self.followed else None
 
-    def began(self, player: str, at: float) -> None:
+    def began(self, player: str, at: float, *, neural: bool = False) -> None:
         """Take note that a sentence begins, and when its player took the first of its samples."""
         before, self._before = self._before, None
         if before is not None and before[0] == player and 0 < at - before[1] < LONGEST:
-            self._took.setdefault(player, deque(maxlen=REMEMBERED)).append(at - before[1])
+            self._took.setdefault((player, neural), deque(maxlen=REMEMBERED)).append(at - before[1])
 
 
 class Players:
@@ -124,7 +126,7 @@ class Players:
         self._own_lead_in = say.lead_in
         self._audible = self._configure.audible if say.audible is None else say.audible
         self.output = None
-        self.gap.followed = say.followed
+        self.gap.followed, self.gap.by_neural = say.followed, say.by_neural
 
     def tell(self, player: Player) -> None:
         """Take note of where the sentence in hand goes now; that it was muted before is not forgotten."""

@@ -29,9 +29,11 @@ LONGEST = 250
 _COMPARED = 1 << 20
 #: Sounds after which a piece may end at a comma, too.
 _LONG = 150
-#: What ends a clause, by what Piper's voices know of it: theirs are these six. Behind the last three ends a sentence.
+#: What ends a clause in Piper's voices; behind the last three ends a sentence.
+STOPS = ",;:.!?"
+#: What ends one in a text, by what of these it is.
 _STOPS = {
-    **{each: each for each in ",;:.!?"},
+    **{each: each for each in STOPS},
     **dict.fromkeys("，、،", ","),
     **dict.fromkeys("；؛", ";"),
     "：": ":",
