@@ -229,7 +229,7 @@ def test_a_voice_that_cannot_be_loaded_is_espeak_and_says_so(env: dict[str, str]
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", INSTEAD)
         assert robot.neural(BROKEN) == {"state": "failed", "why": why}
         assert f"{BROKEN} failed: " in run([*TALK, "status"], env).out
-        assert f"voice {BROKEN} cannot be loaded, espeak speaks in its place: {why}" in robot.server.log
+        assert f"voice {BROKEN} cannot be loaded, espeak speaks where it may: {why}" in robot.server.log
         insists = robot.say("hello", None, voice_only=True).wait(LIMIT)
         assert (insists.state.name, insists.reason, insists.message) == (
             "ABORTED",
@@ -309,3 +309,56 @@ def test_a_pitch_is_refused_with_a_voice_that_has_none(env: dict[str, str]) -> N
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", TINY), "the server's pitch is for other voices"
         assert robot.heard(robot.say("hello", None, pitch=70)) == ("SUCCEEDED", TINY)
         assert robot.heard(robot.say("hello", None, voice_only=True)) == ("SUCCEEDED", TINY)
+
+
+# -- and never for ever
+
+
+def test_goals_end_at_once_where_the_engine_cannot_start(env: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "site" / "pyttsx3.py").write_text("raise ModuleNotFoundError('no pyttsx3 here', name='pyttsx3')")
+    with _robot(env, "--voice", TINY) as robot:
+        robot.until(lambda: "pyttsx3 is missing" in robot.server.log)
+        goals = [robot.say("hello", None), robot.say(voice_only=True), robot.say("behind", "en")]
+        assert [each.wait(LIMIT).reason for each in goals] == ["engine_failed"] * 3
+
+
+def test_an_engine_that_hangs_while_it_loads_is_replaced(env: dict[str, str], hold: Path) -> None:
+    with _robot(env) as robot:
+        goal = robot.say(voice_only=True)
+        robot.until(lambda: robot.neural()["state"] == "loading")
+        for engine in children(robot.server.process.pid):
+            os.kill(engine, signal.SIGSTOP)
+        robot.until(lambda: "no sign of life for 3 s while it loaded piper/tiny" in robot.server.log)
+        hold.unlink()
+        assert robot.heard(goal) == ("SUCCEEDED", TINY)
+
+
+def test_a_server_s_voice_that_changes_lets_go_who_waited_for_it(env: dict[str, str], hold: Path) -> None:
+    assert hold.exists()
+    with _robot(env, "--voice", TINY) as robot:
+        goal = robot.say("hello", None, voice_only=True)
+        robot.until(lambda: robot.neural()["state"] == "loading")
+        robot.client.set(voice="en-us")
+        assert robot.heard(goal) == ("SUCCEEDED", INSTEAD)
+
+
+def test_a_voice_that_another_begins_with_is_found_when_it_is_put_there(env: dict[str, str], tmp_path: Path) -> None:
+    tiny_voice.put(tmp_path / "voices", "joe2")
+    with _robot(env) as robot:
+        assert robot.heard(robot.say(voice="piper/joe", voice_only=True)) == ("SUCCEEDED", "piper/joe2")
+        tiny_voice.put(tmp_path / "voices", "joe")
+        assert robot.heard(robot.say(voice="piper/joe", voice_only=True)) == ("SUCCEEDED", "piper/joe")
+
+
+def test_a_goal_that_insists_on_a_voice_that_kills_the_engine_ends_for_it(env: dict[str, str], hold: Path) -> None:
+    assert hold.exists()
+    with _robot(env, "--voice", TINY) as robot:
+        for _ in range(2):
+            robot.until(lambda: robot.neural()["state"] == "loading")
+            robot.kill_engine()
+            robot.until(lambda: robot.neural()["state"] != "loading")
+        why = "the engine process ended while it was being loaded"
+        ended = robot.say("hello", None, voice_only=True).wait(LIMIT)
+        assert (ended.reason, ended.message) == ("voice_failed", f"Talk aborted: {why}")
+        assert f"voice piper/tiny is left alone: {why}" in robot.server.log
+        assert robot.server.log.count("the engine crashed") == 2

@@ -17,6 +17,7 @@ from talkcli.engine.synthesizers import SYNTHESIZERS, is_own
 from talkcli.engine.synthesizers.base import NotInstalled, Sound, UnknownVoice
 from talkcli.engine.synthesizers.voices import find_voice, is_neural, language_of, list_voices, unknown_voice
 from talkcli.frozen import TYPE_CHECKING, fields, replace
+from talkcli.goals.options import model_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -153,9 +154,10 @@ class Settings:
         """
         try:
             self.set_voice(say.voice)
-        except CannotSpeak:
+        except CannotSpeak as error:
             if say.voice_only or not is_neural(say.voice or ""):
                 raise
+            sys.stderr.write(f"{say.id} is spoken by espeak: {error}\n")  # for the server's log
             self._set_language(language_of(say.voice or ""))
         wanted = fields(say)
         for name in self._set:
@@ -182,6 +184,8 @@ class Settings:
 
     def _driver_id(self, wanted: str) -> str:
         found = find_voice(wanted, self._voices)
+        if found is not None and is_neural(wanted) and model_of(wanted) != model_of(found.id):
+            found = None  # a beginning: another voice may have been put there since that it means
         if found is None:  # not each time: it takes some milliseconds, and what is new is seldom asked for
             self._voices = list_voices(self._engine)
             found = find_voice(wanted, self._voices)

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import JsonObject
 
-#: Seconds between two messages of an engine process that has a goal in hand. Far below `HANG_AFTER`, so that one
-#: late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
+#: Seconds between two messages of an engine process that has a goal in hand, or loads a voice. Far below `HANG_AFTER`,
+#: so that one late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
 ALIVE_EVERY = 0.5
 
 #: Names, in the environment, the descriptor that the player must inherit: by its end the server sees that process and
@@ -36,7 +36,8 @@ LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
 
 #: Seconds until a process that was started must be ready: a cold start from an SD card takes two or three.
 START_LIMIT = 10.0
-#: Seconds without a sign of life from a process that has a goal in hand; it sends one each `ALIVE_EVERY`.
+#: Seconds without a sign of life from a process that has a goal in hand, or loads a voice; it sends one each
+#: `ALIVE_EVERY`.
 HANG_AFTER = 3.0
 #: Seconds after which a neural voice is given up that is being loaded: it takes three on a small machine.
 LOAD_LIMIT = 60.0
@@ -198,9 +199,12 @@ class Started:
 
 @frozen
 class Alive:
-    """A sign of life from a process that has a goal in hand, at most `ALIVE_EVERY` seconds after the last message."""
+    """A sign of life from a process that has a goal in hand, or loads a voice.
 
-    id: str
+    At most `ALIVE_EVERY` seconds after the last message.
+    """
+
+    id: str  # of the goal; "" if there is none
 
 
 @frozen

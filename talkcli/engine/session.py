@@ -190,6 +190,7 @@ class Session:
 
         What the server wants now is carried out inside: a sentence can be stopped when this returns.
         """
+        self._tell_loaded()
         poll = select.poll()
         if not self._channel.closed:
             poll.register(self._channel.descriptor, select.POLLIN)
@@ -208,12 +209,11 @@ class Session:
                 self._carry_out_now(command)
             if self._channel.closed:
                 self._silence()
-        for event in loads.news() if loads else ():
-            self._channel.send(event)
+        self._tell_loaded()
         self._tell_output()
         due = self._alive_due()
-        if self._goal is not None and due is not None and time.monotonic() >= due:
-            self._channel.send(protocol.Alive(self._goal.id))
+        if due is not None and time.monotonic() >= due:
+            self._channel.send(protocol.Alive(self._goal.id if self._goal else ""))
 
     def _carry_out_now(self, command: Command) -> None:
         """Carry out what concerns the goal in hand; the rest has to wait."""
@@ -236,6 +236,10 @@ class Session:
             if self._pump is not None and goal.spoken and not goal.interrupted:
                 goal.interrupted = True
                 self._engine.stop()
+
+    def _tell_loaded(self) -> None:
+        for event in self._synthesizer.news() if self._synthesizer else ():
+            self._channel.send(event)
 
     def tell_voice(self, voice: str, why: str | None) -> None:
         """Tell by which voice the goal in hand is heard, if that is not known; `why`: as in `Output.begin`."""
@@ -364,7 +368,8 @@ class Session:
         self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration, *gaps))
 
     def _alive_due(self) -> float | None:
-        if self._goal is None or self._lost(self._goal):
+        loading = self._synthesizer is not None and self._synthesizer.descriptor is not None
+        if not loading and (self._goal is None or self._lost(self._goal)):
             return None
         return self._channel.sent_at + protocol.ALIVE_EVERY
 

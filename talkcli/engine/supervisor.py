@@ -152,6 +152,9 @@ class Supervisor:
         self._started_at = 0.0
         self._restarts = Restarts(time.monotonic())
         self._goal: Handed | None = None
+        #: the neural voice that the process loads, and when it last gave a sign of life
+        self._loading: str | None = None
+        self._load_heard_at = 0.0
         #: the killed ones that are not known to be gone
         self._dying: list[EngineProcess] = []
         self._complaints = Quota(LINES, WHILE)
@@ -196,9 +199,7 @@ class Supervisor:
 
     def load(self, voice: str, drop: tuple[str, ...] = ()) -> None:
         """Have the process load a neural voice, as `protocol.Load`; `Loaded` is posted if it lives so long."""
-        process = self._open
-        if process and not process.send(protocol.Load(voice, drop)):
-            self._inbox.call(lambda: self._refused(process))
+        self._inbox.call(lambda: self._load(protocol.Load(voice, drop)))
 
     def give_up(self, goal_id: str) -> None:
         """Let go of a goal that didn't end in time: its process is left behind, there will be no `Ended`."""
@@ -243,6 +244,9 @@ class Supervisor:
             yield goal.stop_at + STOP_LIMIT, f"the engine did not confirm a stop within {STOP_LIMIT * 1000:.0f} ms"
         if goal and goal.heard_at is not None:
             yield goal.heard_at + HANG_AFTER, f"the engine gave no sign of life for {HANG_AFTER:g} s"
+        if self._loading is not None:
+            words = f"the engine gave no sign of life for {HANG_AFTER:g} s while it loaded {self._loading}"
+            yield self._load_heard_at + HANG_AFTER, words
         if goal and goal.pause_at is not None:
             yield goal.pause_at + PAUSE_LIMIT, f"the engine did not confirm a pause within {PAUSE_LIMIT:g} s"
 
@@ -301,6 +305,13 @@ class Supervisor:
             if goal:
                 goal.heard_at = None
             self._refused(process)
+
+    def _load(self, load: protocol.Load) -> None:
+        process = self._process
+        if process and process.ready:  # else another will be, of which it is wanted anew
+            self._loading, self._load_heard_at = load.voice, time.monotonic()
+            if not process.send(load):
+                self._refused(process)
 
     def _refused(self, process: EngineProcess) -> None:
         self._hear(process)  # where it is dead, it is known how it died
@@ -391,20 +402,10 @@ class Supervisor:
             self._post(EngineSaid(words))
 
     def _note(self, process: EngineProcess, event: protocol.Event) -> None:
+        self._load_heard_at = time.monotonic()
         if isinstance(event, protocol.OF_A_GOAL):
-            goal = self._goal
-            if goal is None or not goal.spoken or event.id != goal.say.id:
-                return  # of a goal that has ended already
-            goal.heard_at = time.monotonic()
-            if isinstance(event, protocol.Started):
-                goal.started = True
-            elif isinstance(event, protocol.Ended):
-                self._finish(event)
-            elif isinstance(event, protocol.Word | protocol.Output | protocol.Speaks):
-                self._post(event)
-            elif isinstance(event, protocol.Paused) and event.number == goal.pause:
-                goal.pause_at = None
-                self._post(event)
+            if self._goal and self._goal.spoken and event.id == self._goal.say.id:  # else it has ended already
+                self._note_of(self._goal, event)
             return
         if isinstance(event, protocol.Ready):
             process.ready = True
@@ -412,17 +413,31 @@ class Supervisor:
             self._open = process
         elif isinstance(event, protocol.StartFailed):
             process.failed = event
+        elif isinstance(event, protocol.Loaded) and event.voice == self._loading:
+            self._loading = None
         elif isinstance(event, protocol.Voices):
             self._configure = replace(self._configure, list_voices=False)  # the next process need not
         self._post(event)
         self._hand_over()
+
+    def _note_of(self, goal: Handed, event: protocol.Event) -> None:
+        goal.heard_at = time.monotonic()
+        if isinstance(event, protocol.Started):
+            goal.started = True
+        elif isinstance(event, protocol.Ended):
+            self._finish(event)
+        elif isinstance(event, protocol.Word | protocol.Output | protocol.Speaks):
+            self._post(event)
+        elif isinstance(event, protocol.Paused) and event.number == goal.pause:
+            goal.pause_at = None
+            self._post(event)
 
     def _lose_process(self, words: str, reason: str) -> None:
         """Kill the process, end its goal once it is silent, and plan the next start."""
         process, now = self._process, time.monotonic()
         if process is None:
             return
-        self._process = self._open = None
+        self._process = self._open = self._loading = None
         process.kill()
         self._selector.unregister(process.socket.fileno())
         process.gone_by = now + SILENCE_LIMIT

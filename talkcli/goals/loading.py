@@ -47,8 +47,8 @@ class Loading:
         """Return the monotonic time from which on a goal may begin whose turn it is; 0 for at once.
 
         `usual`: the voice of those that have none of their own. Who is urgent waits for no voice, nor who would expire
-        meanwhile; who insists on it waits until it is there, or it is known that it won't be. It waits for so long
-        since its turn came, and no longer than since the voice was begun with.
+        meanwhile; who insists on it waits until it is there, or it is known that it won't be. The time counts
+        from when the voice was begun with; where it is not, from the goal's turn.
         """
         since = self._since.get(model_of(record.say.voice or usual)) if self._since else None
         if since is None:
@@ -57,5 +57,5 @@ class Loading:
             return inf
         if record.preempt or record.priority > 0:
             return 0.0
-        patience = min(since, record.turn_at) + PATIENCE
+        patience = (since if since < inf else record.turn_at) + PATIENCE
         return patience if record.expires_at is None else min(patience, record.expires_at - SPARE)

@@ -101,7 +101,7 @@ def loaded(voice: Loaded) -> None:
     if voice.error is None:
         line(f"voice {shown(voice.voice)} loaded in {voice.seconds:.1f} s")
     else:
-        line(f"voice {shown(voice.voice)} cannot be loaded, espeak speaks in its place: {shown(voice.error)}")
+        line(f"voice {shown(voice.voice)} cannot be loaded, espeak speaks where it may: {shown(voice.error)}")
 
 
 def sound_of(engine: Ready) -> str:

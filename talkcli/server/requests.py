@@ -351,6 +351,7 @@ class Requests:
         self._scheduler.settings = replace(self._scheduler.settings, **changed)
         self._look()  # what preempts may have room
         self._speech.want(changed.get("voice"), anew=True)
+        self._speech.apply(self._scheduler.tick(self._speech.now()))  # who waited for a voice may wait no more
         if changed:
             values = ", ".join(f"{name} {value}" for name, value in changed.items())
             log.line(f"set to {log.shown(values)} by {log.who(call.connection.sender)}")

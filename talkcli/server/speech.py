@@ -147,22 +147,17 @@ class Speech:
     # -- neural voices, which have to be loaded
 
     def want(self, voice: str | None, *, anew: bool = False) -> None:
-        """Have a voice loaded beside the speech, if it is a neural one: a goal that needs it waits for that.
+        """Have goals wait for a voice, if it is a neural one that is not loaded; `apply` has it loaded if any does.
 
-        `anew`: whatever was wrong with it before.
+        `anew`: whatever was wrong with it before. Without an engine nothing is loaded: the next one's `Ready` asks.
         """
         model = model_of(voice)
-        if not is_neural(model):
+        if not is_neural(model) or self.engine_words != READY:
             return
         if anew:
             self.voices.forgive(model)
-        self._await(model)
-        self._load_next()
-
-    def _await(self, voice: str) -> None:
-        """Have goals wait for a neural voice that is to be loaded, by its id without a speaker."""
-        if self.voices.want(voice, elapsed()) is Loading.WAITING:
-            self.scheduler.loading.wait_for(voice)
+        if self.voices.want(model, elapsed()) is Loading.WAITING:
+            self.scheduler.loading.wait_for(model)
 
     def _load_next(self) -> None:
         """Have the engine load what is needed next, if anything is, and there is room for it.
@@ -174,7 +169,7 @@ class Speech:
             return
         if self.scheduler.active and not self.voices.warm:
             return
-        found = self.voices.next(self._needed())
+        found = self.voices.next(self._needed(), model_of(self.scheduler.settings.voice))
         if found is None:
             return
         voice, drop = found
@@ -187,12 +182,12 @@ class Speech:
         self.engine.load(voice, drop)
 
     def _needed(self) -> list[str]:
-        """Return what has to be loaded for the goals in their order, and for those that bring no voice.
+        """Return what has to be loaded for the goals, in their order.
 
         Not for one that is heard: its voice is there until it has spoken.
         """
         goals = (self._asked(each) for each in self.scheduler.unfinished() if each.voice is None)
-        return list(filter(is_neural, dict.fromkeys(map(model_of, (*goals, self.scheduler.settings.voice)))))
+        return list(filter(is_neural, dict.fromkeys(map(model_of, goals))))
 
     def _loaded(self, loaded: protocol.Loaded) -> None:
         log.loaded(loaded)
@@ -302,8 +297,11 @@ class Speech:
         chosen = for_engine(record.say, self.scheduler.settings)
         if not is_neural(chosen["voice"] or ""):
             chosen["voice_only"] = False
-        elif chosen["voice_only"] and record.say.pitch is None:
-            chosen["pitch"] = INITIAL.pitch  # the server's own is for voices that have one
+        elif chosen["voice_only"]:
+            if why := self.voices.failure(model_of(chosen["voice"])):
+                self.report(protocol.Ended(record.id, protocol.FAILED, "voice_failed", why))
+                return
+            chosen["pitch"] = INITIAL.pitch  # another is for voices that have one
         self.engine.say(protocol.Say(record.id, record.text or "", followed=followed, by_neural=by_neural, **chosen))
 
     def _tell_followed(self) -> None:
@@ -368,7 +366,9 @@ class Speech:
 
     def _died(self, died: EngineDied) -> None:
         self.scheduler.engine_lost()
-        self.voices.engine_lost(elapsed())
+        given_up = self.voices.engine_lost(elapsed())
+        if given_up:
+            log.line(log.shown(f"voice {given_up} is left alone: {self.voices.failure(given_up)}"))
         self._set_timer()
         self._engine_fails(died.words)
 
@@ -381,8 +381,8 @@ class Speech:
         self.ready, self.engine_words, self.voices.driver = ready, READY, ready.driver
         self.engine_known.set()
         now = self.now()
-        for voice in self._needed():
-            self._await(voice)
+        for voice in (*self._needed(), self.scheduler.settings.voice):
+            self.want(voice)
         self.apply(self.scheduler.engine_ready(now))
 
     def _start_failed(self, failed: protocol.StartFailed) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING
 
+from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import is_own
 from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.engine.synthesizers.voices import NEURAL, find_voice, is_neural, speaker_number, unknown_voice
@@ -19,7 +20,6 @@ from talkcli.goals.options import DEFAULT_VOICE, SPEAKER
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from talkcli.engine.protocol import Voice
     from talkcli.goals.goal import JsonObject
 
 #: Seconds after which a voice that failed may be loaded again, where a goal asks for it: twice as long each time, up to
@@ -85,9 +85,10 @@ class Voices:
         """
         if voice is None or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice)):
             return None
-        found = self._find(voice, usual)
+        voices = self._known(voice)
+        found = find_voice(voice, voices, usual)
         if found is None:
-            return "unknown_voice", unknown_voice(voice, self.listed or (), self._foreign)
+            return "unknown_voice", unknown_voice(voice, voices, self._foreign)
         lacking = self._lacking(found.id) if is_neural(voice) else None
         return ("unknown_voice", f"the voice {voice[:60]} cannot be spoken: {lacking}") if lacking else None
 
@@ -95,34 +96,38 @@ class Voices:
         """Return a voice as it was asked for, a neural one by its id; `usual`: the one that the server speaks with."""
         if not voice or voice == DEFAULT_VOICE or not (is_neural(voice) or is_neural(usual or "")):
             return voice
-        found = find_voice(voice, self.listed or self._files(), usual)
+        found = find_voice(voice, self._known(voice), usual)
         return found.id if found and is_neural(found.id) else voice
 
-    def _find(self, voice: str, usual: str | None) -> Voice | None:
-        """Return a voice that there is; a neural one may have been put there just now."""
-        found = find_voice(voice, self.listed or (), usual)
-        if found is None and is_neural(voice) and self._foreign is None:
-            self.look_for_files()
-            found = find_voice(voice, self.listed or self._files())
-        return found
+    def _known(self, voice: str) -> tuple[Voice, ...]:
+        """Return the voices that one may be meant of: of neural ones those whose files are there now."""
+        if not is_neural(voice):
+            return self.listed or self._files()
+        if self._foreign is not None:
+            return ()
+        from talkcli.engine.synthesizers import models
+
+        return tuple(Voice(NEURAL + name, None, name) for name in models.found())
 
     @property
     def _foreign(self) -> str | None:
         """The driver, where it is none of `talk`'s own; on another system than Linux all are."""
         return None if is_own(self.driver) else self.driver or "the system's own"
 
-    def _lacking(self, voice: str) -> str | None:
+    @staticmethod
+    def _lacking(voice: str) -> str | None:
         """Return what a neural voice lacks, by its id: a package, or the speaker that is asked for."""
         from talkcli.engine.synthesizers import models
 
         model, mark, speaker = voice.partition(SPEAKER)
         if mark:
-            # The engine's list has no speakers.
-            speakers = next((each.speakers for each in self._files() if each.id == model), None) or ("",)
             try:
-                speaker_number(speaker, {name: number for number, name in enumerate(speakers)}, len(speakers))
+                about = models.describe(models.found()[model.removeprefix(NEURAL)])
+                speaker_number(speaker, about.speaker_names, about.speakers)
             except UnknownVoice as error:
                 return str(error)
+            except (KeyError, models.BadFile):  # it comes again where it is loaded
+                pass
         return models.missing()
 
     def look_for_files(self) -> None:
@@ -148,29 +153,31 @@ class Voices:
         """Whether one could be loaded now."""
         return self._loading is None and any(each.wanted for each in self.neural.values())
 
-    def next(self, needed: Sequence[str]) -> tuple[str, tuple[str, ...]] | None:
+    def next(self, needed: Sequence[str], usual: str = "") -> tuple[str, tuple[str, ...]] | None:
         """Return a voice to be loaded now, and those to be dropped for it; it is taken for begun with then.
 
         `needed`: those of the goals that wait, in their order. One at a time, and none for which one would have to be
-        dropped that is needed before it: that would be loaded again, and so on.
+        dropped that is needed before it: that would be loaded again, and so on. `usual`: the server's own, for which
+        nothing is dropped while no goal needs it.
         """
         if not self.lacking:
             return None
         before: dict[str, int] = {}
-        for voice in needed:
+        for voice in (*needed, usual):
             found = self.neural.get(voice)
             if found and found.state is State.LOADED:
                 before[voice] = found.size
             elif found and found.wanted:
-                if before and sum(before.values()) + found.size > self._memory:
-                    return None
                 drop = self._make_room(sum(before.values()) + found.size, before)
+                if drop is None or (drop and voice not in needed):
+                    return None
                 self._loading, found.wanted = voice, False
                 if found.state is State.WAITING:
                     found.state = State.LOADING
                 for each in drop:
                     self.unloaded(each, needed)
                 return voice, drop
+        self._forget_what_nobody_needs((*needed, usual))
         return None
 
     def loaded(self, voice: str, error: str | None, now: float) -> None:
@@ -190,8 +197,11 @@ class Voices:
         if found and voice in needed:
             self.neural[voice] = Neural(found.size)
 
-    def engine_lost(self, now: float) -> None:
-        """Take note that nothing is loaded any more; a voice that was being loaded may be why."""
+    def engine_lost(self, now: float) -> str | None:
+        """Take note that nothing is loaded any more; a voice that was being loaded may be why.
+
+        Return it where it is taken for the cause from now on.
+        """
         at, self._loading, self.warm = self._loading, None, False
         for voice, found in list(self.neural.items()):
             if voice == at and found.failures + 1 >= DEATHS:
@@ -200,6 +210,7 @@ class Voices:
                 self.neural[voice] = Neural(found.size, failures=found.failures + 1)
             elif found.state is not State.FAILED:
                 del self.neural[voice]
+        return at if at and self.failure(at) else None
 
     def forgive(self, voice: str) -> None:
         """Forget what was wrong with a voice."""
@@ -207,8 +218,13 @@ class Voices:
         if found and found.state is State.FAILED and voice != self._loading:
             del self.neural[voice]
 
-    def _make_room(self, size: int, keep: Collection[str]) -> tuple[str, ...]:
-        """Return what has to be dropped for so many bytes in all, the least asked for first."""
+    def failure(self, voice: str) -> str | None:
+        """Return why a voice can't be had; None for one that can, or may."""
+        found = self.neural.get(voice)
+        return found.why if found and found.state is State.FAILED else None
+
+    def _make_room(self, size: int, keep: Collection[str]) -> tuple[str, ...] | None:
+        """Return what has to be dropped for so many bytes in all, the least asked for first; None if that won't do."""
         others = [
             (voice, each.size)
             for voice, each in self.neural.items()
@@ -220,7 +236,14 @@ class Voices:
             if total > self._memory:
                 total -= each
                 drop.append(voice)
-        return tuple(drop)
+        return None if keep and total > self._memory else tuple(drop)
+
+    def _forget_what_nobody_needs(self, needed: Collection[str]) -> None:
+        for voice, found in list(self.neural.items()):
+            if found.wanted and voice not in needed:
+                found.wanted = False
+                if found.state is State.WAITING:
+                    del self.neural[voice]
 
     @staticmethod
     def _size(voice: str) -> int:

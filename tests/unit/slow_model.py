@@ -343,8 +343,10 @@ class SlowModel:
             return float("inf")
         if goal.preempt or goal.priority > 0:
             return None
-        since = [each for each in (self.loading[name], goal.turn_at) if each is not None]
-        limits = [each + PATIENCE for each in since]
+        since = self.loading[name]
+        if since is None:
+            since = goal.turn_at
+        limits = [] if since is None else [since + PATIENCE]
         if goal.ttl is not None:
             limits.append(goal.accepted_at + goal.ttl - SPARE)
         return min(limits)

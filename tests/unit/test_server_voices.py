@@ -50,6 +50,8 @@ def test_what_nobody_needs_any_more_is_not_loaded() -> None:
     voices = Asked()
     voices.wants(A)
     assert voices.next([]) is None
+    assert voices.next([A]) is None
+    voices.wants(A)
     assert voices.next([A]) == (A, ())
 
 
@@ -149,3 +151,28 @@ def test_what_the_engine_loads_of_itself_is_known_and_stops_no_other() -> None:
     voices.loaded(D, None, 0.0)
     assert voices.states() == {A: "loading", D: "loaded"}
     assert not voices.lacking
+
+
+def test_nothing_is_dropped_for_the_server_s_own_while_no_goal_needs_it() -> None:
+    voices = Asked(1)
+    voices.loads(A)
+    voices.wants(B)
+    assert voices.next([], B) is None
+    assert voices.next([B], B) == (B, (A,))
+    alone = Asked(0)
+    alone.wants(A)
+    assert alone.next([], A) == (A, ())
+
+
+def test_what_was_asked_for_by_a_goal_that_was_refused_keeps_nobody_looking() -> None:
+    voices = Asked()
+    voices.wants(A)
+    assert voices.next([], B) is None
+    assert (voices.lacking, voices.states()) == (False, {})
+    voices.wants(A)
+    voices.next([A])
+    voices.loaded(A, "no json", 0.0)
+    voices.wants(A, now=RETRY_AFTER)
+    assert voices.lacking
+    assert voices.next([]) is None
+    assert (voices.lacking, voices.states()) == (False, {A: "failed"})

@@ -7,7 +7,9 @@ speaks in its place, in the same language, unless the sentence is to be heard by
 
 from __future__ import annotations
 
-from talkcli.engine.players.base import CannotSpeak
+import traceback
+
+from talkcli.engine.players.base import CannotSpeak, Stopped
 from talkcli.engine.synthesizers.base import Sound
 from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.frozen import TYPE_CHECKING, replace
@@ -49,16 +51,23 @@ class Choice:
         if neural is None or self._chosen is not neural or sound.voice_only:
             self._chosen.speak(text, sound, output)
             return
-        why = f"{neural.voice} is not loaded"
+        why = neural.error or f"{neural.voice} is not loaded"
         if neural.ready:
             first = _Given(output)
             try:
                 neural.speak(text, replace(sound, pitch=Sound().pitch), first)
                 return
+            except Stopped:
+                raise
             except CannotSpeak as error:
                 if error.reason != "voice_failed" or first.anything:
                     raise
                 why = str(error)
+            except Exception as error:
+                if first.anything:
+                    raise
+                traceback.print_exc()  # a bug: that, too, is no reason for silence
+                why = f"{neural.voice} failed: {type(error).__name__}: {error}"
         self._espeak.load_language(neural.language)
         self._espeak.speak(text, sound, _Given(output, why))
 

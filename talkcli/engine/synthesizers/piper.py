@@ -8,6 +8,7 @@ and by nobody else meanwhile.
 from __future__ import annotations
 
 import contextlib
+import itertools
 
 from talkcli.engine.players.base import SAMPLE, CannotSpeak
 from talkcli.engine.synthesizers import models
@@ -89,6 +90,11 @@ class Piper:
         return self.loader.model(self._model_id) is not None
 
     @property
+    def error(self) -> str | None:
+        """Why the voice in force can't be had, by the last attempt to load it."""
+        return self.loader.error(self._model_id)
+
+    @property
     def language(self) -> str:
         """The language of the voice in force, by libespeak-ng's name for it: its files say it, or else its name."""
         try:
@@ -111,7 +117,7 @@ class Piper:
         model, _, speaker = voice.partition(SPEAKER)
         path = models.found().get(model.removeprefix(NEURAL)) if voice.startswith(NEURAL) else None
         if path is None:
-            raise UnknownVoice("its file is not there")
+            raise UnknownVoice("its file is not there any more")
         with contextlib.suppress(BadFile):  # it comes again where the model is loaded
             _number(models.describe(path), speaker)
         self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
@@ -189,7 +195,9 @@ def _made(model: Model, spelled: Iterator[Piece], speaker: int, sound: Sound, ru
         known = True
         frames = model.encode(numbers, speaker, _pace(sound.rate), run)
         begins = [0, *frames.ends]
-        words = tuple((start, length, _begin(model, piece, places, begins, at)) for at, start, length in piece.words)
+        # One that lacks all of its sounds is put to the next, which may be heard before that.
+        heard_at = itertools.accumulate((_begin(model, piece, places, begins, at) for at, _, _ in piece.words), max)
+        words = tuple((start, length, at) for (_, start, length), at in zip(piece.words, heard_at, strict=True))
         loudest = 0.0
         faint = 0  # samples, up to here
         begin, many = 0, _FIRST
