@@ -346,6 +346,48 @@ def test_libespeak_speaks_on_as_before_after_it_was_asked_how_another_language_s
         espeak.load(own)
 
 
+def test_the_end_of_a_spelling_waits_for_nothing_and_the_next_sentence_for_what_the_library_does_still() -> None:
+    espeak = _espeak()
+    before = _spoken(espeak)
+    asked, go = threading.Event(), threading.Event()
+    order: list[object] = []
+
+    def spell() -> None:
+        try:
+            order.append(speller.clauses("hello"))
+        except Stopped as error:
+            order.append(error)
+
+    class Listening(Tape):
+        def begin(self, rate: int, voice: str, why: str | None = None) -> None:
+            order.append("begun")
+            super().begin(rate, voice, why)
+
+    with espeak.spelling("de") as speller:
+        library = speller._to_phonemes
+
+        def held(*arguments: object) -> object:
+            asked.set()
+            go.wait(LATE)
+            said = library(*arguments)
+            order.append("returned")
+            return said
+
+        speller._to_phonemes = held
+        thread = threading.Thread(target=spell)
+        thread.start()
+        assert asked.wait(LATE)
+    assert not order
+    threading.Timer(0.1, go.set).start()
+    tape = Listening()
+    espeak.speak(TEXT, Sound(), tape)
+    thread.join(LATE)
+    assert order[0] == "returned"
+    assert "begun" in order
+    assert [type(each) for each in order if not isinstance(each, str)] == [Stopped]
+    _assert_alike(tape, before)
+
+
 @pytest.mark.parametrize(
     ("language", "text", "ends"),
     [

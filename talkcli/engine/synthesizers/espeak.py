@@ -138,6 +138,8 @@ class Espeak:
         self._text = ""
         self._output: Output | None = None
         self._raised: BaseException | None = None
+        #: to whom the library was lent last, who may still be at work with it; None where it was taken back
+        self._lent: Spelling | None = None
         found = (each for each in _DEFAULTS if espeak.SetVoiceByName(each.encode()) == espeak.EE_OK)
         self.voice = next(found, "")
         if not self.voice:
@@ -146,11 +148,13 @@ class Espeak:
 
     def voices(self) -> tuple[Voice, ...]:
         """Return the library's voices, those of MBROLA's that can be spoken with, and the variants."""
+        self._take_back()
         espeak = self._espeak
         return (*_listed(espeak, None), *_mbrola_voices(espeak), *_variants(espeak))
 
     def load(self, voice: str) -> None:
         """Take an id of `voices`, with a variant behind it or without, or what else the library takes for a voice."""
+        self._take_back()
         # Some voices leave their own speed to the next one, up to a third slower, unless the rate is set after it.
         self._set.clear()
         if not voice or self._espeak.SetVoiceByName(voice.encode("utf-8", "replace")) != self._espeak.EE_OK:
@@ -161,6 +165,7 @@ class Espeak:
 
     def speak(self, text: str, sound: Sound, output: Output) -> None:
         """Speak as `Synthesizer` says; with this library the samples differ a little each time."""
+        self._take_back()
         output.begin(self._rate, self.voice)
         espeak = self._espeak
         self._obey(sound)
@@ -175,6 +180,7 @@ class Espeak:
 
     def load_language(self, language: str) -> None:
         """Take a voice of this language, "de-at", or else of its first part, or else English."""
+        self._take_back()
         self._listed = self._listed or _listed(self._espeak, None)
         words = (language, language.partition("-")[0], *_DEFAULTS)
         found = (find_voice(each, self._listed) for each in words)
@@ -185,20 +191,32 @@ class Espeak:
         """Lend the library, for what it knows of the sounds of a language, by one of its voices; UnknownVoice.
 
         Until the end of the `with` it speaks nothing else. It may be asked in another thread, in one at a time; what it
-        is asked later ends there with Stopped.
+        is asked there at the end, or later, ends with Stopped. The end waits for nothing: what the library does then
+        for that thread ends within milliseconds where it speaks, and in up to 130 where it is asked for sounds, and
+        whatever uses the library next waits for it.
         """
-        speller = None
+        self._take_back()
         self._listed = self._listed or _listed(self._espeak, None)
         voice = find_voice(language, self._listed)
+        if voice is None:
+            raise self._knows_none(language)
+        self._lent = speller = Spelling(self._espeak, voice.id)
         try:
-            if voice is None or self._espeak.SetVoiceByName(voice.id.encode()) != self._espeak.EE_OK:
-                raise UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
+            if self._espeak.SetVoiceByName(voice.id.encode()) != self._espeak.EE_OK:
+                raise self._knows_none(language)
             self._espeak.SetParameter(self._espeak.RATE, _USUAL, 0)
-            speller = Spelling(self._espeak, voice.id)
             yield speller
         finally:
-            if speller is not None:
-                speller.end()
+            speller.end()
+
+    def _knows_none(self, language: str) -> UnknownVoice:
+        return UnknownVoice(f'{self.version} has no voice "{language}", which knows its sounds')
+
+    def _take_back(self) -> None:
+        """Have the library as it was before it was lent."""
+        lent, self._lent = self._lent, None
+        if lent is not None:
+            lent.wait()
             self._espeak.SetSynthCallback(self._on_audio)
             self._espeak.SetVoiceByName(self.voice.encode())
             self._set.clear()
@@ -286,8 +304,11 @@ class Spelling:
         return self._speak(f"{word} A") - alone < _NO_PAUSE
 
     def end(self) -> None:
-        """Leave the library alone: what it does now for another thread ends within a millisecond or two."""
+        """Have all that is asked, now or later, end with Stopped; from any thread."""
         self._over = True
+
+    def wait(self) -> None:
+        """Wait, once it was ended, until the library does nothing for it any more."""
         with self._at_work:
             pass
 
@@ -295,7 +316,10 @@ class Spelling:
         with self._at_work:
             if self._over:
                 raise Stopped
-            return function(*arguments, **more)
+            result = function(*arguments, **more)
+        if self._over:  # and so it may be half of it
+            raise Stopped
+        return result
 
     def _speak(self, text: str) -> int:
         """Have a text spoken to nobody; return where the first clause of it ends, in samples, and keep its words."""
