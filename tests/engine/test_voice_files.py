@@ -115,11 +115,13 @@ def test_a_speaker_goes_by_its_number_where_its_name_cannot_be_typed(
     assert voice.speakers == ("amused", "1", "2", "3", "4", "calm")
 
 
-def test_what_is_very_long_in_a_json_is_cut_in_the_list(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_very_long_in_a_json_is_cut_where_it_is_told(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TALK_VOICES", str(home / "v"))
     told = tiny_voice.description(language="l" * 1000, dataset="d" * 1000)
     told["audio"] = {"sample_rate": 8000, "quality": "q" * 1000}
-    tiny_voice.put(home / "v", "a", beside=told)
+    told["espeak"] = {"voice": "e" * 1000}
+    path = tiny_voice.put(home / "v", "a", beside=told)
+    assert describe(str(path)).speller == f"{'e' * 40}…"
     (voice,) = voices()
     assert voice.name == f"{'d' * 40}…, {'q' * 40}…"
     assert (voice.language, voice.quality) == (f"{'l' * 40}…", f"{'q' * 40}…")
@@ -254,6 +256,44 @@ def test_what_a_link_points_to_is_looked_at_too(home: Path) -> None:
     path.parent.chmod(0o777)
     with pytest.raises(BadFile, match=f"{path.parent} can be written"):
         open_checked(str(link))
+
+
+@pytest.mark.parametrize("what", ["file", "directory"])
+def test_a_link_on_the_way_may_not_be_where_everybody_may_write(home: Path, what: str) -> None:
+    path = tiny_voice.put(home / "there", "a")
+    begin, end = (path, path) if what == "file" else (path.parent, path.parent)
+    between, link = home / "between", home / "v"
+    for each in (between, link):
+        each.mkdir()
+        (each / begin.name).symlink_to(os.path.relpath(end, each))
+        end = each / begin.name
+    way = end if what == "file" else end / path.name
+    open_checked(str(way)).close()
+    between.chmod(0o777)
+    with pytest.raises(BadFile, match=f"^{between} can be written by others, .*: chmod go-w {between}$"):
+        open_checked(str(way))
+
+
+def test_links_that_go_round_are_told(home: Path) -> None:
+    path = tiny_voice.put(home / "v", "a")
+    path.unlink()
+    path.symlink_to(path)
+    with pytest.raises(BadFile, match=f"^{path} cannot be read: {os.strerror(errno.ELOOP)}$"):
+        open_checked(str(path))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
+def test_another_users_link_is_refused_where_it_could_be_turned(home: Path) -> None:
+    path = tiny_voice.put(home / "there", "a")
+    everybodys = home / "tmp"
+    everybodys.mkdir()
+    everybodys.chmod(0o1777)
+    link = everybodys / "v"
+    link.symlink_to(path.parent)
+    open_checked(str(link / path.name)).close()
+    os.chown(link, 4711, -1, follow_symlinks=False)
+    with pytest.raises(BadFile, match=rf"^{link} is another user's \(#4711\)"):
+        open_checked(str(link / path.name))
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file away")

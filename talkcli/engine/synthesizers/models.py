@@ -38,6 +38,8 @@ _MOST_SPEAKERS = 4096
 _SHOWN, _LONGEST_NAME = 40, 64
 #: Samples per second that a player can be asked for.
 _RATES = range(4000, 192001)
+#: Links that are followed on the way to a file, as many as Linux follows.
+_MOST_LINKS = 40
 #: Numbers of a sound: Piper's voices have one. What a model needs grows with the square of all in a sentence.
 _MOST_NUMBERS = 4
 #: What a model takes between two sounds, before the first and behind the last, by its names in `phoneme_id_map`.
@@ -140,41 +142,71 @@ def open_checked(path: str, missing: str = "put it there again", model: str | No
 
 
 def _look_at(*paths: str) -> None:
-    """Look at files, and the directories on the way to each, and to what it points to where it is a link; BadFile.
+    """Look at files, and at all that is gone through on the way to each; BadFile.
 
-    Above the file's own a directory may be everybody's that has the sticky bit, as /tmp has: what is in it can be
-    replaced by nobody but its owner.
+    A directory may be everybody's that has the sticky bit, as /tmp has, unless the file is in it, or a link in the
+    file's place: what is in it can be replaced by nobody but its owner.
     """
     ways: dict[str, bool] = {}  # whether it may be everybody's so
     for path in paths:
-        for each in (os.path.abspath(path), os.path.realpath(path)):
-            ways[each] = ways[os.path.dirname(each)] = False
-            directory = os.path.dirname(each)
-            while (parent := os.path.dirname(directory)) != directory:
-                directory = parent
-                ways.setdefault(directory, True)
+        for each, may_be_sticky in reversed([*_way(path)]):
+            ways[each] = ways.get(each, True) and may_be_sticky
     wrong = []
     for each, may_be_sticky in ways.items():
-        try:
-            status = os.stat(each)
-        except FileNotFoundError:  # whoever opens it says so
-            continue
+        status = os.stat(each)
         if _is_others(each, status, each) and not (may_be_sticky and status.st_mode & stat.S_ISVTX):
             wrong.append(each)
     if wrong:
         raise _writable(*wrong)
 
 
+def _way(path: str) -> Iterator[tuple[str, bool]]:
+    """Yield the directories that are gone through to a file, and it, each without links, and whether it leads further.
+
+    It ends before what is not there: whoever opens the file says so. BadFile if a link is another user's.
+    """
+    at, links = os.sep, 0
+    parts = os.path.join("" if os.path.isabs(path) else os.getcwd(), path).split(os.sep)[::-1]
+    while parts:
+        part = parts.pop()
+        if part in {"", os.curdir}:
+            continue
+        yield at, bool(parts)
+        if part == os.pardir:
+            at = os.path.dirname(at)
+            continue
+        each = os.path.join(at, part)
+        try:
+            status = os.lstat(each)
+        except FileNotFoundError:
+            return
+        if not stat.S_ISLNK(status.st_mode):
+            at = each
+            continue
+        links += 1
+        if links > _MOST_LINKS:
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), path)
+        _refuse_anothers(each, status)
+        target = os.readlink(each)
+        at = os.sep if os.path.isabs(target) else at
+        parts += target.split(os.sep)[::-1]
+    yield at, False
+
+
 def _is_others(path: str, status: os.stat_result, file: str | int) -> bool:
     """Tell whether others than root and this user may write a file, which is called `path`; BadFile if it is theirs."""
-    if status.st_uid not in {0, os.geteuid()}:
-        words = f"{path} is another user's (#{status.st_uid}), who could change the voice"
-        raise BadFile(f"{words}: put it into a directory of your own")
+    _refuse_anothers(path, status)
     if status.st_mode & stat.S_IWOTH:
         return True
     if not status.st_mode & stat.S_IWGRP:
         return False
     return _has_list(file) or not any(_is_alone(each, status.st_gid) for each in {0, os.geteuid()})
+
+
+def _refuse_anothers(path: str, status: os.stat_result) -> None:
+    if status.st_uid not in {0, os.geteuid()}:
+        words = f"{path} is another user's (#{status.st_uid}), who could change the voice"
+        raise BadFile(f"{words}: put it into a directory of your own")
 
 
 def _has_list(file: str | int) -> bool:
@@ -257,7 +289,7 @@ def _described(found: Any) -> Description:
     code = found.get("language", {}).get("code") or found["espeak"]["voice"]
     return Description(
         rate=rate,
-        speller=str(found["espeak"]["voice"]),
+        speller=_cut(found["espeak"]["voice"]),
         language=_cut(code).replace("_", "-").lower(),
         name=", ".join(filter(None, parts)) or "Piper",
         quality=quality or None,
