@@ -34,7 +34,7 @@ class _Written:
     def stop(self, _: str) -> None:
         self.written.append("stop")
 
-    def follow(self, _: str, followed: bool) -> None:
+    def follow(self, _: str, followed: bool, by_neural: bool) -> None:
         """Take note of what is no news for this test."""
 
 

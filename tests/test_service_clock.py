@@ -32,7 +32,7 @@ class _BusyEngine:
     def say(self, goal: protocol.Say) -> None:
         self.said.append(goal.text)
 
-    def follow(self, goal_id: str, followed: bool) -> None:
+    def follow(self, goal_id: str, followed: bool, by_neural: bool) -> None:
         """Take note of what makes no difference here."""
 
 

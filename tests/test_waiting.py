@@ -63,7 +63,7 @@ class Engine:
     def stop(self, _: str) -> None:
         pass
 
-    def follow(self, _: str, followed: bool) -> None:
+    def follow(self, _: str, followed: bool, by_neural: bool) -> None:
         """Take note of what makes no difference here."""
 
 

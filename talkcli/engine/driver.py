@@ -146,18 +146,19 @@ class Settings:
         self._error: Exception | None = None
         engine.connect("error", self._note)
 
-    def apply(self, say: Say) -> None:
+    def apply(self, say: Say) -> str | None:
         """Set what the goal wants; CannotSpeak if that cannot be had.
 
         A neural voice that is gone, since the goal was accepted or the server was told to speak by it, is no reason for
-        silence: the driver's own speaks then, in its language if it can.
+        silence: the driver's own speaks then, in its language if it can, and why is returned.
         """
+        why = None
         try:
             self.set_voice(say.voice)
         except CannotSpeak as error:
             if say.voice_only or not is_neural(say.voice or ""):
                 raise
-            sys.stderr.write(f"{say.id} is spoken by espeak: {error}\n")  # for the server's log
+            why = str(error)
             self._set_language(language_of(say.voice or ""))
         wanted = fields(say)
         for name in self._set:
@@ -165,6 +166,7 @@ class Settings:
             if self._set[name] != value:
                 self._put(name, value, f"{name} to {value}")
                 self._set[name] = value
+        return why
 
     def set_voice(self, wanted: str | None) -> None:
         """Set the voice; None is the one that the driver started with. CannotSpeak if there is no such voice."""

@@ -147,11 +147,11 @@ class Session:
     def open(
         self,
         engine: Any,
-        apply: Callable[[protocol.Say], None],
+        apply: Callable[[protocol.Say], str | None],
         pump: Callable[[], None] | None,
         synthesizer: Choice | None = None,
     ) -> None:
-        """Take the engine, and what sets its properties for a goal or raises CannotSpeak.
+        """Take the engine, and what sets its properties for a goal: CannotSpeak, or why another voice speaks, or None.
 
         `pump`: for a foreign driver, called about 20 times a second while it has a goal; `synthesizer`: what loads
         voices beside the speech, if anything does.
@@ -280,7 +280,9 @@ class Session:
         for command in waiting:
             self._carry_out_now(command)
         try:
-            self._apply(say)
+            why = self._apply(say)
+            if why is not None:
+                sys.stderr.write(f"{say.id} is spoken by another voice: {why}\n")
         except CannotSpeak as error:
             if self._goal is not None:
                 self._end(protocol.FAILED, error.reason, str(error))

@@ -24,14 +24,11 @@ if TYPE_CHECKING:
 
 #: Seconds before the next start, by the number of processes in a row that died before they were of use.
 BACK_OFF = (0.0, 0.1, 0.5, 2.0, 10.0)
-
 #: Lines of the process's standard error that are passed on in a while, and the seconds of that: a whole traceback, and
 #: no flood, as a driver of somebody else's may write a line for each word, for months.
 LINES, WHILE = 20, 60.0
-
 #: A ready process that dies sooner than this, with no goal in hand, was of no use.
 SHORT_LIFE = 1.0
-
 #: Seconds without a ready process after which each start that fails costs a goal: nobody waits for ever.
 PATIENCE = 10.0
 
@@ -188,10 +185,7 @@ class Supervisor:
         self._inbox.call(lambda: self._hold(goal_id, None))
 
     def follow(self, goal_id: str, followed: bool, by_neural: bool) -> None:
-        """Tell whether another goal waits behind this one: the silence between them may be made shorter then.
-
-        `by_neural`: whether that one asks for a neural voice.
-        """
+        """Tell whether another goal waits, `by_neural` by a neural voice: the silence before it may be made shorter."""
         process = self._open
         if process:
             # An engine that has no room for it at this moment is not hung for that, and little is lost.
@@ -307,11 +301,10 @@ class Supervisor:
             self._refused(process)
 
     def _load(self, load: protocol.Load) -> None:
-        process = self._process
-        if process and process.ready:  # else another will be, of which it is wanted anew
+        if self._process and self._process.ready:  # else another will be, of which it is wanted anew
             self._loading, self._load_heard_at = load.voice, time.monotonic()
-            if not process.send(load):
-                self._refused(process)
+            if not self._process.send(load):
+                self._refused(self._process)
 
     def _refused(self, process: EngineProcess) -> None:
         self._hear(process)  # where it is dead, it is known how it died
