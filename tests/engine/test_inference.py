@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 import threading
@@ -102,6 +103,43 @@ def test_a_model_is_loaded_from_what_was_kept_of_it(tmp_path: Path) -> None:
     assert (_in_pieces(_loaded(path, Cache(str(tmp_path / "c")))) == first).all()
     assert sorted((tmp_path / "c").iterdir()) == kept
     assert all(each.stat().st_mtime_ns > before for each, before in zip(kept, at, strict=True))
+
+
+def test_halves_are_read_from_files_that_are_gone_when_it_is_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bytes would be kept, and copied while no other thread runs."""
+    import onnxruntime
+
+    session, given = onnxruntime.InferenceSession, []
+
+    def noting(model: str | bytes, *rest: Any, **more: Any) -> Any:
+        given.append(model)
+        return session(model, *rest, **more)
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", noting)
+    path = tiny_voice.put(tmp_path / "v", "a")
+    before = os.listdir("/proc/self/fd")
+    _loaded(path)
+    _loaded(path, Cache(str(tmp_path / "c")))
+    assert len(given) == 4
+    assert [each for each in given if not isinstance(each, str)] == []
+    assert os.listdir("/proc/self/fd") == before
+
+
+@pytest.mark.parametrize("cached", [True, False])
+def test_where_no_file_may_be_written_a_model_is_loaded_all_the_same(tmp_path: Path, cached: bool) -> None:
+    path = tiny_voice.put(tmp_path / "v", "a")
+    usual = _in_pieces(_loaded(path))
+    cache = Cache(str(tmp_path / "c"))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        model = _loaded(path, cache if cached else None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (_in_pieces(model) == usual).all()
+    assert not [*(tmp_path / "c").iterdir()]
 
 
 @pytest.mark.parametrize("damage", [b"", b"\0" * 100, None])

@@ -374,7 +374,7 @@ def _keep(cache: Cache, key: str, content: bytes = b"encoder") -> str | None:
             with open(path, "wb") as file:
                 file.write(content)
 
-    cache.keep(key, write, b"decoder")
+    cache.keep(key, write, [b"deco", b"der"])
     return given[-1]
 
 
@@ -442,7 +442,7 @@ def test_what_fails_of_itself_fails_without_being_kept_too(home: Path) -> None:
 
     cache = Cache(str(home / "c"))
     with pytest.raises(ValueError, match="broken"):
-        cache.keep(KEY, fails, b"")
+        cache.keep(KEY, fails, [])
     assert cache.find(KEY) is None
     assert not [each for each in _kept(home / "c") if each.endswith(".new")]
 

@@ -16,13 +16,17 @@ import time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from typing import TypeVar
+
+    from talkcli.engine.synthesizers.vits import Buffer
 
     _T = TypeVar("_T")
 
 #: Bytes that are kept, of eight voices or so; past that the oldest go.
 LARGEST = 500_000_000
+#: Bytes of a half that are collected to be written at once: no other thread waits for more than that to be copied.
+AT_ONCE = 1 << 20
 _ENCODER, _DECODER = ".encoder.onnx", ".decoder.onnx"
 #: How a directory ends in which one is being written, which takes seconds, and those after which its writer was killed.
 _UNFINISHED, _KILLED = ".new", 3600.0
@@ -52,8 +56,10 @@ class Cache:
             return None
         return paths
 
-    def keep(self, key: str, encoder: Callable[[str | None], _T], decoder: bytes) -> _T:
+    def keep(self, key: str, encoder: Callable[[str | None], _T], decoder: Iterable[Buffer]) -> _T:
         """Return what `encoder` returns, which writes a file to the path that it is given, and keep both halves.
+
+        `decoder`: what its file consists of.
 
         Where they can't be kept it is called with None.
         """
@@ -72,9 +78,9 @@ class Cache:
             with contextlib.suppress(OSError):
                 os.unlink(self._place(key, each))
 
-    def _written(self, key: str, unfinished: str, encoder: Callable[[str | None], _T], decoder: bytes) -> _T:
-        with open(unfinished, "wb") as file:
-            file.write(decoder)
+    def _written(self, key: str, unfinished: str, encoder: Callable[[str | None], _T], decoder: Iterable[Buffer]) -> _T:
+        with open(unfinished, "wb", AT_ONCE) as file:
+            file.writelines(decoder)
         os.replace(unfinished, self._place(key, _DECODER))
         made = encoder(unfinished)
         os.replace(unfinished, self._place(key, _ENCODER))

@@ -55,12 +55,15 @@ class NotCut(Exception):
 
 @frozen
 class Halves:
-    """Both halves, each a model of its own."""
+    """Both halves, each a model of its own, in parts: its bytes are these, one after the other.
+
+    The weights, which are nearly all of it, are not copied: they are the whole's.
+    """
 
     #: has the whole's inputs; its outputs are what the decoder needs, and last the frames of each sound
-    encoder: bytes
+    encoder: tuple[Buffer, ...]
     #: its inputs are the encoder's outputs but for the last; its output is the whole's
-    decoder: bytes
+    decoder: tuple[Buffer, ...]
 
 
 def halves(model: Buffer) -> Halves:
@@ -254,11 +257,11 @@ def _encoded(value: int) -> bytes:
     return bytes([*out, value])
 
 
-def _model(head: list[Field], graph: list[Field]) -> bytes:
-    """Return a model; the weights, which are nearly all of it, are copied once."""
+def _model(head: list[Field], graph: list[Field]) -> tuple[Buffer, ...]:
+    """Return a model, in parts."""
     parts = list(_written(graph))
     key = _encoded(_GRAPH << 3 | _BYTES) + _encoded(sum(map(len, parts)))
-    return b"".join([*_written(head), key, *parts])
+    return (*_written(head), key, *parts)
 
 
 def _written(fields: Iterable[Field]) -> Iterator[Buffer]:
