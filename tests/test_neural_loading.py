@@ -247,6 +247,7 @@ def test_what_is_mended_is_loaded_again(env: dict[str, str], tmp_path: Path) -> 
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", BROKEN)
 
 
+@pytest.mark.slow
 def test_one_that_is_asked_for_again_is_tried_again_after_a_while(env: dict[str, str], tmp_path: Path) -> None:
     with _robot(env) as robot:
         assert robot.heard(robot.say("hello", BROKEN)) == ("SUCCEEDED", INSTEAD)

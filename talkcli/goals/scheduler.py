@@ -115,7 +115,6 @@ class Scheduler:
         self.paused = False
         #: whether there is an engine to start the next goal; without one they wait
         self.has_engine = True
-        #: what goals may have to wait for; `tick` looks whether they still do
         self.loading = Loading()
         #: whether it was told to end, and takes no goal any more
         self.closing = False
@@ -258,6 +257,7 @@ class Scheduler:
         """End the goal whose turn it is: an engine was waited for long enough, and once more none came."""
         if self.has_engine:
             return []
+        self.loading.clear()  # there is nothing that would load a voice
         record, effects = self._activate_next(now)
         return effects + self.failed(record.id, "engine_failed", words, None, now) if record else effects
 

@@ -25,7 +25,6 @@ from tests.conformance.hearing import (
     send,
 )
 from tests.conformance.told import assert_recalled, assert_rejected, assert_told_in_order, submit
-from tests.conformance.voices import with_both
 from tests.support.compare import assert_heard, compare, loudness
 from tests.support.reference import Sentence
 
@@ -98,7 +97,6 @@ def test_row_37_of_three_goals_with_one_key_the_newest_is_heard_in_the_first_one
     assert_told_in_order(talk)
 
 
-@with_both
 def test_row_37_the_goal_that_is_spoken_is_not_replaced_by_its_key(talk: Talk, voice: Voice) -> None:
     first = busy(talk, key="battery")
     second = send(talk, LOW, key="battery")

@@ -60,7 +60,6 @@ def test_row_03_cancel_by_id_is_silent_when_it_returns(talk: Talk, voice: Voice)
     assert "two" in ended["spoken"] != LONG
 
 
-@with_both
 def test_row_03_the_reply_to_a_cancel_comes_when_it_is_silent(talk: Talk) -> None:
     """Within 150 ms of the request, wherever in the sentence it comes."""
 
@@ -102,7 +101,6 @@ def test_row_16_a_server_that_is_terminated_answers_every_waiter(talk: Talk, voi
     assert last < ended + PRECISION
 
 
-@with_both
 def test_row_24_a_newcomer_is_heard_when_the_one_before_it_is_silent(
     make_talk: MakeTalk, sink: Sink, voice: Voice
 ) -> None:

@@ -110,7 +110,8 @@ def test_done_when_thirty_words_are_told_as_they_are_heard(
         measured.assert_in_time()
 
 
-@pytest.mark.parametrize("rate", [200, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [200, 300])
 def test_done_when_thirty_words_of_a_neural_voice_are_told_as_they_are_heard(
     make_talk: MakeTalk, sink: Sink, joe: Joe, rate: int
 ) -> None:

@@ -252,7 +252,10 @@ class SlowModel:
 
     def engine_missing(self) -> None:
         """It costs the goal whose turn it would be, and no other."""
-        if self.voice or self.paused or self.engine:
+        if self.engine:
+            return
+        self.loading = {}
+        if self.voice or self.paused:
             return
         self.recall_what_is_too_late()
         if self.queue:
