@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.conformance.hearing import QUICK
+from tests.support.espeak import RATE
 from tests.support.listener import WORD, align
 from tests.support.loaded import serve_with
 from tests.support.processes import run_talk
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 #: Has a test run with both voices each time, not by the slow tests alone.
 with_both = pytest.mark.parametrize("voice", ["espeak", "joe"], indirect=True)
 
+#: Seconds of a block of samples, the blocks of a pause, and what no sample of it reaches.
+_BLOCK, _PAUSE, _SILENT = 0.01, 8, 50
 #: Seconds in which a sentence must be rendered, its voice's load included.
 _PATIENCE = 30.0
 
@@ -93,6 +96,16 @@ class Espeak:
 ESPEAK = Espeak()
 
 
+def _behind_a_pause(samples: Samples, begin: float, end: float) -> float:
+    """Return where a word begins that is heard between these seconds; to a recognizer the pause before is part of it."""
+    blocks = [
+        int(np.abs(samples[int(at * RATE) : int((at + _BLOCK) * RATE)]).max(initial=0)) < _SILENT
+        for at in np.arange(begin, end, _BLOCK)
+    ]
+    pause = next((at for at in range(_PAUSE) if all(blocks[at : at + _PAUSE])), None)
+    return begin if pause is None else begin + blocks.index(False, pause) * _BLOCK
+
+
 @dataclass(frozen=True)
 class Joe:
     """A real neural voice, without noise."""
@@ -117,11 +130,13 @@ class Joe:
         return [self._rendered(each if isinstance(each, Sentence) else Sentence(each, rate)) for each in sentences]
 
     def render_with_words(self, sentence: Sentence) -> Rendering:
-        """Its words are where a recognizer of speech hears them."""
+        """Its words are where a recognizer of speech hears them, and behind a pause where that ends."""
         samples = self._rendered(sentence)
         words = WORD.finditer(sentence.text.lower())
         heard = align(samples, sentence.text)
-        return Rendering(samples, tuple((*at.span(), each.begin) for at, each in zip(words, heard, strict=True)))
+        ends = [*(each.begin for each in heard[1:]), len(samples) / RATE]
+        begins = [_behind_a_pause(samples, each.begin, end) for each, end in zip(heard, ends, strict=True)]
+        return Rendering(samples, tuple((*at.span(), begin) for at, begin in zip(words, begins, strict=True)))
 
     @property
     def places(self) -> dict[str, str]:

@@ -303,8 +303,11 @@ def test_whatever_memory_there_is_a_sentence_has_one_end_and_the_next_is_espeaks
         except AssertionError:
             engine.process.wait(20)
             return
-        message = _failed(ended)
-        assert "there is no memory for it; end another program" in message or INSTALL in message
+        if ended.outcome == protocol.COMPLETED:
+            assert megabytes > 300, "so much it takes"
+        else:
+            message = _failed(ended)
+            assert "there is no memory for it; end another program" in message or INSTALL in message
         assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
 
 
