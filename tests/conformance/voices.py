@@ -97,13 +97,15 @@ ESPEAK = Espeak()
 
 
 def _behind_a_pause(samples: Samples, begin: float, end: float) -> float:
-    """Return where a word begins that is heard between these seconds; to a recognizer the pause before is part of it."""
-    blocks = [
+    """Return where a word begins, heard between these seconds: a recognizer takes the pause before for a part of it."""
+    silent = [
         int(np.abs(samples[int(at * RATE) : int((at + _BLOCK) * RATE)]).max(initial=0)) < _SILENT
         for at in np.arange(begin, end, _BLOCK)
     ]
-    pause = next((at for at in range(_PAUSE) if all(blocks[at : at + _PAUSE])), None)
-    return begin if pause is None else begin + blocks.index(False, pause) * _BLOCK
+    for at in range(_PAUSE):
+        if all(silent[at : at + _PAUSE]) and False in silent[at + _PAUSE :]:
+            return begin + silent.index(False, at) * _BLOCK
+    return begin
 
 
 @dataclass(frozen=True)
