@@ -299,7 +299,10 @@ def test_a_voice_whose_files_go_away_is_no_reason_for_silence(env: dict[str, str
         (tmp_path / "voices" / "tiny.onnx").unlink()
         robot.kill_engine()
         robot.until(lambda: robot.neural()["state"] == "failed")
-        assert robot.heard(robot.say("hello", None))[0] == "SUCCEEDED"
+        goal = robot.say("hello", None)
+        state, voice = robot.heard(goal)
+        assert state == "SUCCEEDED"
+        assert f'{goal.id} is spoken by {voice}: unknown voice "piper/tiny"' in robot.server.log
 
 
 def test_a_pitch_is_refused_with_a_voice_that_has_none(env: dict[str, str]) -> None:

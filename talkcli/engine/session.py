@@ -124,8 +124,9 @@ class Session:
         self.players = players
         #: where the goal in hand goes, as the server was told
         self._told: Output | None = None
-        #: id of the voice by which it is heard, as the server was told
+        #: id of the voice by which it is heard, as the server was told, and why its own can't be set, if it can't
         self._voice = ""
+        self._why: str | None = None
         self._backlog: deque[Command] = deque()
         self._goal: InHand | None = None
         self._engine: Any = None
@@ -245,7 +246,7 @@ class Session:
         """Tell by which voice the goal in hand is heard, if that is not known; `why`: as in `Output.begin`."""
         if self._goal is not None and voice != self._voice:
             self._voice = voice
-            self._channel.send(protocol.Speaks(self._goal.id, voice, why))
+            self._channel.send(protocol.Speaks(self._goal.id, voice, why or self._why))
 
     def _tell_output(self) -> None:
         output = self.players.output
@@ -273,16 +274,14 @@ class Session:
         self.held = self._confirmed = 0
         self.gaps = []
         self.players.begin(say)
-        self._told, self._voice = None, ""
+        self._told, self._voice, self._why = None, "", None
         self._channel.send(protocol.Started(say.id))
         # What came with it in one piece is no later than what comes in a moment.
         waiting, self._backlog = self._backlog, deque()
         for command in waiting:
             self._carry_out_now(command)
         try:
-            why = self._apply(say)
-            if why is not None:
-                sys.stderr.write(f"{say.id} is spoken by another voice: {why}\n")
+            self._why = self._apply(say)
         except CannotSpeak as error:
             if self._goal is not None:
                 self._end(protocol.FAILED, error.reason, str(error))

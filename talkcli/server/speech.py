@@ -26,8 +26,7 @@ from talkcli.server import log
 from talkcli.server.call import go_on
 from talkcli.server.stream import Streams
 from talkcli.server.subscribers import News, Subscribers
-from talkcli.server.voices import State as Loading
-from talkcli.server.voices import Voices
+from talkcli.server.voices import Readiness, Voices
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -156,7 +155,7 @@ class Speech:
             return
         if anew:
             self.voices.forgive(model)
-        if self.voices.want(model, elapsed()) is Loading.WAITING:
+        if self.voices.want(model, elapsed()) is Readiness.WAITING:
             self.scheduler.loading.wait_for(model)
 
     def _load_next(self) -> None:
@@ -173,7 +172,7 @@ class Speech:
         if found is None:
             return
         voice, drop = found
-        if self.voices.neural[voice].state is Loading.LOADING:
+        if self.voices.neural[voice].state is Readiness.LOADING:
             self.scheduler.loading.begin(voice, elapsed())
         for each in drop:
             log.line(f"voice {log.shown(each)} dropped, to make room for {log.shown(voice)}")

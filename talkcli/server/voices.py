@@ -29,7 +29,7 @@ RETRY_AFTER, RETRY_AT_LAST = 5.0, 3600.0
 DEATHS = 2
 
 
-class State(Enum):
+class Readiness(Enum):
     """What has become of a neural voice that was asked for."""
 
     WAITING = "waiting"  # to be loaded
@@ -44,7 +44,7 @@ class Neural:
 
     #: bytes of its file; it takes as many in memory, and some more
     size: int
-    state: State = State.WAITING
+    state: Readiness = Readiness.WAITING
     #: why it can't be had, for people
     why: str | None = None
     #: how often in a row it could not be loaded
@@ -58,7 +58,7 @@ class Neural:
         """Take note that it could not be loaded."""
         self.failures += 1
         self.again_at = now + min(RETRY_AT_LAST, RETRY_AFTER * 2 ** (self.failures - 1))
-        self.state, self.why = State.FAILED, why
+        self.state, self.why = Readiness.FAILED, why
 
 
 class Voices:
@@ -140,11 +140,11 @@ class Voices:
 
     # -- what is loaded
 
-    def want(self, voice: str, now: float) -> State:
+    def want(self, voice: str, now: float) -> Readiness:
         """Take note that a neural voice is asked for, and return how it is."""
         found = self.neural.pop(voice, None) or Neural(self._size(voice))
         self.neural[voice] = found
-        if found.state is State.FAILED and voice != self._loading and now >= found.again_at:
+        if found.state is Readiness.FAILED and voice != self._loading and now >= found.again_at:
             found.wanted = True
         return found.state
 
@@ -165,15 +165,15 @@ class Voices:
         before: dict[str, int] = {}
         for voice in (*needed, usual):
             found = self.neural.get(voice)
-            if found and found.state is State.LOADED:
+            if found and found.state is Readiness.LOADED:
                 before[voice] = found.size
             elif found and found.wanted:
                 drop = self._make_room(sum(before.values()) + found.size, before)
                 if drop is None or (drop and voice not in needed):
                     return None
                 self._loading, found.wanted = voice, False
-                if found.state is State.WAITING:
-                    found.state = State.LOADING
+                if found.state is Readiness.WAITING:
+                    found.state = Readiness.LOADING
                 for each in drop:
                     self.unloaded(each, needed)
                 return voice, drop
@@ -187,7 +187,7 @@ class Voices:
         found = self.neural.setdefault(voice, Neural(self._size(voice)))
         found.wanted = False
         if error is None:
-            found.state, found.why, found.failures = State.LOADED, None, 0
+            found.state, found.why, found.failures = Readiness.LOADED, None, 0
         else:
             found.fail(error, now)
 
@@ -208,27 +208,27 @@ class Voices:
                 found.fail("the engine process ended while it was being loaded", now)
             elif voice == at:
                 self.neural[voice] = Neural(found.size, failures=found.failures + 1)
-            elif found.state is not State.FAILED:
+            elif found.state is not Readiness.FAILED:
                 del self.neural[voice]
         return at if at and self.failure(at) else None
 
     def forgive(self, voice: str) -> None:
         """Forget what was wrong with a voice."""
         found = self.neural.get(voice)
-        if found and found.state is State.FAILED and voice != self._loading:
+        if found and found.state is Readiness.FAILED and voice != self._loading:
             del self.neural[voice]
 
     def failure(self, voice: str) -> str | None:
         """Return why a voice can't be had; None for one that can, or may."""
         found = self.neural.get(voice)
-        return found.why if found and found.state is State.FAILED else None
+        return found.why if found and found.state is Readiness.FAILED else None
 
     def _make_room(self, size: int, keep: Collection[str]) -> tuple[str, ...] | None:
         """Return what has to be dropped for so many bytes in all, the least asked for first; None if that won't do."""
         others = [
             (voice, each.size)
             for voice, each in self.neural.items()
-            if each.state is State.LOADED and voice not in keep
+            if each.state is Readiness.LOADED and voice not in keep
         ]
         total = size + sum(each for _, each in others)
         drop = []
@@ -242,7 +242,7 @@ class Voices:
         for voice, found in list(self.neural.items()):
             if found.wanted and voice not in needed:
                 found.wanted = False
-                if found.state is State.WAITING:
+                if found.state is Readiness.WAITING:
                     del self.neural[voice]
 
     @staticmethod

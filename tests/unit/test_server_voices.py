@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from talkcli.server.voices import DEATHS, RETRY_AFTER, RETRY_AT_LAST, State, Voices
+from talkcli.server.voices import DEATHS, RETRY_AFTER, RETRY_AT_LAST, Readiness, Voices
 
 A, B, C, D = (f"piper/{each}" for each in "abcd")
 
@@ -104,7 +104,7 @@ def test_one_that_fails_is_tried_again_where_it_is_asked_for_later_and_later() -
     assert waited[:3] == pytest.approx([RETRY_AFTER, 2 * RETRY_AFTER, 4 * RETRY_AFTER])
     assert waited[-1] == pytest.approx(RETRY_AT_LAST)
     voices.forgive(A)
-    assert voices.want(A, now) is State.WAITING
+    assert voices.want(A, now) is Readiness.WAITING
 
 
 def test_while_it_is_tried_again_it_has_failed() -> None:
@@ -112,9 +112,9 @@ def test_while_it_is_tried_again_it_has_failed() -> None:
     voices.wants(A)
     voices.next([A])
     voices.loaded(A, "no json", 0.0)
-    assert voices.want(A, RETRY_AFTER) is State.FAILED
+    assert voices.want(A, RETRY_AFTER) is Readiness.FAILED
     assert voices.next([A]) == (A, ())
-    assert voices.want(A, 1000.0) is State.FAILED
+    assert voices.want(A, 1000.0) is Readiness.FAILED
     assert not voices.lacking
     voices.loaded(A, None, 1000.0)
     assert voices.to_json() == {A: {"state": "loaded", "why": None}}

@@ -86,7 +86,7 @@ class Loader:
         return found.model if found else None
 
     def error(self, voice: str) -> str | None:
-        """Return why a voice can't be had, by the last attempt to load it, or to speak with it."""
+        """Return why a voice can't be had, by the last attempt to load it."""
         return self._errors.get(voice)
 
     def suspect(self, voice: str) -> None:
