@@ -13,9 +13,10 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from talkcli.daemon.quota import Quota
 from talkcli.engine import protocol
 from talkcli.engine.inbox import NEVER, Inbox
-from talkcli.engine.process import EngineProcess, Quota
+from talkcli.engine.process import EngineProcess
 from talkcli.engine.protocol import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
 from talkcli.frozen import frozen, replace
 

@@ -12,6 +12,7 @@ import sys
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from talkcli.daemon import log
 from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
@@ -21,8 +22,8 @@ from talkcli.goals.states import State
 from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
 from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
-from talkcli.server import log
 from talkcli.server.call import Call, go_on
+from talkcli.server.log import who
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Iterator
@@ -354,7 +355,7 @@ class Requests:
         self._speech.apply(self._scheduler.tick(self._speech.now()))  # who waited for a voice may wait no more
         if changed:
             values = ", ".join(f"{name} {value}" for name, value in changed.items())
-            log.line(f"set to {log.shown(values)} by {log.who(call.connection.sender)}")
+            log.line(f"set to {log.shown(values)} by {who(call.connection.sender)}")
         call.answer(settings=as_shown(self._scheduler.settings))
 
     def _find(self, goal_id: str) -> Record:

@@ -13,6 +13,8 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli import __version__, peers
+from talkcli.daemon import log
+from talkcli.daemon.systemd import Systemd
 from talkcli.engine import protocol
 from talkcli.engine.protocol import START_LIMIT
 from talkcli.engine.supervisor import Supervisor
@@ -24,13 +26,11 @@ from talkcli.goals.options import INITIAL, MAX_CHARACTERS, Say, Set, as_shown
 from talkcli.goals.scheduler import Scheduler
 from talkcli.protocol.events import PROTOCOL, busy_greeting, greeting
 from talkcli.protocol.lines import encode
-from talkcli.server import log
 from talkcli.server.connection import Connection
 from talkcli.server.listener import InheritedListener, Listener, listen, may_pass
 from talkcli.server.requests import Requests
 from talkcli.server.speech import Speech
 from talkcli.server.stream import Acceptor, make_room
-from talkcli.server.systemd import Systemd
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
@@ -133,7 +133,7 @@ class Server:
         settings, speech = self._settings, self.speech
         descriptors = make_room(settings.max_clients + DOOR)
         self._acceptor = Acceptor(self._loop, lambda each: Connection(self, speech.streams, each).begin(), descriptors)
-        self._loop.set_exception_handler(self._on_bug)
+        self._loop.set_exception_handler(log.loop_bug)
         for number in self._ended_by:
             self._loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the voice along
@@ -304,14 +304,6 @@ class Server:
         with contextlib.suppress(OSError):
             self._listener.close()
         os._exit(EXIT_SIGNAL + number)
-
-    @staticmethod
-    def _on_bug(_: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-        error = context.get("exception")
-        if isinstance(error, Exception):
-            log.bug(str(context.get("message")), error)
-        else:
-            log.line(log.shown(str(context.get("message"))))
 
 
 def _boot() -> str:

@@ -14,6 +14,7 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING
 
+from talkcli.daemon import log
 from talkcli.engine import protocol
 from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.engine.synthesizers.voices import is_neural
@@ -22,7 +23,7 @@ from talkcli.goals.goal import Output
 from talkcli.goals.options import INITIAL, for_engine, model_of
 from talkcli.goals.scheduler import Changed, Effect, Now, Order
 from talkcli.goals.states import State
-from talkcli.server import log
+from talkcli.server import log as server_log
 from talkcli.server.call import go_on
 from talkcli.server.stream import Streams
 from talkcli.server.subscribers import News, Subscribers
@@ -133,7 +134,7 @@ class Speech:
         else:
             doing = f"speaking {scheduler.active.id}" if scheduler.active else "idle"
         waiting = f", {scheduler.pending_count} waiting" if scheduler.pending_count else ""
-        voice = f"; {ready.version or ready.driver}, {log.sound_of(ready)}" if ready else ""
+        voice = f"; {ready.version or ready.driver}, {server_log.sound_of(ready)}" if ready else ""
         return log.shown(doing + waiting + voice)
 
     # -- what is waited for
@@ -189,7 +190,7 @@ class Speech:
         return list(filter(is_neural, dict.fromkeys(map(model_of, goals))))
 
     def _loaded(self, loaded: protocol.Loaded) -> None:
-        log.loaded(loaded)
+        server_log.loaded(loaded)
         self.voices.warm = self.voices.warm or loaded.seconds > 0
         self.voices.loaded(loaded.voice, loaded.error, elapsed())
         self.scheduler.loading.end(loaded.voice)
@@ -243,7 +244,7 @@ class Speech:
         paused, held_id = self.scheduler.paused, held.id if held else None
         self.news.tell([partial(self.subscribers.paused, held_id, paused=paused, by=by, at=time.time())])
         assert by.client
-        log.line(f"{'paused' if paused else 'resumed'} by {log.who(by.client)}")
+        log.line(f"{'paused' if paused else 'resumed'} by {server_log.who(by.client)}")
 
     # -- the scheduler's effects
 
@@ -287,7 +288,7 @@ class Speech:
     def _tell_changed(self, record: Record, state: State, at: float) -> None:
         self.subscribers.changed(record, state, at)
         if state.terminal:
-            log.ended(record, elapsed() - record.began)
+            server_log.ended(record, elapsed() - record.began)
             go_on(self._for_silence.pop(record, {}))
             self.look_finished()
 
@@ -376,7 +377,7 @@ class Speech:
 
     def _ready(self, ready: protocol.Ready) -> None:
         if self.ready != ready:
-            log.ready(ready, self._for_player)
+            server_log.ready(ready, self._for_player)
         self.ready, self.engine_words, self.voices.driver = ready, READY, ready.driver
         self.engine_known.set()
         now = self.now()

@@ -17,9 +17,9 @@ import errno
 import resource
 from typing import TYPE_CHECKING
 
+from talkcli.daemon import log
 from talkcli.protocol.events import busy_greeting
 from talkcli.protocol.lines import encode
-from talkcli.server import log
 
 if TYPE_CHECKING:
     import asyncio

@@ -10,11 +10,11 @@ from collections import deque
 from itertools import chain, count
 from typing import TYPE_CHECKING
 
+from talkcli.daemon import log
 from talkcli.frozen import replace
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.protocol.lines import encode
-from talkcli.server import log
 
 if TYPE_CHECKING:
     import asyncio

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from talkcli.server import log
+from talkcli.daemon import log
 
 if TYPE_CHECKING:
     import pytest
@@ -16,7 +16,7 @@ def test_storm_of_the_same_is_a_line_and_a_number(
 ) -> None:
     now = 1000.0
     monkeypatch.setattr(log, "_seldom", {})
-    monkeypatch.setattr("talkcli.server.log.time.monotonic", lambda: now)
+    monkeypatch.setattr("talkcli.daemon.log.time.monotonic", lambda: now)
     with open(2, "w", encoding="utf-8", closefd=False) as stderr:
         monkeypatch.setattr(sys, "stderr", stderr)
         for second in range(600):  # ten minutes of it, ten times a second

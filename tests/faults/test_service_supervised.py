@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.server.systemd import RETRY_AFTER, STATUS_AFTER
+from talkcli.daemon.systemd import RETRY_AFTER, STATUS_AFTER
 from tests.conformance.bareserve import SERVE, BareServe, environment, serving
 from tests.faults.supervisor import Supervisor
 from tests.support import processes

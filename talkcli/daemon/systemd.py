@@ -1,4 +1,4 @@
-"""What a supervisor is told: that the server serves, how it is, that its event loop lives, that it ends.
+"""What a supervisor is told: that this process is ready, how it is, that its event loop lives, that it ends.
 
 The datagrams of sd_notify(3), which systemd and others read. Without NOTIFY_SOCKET nothing happens. It never waits:
 what the supervisor can't take now is told with what follows. Goals' texts are not told: any user may read what is.
@@ -10,7 +10,7 @@ import os
 import socket
 from typing import TYPE_CHECKING
 
-from talkcli.server import log
+from talkcli.daemon import log
 
 if TYPE_CHECKING:
     import asyncio
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 STATUS_AFTER = 0.5
 #: Seconds after which what could not be sent is sent again.
 RETRY_AFTER = 0.5
-#: Signs of life in the time after which the supervisor gives the server up: one may come late.
+#: Signs of life in the time after which the supervisor gives the process up: one may come late.
 BEATS = 2.5
 
 
@@ -28,7 +28,7 @@ class Systemd:
     """The one that started this process, if it wants to be told. All calls are made in the event loop's thread."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, words: Callable[[], str]) -> None:
-        """`words` returns how the server is, in one line for people."""
+        """`words` returns how the process is, in one line for people."""
         self._loop = loop
         self._words = words
         self._address = _address(os.environ.get("NOTIFY_SOCKET", ""))
@@ -44,17 +44,17 @@ class Systemd:
             self._socket.setblocking(False)
 
     def ready(self) -> None:
-        """Say that clients are served, and begin with the signs of life."""
+        """Say that the process does its work, and begin with the signs of life."""
         self._status = self._words()
         self._send(READY="1", STATUS=self._status)
         self._live()
 
     def changed(self) -> None:
-        """Say soon how the server is now."""
+        """Say soon how the process is now."""
         self._later("status", STATUS_AFTER, self._tell_status)
 
     def stopping(self) -> None:
-        """Say that the server ends; the signs of life go on until `close`."""
+        """Say that the process ends; the signs of life go on until `close`."""
         if self._status != "ending":
             self._status = "ending"
             self._send(STOPPING="1", STATUS=self._status)
