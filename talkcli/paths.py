@@ -34,6 +34,14 @@ def named_socket(option: str | None) -> str | None:
     return option or os.environ.get("TALK_SOCKET") or None
 
 
+def named_robot(option: str | None, socket: str | None) -> str | None:
+    """Return the robot of a fleet that the user named, by option or by variable; `socket`: the option for that.
+
+    What is typed goes before a variable, and of the variables the one for a robot goes first.
+    """
+    return option or (None if socket else os.environ.get("TALK_ROBOT") or None)
+
+
 def client_sockets(named: str | None) -> list[str]:
     """Return the places where a client looks for a server, in this order: the one that was named and no other."""
     if named:

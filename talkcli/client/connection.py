@@ -18,7 +18,7 @@ from collections.abc import Callable
 from talkcli import paths, peers
 from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, hello, ready, sender
 from talkcli.client.following import Followed
-from talkcli.errors import BadRequest, Lost, RequestRefused, ServerUnavailable, UsageError, refusal
+from talkcli.errors import BadRequest, Lost, ServerUnavailable, UsageError, refusal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Say
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from typing import Protocol, TypeVar
 
     from talkcli.client.connect import Begun
+    from talkcli.errors import TalkError
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
@@ -46,11 +47,11 @@ OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
 class Connection(Protocol):
     """A way to one server that has greeted: all that a client and its goals need of it. Any number of threads use it.
 
-    What it sends a server is carried out once or not at all, in the order in which it was sent; it never sends anything
-    again by itself, nor connects anew. Replies and events are taken in in the server's order, each before whatever the
-    server said after it: under `changed`, and under it alone, so that a wait whose `done` looks at several things sees
-    them together. Nothing is taken in but while somebody waits in `request` or `wait_until`; whoever does so does it
-    for all. No lock is held while a server is waited for.
+    What it sends a server is carried out once or not at all, in the order in which it was sent; nothing that could have
+    an effect is sent again by itself, but a goal with its id, which is not spoken twice. Replies and events are taken
+    in in the server's order, each before whatever the server said after it: under `changed`, and under it alone, so
+    that a wait whose `done` looks at several things sees them together. Nothing is taken in but while somebody waits in
+    `request` or `wait_until`; whoever does so does it for all. No lock is held while a server is waited for.
 
     It ends once and for ever, with `close`, or where nothing more can come: `ended` says why from then on. What came
     before is handed out first. What waits is told so, and what is asked afterwards is ServerUnavailable: nothing was
@@ -135,27 +136,214 @@ def taken(connection: Connection, take: Callable[[], _T], end: float | None) -> 
         yield found
 
 
-def _refusal(reply: JsonObject, items: list[JsonObject]) -> RequestRefused:
-    from talkcli.terminal.text import printable  # no start pays for it
-
-    error = reply.get("error")
-    code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
-    return refusal(str(code), printable(str(message)), items)
-
-
-class _Exchange:
+class Exchange:
     """One request on its way: the lines of its list, and at last its reply."""
 
-    __slots__ = ("items", "on_reply", "reply", "touched")
+    __slots__ = ("error", "items", "latest", "number", "on_reply", "reply", "request", "sent", "touched", "tries")
 
-    def __init__(self, on_reply: OnReply | None) -> None:
+    def __init__(self, number: int, request: Request, on_reply: OnReply | None) -> None:
+        #: by which its reply is known
+        self.number = number
+        self.request = request
+        #: whether it has gone out, or may have
+        self.sent = True
+        #: how often it went out again; until when it means anything, by the clock of the connection that asks again
+        self.tries = 0
+        self.latest: float | None = None
         self.items: list[JsonObject] = []
         self.reply: JsonObject | None = None
+        #: why there will be no reply, where that is known of this one alone
+        self.error: TalkError | None = None
         self.on_reply = on_reply
         self.touched = time.monotonic()
 
+    @property
+    def over(self) -> bool:
+        """Whether nothing more is to be waited for."""
+        return self.reply is not None or self.error is not None
 
-class SocketConnection:
+
+class BaseConnection:
+    """What connections do alike, whatever they lead through: number requests, read for all, hand out what comes.
+
+    A class of it says how a request is sent and what has come; see `Connection` for what is promised.
+    """
+
+    #: requests that can still have an effect, though nobody knows of it, where they were sent and not answered
+    lasting: tuple[type[Request], ...] = (Say,)
+
+    def __init__(self, patience: float) -> None:
+        """`patience`: seconds in which the server must answer."""
+        self.path, self.boot = "", ""
+        self.pid: int | None = None
+        self.followed = Followed()
+        self.changed = threading.Condition()
+        self.ended: str | None = None
+        self._process = os.getpid()
+        self._patience = patience
+        self._exchanges: dict[int, Exchange] = {}
+        self._numbers = itertools.count(FIRST)
+        self._lines: deque[bytes] = deque()
+        self._reading = False
+        self._closing = False
+        self._heard = time.monotonic()
+        #: what the server said last that was no answer to anything
+        self._told: str | None = None
+        #: why nothing can be sent at this moment, where that may change
+        self._absent = ""
+
+    def close(self) -> None:
+        self.ended = self.ended or "the connection was closed"
+        if os.getpid() != self._process:
+            self._drop()
+            return
+        with self.changed:
+            self._closing = True
+            self._hang_up()
+            if not self._reading:  # else it would poll a descriptor that may be another file's by now
+                self._drop()
+            self.changed.notify_all()
+
+    def request(
+        self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
+    ) -> tuple[JsonObject, list[JsonObject]]:
+        exchange = Exchange(next(self._numbers), request, on_reply)
+        self._exchanges[exchange.number] = exchange
+        # A goal whose sender was interrupted before it knew the goal's id could not be cancelled any more. One that
+        # waits for room isn't accepted yet: who hangs up takes it back.
+        interruptible = slow or not isinstance(request, Say)
+        try:
+            self._send(exchange.number, request)
+            late, deadline = 0.0, -1.0
+            while not exchange.over and self.ended is None and late != deadline:
+                late, deadline = deadline, self._answer_by(exchange)
+                self.wait_until(lambda: exchange.over, None if slow else deadline, interruptible=interruptible)
+        finally:
+            del self._exchanges[exchange.number]
+        if exchange.error is not None:
+            raise exchange.error
+        if exchange.reply is None and not exchange.sent:
+            raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended or self._absent}")
+        if exchange.reply is None:
+            why = self.ended or f"it did not reply within {self._patience:g} s"
+            words = f"{request.kind} was sent to the server at {self.path}, but {why}"
+            if isinstance(request, Say):
+                raise Lost(f"{words}; it may still be spoken")
+            raise Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
+        if exchange.reply.get("ok") is not True:
+            raise self._refusal(exchange.reply, exchange.items)
+        return exchange.reply, exchange.items
+
+    def post(self, request: Request) -> None:
+        self._send(next(self._numbers), request)
+
+    def wait_until(
+        self,
+        done: Callable[[], bool],
+        deadline: float | None,
+        *,
+        since: float | None = None,
+        interruptible: bool = True,
+    ) -> bool:
+        began = time.monotonic() if since is None else since
+        last = False
+        while True:
+            with self.changed:
+                if done():
+                    return True
+                if self.ended is not None:
+                    return False
+                now = time.monotonic()
+                quiet, why = self._silent_by(began)
+                rest = (quiet if deadline is None else min(deadline, quiet)) - now
+                if last and rest <= 0:
+                    if deadline is None or quiet < deadline:
+                        self.ended = why
+                    return False
+                # What has arrived by the deadline counts: one more look, that doesn't wait.
+                last = rest <= 0
+                if self._reading:
+                    self.changed.wait(max(0.0, rest))
+                    continue
+                self._reading = True
+            try:
+                self._read(rest, interruptible)
+            finally:
+                with self.changed:
+                    self._reading = False
+                    if self._closing:
+                        self._drop()
+                    self.changed.notify_all()
+
+    # -- what each does in its own way
+
+    def _send(self, number: int, request: Request) -> None:
+        """Send a request; ServerUnavailable where that is impossible."""
+        raise NotImplementedError
+
+    def _fill(self, timeout: float, interruptible: bool) -> None:
+        """Put what has come into `_lines`, or wait for it so many seconds; Interrupted."""
+        raise NotImplementedError
+
+    def _hang_up(self) -> None:
+        """Have nothing more come, and a thread that reads find that out; under `changed`."""
+        raise NotImplementedError
+
+    def _drop(self) -> None:
+        """Close this process's descriptors, whoever else has them open."""
+        raise NotImplementedError
+
+    def _answer_by(self, exchange: Exchange) -> float:
+        """Return until when an answer is waited for, by the monotonic clock, as far as it is known now."""
+        return exchange.touched + self._patience
+
+    def _silent_by(self, began: float) -> tuple[float, str]:
+        """Return when the server counts as gone that says nothing, to one who waits since then, and why."""
+        return max(began, self._heard) + SILENCE_LIMIT, f"it has said nothing for {SILENCE_LIMIT:g} s"
+
+    def _refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
+        """Return the error that a reply stands for; `items`: what was listed before."""
+        from talkcli.terminal.text import printable  # no start pays for it
+
+        error = reply.get("error")
+        code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
+        return refusal(str(code), printable(str(message)), items)
+
+    # -- what has come
+
+    def _read(self, timeout: float, interruptible: bool) -> None:
+        """Read what there is, or wait for it, and hand it out."""
+        if not self._lines:
+            self._fill(timeout, interruptible)
+        while self._lines:
+            try:
+                message = decode(self._lines.popleft())
+                with self.changed:
+                    self._dispatch(message)
+            except (BadRequest, ValueError) as error:  # ValueError: a goal or an event that is none
+                self.ended = self.ended or f"it sent what is no message: {error}"
+                return
+
+    def _dispatch(self, message: JsonObject) -> None:
+        if "event" in message:
+            self.followed.hear(message)
+            return
+        number = message.get("seq")
+        if number is None and message.get("ok") is False:
+            self._told = f"the server closed it: {self._refusal(message, [])}"
+        exchange = self._exchanges.get(number) if isinstance(number, int) else None
+        if exchange is None or exchange.over:
+            return
+        exchange.touched = time.monotonic()
+        if "ok" not in message:
+            exchange.items.append(message)
+            return
+        if exchange.on_reply and message.get("ok") is True:
+            exchange.on_reply(message, exchange.items)
+        exchange.reply = message  # now: what can't be understood is no reply
+
+
+class SocketConnection(BaseConnection):
     """A connection by a Unix socket. There is no thread behind it."""
 
     def __init__(
@@ -178,6 +366,7 @@ class SocketConnection:
 
         What is raised, `Client` says.
         """
+        super().__init__(patience)
         self._interrupt = interrupt
         name = sender(name)
         if name and len(name) > MAX_NAME:
@@ -187,124 +376,17 @@ class SocketConnection:
         assert begun.socket
         self._socket, self.path, self.boot, self.pid = begun.socket, begun.path, begun.boot, begun.pid
         self._splitter = LineSplitter()
-        self._lines = deque(self._splitter.feed(begun.received))
+        self._lines.extend(self._splitter.feed(begun.received))
         # The beginning of the first line to be sent, if that was sent before there was this connection.
         self._sent_early = begun.sent
-        self._process = os.getpid()
-        self._patience = patience
-        self._exchanges: dict[int, _Exchange] = {}
-        self._numbers = itertools.count(FIRST)
-        self.followed = Followed()
-        self.changed = threading.Condition()
         self._sending = threading.Lock()
-        self._reading = False
-        self._closing = False
-        self._heard = time.monotonic()
-        #: what the server said last that was no answer to anything
-        self._told: str | None = None
         #: why nothing more can be sent, once that is so; what was sent before may still be answered
         self._mute: str | None = None
-        self.ended: str | None = None
 
     @property
     def listener(self) -> int:
         """The process that listens, as the kernel tells it."""
         return peers.credentials(self._socket)[0]
-
-    def close(self) -> None:
-        self.ended = self.ended or "the connection was closed"
-        if os.getpid() != self._process:
-            # To shut it down would cut the parent's; and a thread of the parent's may have held the lock at the fork.
-            self._socket.close()
-            return
-        with self.changed:
-            self._closing = True
-            self._shut(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
-            if not self._reading:  # else it would poll a descriptor that may be another file's by now
-                self._socket.close()
-            self.changed.notify_all()
-
-    def request(
-        self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
-    ) -> tuple[JsonObject, list[JsonObject]]:
-        number = next(self._numbers)
-        exchange = _Exchange(on_reply)
-        self._exchanges[number] = exchange
-        # A goal whose sender was interrupted before it knew the goal's id could not be cancelled any more. One that
-        # waits for room isn't accepted yet: who hangs up takes it back.
-        interruptible = slow or not isinstance(request, Say)
-        try:
-            self._send(request_line({"seq": number, **write_request(request)}))
-            touched = None
-            while exchange.reply is None and self.ended is None and touched != exchange.touched:
-                touched = exchange.touched
-                deadline = None if slow else touched + self._patience
-                self.wait_until(lambda: exchange.reply is not None, deadline, interruptible=interruptible)
-        finally:
-            del self._exchanges[number]
-        if exchange.reply is None:
-            why = self.ended or f"it did not reply within {self._patience:g} s"
-            words = f"{request.kind} was sent to the server at {self.path}, but {why}"
-            if isinstance(request, Say):  # it alone can still have an effect that the sender does not know of
-                raise Lost(f"{words}; it may still be spoken")
-            raise ServerUnavailable(words)
-        if exchange.reply.get("ok") is not True:
-            raise _refusal(exchange.reply, exchange.items)
-        return exchange.reply, exchange.items
-
-    def post(self, request: Request) -> None:
-        self._send(request_line({"seq": next(self._numbers), **write_request(request)}))
-
-    def wait_until(
-        self,
-        done: Callable[[], bool],
-        deadline: float | None,
-        *,
-        since: float | None = None,
-        interruptible: bool = True,
-    ) -> bool:
-        began = time.monotonic() if since is None else since
-        last = False
-        while True:
-            with self.changed:
-                if done():
-                    return True
-                if self.ended is not None:
-                    return False
-                now = time.monotonic()
-                quiet = max(began, self._heard) + SILENCE_LIMIT
-                rest = (quiet if deadline is None else min(deadline, quiet)) - now
-                if last and rest <= 0:
-                    if deadline is None or quiet < deadline:
-                        self.ended = f"it has said nothing for {SILENCE_LIMIT:g} s"
-                    return False
-                # What has arrived by the deadline counts: one more look, that doesn't wait.
-                last = rest <= 0
-                if self._reading:
-                    self.changed.wait(max(0.0, rest))
-                    continue
-                self._reading = True
-            try:
-                self._read(rest, interruptible)
-            finally:
-                with self.changed:
-                    self._reading = False
-                    if self._closing:
-                        self._socket.close()
-                    self.changed.notify_all()
-
-    def _read(self, timeout: float, interruptible: bool) -> None:
-        """Read what there is, or wait for it, and hand it out."""
-        if not self._lines:
-            self._fill(timeout, interruptible)
-        while self._lines:
-            try:
-                message = decode(self._lines.popleft())
-                with self.changed:
-                    self._dispatch(message)
-            except (BadRequest, ValueError) as error:  # ValueError: a goal or an event that is none
-                self.ended = self.ended or f"it sent what is no message: {error}"
-                return
 
     def _fill(self, timeout: float, interruptible: bool) -> None:
         try:
@@ -325,23 +407,11 @@ class SocketConnection:
         self._heard = time.monotonic()
         self._lines.extend(self._splitter.feed(data))
 
-    def _dispatch(self, message: JsonObject) -> None:
-        if "event" in message:
-            self.followed.hear(message)
-            return
-        number = message.get("seq")
-        if number is None and message.get("ok") is False:
-            self._told = f"the server closed it: {_refusal(message, [])}"
-        exchange = self._exchanges.get(number) if isinstance(number, int) else None
-        if exchange is None:
-            return
-        exchange.touched = time.monotonic()
-        if "ok" not in message:
-            exchange.items.append(message)
-            return
-        if exchange.on_reply and message.get("ok") is True:
-            exchange.on_reply(message, exchange.items)
-        exchange.reply = message  # now: what can't be understood is no reply
+    def _hang_up(self) -> None:
+        self._shut(SHUT_RDWR)  # wakes a thread that reads; closing alone would not
+
+    def _drop(self) -> None:
+        self._socket.close()
 
     def _shut(self, direction: int) -> None:
         try:
@@ -349,8 +419,9 @@ class SocketConnection:
         except OSError:
             pass  # the server has hung up
 
-    def _send(self, data: bytes) -> None:
+    def _send(self, number: int, request: Request) -> None:
         """Send a line. What fails here ends nothing that is waited for: the reader still hears what was said before."""
+        data = request_line({"seq": number, **write_request(request)})
         end = time.monotonic() + ANSWER_LIMIT
         with self._sending:
             why = self.ended or self._mute

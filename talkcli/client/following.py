@@ -8,10 +8,10 @@ from __future__ import annotations
 from _weakrefset import WeakSet  # as `threading` has it: the rest of `weakref` takes longer to import
 from collections import deque
 
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
 from talkcli.protocol import events
-from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
+from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, WordHeard
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,6 +25,14 @@ MAX_FEEDBACK = 5_000
 #: States kept for whoever watches all goals, and doesn't take them while others read on the same connection: those of
 #: some 3,000 goals. None is dropped: past this, watching ends.
 MAX_STATES = 10_000
+
+
+@frozen
+class Gone:
+    """Nothing more will be heard of a goal, though the connection goes on: the server has forgotten it."""
+
+    #: why, for people
+    why: str
 
 
 class EventBuffer:
@@ -70,17 +78,27 @@ class Followed:
     """Who is told what of the events that come in: of one goal, of all speech, of everything. Used under one lock."""
 
     def __init__(self) -> None:
-        self._goals: dict[str, list[Callable[[Event], None]]] = {}
+        self._goals: dict[str, list[Callable[[Event | Gone], None]]] = {}
         #: a watch ends when nobody holds its iterator any more
         self._watches: WeakSet[EventBuffer] = WeakSet()
 
-    def add(self, goal_id: str, hear: Callable[[Event], None]) -> None:
-        """Tell of a goal, and of speech that is held or goes on, until the goal's Result, which is the last."""
+    def add(self, goal_id: str, hear: Callable[[Event | Gone], None]) -> None:
+        """Tell of a goal, and of speech that is held or goes on, until its Result, or Gone: its last."""
         self._goals.setdefault(goal_id, []).append(hear)
 
     def watch(self, buffer: EventBuffer) -> None:
         """Put everything that happens into this buffer, as long as somebody holds it."""
         self._watches.add(buffer)
+
+    @property
+    def watched(self) -> bool:
+        """Whether anybody watches everything."""
+        return bool(self._watches)
+
+    def lose(self, goal_id: str, why: str) -> None:
+        """Tell those who follow a goal that nothing more will be heard of it."""
+        for hear in self._goals.pop(goal_id, ()):
+            hear(Gone(why))
 
     def hear(self, message: JsonObject) -> None:
         """Hand on an event; ValueError where it is none."""
@@ -88,6 +106,9 @@ class Followed:
         if isinstance(event, Result):
             for hear in self._goals.pop(event.goal.id, ()):
                 hear(event)
+        elif isinstance(event, Snapshot):  # what was watched before is watched anew
+            for buffer in self._watches:
+                buffer.add(event)
         elif isinstance(event, StateChanged | WordHeard | PausedChanged):
             if isinstance(event, PausedChanged):
                 hearing = [hear for each in self._goals.values() for hear in each]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 
 from talkcli.client.connection import taken
-from talkcli.client.following import EventBuffer
+from talkcli.client.following import EventBuffer, Gone
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
@@ -134,11 +134,13 @@ class GoalHandle:
             if not self.state.terminal:
                 self._connection.followed.add(self.id, self._hear)
 
-    def _hear(self, event: Event) -> None:
+    def _hear(self, event: Event | Gone) -> None:
         """Take up an event of this goal, or of all speech."""
         if self.state.terminal:
             return
-        if isinstance(event, Result):
+        if isinstance(event, Gone):
+            self.goal = _lost(self.goal, event.why)
+        elif isinstance(event, Result):
             self.goal = event.goal
         elif isinstance(event, StateChanged):
             # Its end comes with the result, which says how and why.
@@ -197,8 +199,7 @@ class GoalHandle:
         """Conclude that the goal is lost, and return True, where nothing more can be heard of it."""
         ended = self._connection.ended
         if ended is not None:
-            words = f"Talk lost: {ended}; it may still be spoken"
-            self._settle(replace(self.goal, state=State.LOST, reason="lost", message=words))
+            self._settle(_lost(self.goal, f"{ended}; it may still be spoken"))
         return ended is not None
 
 
@@ -247,6 +248,11 @@ class _Stream:
         self.going = [each for each in self.going if not each.state.terminal]
         # A stable sort: a Result has the number of its goal's last event, and was found after that.
         return [(handle, event) for _, handle, event in sorted(found, key=lambda each: each[0])]
+
+
+def _lost(goal: Goal, why: str) -> Goal:
+    """Return what is known of a goal of which nothing more can be heard."""
+    return replace(goal, state=State.LOST, reason="lost", message=f"Talk lost: {why}")
 
 
 def _end(timeout: float | None) -> float | None:

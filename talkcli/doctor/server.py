@@ -223,11 +223,7 @@ def judge(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
 
 
 def _itself(server: JsonObject) -> Finding:
-    version, engine = server.get("version"), server.get("engine")
-    parts = [f"talk {version}", f"up {_span(server.get('uptime'))}", f"engine {engine}"]
-    parts += [f"{name} {server[name]}" for name in ("synthesizer", "player", "device") if server.get(name)]
-    parts.append(f"{server.get('pending')} waiting, {server.get('clients')} of {server.get('max_clients')} clients")
-    words = "; ".join(parts)
+    version, engine, words = server.get("version"), server.get("engine"), summary(server)
     if server.get("paused") is True:
         return failed("server", f"speech is paused; {words}", "talk resume")
     if engine not in {"ready", "starting"}:
@@ -236,6 +232,14 @@ def _itself(server: JsonObject) -> Finding:
         step = "start the server again, with the talk that is installed now"
         return warning("server", f"{words}; this is talk {__version__}", step)
     return done("server", words)
+
+
+def summary(server: JsonObject) -> str:
+    """Return how a server describes itself, for people."""
+    parts = [f"talk {server.get('version')}", f"up {span(server.get('uptime'))}", f"engine {server.get('engine')}"]
+    parts += [f"{name} {server[name]}" for name in ("synthesizer", "player", "device") if server.get(name)]
+    parts.append(f"{server.get('pending')} waiting, {server.get('clients')} of {server.get('max_clients')} clients")
+    return "; ".join(parts)
 
 
 def _settings(server: JsonObject) -> Finding:
@@ -257,7 +261,7 @@ def _failures(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
         return done("failures", f"none in {many}")
     last = aborted[-1]
     words = (last.message or "").removeprefix("Talk aborted: ")
-    when = "" if last.ended_at is None else f", {_span(now - last.ended_at)} ago ({clock(last.ended_at)})"
+    when = "" if last.ended_at is None else f", {span(now - last.ended_at)} ago ({clock(last.ended_at)})"
     who = f"{many} ABORTED, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many} ABORTED, last {last.id}"
     told = f"{who}{when}: {last.reason}: {words}"
     after = [each for each in log[log.index(last) + 1 :] if each.state is State.SUCCEEDED]
@@ -266,7 +270,7 @@ def _failures(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
     return warning("failures", told, remedy(last.reason, words, server.get("player"), server.get("device")))
 
 
-def _span(seconds: object) -> str:
+def span(seconds: object) -> str:
     """Return a length of time for people, in its largest unit."""
     if not isinstance(seconds, int | float):
         return "?"

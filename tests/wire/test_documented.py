@@ -13,6 +13,7 @@ import pytest
 
 from talkcli import errors, paths
 from talkcli.cli import click_app, commands
+from talkcli.fleet import policy, topics
 from talkcli.goals import states
 from talkcli.goals.goal import Goal
 from talkcli.goals.history import MAX_ENDED, MAX_REJECTED
@@ -24,7 +25,8 @@ from talkcli.protocol.requests import KINDS, read_request
 from talkcli.server import connection, stream
 from talkcli.server.requests import ALL_WAITING, EACH, MAX_WAITING, RECENT
 from talkcli.server.run import MAX_CLIENTS, MAX_QUEUE
-from tests.support.documents import DOCUMENTS, README, ROOT, WIRE, first_column, tables, words
+from tests.support.documents import DOCUMENTS, FLEET, README, ROOT, WIRE, first_column, tables, words
+from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
     from tests.support.documents import Document
@@ -53,9 +55,9 @@ def requests_table() -> dict[str, dict[str, tuple[str, ...]]]:
 
 
 @cache
-def sources() -> list[tuple[str, ast.AST]]:
-    """Return every node of the sources, with the name of its file."""
-    paths = sorted((ROOT / "talkcli").rglob("*.py"))
+def sources(*, fleet: bool = False) -> list[tuple[str, ast.AST]]:
+    """Return every node of the sources, with the name of its file: without a fleet's, or those alone."""
+    paths = [each for each in sorted((ROOT / "talkcli").rglob("*.py")) if (each.parent.name == "fleet") is fleet]
     return [(path.name, node) for path in paths for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
 
 
@@ -69,10 +71,10 @@ def constants(node: ast.AST | None) -> set[str]:
     return {found} if isinstance(found, str) and CODE.fullmatch(found) else set()
 
 
-def arguments(places: dict[str, int], keyword: str) -> set[str]:
+def arguments(places: dict[str, int], keyword: str, *, fleet: bool = False) -> set[str]:
     """Return the codes that stand at their place in the calls of the sources."""
     found = set()
-    for _, node in sources():
+    for _, node in sources(fleet=fleet):
         if not isinstance(node, ast.Call):
             continue
         name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
@@ -168,6 +170,29 @@ def test_limits_are_those_of_the_code() -> None:
     assert f"and {EACH >> 10} KiB)" in limits["requests that wait"]
 
 
+def test_limits_of_a_fleet_are_those_of_the_code() -> None:
+    needs_packages("paho")
+    from talkcli.fleet import askers, bridge, link, news, session
+
+    limits = {row[0]: row[1] for row in tables(FLEET.section("Limits"))[0][1:]}
+    assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")
+    assert limits["correlation data"] == f"{policy.MAX_CORRELATION} bytes"
+    assert f"past {policy.MAX_CORRELATION} bytes the request" in FLEET.section("Requests and replies")
+    assert f"at most {(link.MAX_PACKET - link.MAX_HEAD) // 1024} KiB" in limits["a reply's payload"]
+    assert limits["goals from afar that are pending"] == str(policy.SHARE)
+    assert limits["askers"].startswith(f"{askers.MAX_SESSIONS}, and {session.MAX_WAITING} requests of each")
+    assert limits["requests that wait"].startswith(f"{session.MAX_HELD >> 20} MiB for all askers")
+    assert limits["an asker that says nothing"] == f"{session.IDLE:g} s"
+    assert limits["ids that are remembered"] == f"{policy.REMEMBERED:,}"
+    assert f"past {bridge.SOFT_OUTPUT // 1024} KiB" in limits["what the broker is slow to take"]
+    assert f"past {bridge.HARD_OUTPUT // 2**20} MiB" in limits["what the broker is slow to take"]
+    section = FLEET.section("Topics")
+    assert f"1 to {topics.LONGEST} of" in section
+    assert f"expires after {bridge.PRESENCE_EXPIRY} s, renewed every {bridge.PRESENCE_EVERY:g} s" in section
+    assert f"expires after {news.EVENT_EXPIRY} s" in section
+    assert f"more than {policy.STALE_AFTER:g} s ago" in " ".join(FLEET.section("What is refused").split())
+
+
 def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
     variables = {"XDG_RUNTIME_DIR": "/own/run", "TMPDIR": "/own/tmpdir", "TEMP": "/own/temp", "TMP": "/own/tmp"}
     for name, value in variables.items():
@@ -219,6 +244,15 @@ def test_error_codes_are_in_the_table() -> None:
     assert sorted(first_column(tables(WIRE.section("Errors and limits"))[0])) == sorted(codes)
 
 
+def test_error_codes_of_a_fleet_are_in_its_table() -> None:
+    """Those that a bridge has besides the wire's."""
+    codes = arguments({"BadRequest": 1, "failure": 1, "_refuse": 1}, "code", fleet=True)
+    codes |= {policy.STALE, errors.Busy.code}
+    codes -= set(first_column(tables(WIRE.section("Errors and limits"))[0]))
+    table = tables(FLEET.section("What is refused"))[0]
+    assert sorted(first_column(table)) == sorted(codes)
+
+
 def test_exit_codes_are_in_the_table() -> None:
     rows = [row[0] for row in tables(README.section("Exit codes"))[0][1:]]
     assert rows[-1] == f"{errors.EXIT_SIGNAL}+n"
@@ -250,7 +284,8 @@ def test_commands_are_in_the_table() -> None:
 def test_every_command_in_the_examples_can_be_read(document: Document) -> None:
     """Its options are the command's own; what stands around it is the shell's business. The README has all commands."""
     seen = set()
-    for name, rest in re.findall(r"\btalk (?:--json )?([a-z]+)\b([^|#;&\n]*)", "".join(document.examples("sh"))):
+    lines = "".join(document.examples("sh"))
+    for name, rest in re.findall(r"\btalk (?:--json |--robot \S+ )?([a-z]+)\b([^|#;&\n]*)", lines):
         if name not in commands.COMMANDS:
             continue
         seen.add(name)
