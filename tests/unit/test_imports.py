@@ -23,7 +23,7 @@ from tests.support.surroundings import needs
 PACKAGE = Path(talkcli.__file__).parent
 
 #: Each layer may import those before it, and itself; nothing imports one behind it.
-LAYERS = ["ground", "goals", "protocol", "terminal", "client", "engine", "server", "doctor", "cli"]
+LAYERS = ["ground", "goals", "protocol", "terminal", "daemon", "client", "engine", "server", "fleet", "doctor", "cli"]
 #: The files of the ground, which lie flat and import nothing of the others but each other.
 GROUND = {"errors", "frozen", "paths", "peers"}
 #: What lies flat besides: the package's face and its command, which hand on what others have.
@@ -33,10 +33,14 @@ PURE = [
     "errors",
     "frozen",
     "client.following",
+    "daemon.quota",
     "engine.synthesizers.guard",
     "engine.synthesizers.phonemes",
     "engine.synthesizers.vits",
     "engine.words",
+    "fleet.message",
+    "fleet.policy",
+    "fleet.topics",
 ]
 IMPURE = {
     *("asyncio", "threading", "_thread", "socket", "_socket", "select", "selectors", "signal", "time", "datetime"),
@@ -53,7 +57,8 @@ ONLY = {
     "numpy": {"engine"},
     "onnxruntime": {"engine"},
     "click": {"cli"},
-    "asyncio": {"server"},
+    "asyncio": {"daemon", "server", "fleet"},
+    "paho": {"fleet"},
     "platformdirs": {"paths"},
 }
 
@@ -193,8 +198,8 @@ def test_every_module_is_used() -> None:
     while new:
         used |= new
         new = {name for module in new for name, _ in inside(module)} - used
-    parents = {module.rpartition(".")[0] for module in sources()}
-    assert sources().keys() - used <= parents
+    heads = {module_name(each) for each in PACKAGE.rglob("__init__.py")}
+    assert sources().keys() - used <= heads
 
 
 def test_no_module_imports_itself_by_a_detour_not_even_for_its_types() -> None:
@@ -250,10 +255,25 @@ def test_the_server_is_imported_by_the_serve_command_alone() -> None:
                 assert module == "cli.serve", f"talkcli.{module}:{each.line} imports the server"
 
 
+#: What is the fleet's own among the commands and the doctor's modules: nobody else pays for what they import.
+OF_THE_FLEET = {"cli.bridge", "cli.fleet", "doctor.broker"}
+
+
+def test_the_fleet_stands_beside_the_server_and_is_imported_only_where_it_is_asked_for() -> None:
+    for module in sources():
+        for name, each in inside(module):
+            where = f"talkcli.{module}:{each.line} imports {name}"
+            if part(module) == "fleet":
+                assert part(name) not in {"server", "engine"}, where
+            elif part(name) == "fleet" or name in OF_THE_FLEET:
+                assert part(module) in {"cli", "doctor"}, where
+                assert each.function or each.typing or module in OF_THE_FLEET, where
+
+
 #: Who else may end the process on the spot: the server, on its second signal, in the handler.
 ENDING = {"server.run": {"os._exit"}, "engine.main": {"os._exit"}}
-#: Who else may write to standard error: the server's log, and the engine process, whose server reads it.
-COMPLAINING = {"server.log", "engine.main", "engine.session"}
+#: Who else may write to standard error: the log of what runs for months, and the engine process, whose server reads it.
+COMPLAINING = {"daemon.log", "engine.main", "engine.session"}
 
 
 def test_only_the_cli_prints_and_exits() -> None:
@@ -266,7 +286,10 @@ def test_only_the_cli_prints_and_exits() -> None:
         assert "sys.stderr" not in words or module in COMPLAINING, f"talkcli.{module} writes to standard error"
 
 
-HEAVY = ["asyncio", "pyttsx3", "click", "platformdirs", "espeakng_loader", "talkcli.server", "talkcli.goals.scheduler"]
+HEAVY = [
+    *("asyncio", "pyttsx3", "click", "platformdirs", "espeakng_loader"),
+    *("paho", "talkcli.daemon", "talkcli.fleet", "talkcli.server", "talkcli.goals.scheduler"),
+]
 #: What every start of a client would pay for: each takes as long to import as a server takes to answer, or longer.
 COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", "logging", "subprocess", "tempfile"]
 
@@ -292,7 +315,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 
 
 #: The doctor's modules that judge; each gathers what it judges, too, but for the last.
-JUDGING = ["machine", "voice", "neural", "sound", "server", "sentence", "report"]
+JUDGING = ["machine", "voice", "neural", "sound", "server", "sentence", "broker", "report"]
 #: What the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
     "talkcli.engine.players",
@@ -367,6 +390,8 @@ def test_contributing_names_every_file_that_an_option_goes_through() -> None:
     steps = text.partition("**An option of `say`**")[2].partition("\n\nWire, checks")[0]
     named = {module_name(PACKAGE / each) for each in re.findall(r"talkcli/([\w/]+\.py)", steps)}
     having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
+    # On a broker it is a message's expiry, too; no other option is known there.
+    having -= {module for module in having if part(module) == "fleet"}
     assert named - having == {"engine.protocol"}  # which is not told
     # Examples and help of commands; and a sentence that the doctor says, as any client does.
     assert having - named == {"cli.commands", "doctor.sentence"}

@@ -1,0 +1,115 @@
+"""The topics of a fleet: what is where on the broker, and who may do what there. Pure: names in, names out.
+
+Rules for this file: a topic may be added, never renamed or given another meaning; who is asked for something stands in
+the levels before the last, and who asks in the last, since that one an ordinary ACL can tie to a login.
+"""
+
+from __future__ import annotations
+
+import re
+
+from talkcli.frozen import frozen
+from talkcli.goals.option import MAX_NAME
+
+PREFIX = "talk"
+#: The group that every robot is in.
+EVERYBODY = "all"
+#: What a session's own marker is called, in the place of a robot: no robot can be.
+MARKER = "_"
+#: Characters of a robot's, a group's or a user's name: a bridge calls itself "mqtt:" and that name at its server.
+LONGEST = MAX_NAME - len("mqtt:")
+_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{LONGEST - 1}}}")
+
+#: What stands under a robot's name, beside its events and its own presence, status and echo: all that one may ask.
+REQUEST, SAY, CANCEL = "request", "say", "cancel"
+PRESENCE, STATUS, EVENT, ECHO = "presence", "status", "event", "echo"
+
+
+def fault(name: str) -> str | None:
+    """Return what is wrong with a name of a robot, a group or a user, for people; None where it can be one level."""
+    if _NAME.fullmatch(name):
+        return None
+    return f"must be 1 to {LONGEST} of A-Z a-z 0-9 . _ -, the first of them a letter or a digit"
+
+
+def robot(name: str, *levels: str) -> str:
+    """Return a topic of a robot's."""
+    return "/".join((PREFIX, "robot", name, *levels))
+
+
+def group(name: str, *levels: str) -> str:
+    """Return a topic of a group's."""
+    return "/".join((PREFIX, "group", name, *levels))
+
+
+def reply(user: str, session: str, name: str) -> str:
+    """Return where a robot answers a session of this user's."""
+    return "/".join((PREFIX, "reply", user, session, name))
+
+
+@frozen
+class Asked:
+    """What a topic says of a message that asks a robot for something."""
+
+    #: REQUEST, or SAY or CANCEL, of which the payload is plain text
+    kind: str
+    #: who asks, as the broker's ACL lets nobody else write there
+    user: str
+
+
+def asked(topic: str) -> Asked | None:
+    """Return what a topic that a robot listens to asks for; None where it asks for nothing."""
+    prefix, _, rest = topic.partition("/")
+    levels = rest.split("/")
+    if prefix != PREFIX or len(levels) != 4 or fault(levels[3]):
+        return None
+    whose, _, kind, user = levels
+    known = {"robot": (REQUEST, SAY, CANCEL), "group": (REQUEST,)}.get(whose, ())
+    return Asked(kind, user) if kind in known else None
+
+
+def answer(response: str, user: str, name: str) -> str | None:
+    """Return where a robot answers this user, who named this response topic; None where that is not the user's own.
+
+    Nobody may have a robot publish anywhere else: not to another user, and not to another robot.
+    """
+    levels = response.split("/")
+    if levels[:3] != [PREFIX, "reply", user] or len(levels) not in (4, 5) or fault(levels[3]):
+        return None
+    return reply(user, levels[3], name) if levels[4:] in ([], [name]) else None
+
+
+def access(operators: tuple[str, ...] = ("OPERATOR",)) -> str:
+    """Return what mosquitto's `acl_file` has for all robots, each of which logs in by its own name, and for these.
+
+    An operator's lines are by name: mosquitto applies its patterns to everybody who logs in, so that with a pattern for
+    operators each robot could command the others. What the patterns for robots give to an operator is a robot of the
+    operator's own name, which there is none of, and to read what groups are asked.
+    """
+    lines = [
+        "# Robots: each logs in by its own name, %u, and is heard under that alone.",
+        f"pattern read {robot('%u', REQUEST, '+')}",
+        f"pattern read {robot('%u', SAY, '+')}",
+        f"pattern read {robot('%u', CANCEL, '+')}",
+        f"pattern read {group('+', REQUEST, '+')}",
+        f"pattern readwrite {robot('%u', PRESENCE)}",
+        f"pattern readwrite {robot('%u', ECHO)}",
+        f"pattern write {robot('%u', STATUS)}",
+        f"pattern write {robot('%u', EVENT, '+')}",
+        f"pattern write {reply('+', '+', '%u')}",
+    ]
+    for each in operators:
+        lines += [
+            "",
+            "# An operator, who may ask every robot, and hear what each says: such lines for each login.",
+            f"user {each}",
+            f"topic write {robot('+', REQUEST, each)}",
+            f"topic write {robot('+', SAY, each)}",
+            f"topic write {robot('+', CANCEL, each)}",
+            f"topic write {group('+', REQUEST, each)}",
+            f"topic read {robot('+', PRESENCE)}",
+            f"topic read {robot('+', STATUS)}",
+            f"topic read {robot('+', EVENT, '+')}",
+            f"topic readwrite {reply(each, '+', '+')}",
+        ]
+    return "\n".join(lines)
