@@ -181,7 +181,7 @@ class ClickCommand(_Documented):
         context = click.get_current_context()
         options: Common = context.obj
         options.typed = {each for each in given if context.get_parameter_source(each) is ParameterSource.COMMANDLINE}
-        fault = self.row.fault(given, options.typed)
+        fault = self.row.fault(given, options.typed, options.robot, options.socket)
         if fault:
             raise click.UsageError(fault, context)
         return self.row.carry_out(options, given)
@@ -247,7 +247,7 @@ def talk(context: click.Context) -> None:
 def _first_screen(context: click.Context) -> str:
     """Return what a newcomer needs first; with the prompt below it, it fits a terminal of 24 lines."""
     formatter = context.make_formatter()
-    formatter.write(f"{talk.help}\n\n")
+    formatter.write(f"{talk.help}\n")
     with formatter.indentation():
         _write_lines(_EXAMPLES, formatter)
     talk.format_commands(context, formatter)

@@ -34,6 +34,7 @@ ASKING: Codes = {
     5: "the server has as many clients as it takes",
     9: "this command and the server speak different versions of the protocol",
     10: "permission denied",
+    12: "lost: it was sent, then nothing more was heard; it may have an effect all the same",
 }
 #: All of them, as the README's table has them; each command's help says which are its own.
 ALL_EXIT_CODES: Codes = {
@@ -78,12 +79,33 @@ class Command:
     no_such_option: str = ""
     #: whether a plain line of it is read without click: scripts call most of them all the time
     plain: bool = True
+    #: whether it means a server, which may be a robot's of a fleet, and not this machine alone
+    asks: bool = True
     rule: Rule | None = None
 
-    def fault(self, given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
-        """Return what is wrong with values that each can be read, for people, or None."""
+    def fault(
+        self, given: Mapping[str, Any], typed: AbstractSet[str], robot: str | None = None, socket: str | None = None
+    ) -> str | None:
+        """Return what is wrong with values that each can be read, for people, or None.
+
+        `robot`, `socket`: the options of every command that say whom it means, as they were typed.
+        """
+        if robot is not None and (stray := self._stray(given, robot, socket)):
+            return stray
         refused = (words for each in self.options if (words := each.refusal(given[each.name])))
         return next(refused, None) or (self.rule(given, typed) if self.rule else None)
+
+    def _stray(self, given: Mapping[str, Any], robot: str, socket: str | None) -> str | None:
+        """Return what is wrong with naming a robot, or None."""
+        from talkcli.fleet import topics
+
+        if socket:
+            return "--robot is a robot of a fleet, --socket a server of this machine: leave out one of them"
+        if not self.asks or given.get("output") is not None:
+            what = f"{self.name} --output" if self.asks else self.name
+            return f"'talk {what}' is of this machine alone: leave out --robot"
+        fault = topics.fault(robot)
+        return f"no robot can be called '{robot}': a name {fault}" if fault else None
 
     def carry_out(self, options: Common, given: Mapping[str, Any]) -> int | None:
         """Carry it out with what was given, and return the exit code; None for 0."""
@@ -107,6 +129,14 @@ COMMON = (
         "Socket of the server.  [env var: TALK_SOCKET; default: the usual places, as 'talk doctor' lists]",
         offers="files",
     ),
+    option(
+        "--robot",
+        WORD,
+        "A robot of a fleet, by its broker (TALK_BROKER); not this machine.  [env var: TALK_ROBOT]",
+        metavar="NAME",
+        offers="robots",
+    ),
+    option("--insecure", FLAG, "Send the password to the broker without TLS."),
     option("--json", FLAG, "For programs: one JSON object a line; errors, too."),
     option("-q, --quiet", FLAG, "No ids, no notes."),
 )

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 #: The shells that there is a completion script for, and the units of systemd's.
 SHELLS = ("bash", "zsh", "fish")
 UNITS = ("user", "system", "user-socket", "system-socket")
+BRIDGE_UNITS = ("user", "system")
 
 
 def _timeout(words: str) -> Option:
@@ -138,6 +139,34 @@ def _serve_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
     return None
 
 
+_BRIDGE = (
+    option("--name", WORD, "The robot's name, which no other robot has.", metavar="NAME"),
+    option("--group", WORD, "Groups that it is in besides 'all'; several with commas.", metavar="GROUP"),
+    option(
+        "--allow",
+        WORD,
+        "Requests that are taken from afar.",
+        default="say,cancel,status,wait,log,voices,pause,resume",
+        metavar="LIST",
+    ),
+    option("--no-text", FLAG, "Leave what is said out of status and events."),
+    option(
+        "--print-unit",
+        TEXT,
+        f"Print a systemd unit with these options, and end. One of {', '.join(BRIDGE_UNITS)}; it says where it goes.",
+        metavar="UNIT",
+        choices=BRIDGE_UNITS,
+    ),
+    option("--print-acl", FLAG, "Print who may do what on the broker; for mosquitto's acl_file."),
+)
+
+
+def _bridge_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
+    if given["name"] is None and not given["print_acl"]:
+        return "--name is missing: what the robot is called on the broker"
+    return None
+
+
 _IDS = Option("ids", IDS, metavar=IDS.metavar, offers="goal_ids")
 
 #: The commands, in the order in which help lists them: what a newcomer needs first comes first.
@@ -153,6 +182,7 @@ _ROWS = (
         """,
         runs="serve:serve",
         plain=False,
+        asks=False,
         examples="""
         talk serve --rate 150
         talk serve --player null       no sound, same timing: for simulation and CI
@@ -392,6 +422,8 @@ _ROWS = (
         its turn (20 seconds at most), or without a server by an engine of this command's own, with TALK_PLAYER and
         TALK_VOICE. With --silent it is always that engine, which plays zeros by the server's player: no goal waits,
         and none is in the log.
+
+        With --robot it is the way to a robot of a fleet: broker, certificate, login, rights, the robot's answer.
         """,
         runs="doctor:doctor",
         plain=False,
@@ -399,16 +431,46 @@ _ROWS = (
         talk doctor
         talk doctor --silent                    at night: all of it, without a sound
         ssh robot talk doctor                   the exit code comes back
+        talk doctor --robot anna                what is between here and anna
         talk --json doctor | jq 'select(.state != "done")'
         """,
         exit_codes={
-            0: "a sentence would be heard",
+            0: "a sentence would be heard; with --robot: the robot answers",
             1: "anything not named here; a bug says so",
             2: "usage",
             4: "it would not, as without a server",
             "128+n": "ended by signal n",
         },
         options=(option("--silent", FLAG, "Play half a second of zeros, which is no goal and no sound."),),
+    ),
+    Command(
+        name="bridge",
+        summary="Be a robot on an MQTT broker, in the foreground.",
+        about="""
+        Be the robot of this name on an MQTT broker, in the foreground, until SIGTERM or Ctrl-C.
+
+        Who may write to it there can have it speak, by the server of this machine. Its log is on standard error.
+
+        TALK_BROKER names the broker: mqtts://HOST, or mqtt://HOST without TLS. Beside it are TALK_MQTT_USER and
+        TALK_MQTT_PASSWORD_FILE, and for certificates TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY, all three files.
+        """,
+        runs="bridge:bridge",
+        plain=False,
+        asks=False,
+        examples="""
+        TALK_BROKER=mqtts://broker talk bridge --name anna
+        talk bridge --name anna --group warehouse,night --allow say,cancel
+        talk bridge --name anna --print-unit system   a service for systemd
+        talk bridge --print-acl                       for the broker
+        """,
+        exit_codes={
+            0: "ended by SIGTERM or SIGINT",
+            1: "anything not named here; a bug says so",
+            2: "usage: a setting that is wrong or missing, or paho-mqtt is",
+            11: "another bridge of this name is there already",
+        },
+        options=_BRIDGE,
+        rule=_bridge_rule,
     ),
     Command(
         name="completion",
@@ -421,6 +483,7 @@ _ROWS = (
         """,
         runs="completion:completion",
         plain=False,
+        asks=False,
         examples="""
         eval "$(talk completion bash)"   the last line of ~/.bashrc
         eval "$(talk completion zsh)"    the last line of ~/.zshrc

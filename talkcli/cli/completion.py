@@ -206,6 +206,25 @@ def voices(context: click.Context, _: click.Parameter, incomplete: str) -> Items
     return []
 
 
+def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
+    """Return the robots of the fleet that are there."""
+    options: Common = context.find_root().obj
+    try:
+        broker = options.broker()
+        from talkcli.fleet.roster import roster
+
+        found = roster(broker, PATIENCE)
+    except (TalkError, OSError, ValueError):
+        return []
+    there = [(name, ", ".join(_groups(said)) or "robot") for name, said in sorted(found.items()) if said.get("online")]
+    return _items(there, incomplete)
+
+
+def _groups(presence: JsonObject) -> list[str]:
+    groups = presence.get("groups")
+    return [printable(str(each), _MAX_TEXT) for each in groups] if isinstance(groups, list) else []
+
+
 def files(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
     """Have the shell offer files."""
     return [CompletionItem(incomplete, type="file")]

@@ -19,7 +19,7 @@ from talkcli.client.connect import ask, hello, reach, sender, stand_back
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.option import FLAG, MAX_ID, MAX_NAME
 from talkcli.goals.options import MAX_CHARACTERS, Cancel, Say, bad_key
-from talkcli.paths import named_socket
+from talkcli.paths import named_robot, named_socket
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -119,7 +119,9 @@ def _complete(
         given[argument.name] = tuple(words) if many else next(iter(words), None)
     elif words:
         return None
-    return None if command.fault(given, typed) else Plain(command, given, common, typed)
+    if command.fault(given, typed, common.get("robot"), common.get("socket")):
+        return None
+    return Plain(command, given, common, typed)
 
 
 def carry_out(plain: Plain) -> int:
@@ -146,7 +148,11 @@ def carry_out(plain: Plain) -> int:
 
 
 def asks_at_once(plain: Plain) -> bool:
-    """Whether a command begins with a request, and doesn't read standard input before, which may take any time."""
+    """Whether a command begins with a request to this machine's server, and reads no standard input before, which may
+    take any time.
+    """
+    if named_robot(plain.common.get("robot"), plain.common.get("socket")):
+        return False
     return plain.command.name in _EARLY and not plain.given.get("lines") and plain.given.get("text") != ("-",)
 
 

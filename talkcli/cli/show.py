@@ -11,8 +11,8 @@ import stat
 import sys
 import time
 
-from talkcli import __version__
-from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, EXIT_TIMEOUT, TalkError, limits
+from talkcli import __version__, paths
+from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, EXIT_TIMEOUT, TalkError, UsageError, limits
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from talkcli.client.client import Client
     from talkcli.client.connect import Begun
+    from talkcli.client.connection import Connection
+    from talkcli.fleet.broker import Broker
     from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.events import Event
     from talkcli.terminal.text import Screen
@@ -42,6 +44,8 @@ class Common:
     """What every command is given: the options that all have, and what was done before it is carried out."""
 
     socket: str | None = None
+    robot: str | None = None
+    insecure = False
     json = False
     quiet = False
     #: how far its connection has come already, maybe with its request sent: see `plain`
@@ -65,10 +69,38 @@ class Common:
         """
         from talkcli.client.client import Client
         from talkcli.client.connect import ANSWER_LIMIT
+
+        options = {"patience": min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), **options}
+        robot = paths.named_robot(self.robot, self.socket)
+        if robot:
+            end = None if timeout is None else self.began + timeout
+            return Client.over(self._reach(robot, end=end, **options))
         from talkcli.client.connection import SocketConnection
 
-        options = {"urgent": self.urgent, "patience": min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), **options}
-        return Client.over(SocketConnection(self.socket, begun=self.begun, **options))
+        return Client.over(SocketConnection(self.socket, begun=self.begun, **{"urgent": self.urgent, **options}))
+
+    def broker(self) -> Broker:
+        """Return the broker of the fleet; UsageError where that, or what it needs, is not there."""
+        need_fleet()
+        from talkcli.fleet.broker import from_environment
+
+        return from_environment(os.environ, insecure=self.insecure)
+
+    def _reach(self, robot: str, **options: Any) -> Connection:
+        """Return a connection to a robot of a fleet."""
+        broker = self.broker()
+        from talkcli.fleet.robot import RobotConnection
+
+        options.pop("urgent", None)  # a broker keeps no places for that
+        return RobotConnection(robot, broker, **options)
+
+
+def need_fleet() -> None:
+    """UsageError where what a fleet needs is not installed."""
+    from talkcli.fleet.broker import has_client
+
+    if not has_client():
+        raise UsageError("a fleet needs paho-mqtt: pip install 'talkcli[fleet]'")
 
 
 def ended(command: Callable[[], object], options: Common) -> int:

@@ -334,7 +334,9 @@ class _Tally(threading.Thread):
 
 
 def _own(client: Client) -> list[str]:
-    """Return the ids of all goals of this process that have not ended."""
+    """Return the ids of all goals of this process that have not ended; none where the server is on another machine."""
+    if client._connection.listener is None:
+        return []  # what has this number there is another
     going = unfinished(client.status())
     return [each.id for each in going if each.client is not None and each.client.pid == os.getpid()]
 

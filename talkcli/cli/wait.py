@@ -95,6 +95,10 @@ def give_up(goal: GoalHandle, interrupts: Interrupts, options: Common, shown: Fe
     unknown = ""
     try:
         goal.request_cancel()
+    except ServerUnavailable as error:
+        regardless(shown.aside, f"{goal.id}: could not be cancelled: {error}")
+        return regardless(report, goal.goal, options, shown)
+    try:
         regardless(until_ended, [goal], SILENCE, shown)
     except TimeoutError:
         unknown = f"the server did not confirm within {SILENCE:g} s that it is silent"

@@ -12,6 +12,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.doctor import machine, sentence, server, sound, voice
+from talkcli.doctor.report import HEARD
 from talkcli.engine.players import PLAYERS, is_silent
 from talkcli.engine.synthesizers import is_own
 from talkcli.engine.synthesizers.voices import is_neural
@@ -32,6 +33,8 @@ LIMIT = 20.0
 
 class Examination:
     """One run of the doctor."""
+
+    question = HEARD
 
     def __init__(self, socket: str | None, *, silent: bool, interrupt: Mapping[int, int] | None = None) -> None:
         """`socket`: --socket; `silent`: play the sentence without sound; `interrupt`: what ends it, as in `ready`."""

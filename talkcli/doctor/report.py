@@ -47,6 +47,25 @@ class Finding:
         return {"check": self.check, "state": self.state, "message": self.message, "next": self.next}
 
 
+@frozen
+class Question:
+    """What is to be found out."""
+
+    #: the check without which nothing is proved
+    proof: str
+    #: the answers, for people
+    yes: str
+    no: str
+
+
+#: Of a sentence here; of a robot of a fleet; and of that robot, where it asks itself.
+HEARD = Question(SENTENCE, "a sentence is heard, unless the loudspeaker itself is off", "a sentence would not be heard")
+ANSWERED = Question("bridge", "the robot answers", "the robot would not answer")
+ADMITTED = Question(
+    "rights", "the broker takes what this robot's bridge says", "this robot's bridge would not be heard"
+)
+
+
 def done(check: str, message: str) -> Finding:
     """Return a finding that all is well."""
     return Finding(check, DONE, printable(message))
@@ -68,9 +87,9 @@ def some(names: tuple[str, ...]) -> str:
     return ", ".join(names) if rest <= 1 else f"{', '.join(names[:_SHOWN])} and {rest} more"
 
 
-def heard(findings: Sequence[Finding]) -> bool:
-    """Tell whether a sentence would be heard: one was played, and nothing failed."""
-    return any(each.check == SENTENCE for each in findings) and all(each.state != FAILED for each in findings)
+def heard(findings: Sequence[Finding], question: Question = HEARD) -> bool:
+    """Tell whether a sentence would be heard, or whatever the question is: it was proved, and nothing failed."""
+    return any(each.check == question.proof for each in findings) and all(each.state != FAILED for each in findings)
 
 
 def next_step(findings: Sequence[Finding]) -> str | None:
@@ -92,17 +111,17 @@ def lines(finding: Finding, screen: Screen) -> list[str]:
     return [head + first, *(_INDENT + each for each in rest)]
 
 
-def verdict(findings: Sequence[Finding], screen: Screen) -> str:
+def verdict(findings: Sequence[Finding], screen: Screen, question: Question = HEARD) -> str:
     """Return what it all means, with the one thing to do next on lines of its own."""
-    if heard(findings):
+    if heard(findings, question):
         warned = sum(each.state == WARNING for each in findings)
         seen = "" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings"
-        return f"a sentence is heard, unless the loudspeaker itself is off{seen}"
+        return f"{question.yes}{seen}"
     step = next_step(findings)
     if step is None:
-        return "a sentence would not be heard"
+        return question.no
     room = screen.room(len(_STEP))
-    return "\n".join(["a sentence would not be heard; do this next:", *(_STEP + each for each in _wrapped(step, room))])
+    return "\n".join([f"{question.no}; do this next:", *(_STEP + each for each in _wrapped(step, room))])
 
 
 def _wrapped(text: str, room: int | None) -> list[str]:
