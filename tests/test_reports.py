@@ -6,11 +6,11 @@ import asyncio
 import threading
 from typing import TYPE_CHECKING
 
+from talkcli.daemon import log
 from talkcli.engine import protocol
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import Say
 from talkcli.goals.scheduler import Scheduler
-from talkcli.server import log
 from talkcli.server.speech import AT_ONCE, Speech
 
 if TYPE_CHECKING:

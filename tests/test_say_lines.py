@@ -25,12 +25,6 @@ if TYPE_CHECKING:
 ENDLESS = "never-ends words=1\n"
 
 
-def texts(talk: Talk, *states: str) -> list[str]:
-    """Return the texts of the goals that came to one of these states, in the order in which they did."""
-    known = {each["id"]: each["goal"]["text"] for each in talk.watcher.events() if each.get("goal")}
-    return [known[each["id"]] for each in talk.watcher.events() if each.get("state") in states]
-
-
 class Typing:
     """A client whose standard input stays open."""
 
@@ -74,7 +68,7 @@ def test_each_line_is_a_goal_and_its_id_is_printed(scripted: Talk) -> None:
     scripted.watcher.wait_for_terminal(ids[-1])
     said = ["length=0 one", "length=0 two", "length=0 -x 日本", "length=0 last"]
     assert [scripted.goal(each)["text"] for each in ids] == said
-    assert texts(scripted, "ACTIVE") == said
+    assert scripted.watcher.texts("ACTIVE") == said
 
 
 def test_input_that_never_ends_is_spoken_line_by_line(scripted: Talk) -> None:
@@ -131,7 +125,12 @@ def test_bytes_that_are_no_utf8_are_left_out_and_their_line_is_spoken(scripted: 
         "talk: line 4, column 1: the byte 0xff is not UTF-8, and is not spoken",
         "talk: line 5, column 15: the byte 0xc3 is not UTF-8, and is not spoken",
     ]
-    assert texts(scripted, "ACTIVE") == ["length=0 one", "length=0 t\ufffdw\ufffdo", "\ufffd", "length=0 three\ufffd"]
+    assert scripted.watcher.texts("ACTIVE") == [
+        "length=0 one",
+        "length=0 t\ufffdw\ufffdo",
+        "\ufffd",
+        "length=0 three\ufffd",
+    ]
     assert run_bytes(scripted, data, "-q").stderr == b""
 
 
@@ -208,7 +207,7 @@ def test_lines_wait_for_room_and_none_is_lost(make_talk: MakeTalk, words: list[s
     assert (done.code, done.err) == (0, "")
     ids = done.out.split()
     talk.watcher.wait_for_terminal(ids[-1])
-    assert texts(talk, "SUCCEEDED") == lines
+    assert talk.watcher.texts("SUCCEEDED") == lines
     assert len(set(ids)) == len(lines)
 
 
@@ -271,8 +270,8 @@ def test_line_that_waits_for_room_is_never_spoken_after_the_signal(make_talk: Ma
     code, out, err = typing.end(signal.SIGINT)
     assert code == 130
     assert re.search("line [23] may not have been accepted; what follows it was not sent", err)
-    assert texts(talk, "ACTIVE") == [ENDLESS.rstrip()]
-    assert texts(talk, "PENDING")[:2] == [ENDLESS.rstrip(), "second"]
+    assert talk.watcher.texts("ACTIVE") == [ENDLESS.rstrip()]
+    assert talk.watcher.texts("PENDING")[:2] == [ENDLESS.rstrip(), "second"]
     if "--json" in words:
         last = [json.loads(each) for each in out][-2:]
         states = [each["goal"]["state"] if "event" in each else each["state"] for each in last]
@@ -348,7 +347,7 @@ def test_standard_output_that_was_closed_from_the_start_matters_to_nothing(scrip
     client, _ = piped(scripted, *words, read=False)
     assert client.communicate("length=0 a\n\0\nlength=0 b\n", 10)[1].startswith("talk: line 2: ")
     assert client.returncode == 5
-    scripted.watcher.wait_until(lambda _: texts(scripted, "SUCCEEDED") == ["length=0 a", "length=0 b"])
+    scripted.watcher.wait_until(lambda _: scripted.watcher.texts("SUCCEEDED") == ["length=0 a", "length=0 b"])
 
 
 @pytest.mark.parametrize("words", [["--wait"], ["--wait", "--json"], ["-f"]])
@@ -380,7 +379,7 @@ def test_reader_that_goes_away_stops_no_lines_that_nobody_waits_for(scripted: Ta
         scripted.watcher.wait_for_terminal(lines.readline().strip())
     assert client.communicate("length=0 b\nlength=0 c\n", 10) == ("", "")
     assert client.returncode == 0
-    scripted.watcher.wait_until(lambda _: texts(scripted, "SUCCEEDED") == [f"length=0 {each}" for each in "abc"])
+    scripted.watcher.wait_until(lambda _: scripted.watcher.texts("SUCCEEDED") == [f"length=0 {each}" for each in "abc"])
 
 
 def test_standard_input_that_cannot_be_read_is_told(scripted: Talk) -> None:
@@ -405,4 +404,4 @@ def test_a_thread_that_cannot_be_had_is_told_before_anything_is_read(scripted: T
     done = run([sys.executable, "-c", code], scripted.env)
     assert (done.code, done.out) == (1, ""), done
     assert "no thread can be started to wait for the goals: see 'free', 'ulimit -u'" in done.err
-    assert texts(scripted, "PENDING") == []
+    assert scripted.watcher.texts("PENDING") == []

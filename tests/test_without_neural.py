@@ -16,31 +16,13 @@ from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.engine.test_neural import NEURAL_MODULES
 from tests.support import census, tiny_voice
 from tests.support.processes import children
+from tests.support.spied import imported, spied
 from tests.support.surroundings import needs_packages, short_directory
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-#: Runs first in each Python process, which then writes down what it imports, or tries to.
-SPY = """
-import os, sys
-def spy(event, details):
-    if event == "import":
-        with open(f"{os.environ['SPIED']}/{os.getpid()}", "a") as file:
-            file.write(f"{details[0]}\\n")
-sys.addaudithook(spy)
-"""
-#: … and finds none of these packages; it imports nothing itself, so that nothing else is different.
-HIDING = """
-import sys
-(Path,) = [each for each in sys.meta_path if getattr(each, "__name__", "") == "PathFinder"]
-class Hiding(Path):
-    @classmethod
-    def find_spec(cls, name, *rest):
-        return None if name.partition(".")[0] in {names!r} else super().find_spec(name, *rest)
-sys.meta_path[sys.meta_path.index(Path)] = Hiding
-"""
 #: What neural voices alone have a use for, in whatever process; others of `NEURAL_MODULES` a server needs anyway.
 OWN = {*NEEDED, *(each for each in NEURAL_MODULES if each.startswith("talkcli."))}
 #: kB by which memory differs from one start to the next.
@@ -61,15 +43,11 @@ class Cost:
 
 def measure(directory: Path, *options: str, without: Sequence[str] = ()) -> Cost:
     """Run a server with these options, and clients one after the other, where these packages are not there."""
-    for each in ("site", "spied"):
-        (directory / each).mkdir(parents=True)
-    (directory / "site" / "sitecustomize.py").write_text(SPY + HIDING.format(names=[*without]))
     tiny_voice.put(directory / "voices", "tiny")
     with short_directory() as home:
         os.mkdir(f"{home}/run", 0o700)
         env = environment(home, XDG_RUNTIME_DIR=f"{home}/run", TALK_VOICES=str(directory / "voices"))
-        path = [str(directory / "site"), *filter(None, [env.get("PYTHONPATH")])]
-        env |= {"PYTHONPATH": os.pathsep.join(path), "SPIED": str(directory / "spied")}
+        env = spied(directory, env, without)
         with serving(env, *options) as server:
             for command in COMMANDS:
                 done = run([*TALK, *command], env)
@@ -79,16 +57,16 @@ def measure(directory: Path, *options: str, without: Sequence[str] = ()) -> Cost
             (engine,) = children(pid)
             counted = census.settled(pid, lambda now: now.processes == 2)
             threads = len(os.listdir(f"/proc/{engine}/task"))
-    imported = {int(each.name): frozenset(each.read_text().split()) for each in (directory / "spied").iterdir()}
-    clients = frozenset().union(*(found for each, found in imported.items() if each not in {pid, engine}))
-    return Cost(imported[pid], imported[engine], clients, counted, threads)
+    found = imported(directory)
+    clients = frozenset().union(*(names for each, names in found.items() if each not in {pid, engine}))
+    return Cost(found[pid], found[engine], clients, counted, threads)
 
 
 def test_neither_server_nor_engine_nor_clients_import_start_or_keep_anything_of_it(tmp_path: Path) -> None:
     needs_packages(*NEEDED)
     installed, missing = measure(tmp_path / "with"), measure(tmp_path / "without", without=NEEDED)
     for each in (installed, missing):
-        assert all("talkcli" in imported for imported in (each.server, each.engine, each.clients))
+        assert all("talkcli" in names for names in (each.server, each.engine, each.clients))
         assert (each.server | each.engine | each.clients) & OWN == set()
     assert installed.engine & {*NEURAL_MODULES} == set()
     assert installed.server == missing.server

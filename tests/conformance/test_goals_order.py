@@ -254,7 +254,8 @@ def test_all_hear_of_the_server_s_end_where_it_is_more_than_may_wait_for_them(ma
 COUNTING = """
 import sys
 sys.path.insert(0, {root!r})
-from talkcli.server import log, requests
+from talkcli.daemon import log
+from talkcli.server import requests
 from tests.support import scripted_serve
 let_go = requests.Requests._let_go
 def counted(self):

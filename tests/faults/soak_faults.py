@@ -18,7 +18,7 @@ from tests.support.surroundings import command_line
 
 if TYPE_CHECKING:
     import random
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from tests.support.processes import Talk
     from tests.support.sink import Sink
@@ -30,6 +30,23 @@ _WARM = 3.0
 #: Seconds between two kills of an engine process, and between two where the next one is to be met in its start.
 KILLS = (0.12, 5.0)
 _IN_ITS_START = (0.0, 0.08)
+
+
+def in_turn(
+    kinds: Sequence[Callable[[], None]], chance: random.Random, every: float, over: Callable[[], bool]
+) -> Iterator[Callable[[], None]]:
+    """Yield one of these every so many seconds, more or less, each kind as often as the others, until it is over."""
+    left: list[Callable[[], None]] = []
+    while True:
+        due = time.monotonic() + every * chance.uniform(0.5, 1.5)
+        while time.monotonic() < due:
+            time.sleep(0.1)
+            if over():
+                return
+        if not left:
+            left = list(kinds)
+            chance.shuffle(left)
+        yield left.pop()
 
 
 class Faults:
@@ -74,17 +91,7 @@ class Faults:
         def over() -> bool:
             return enough() or (time.monotonic() >= end and self.done.total() >= least)
 
-        kinds: list[Callable[[], None]] = []
-        while True:
-            due = time.monotonic() + self._every * self._chance.uniform(0.5, 1.5)
-            while time.monotonic() < due:
-                time.sleep(0.1)
-                if over():
-                    return
-            if not kinds:
-                kinds = list(self._kinds)
-                self._chance.shuffle(kinds)
-            kind = kinds.pop()
+        for kind in in_turn(self._kinds, self._chance, self._every, over):
             self.last = kind.__name__
             kind()
             self.done[kind.__name__] += 1

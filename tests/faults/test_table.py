@@ -1,4 +1,4 @@
-"""The table of faults names tests that exist, and every test module of this folder."""
+"""The tables of faults name tests that exist, and that of this folder every test module of it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
+#: The folders that have such a table, in their README.
+FOLDERS = (HERE, ROOT / "tests" / "fleet")
 #: A file, a function, or both: `test_a.py::test_b`; `::test_c` is of the file that was named before it.
 _NAMED = re.compile(r"`((?:tests/)?[\w/]*\.py)?(?:::(\w+))?`")
 
@@ -17,27 +21,28 @@ def functions(path: Path) -> set[str]:
     return {each.name for each in ast.walk(tree) if isinstance(each, ast.FunctionDef)}
 
 
-def rows() -> list[str]:
-    lines = (HERE / "README.md").read_text(encoding="utf-8").splitlines()
+def rows(folder: Path) -> list[str]:
+    lines = (folder / "README.md").read_text(encoding="utf-8").splitlines()
     return [
         each for each in lines if each.startswith("| ") and not re.match(r"\| (---|fault|it covers|line|text) \|", each)
     ]
 
 
-def named(row: str) -> list[tuple[Path, str | None]]:
+def named(folder: Path, row: str) -> list[tuple[Path, str | None]]:
     found: list[tuple[Path, str | None]] = []
     path = None
     for file, function in _NAMED.findall(row.split("|")[2]):
         if file:
-            path = ROOT / file if file.startswith("tests/") else HERE / file
+            path = ROOT / file if file.startswith("tests/") else folder / file
         if path and (file or function):
             found.append((path, function or None))
     return found
 
 
-def test_every_row_names_tests_that_exist() -> None:
-    for row in rows():
-        tests = named(row)
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_every_row_names_tests_that_exist(folder: Path) -> None:
+    for row in rows(folder):
+        tests = named(folder, row)
         assert tests, f"no test: {row}"
         for path, function in tests:
             assert path.is_file(), f"{path} does not exist: {row}"
@@ -47,7 +52,7 @@ def test_every_row_names_tests_that_exist() -> None:
 
 def test_every_module_of_faults_is_named() -> None:
     """Those of the service beside the faults (units, sd_notify) are no rows."""
-    shown = {path.name for row in rows() for path, _ in named(row)}
+    shown = {path.name for row in rows(HERE) for path, _ in named(HERE, row)}
     others = {
         "test_table.py",
         "test_engine_log.py",

@@ -41,9 +41,9 @@ def count(pid: int) -> Census:
     )
 
 
-def settled(pid: int, wanted: Callable[[Census], bool]) -> Census:
+def settled(pid: int, wanted: Callable[[Census], bool], within: float = _SETTLED) -> Census:
     """Return the first count that is as wanted, or the last one: what is closed goes in its own time."""
-    end = time.monotonic() + _SETTLED
+    end = time.monotonic() + within
     while not wanted(found := count(pid)) and time.monotonic() < end:
         time.sleep(0.05)  # that a process or a connection is gone is no event for others
     return found
@@ -52,7 +52,7 @@ def settled(pid: int, wanted: Callable[[Census], bool]) -> Census:
 def assert_as_before(pid: int, before: Census, memory: int) -> Census:
     """Assert that a server has no more processes, descriptors and threads than before, and so many kB more at most."""
     found = settled(pid, lambda now: _fits(now, before))
-    assert _fits(found, before), f"before: {before}; now: {found}; {_told(pid)}"
+    assert _fits(found, before), f"before: {before}; now: {found}; {told(pid)}"
     assert found.memory <= before.memory + memory, f"before: {before}; now: {found}"
     return found
 
@@ -83,8 +83,8 @@ def _own(pid: int) -> int:
     return 0  # it has ended
 
 
-def _told(pid: int) -> str:
-    """Return what a server has, for messages."""
+def told(pid: int) -> str:
+    """Return what a process has, for messages."""
     targets = []
     for each in os.listdir(f"/proc/{pid}/fd"):
         with contextlib.suppress(OSError):

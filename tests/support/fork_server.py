@@ -28,7 +28,10 @@ from typing import Any
 _KILLED_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 #: What belongs to the engine process alone, or writes files when it is run: no client and no server imports it.
 _LEFT_OUT = {f"talkcli.{each}" for each in ("__main__", "engine.main")}
-_PACKAGES = ("cli", "client", "doctor", "engine", "engine.players", "goals", "protocol", "server", "terminal")
+_PACKAGES = (
+    *("cli", "client", "daemon", "doctor", "engine", "engine.players", "fleet", "goals", "protocol", "server"),
+    "terminal",
+)
 
 
 def _import_talk() -> None:

@@ -84,7 +84,64 @@ def run_talk(words: Sequence[str], env: Mapping[str, str], timeout: float) -> tu
     return process.wait(), out, err
 
 
-class Talk:
+class Clients:
+    """Runs clients for a test, in the environment `env`; `log` is what is told of one that goes wrong."""
+
+    def __init__(self) -> None:
+        self._clients: list[Process] = []
+
+    @property
+    def env(self) -> dict[str, str]:
+        """The environment of the clients."""
+        raise NotImplementedError
+
+    @property
+    def log(self) -> str:
+        """What else tells why a client did what it did."""
+        raise NotImplementedError
+
+    def start(self, *words: str, stdin: int = subprocess.DEVNULL) -> Process:
+        """Start a client in the background, its output in pipes; `finish()` waits for it."""
+        client = start_talk(words, self.env, stdin)
+        self._clients.append(client)
+        return client
+
+    def finish(self, client: Process, timeout: float = 20, stdin: str | None = None) -> Finished:
+        """Wait for a client to end; seconds are counted from this call. It never may show a traceback."""
+        began = time.monotonic()
+        assert isinstance(client.args, list)
+        command = tuple(str(each) for each in client.args[2:])
+        try:
+            out, err = client.communicate(stdin, timeout=timeout)
+        except subprocess.TimeoutExpired:
+            client.kill()
+            out, err = client.communicate()
+            raise AssertionError(
+                f"{' '.join(command)} did not end within {timeout} s\nout: {out}\nerr: {err}\nlog: {self.log}"
+            ) from None
+        result = Finished(command, client.wait(), out, err, time.monotonic() - began)
+        assert "Traceback" not in err, f"{' '.join(command)}: {err}"
+        return result
+
+    def run(self, *words: str, timeout: float = 20, stdin: str | None = None) -> Finished:
+        """Run a client to its end: `talk.run("say", "--wait", "--", "battery low")`."""
+        began = time.monotonic()
+        client = self.start(*words, stdin=subprocess.DEVNULL if stdin is None else subprocess.PIPE)
+        done = self.finish(client, timeout, stdin)
+        return Finished(done.command, done.code, done.out, done.err, time.monotonic() - began)
+
+    def _end_clients(self) -> None:
+        for client in self._clients:
+            if client.poll() is None:
+                client.kill()
+            client.wait()
+            for pipe in (client.stdin, client.stdout, client.stderr):
+                if pipe:
+                    with contextlib.suppress(BrokenPipeError):
+                        pipe.close()
+
+
+class Talk(Clients):
     """A server, started, greeted and watched from before its first goal; `stop()` ends it and asserts that all is well.
 
     `unfinished`: ids of goals that may have no terminal event when the watcher is checked (True: any).
@@ -103,9 +160,9 @@ class Talk:
         forked: bool = True,
     ) -> None:
         """`program` serves in the place of `talk serve`; one that is not `forked` shows in /proc what it is."""
+        super().__init__()
         self.unfinished: Collection[str] | bool = False
         self._mark = uuid.uuid4().hex
-        self._clients: list[Process] = []
         self._server: subprocess.Popen[bytes] | Forked | None = None
         self._watcher: Watcher | None = None
         self._recording: Recording | None = None
@@ -192,36 +249,6 @@ class Talk:
         """Tell the scripted engine how each of its next starts goes: see `script`; "" for a plain one."""
         with open(f"{self.directory}/start", "w", encoding="utf-8") as file:
             file.write(behaviour)
-
-    def start(self, *words: str, stdin: int = subprocess.DEVNULL) -> Process:
-        """Start a client in the background, its output in pipes; `finish()` waits for it."""
-        client = start_talk(words, self.env, stdin)
-        self._clients.append(client)
-        return client
-
-    def finish(self, client: Process, timeout: float = 20, stdin: str | None = None) -> Finished:
-        """Wait for a client to end; seconds are counted from this call. It never may show a traceback."""
-        began = time.monotonic()
-        assert isinstance(client.args, list)
-        command = tuple(str(each) for each in client.args[2:])
-        try:
-            out, err = client.communicate(stdin, timeout=timeout)
-        except subprocess.TimeoutExpired:
-            client.kill()
-            out, err = client.communicate()
-            raise AssertionError(
-                f"{' '.join(command)} did not end within {timeout} s\nout: {out}\nerr: {err}\nlog: {self.log}"
-            ) from None
-        result = Finished(command, client.wait(), out, err, time.monotonic() - began)
-        assert "Traceback" not in err, f"{' '.join(command)}: {err}"
-        return result
-
-    def run(self, *words: str, timeout: float = 20, stdin: str | None = None) -> Finished:
-        """Run a client to its end: `talk.run("say", "--wait", "--", "battery low")`."""
-        began = time.monotonic()
-        client = self.start(*words, stdin=subprocess.DEVNULL if stdin is None else subprocess.PIPE)
-        done = self.finish(client, timeout, stdin)
-        return Finished(done.command, done.code, done.out, done.err, time.monotonic() - began)
 
     def status(self) -> float:
         """Return the seconds that `talk status` takes: on an idle server the control of `limits`."""
@@ -311,14 +338,7 @@ class Talk:
             time.sleep(0.01)  # a socket's appearance is no event
 
     def _end(self) -> None:
-        for client in self._clients:
-            if client.poll() is None:
-                client.kill()
-            client.wait()
-            for pipe in (client.stdin, client.stdout, client.stderr):
-                if pipe:
-                    with contextlib.suppress(BrokenPipeError):
-                        pipe.close()
+        self._end_clients()
         if self._server:
             self._server.kill()
             self._server.wait()

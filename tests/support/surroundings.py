@@ -27,13 +27,20 @@ MARK = "TALK_TEST_ID"
 #: What a child may take from the environment of the tests; the user's audio, runtime directory and settings stay out.
 _KEPT = ("PATH", "TMPDIR", "SYSTEMROOT", "LD_LIBRARY_PATH", "COVERAGE_PROCESS_START")
 
+#: Where programs are that run for all of a machine.
+_SYSTEM = "/usr/local/sbin:/usr/sbin:/sbin"
 #: Seconds in which a killed process must be gone.
 _KILL_LIMIT = 2.0
 
 
 def needs(*programs: str) -> None:
     """Skip the test if one of the programs is missing; where CI is set, fail it: there nothing may be skipped."""
-    _skip_without([each for each in programs if shutil.which(each) is None])
+    _skip_without([each for each in programs if find_program(each) is None])
+
+
+def find_program(name: str) -> str | None:
+    """Return the path of a program, one also of one that a user's PATH does not name, as Debian's mosquitto."""
+    return shutil.which(name) or shutil.which(name, path=_SYSTEM)
 
 
 def needs_packages(*names: str) -> None:
@@ -85,6 +92,12 @@ def dying_with_parent(command: list[str]) -> list[str]:
         return command
     needs("setpriv")
     return [shutil.which("setpriv") or "setpriv", "--pdeathsig", "KILL", "--", *command]
+
+
+def stop_child(pid: int) -> None:
+    """Stop a child of this process as it is (SIGSTOP); it has stopped when this returns, or has ended."""
+    os.kill(pid, signal.SIGSTOP)
+    os.waitid(os.P_PID, pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
 
 
 def marked(mark: str) -> list[int]:

@@ -55,6 +55,12 @@ class Watcher:
         """Return the states of a goal in the order of their events."""
         return [each["state"] for each in self.events(goal_id) if each["event"] == "state"]
 
+    def texts(self, *states: str) -> list[str]:
+        """Return the texts of the goals that came to one of these states, in the order in which they did."""
+        events = self.events()
+        known = {each["id"]: each["goal"]["text"] for each in events if each.get("goal")}
+        return [known[each["id"]] for each in events if each.get("state") in states]
+
     def words(self, goal_id: str) -> list[Message]:
         """Return the word events of a goal."""
         return [each for each in self.events(goal_id) if each["event"] == "word"]

@@ -1,0 +1,100 @@
+"""Fixtures: brokers, bridges, and a robot that has both."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any, Protocol
+
+import pytest
+
+from talkcli.fleet import topics
+from tests.fleet.robot import Robot
+from tests.support.bridge import Bridge
+from tests.support.broker import Broker
+from tests.support.processes import Talk
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+
+#: Who may log in at a secure broker, each with a password of its own: two robots, an operator, and one who may nothing.
+ROBOTS, OPERATORS, OTHERS = ("anna", "bert"), ("olga",), ("otto",)
+
+
+class MakeBridge(Protocol):
+    """Starts a bridge for a test: `make_bridge(talk, broker, "anna", "--allow", "say")`; see `Bridge`."""
+
+    def __call__(
+        self,
+        talk: Talk,
+        broker: Broker,
+        name: str,
+        *options: str,
+        groups: Sequence[str] = (),
+        user: str | None = None,
+        password: str | bool = True,
+        cert: str | None = None,
+        observer: str | None = None,
+        port: int | None = None,
+        env: Mapping[str, str] | None = None,
+        online: bool = True,
+    ) -> Bridge:
+        """Return the bridge, online or at least started."""
+        ...
+
+
+@pytest.fixture
+def broker() -> Iterator[Broker]:
+    """A broker without TLS, which lets everybody in, and do anything: what mosquitto does on a machine of its own."""
+    with Broker() as result:
+        yield result
+
+
+@pytest.fixture
+def secure_broker() -> Iterator[Broker]:
+    """A broker with TLS, passwords, and the rules that talk prints for its robots and the operator."""
+    users = {name: f"password of {name}" for name in (*ROBOTS, *OPERATORS, *OTHERS)}
+    with Broker(secure=True, users=users, acl=topics.access(OPERATORS) + "\n") as result:
+        yield result
+
+
+@pytest.fixture
+def make_bridge() -> Iterator[MakeBridge]:
+    """Starts bridges; each that still runs at the end is ended by SIGTERM, and must have gone well.
+
+    A test asks for its broker before, so that this is there until then: it takes their goodbyes.
+    """
+    bridges: list[Bridge] = []
+
+    def make(*words: Any, online: bool = True, **named: Any) -> Bridge:
+        bridge = Bridge(*words, **named)
+        bridges.append(bridge)
+        if online:
+            bridge.await_online()
+        return bridge
+
+    with contextlib.ExitStack() as stack:
+        # Entered before the first bridge and left in reverse: all are closed, whichever fails its check.
+        for_all = stack.enter_context(contextlib.ExitStack())
+        yield lambda *words, **named: for_all.enter_context(contextlib.closing(make(*words, **named)))
+        for bridge in bridges:
+            if bridge.running:
+                code = bridge.terminate()
+                assert code == 0, f"the bridge {bridge.name} ended with {code}: {bridge.log}"
+
+
+@pytest.fixture
+def robot(scripted: Talk, broker: Broker, make_bridge: MakeBridge) -> Robot:
+    """A robot, anna, online, that speaks by a script: for a tenth of a second, or as its texts say."""
+    return Robot(scripted, broker, make_bridge(scripted, broker, "anna"))
+
+
+@pytest.fixture(scope="module")
+def lasting_robot() -> Iterator[Robot]:
+    """A robot as `robot` is one, for all tests of a module that leave it as it is."""
+    with Broker() as broker, contextlib.closing(Talk(scripted=True)) as talk:
+        with Bridge(talk, broker, "anna") as bridge:
+            bridge.await_online()
+            yield Robot(talk, broker, bridge)
+            assert bridge.terminate() == 0, bridge.log
+        talk.stop()

@@ -1,0 +1,217 @@
+"""Bridge, broker, server or network goes away, and comes back: each is told in time, and each result once."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.client.client import Client
+from tests.fleet.robot import LONG, Robot
+from tests.support.bridge import Desk
+from tests.support.mqtt import Listener
+from tests.support.proxy import Proxy
+from tests.support.surroundings import needs_packages
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.fleet.conftest import MakeBridge
+    from tests.support.broker import Broker
+    from tests.support.processes import Finished
+    from tests.support.proxy import Way
+
+#: Seconds in which a desk knows that a bridge was killed, and that the network of a robot is gone.
+KILLED, CUT_OFF = 1.0, 20.0
+#: Seconds in which all are back once a broker is, and those for which a desk waits for that.
+BACK, ABSENCE = 15.0, 30.0
+#: Seconds for which the broker keeps that a robot is online.
+EXPIRY = 150
+
+
+def assert_one_result(done: Finished) -> None:
+    """Assert that a `--json say --wait` was told one result, that all was played."""
+    assert done.code == 0, done
+    told = [json.loads(line) for line in done.out.splitlines()]
+    assert [each["state"] for each in told] == ["SUCCEEDED"], done
+
+
+@pytest.mark.parametrize(("text", "over"), [("length=0.5 long", False), ("short", True)])
+def test_a_bridge_that_is_killed_is_offline_within_a_second_and_the_next_tells_the_result(
+    robot: Robot, text: str, over: bool
+) -> None:
+    """bridge killed"""
+    with robot.listen() as listener, Desk(robot.broker) as somebody:
+        asked = somebody.start("--robot", "anna", "--json", "say", "--wait", "--id", "mine", "--", text)
+        robot.talk.watcher.wait_for("mine", "ACTIVE")
+        with limits():
+            killed = time.monotonic()
+            robot.bridge.kill()
+            offline = listener.await_message(robot.is_offline)
+            assert_within(offline.arrived - killed, KILLED, "OFFLINE after the bridge was killed")
+        if over:  # before the next bridge is there
+            robot.talk.watcher.wait_for_terminal("mine")
+        robot.bridge.start()
+        robot.bridge.await_online()
+        assert_one_result(somebody.finish(asked))
+    assert robot.spoken == [text]
+
+
+@pytest.mark.slow
+def test_a_robot_whose_network_is_gone_is_offline_within_20_seconds(
+    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
+) -> None:
+    """network gone"""
+    with Proxy(broker.port) as proxy:
+        talk = make_talk(scripted=True)
+        robot = Robot(talk, broker, make_bridge(talk, broker, "anna", port=proxy.port))
+        with robot.listen() as listener:
+            gone = time.monotonic()
+            proxy.hold()
+            offline = listener.await_message(robot.is_offline, within=CUT_OFF + 5)
+            assert_within(offline.arrived - gone, CUT_OFF, "OFFLINE without a network")
+            proxy.cut()
+            proxy.release()
+            listener.await_message(lambda each: robot.is_online(each) and each.arrived > offline.arrived, within=BACK)
+        assert robot.desk("say", "--wait", "back").code == 0
+
+
+def test_a_broker_that_is_killed_in_mid_sentence_costs_no_result(robot: Robot) -> None:
+    """broker killed in mid-sentence"""
+    with Desk(robot.broker) as somebody:
+        asked = somebody.start("--robot", "anna", "--json", "say", "--wait", "--id", "mine", "--", "length=0.5 long")
+        robot.talk.watcher.wait_for("mine", "ACTIVE")
+        robot.broker.kill()
+        assert robot.talk.run("say", "one of its own").code == 0
+        robot.bridge.await_log("no broker")  # it has tried to come back
+        robot.broker.start()
+        with limits():
+            up = time.monotonic()
+            assert_one_result(somebody.finish(asked, timeout=BACK + 10))
+            assert_within(time.monotonic() - up, BACK, "the result after the broker was back")
+        robot.bridge.await_online(within=BACK)
+        assert robot.desk("say", "--wait", "back").code == 0
+    assert robot.spoken == ["length=0.5 long", "one of its own", "back"]
+
+
+@pytest.mark.parametrize("way", ["to_client", "to_broker"])
+def test_a_goal_whose_acceptance_was_lost_on_the_way_is_asked_for_and_spoken_once(robot: Robot, way: Way) -> None:
+    """broker killed in mid-sentence"""
+    with Proxy(robot.broker.port) as proxy, desk_of(robot, proxy.port) as client:
+        proxy.hold(way)
+        said: list[str] = []
+        saying = threading.Thread(target=lambda: said.append(client.say("only once").wait().state.name))
+        saying.start()
+        if way == "to_client":
+            robot.talk.watcher.wait_for(None, "SUCCEEDED")
+        proxy.cut()
+        proxy.release()
+        saying.join(BACK)
+        assert said == ["SUCCEEDED"]
+    assert robot.spoken == ["only once"]
+
+
+def desk_of(robot: Robot, port: int) -> Client:
+    """Return a client of the robot, which comes to the broker by that port."""
+    needs_packages("paho")
+    from talkcli.fleet.broker import from_environment
+    from talkcli.fleet.robot import RobotConnection
+
+    found = from_environment({"TALK_BROKER": robot.broker.url_at(port), "TALK_MQTT_USER": "olga"})
+    return Client.over(RobotConnection(robot.name, found))
+
+
+@pytest.mark.slow
+def test_a_broker_that_does_not_come_back_is_given_up_after_half_a_minute(robot: Robot) -> None:
+    """broker killed in mid-sentence"""
+    with Desk(robot.broker) as somebody:
+        asked = somebody.start("--robot", "anna", "say", "--wait", "--", "length=4 long")
+        robot.talk.watcher.wait_for(None, "ACTIVE")
+        with limits():
+            robot.broker.kill()
+            done = somebody.finish(asked, timeout=ABSENCE + 10)
+            assert_within(done.seconds, ABSENCE + 1, "giving up")
+        assert done.seconds > ABSENCE - 1
+    assert done.code == 12, done
+    assert f"broker at {robot.broker.url}" in done.err
+    robot.talk.watcher.wait_for(None, "SUCCEEDED")
+
+
+def test_a_server_that_is_killed_is_told_at_once_and_so_is_the_next(robot: Robot) -> None:
+    """server dead, bridge alive"""
+    with robot.listen() as listener:
+        killed = time.monotonic()
+        robot.talk.kill()
+        without = listener.await_message(robot.is_without_server)
+        assert without.arrived - killed < KILLED
+        done = robot.desk("say", "hello")
+        assert (done.code, done.out) == (3, ""), done
+        assert "anna has no talk server at this moment: nothing was sent" in done.err
+        robot.talk.start_server()
+        listener.await_message(lambda each: robot.is_online(each) and each.json["server"]["pid"] == robot.talk.pid)
+    assert robot.desk("say", "--wait", "back").code == 0
+    assert robot.spoken == ["back"]
+
+
+def test_a_server_that_is_killed_under_a_desk_that_waits_has_lost_the_goal(robot: Robot) -> None:
+    """server dead, bridge alive"""
+    with Desk(robot.broker) as somebody:
+        asked = somebody.start("--robot", "anna", "say", "--wait", "--", LONG)
+        robot.talk.watcher.wait_for(None, "ACTIVE")
+        robot.talk.kill()
+        done = somebody.finish(asked)
+    assert done.code == 12, done
+    assert "lost" in done.err
+
+
+def test_a_robot_that_ends_says_goodbye(robot: Robot) -> None:
+    """robot offline"""
+    with robot.listen() as listener:
+        assert robot.bridge.terminate() == 0
+        listener.await_message(robot.is_offline)
+        with Listener(robot.broker, robot.presence) as later:
+            kept = later.await_message(robot.is_offline)
+            assert (kept.retain, kept.expiry) == (True, None)  # so that who is missing is seen
+        listener.publish(robot.presence, b"")  # which comes behind all that the bridge has said
+        listener.await_message(lambda each: not each.payload)
+        assert [each.json["online"] for each in listener.messages if each.payload] == [True, False]
+
+
+def test_that_a_robot_is_online_is_kept_for_a_while_and_not_for_ever(lasting_robot: Robot) -> None:
+    """robot dies while the broker is away"""
+    with lasting_robot.listen() as listener:
+        online = listener.messages[0]
+        assert online.expiry is not None
+        assert EXPIRY - 20 < online.expiry <= EXPIRY
+
+
+def test_a_goal_of_a_desk_that_is_interrupted_is_cancelled_at_the_robot(lasting_robot: Robot) -> None:
+    """a desk that goes away"""
+    with Desk(lasting_robot.broker) as somebody:
+        asked = somebody.start("--robot", "anna", "say", "--wait", "--id", "interrupted", "--", LONG)
+        lasting_robot.talk.watcher.wait_for("interrupted", "ACTIVE")
+        asked.send_signal(signal.SIGINT)
+        assert somebody.finish(asked).code == 130
+        assert lasting_robot.talk.goal("interrupted")["state"] == "PREEMPTED"
+
+
+def test_a_goal_of_a_desk_whose_time_is_over_is_cancelled_at_the_robot(lasting_robot: Robot) -> None:
+    """a desk that goes away"""
+    done = lasting_robot.desk("say", "--wait", "--timeout", "0.5", "--id", "too-late", "--", LONG)
+    assert done.code == 124, done
+    assert lasting_robot.talk.goal("too-late")["state"] == "PREEMPTED"
+
+
+def test_a_goal_of_a_desk_whose_reader_went_away_is_cancelled_at_the_robot(lasting_robot: Robot) -> None:
+    """a desk that goes away"""
+    with Desk(lasting_robot.broker) as somebody:
+        asked = somebody.start("--robot", "anna", "say", "--wait", "--feedback", "--id", "unread", "--", LONG)
+        lasting_robot.talk.watcher.wait_for("unread", "ACTIVE")
+        assert asked.stdout
+        asked.stdout.close()
+        assert asked.wait(10) == 141
+        assert lasting_robot.talk.goal("unread")["state"] == "PREEMPTED"

@@ -1,0 +1,229 @@
+"""How long a robot's askers have their places, and what they may hold: with a real server, and no broker."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.fleet.house import House
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+#: Seconds without a line of an asker's after which it is gone.
+GONE = 90.0
+
+
+@pytest.fixture
+def talk(make_talk: MakeTalk) -> Talk:
+    """A silent server that holds its speech."""
+    talk = make_talk("--player", "null")
+    talk.request("pause")
+    return talk
+
+
+@pytest.fixture
+def pass_time(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Moves on the clock of the event loop that runs."""
+    passed = 0.0
+
+    def move(seconds: float) -> None:
+        nonlocal passed
+        passed += seconds
+        monkeypatch.setattr(asyncio.get_running_loop(), "time", lambda: time.monotonic() + passed)
+
+    return move
+
+
+def say(number: int, **more: object) -> dict[str, object]:
+    return {"seq": number, "request": "say", "text": f"sentence {number}", **more}
+
+
+# Who is gone
+
+
+@pytest.mark.parametrize("waits", ["for room", "for a result", "for events"])
+def test_an_asker_that_says_nothing_is_gone_whatever_it_waits_for(
+    talk: Talk, pass_time: Callable[[float], None], waits: str
+) -> None:
+    async def run() -> None:
+        house = House(talk.socket)
+        if waits == "for room":
+            for each in range(20):
+                await house.ask(say(each), "s2")
+            house.post(say(100, patient=True, wait=True, id="patient"))
+            await house.ask({"seq": 101, "request": "hello"})
+            assert [ask.seq for ask, _ in house.askers.waiting] == [100]
+        elif waits == "for a result":
+            await house.ask(say(100, wait=True))
+        else:
+            await house.ask({"seq": 100, "request": "watch"})
+        for _ in range(8):  # what it is told is no sign of its life
+            pass_time(11)
+            house.askers.beat()
+            if waits == "for events":
+                await house.ask(say(1), "s3")
+        assert not [each for each in house.lines() if each.get("event") == "gone"]
+        pass_time(GONE - 88 + 0.1)
+        house.askers.beat()
+        assert "says hello every 30 s" in house.lines()[-1]["message"]
+        assert house.askers.waiting == []
+        before = len(house.lines())
+        await house.ask({"seq": 1, "request": "cancel"}, "s4")
+        assert len(house.lines()) == before
+        house.askers.hang_up_all()
+
+    asyncio.run(run())
+
+
+def test_an_asker_that_says_hello_keeps_what_it_waits_for(talk: Talk, pass_time: Callable[[float], None]) -> None:
+    async def run() -> None:
+        house = House(talk.socket)
+        goal = await house.ask(say(1, wait=True))
+        for each in range(2, 8):
+            pass_time(30)
+            house.askers.beat()
+            await house.ask({"seq": each, "request": "hello"})
+        await house.ask({"seq": 10, "request": "cancel"})
+        ended = await house.line(lambda each: each.get("event") == "result")
+        assert ended["goal"]["id"] == goal["goal"]["id"]
+        house.askers.hang_up_all()
+
+    asyncio.run(run())
+
+
+def test_an_asker_to_whom_nothing_is_owed_is_let_go_without_a_word(
+    talk: Talk, pass_time: Callable[[float], None]
+) -> None:
+    async def run() -> None:
+        house = House(talk.socket)
+        await house.ask({"seq": 1, "request": "status"})
+        told = house.lines()
+        pass_time(GONE + 0.1)
+        house.askers.beat()
+        before = talk.request("status")["server"]["clients"]
+        end = time.monotonic() + 5
+        while talk.request("status")["server"]["clients"] >= before:
+            assert time.monotonic() < end, "the connection to the server is kept"
+            await asyncio.sleep(0.01)  # the server tells nobody that a client has left
+        assert house.lines() == told
+
+    asyncio.run(run())
+
+
+# Who makes place
+
+
+def test_for_a_cancel_the_one_makes_place_that_has_said_nothing_for_longest(
+    talk: Talk, pass_time: Callable[[float], None]
+) -> None:
+    async def run() -> None:
+        house = House(talk.socket)
+        for each in range(32):
+            await house.ask({"seq": 1, "request": "watch"}, f"w{each}")
+            pass_time(0.1)
+        await house.ask({"seq": 2, "request": "hello"}, "w0")
+        assert (await house.ask({"seq": 3, "request": "log"}, "another"))["error"]["code"] == "busy"
+        assert (await house.ask({"seq": 3, "request": "cancel"}, "urgent"))["ok"]
+        await house.ask(say(4), "w0")
+        for each in range(32):
+            gone = [line for line in house.lines(f"w{each}") if line.get("event") == "gone"]
+            assert bool(gone) == (each == 1), each
+        assert (await house.ask({"seq": 4, "request": "status"}, "urgent"))["ok"]  # in the place that it has
+        assert (await house.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # to which nothing is owed now
+        await house.ask({"seq": 5, "request": "cancel"}, "w0")
+        house.askers.hang_up_all()
+
+    asyncio.run(run())
+
+
+# What they may hold
+
+
+def test_those_who_come_and_go_at_a_server_that_hangs_are_not_all_in_its_way() -> None:
+    """What it takes to connect can't be interrupted: it ends when it does, and who has gone before is not connected."""
+
+    async def run() -> None:
+        with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
+            listening.bind(f"{directory}/s")
+            listening.listen(256)
+            listening.settimeout(5)
+            house = House(f"{directory}/s")
+            before = threading.active_count()
+            for _ in range(100):
+                for each in range(3):
+                    house.post({"seq": 1, "request": "status"}, f"s{each}")
+                    await asyncio.sleep(0)  # so that it begins
+                    house.post(b"", f"s{each}")
+            assert threading.active_count() - before == 32
+            for _ in range(32):
+                listening.accept()[0].close()
+            house.post({"seq": 2, "request": "status"})
+            (await asyncio.to_thread(listening.accept))[0].close()
+            answer = await house.line(lambda each: each.get("seq") == 2)
+            assert answer["error"]["code"] == "no_server"
+            listening.setblocking(False)
+            with pytest.raises(BlockingIOError):
+                listening.accept()
+
+    asyncio.run(run())
+
+
+def test_all_together_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Talk) -> None:
+    async def run() -> None:
+        house = House(talk.socket)
+        for each in range(20):
+            await house.ask(say(each), "full")
+        long = {"text": "a", "patient": True, "data": {"more": "x" * 900}}
+        blanks = b" " * 60_000
+        line = json.dumps({"seq": 1, "request": "say", **long}).encode()
+        refused = []
+        for session in range(3):
+            for _ in range(40):
+                house.post(line + blanks, f"s{session}")
+            await house.ask({"seq": 2, "request": "hello"}, f"s{session}")
+            refused.append([each for each in house.lines(f"s{session}") if each.get("ok") is False])
+        assert [bool(each) for each in refused] == [False, True, True]
+        assert {each["error"]["code"] for each in refused[1]} == {"busy"}
+        assert (4 << 20) - 61_000 < house.askers.held() <= 4 << 20
+        assert (await house.ask({"seq": 3, "request": "cancel"}, "another"))["ok"]
+        assert house.askers.held() == 0
+        house.askers.hang_up_all()
+
+    asyncio.run(run())
+
+
+def test_a_goal_that_is_turned_away_is_told_of_without_its_words_where_they_are_too_long(talk: Talk) -> None:
+    async def run() -> None:
+        house = House(talk.socket, room=3_000)
+        for each in range(20):
+            await house.ask(say(each), "full")
+        goal = (await house.ask(say(1, text="long " * 1_000, wait=True)))["goal"]
+        assert (goal["state"], goal["reason"], goal["text"]) == ("REJECTED", "queue_full", None)
+        ended = await house.line(lambda each: each.get("event") == "result")
+        assert ended["goal"] == goal
+        await house.ask({"seq": 2, "request": "cancel"})
+        house.askers.hang_up_all()
+
+    asyncio.run(run())
+
+
+def test_what_is_too_long_without_words_too_is_told_to_be(talk: Talk) -> None:
+    async def run() -> None:
+        house = House(talk.socket, room=300)
+        reply = await house.ask({"seq": 1, "request": "status"})
+        assert (reply["ok"], reply["error"]["code"]) == (False, "too_long")
+        assert (await house.ask({"seq": 2, "request": "cancel"}))["count"] == 0
+        house.askers.hang_up_all()
+
+    asyncio.run(run())

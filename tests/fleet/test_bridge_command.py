@@ -1,0 +1,213 @@
+"""`talk bridge` as a command: what it refuses, what it prints, what a supervisor is told, and who may do what."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.fleet import topics
+from tests.conformance.bareserve import TALK, environment, run, serving
+from tests.faults.supervisor import Supervisor
+from tests.fleet.asker import Asker
+from tests.support.spied import spied
+from tests.support.surroundings import needs, short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from tests.conftest import MakeTalk
+    from tests.fleet.conftest import MakeBridge
+    from tests.support.broker import Broker
+    from tests.support.processes import Talk
+
+BROKER = "mqtt://127.0.0.1:1"
+
+
+@pytest.fixture
+def home() -> Iterator[str]:
+    with short_directory() as path:
+        yield path
+
+
+@pytest.fixture
+def talk(make_talk: MakeTalk) -> Talk:
+    return make_talk(scripted=True)
+
+
+def bridge(home: str, *words: str, **extra: str) -> tuple[int, str, str]:
+    done = run([*TALK, "bridge", *words], environment(home, **extra))
+    return done.code, done.out, done.err
+
+
+# What it refuses
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "--name is missing"),
+        (["--name", "a/b"], "--name: the name 'a/b' can't be in a topic, it must be 1 to 59 of A-Z"),
+        (["--name", "+"], "--name: the name '+' can't be"),
+        (["--name", "anna", "--group", "day,#"], "--group: the name '#' can't be"),
+        (["--name", "anna", "--group", "day,"], "--group: the name '' can't be"),
+        (["--name", "anna", "--allow", "say,cancle"], "--allow: no request is called 'cancle': did you mean 'cancel'?"),
+        (["--name", "anna", "--allow", "xyz"], "--allow: no request is called 'xyz': there are say, wait, cancel"),
+        (["--name", "anna", "--print-unit", "launchd"], "--print-unit: 'launchd' is not one of"),
+        (["--name", "anna"], "which broker? TALK_BROKER is not set"),
+        (["anna"], "'talk bridge' takes options alone: what is 'anna'?"),
+    ],
+)
+def test_what_is_wrong_is_named_with_the_next_step(home: str, words: list[str], said: str) -> None:
+    code, out, err = bridge(home, *words)
+    assert (code, out) == (2, "")
+    assert said in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("env", "said"),
+    [
+        ({"TALK_BROKER": "http://broker"}, "TALK_BROKER is no broker's URL"),
+        ({"TALK_BROKER": "mqtts://broker", "TALK_MQTT_CA": "/nowhere"}, "TALK_MQTT_CA: /nowhere: No such file"),
+    ],
+)
+def test_settings_that_can_never_work_end_it_at_its_start(home: str, env: dict[str, str], said: str) -> None:
+    code, out, err = bridge(home, "--name", "anna", **env)
+    assert (code, out) == (2, "")
+    assert said in err
+
+
+def test_what_to_install_is_said_and_what_needs_none_of_it_is_printed(home: str, tmp_path: Path) -> None:
+    env = spied(tmp_path, environment(home, TALK_BROKER=BROKER), ["paho"])
+    done = run([*TALK, "bridge", "--name", "anna"], env)
+    assert (done.code, done.out) == (2, "")
+    assert done.err == "talk: a fleet needs paho-mqtt: pip install 'talkcli[fleet]'\n"
+    for words in (["--print-acl"], ["--name", "anna", "--print-unit", "user"]):
+        done = run([*TALK, "bridge", *words], env)
+        assert (done.code, done.err) == (0, ""), done
+        assert done.out
+
+
+# What it prints
+
+
+def test_the_acl_is_printed(home: str) -> None:
+    assert bridge(home, "--print-acl") == (0, topics.access() + "\n", "")
+
+
+def printed(home: str, name: str, *options: str) -> str:
+    code, out, _ = bridge(home, "--name", "anna", *options, "--print-unit", name)
+    assert code == 0
+    return out
+
+
+def values(unit: str, name: str) -> list[str]:
+    return re.findall(rf"^{name}=(.*)$", unit, re.MULTILINE)
+
+
+def command_of(unit: str) -> list[str]:
+    (line,) = values(unit, "ExecStart")
+    return [each.replace("%%", "%").replace("$$", "$") for each in shlex.split(line)]
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "environment_file"),
+    [
+        ("user", "~/.config/systemd/user", "%h/.config/talk/bridge.env"),
+        ("system", "/etc/systemd/system", "/etc/talk/bridge.env"),
+    ],
+)
+def test_a_unit_says_where_it_and_its_environment_go(home: str, name: str, folder: str, environment_file: str) -> None:
+    unit = printed(home, name)
+    head = unit.partition("\n[Unit]\n")[0].splitlines()
+    assert head[0].startswith(f"# {folder}/talk-bridge.service: ")
+    assert any(f"talk bridge --name NAME --print-unit {name} " in each for each in head)
+    assert any(environment_file.replace("%h", "~") in each for each in head)
+    assert any("daemon-reload" in each and "enable --now talk-bridge" in each for each in head)
+    assert all(each.startswith("#") and len(each) <= 120 for each in head)
+    assert values(unit, "EnvironmentFile") == [environment_file]
+    assert values(unit, "Type") == ["notify"]
+    assert values(unit, "WatchdogSec") == ["30"]
+    assert values(unit, "Restart") == ["on-failure"]
+    assert values(unit, "RestartPreventExitStatus") == ["2"]  # not 11: the other of its name may go
+    assert (values(unit, "RestartSec"), values(unit, "StartLimitIntervalSec")) == (["10"], ["0"])
+    assert values(unit, "RestrictAddressFamilies") == ["AF_UNIX AF_INET AF_INET6"]
+    assert "\n[Install]\nWantedBy=" in unit
+
+
+def test_the_systems_unit_has_the_network_the_servers_socket_and_little_else(home: str) -> None:
+    unit = printed(home, "system")
+    assert values(unit, "User") == ["talk-bridge"]
+    assert values(unit, "Group") == ["audio"]
+    assert not values(unit, "PrivateNetwork") + values(unit, "IPAddressDeny") + values(unit, "DeviceAllow")
+    assert values(unit, "PrivateDevices") == ["yes"]
+    assert "/run/talk/talk.sock" in unit
+
+
+@pytest.mark.parametrize("name", ["user", "system"])
+def test_a_units_command_has_the_options_that_were_given(home: str, name: str) -> None:
+    command = command_of(printed(home, name, "--group", "a,b", "--no-text", "--insecure", "--socket", "/run/other"))
+    assert os.path.isabs(command[0])
+    assert command[-6:] == ["bridge", "--insecure", "--socket=/run/other", "--name=anna", "--group=a,b", "--no-text"]
+    assert command_of(printed(home, name))[-2:] == ["bridge", "--name=anna"]
+
+
+@pytest.mark.parametrize("name", ["user", "system"])
+def test_systemd_finds_nothing_wrong(home: str, name: str) -> None:
+    needs("systemd-analyze")
+    with open(f"{home}/talk-bridge.service", "w", encoding="utf-8") as file:
+        file.write(printed(home, name))
+    scope = ["--user"] if name == "user" else []
+    done = run(
+        ["systemd-analyze", *scope, "verify", "--man=no", f"{home}/talk-bridge.service"],
+        environment(home, XDG_RUNTIME_DIR=home),
+    )
+    assert (done.code, done.err) == (0, ""), done
+
+
+# What a supervisor is told
+
+
+def test_a_supervisor_is_told_how_it_is_whether_a_broker_is_there_or_not(home: str, talk: Talk, broker: Broker) -> None:
+    broker.kill()
+    with Supervisor(f"{home}/n") as supervisor:
+        own = {"NOTIFY_SOCKET": supervisor.address, "WATCHDOG_USEC": "1000000"}
+        command = command_of(printed(home, "system"))
+        with subprocess.Popen(
+            command, env=talk.env | broker.env() | own, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
+        ) as process:
+            try:
+                ready = supervisor.wait_for("READY", "1")
+                supervisor.wait_for("STATUS", "OFFLINE, server there, 0 goals pending")
+                broker.start()
+                supervisor.wait_for("STATUS", f"anna at {broker.url}: online, server there", since=ready)
+                talk.request("pause")
+                with Asker(broker) as asker:
+                    asker.say("a secret")
+                    pending = supervisor.wait_for("STATUS", "1 goal pending")
+                    asker.ask("cancel")
+                supervisor.wait_for("STATUS", "0 goals pending", since=pending)
+                supervisor.wait_for("WATCHDOG", "1", since=pending)
+                assert not any("secret" in value for _, value, _ in supervisor.told)
+                process.send_signal(signal.SIGINT)
+                supervisor.wait_for("STOPPING", "1")
+                assert process.wait(5) == 0
+            finally:
+                process.kill()
+            assert process.stderr
+            assert "Traceback" not in process.stderr.read()
+
+
+def test_it_goes_to_the_socket_that_is_named(home: str, talk: Talk, broker: Broker, make_bridge: MakeBridge) -> None:
+    with serving(environment(home, TALK_SOCKET=f"{home}/s")):
+        make_bridge(talk, broker, "berta", "--socket", f"{home}/s")
+        with Asker(broker) as asker:
+            asker.send({"seq": 1, "request": "status"}, to="talk/robot/berta")
+            assert asker.reply(1)["server"]["socket"] == f"{home}/s"

@@ -1,0 +1,245 @@
+"""A command at the desk says what it says at the robot, byte for byte; it goes to no other place, and ends alike."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import signal
+import socket
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.fleet.robot import LONG, Robot
+from tests.support.bridge import Bridge, Desk
+from tests.support.broker import Broker
+from tests.support.processes import Talk
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.conftest import MakeTalk
+    from tests.fleet.conftest import MakeBridge
+    from tests.support.processes import Clients, Finished, Process
+
+ALLOW = ("--allow", "say,cancel,status,wait,log,voices,pause,resume,set")
+#: What passes between two commands: how long the server is up.
+_UPTIME = re.compile(r'up \d+ s|"uptime": [\d.]+')
+
+
+@pytest.fixture(scope="module")
+def open_robot() -> Iterator[Robot]:
+    """A robot of which all may be asked, which has spoken."""
+    with Broker() as broker, contextlib.closing(Talk(["--player", "null", "--rate", "450"])) as talk:
+        with Bridge(talk, broker, "anna", *ALLOW) as bridge:
+            bridge.await_online()
+            assert talk.run("say", "--wait", "--id", "old", "--key", "door", "hello").code == 0
+            assert talk.run("say", "--id", "bad", "--rate", "9999", "hello").code != 0
+            yield Robot(talk, broker, bridge)
+            assert bridge.terminate() == 0, bridge.log
+        talk.stop()
+
+
+def told(done: Finished) -> tuple[int, str, str]:
+    return done.code, _UPTIME.sub("", done.out), _UPTIME.sub("", done.err)
+
+
+def assert_alike(robot: Robot, *words: str, stdin: str | None = None) -> Finished:
+    """Run a command at the robot and at the desk, and assert that it tells the same; return it as the desk tells it."""
+    at_home = robot.talk.run(*words, stdin=stdin)
+    with Desk(robot.broker) as somebody:
+        afar = somebody.run("--robot", robot.name, *words, stdin=stdin)
+    assert told(afar) == told(at_home)
+    return afar
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("status", 0),
+        ("--json status", 0),
+        ("status old", 0),
+        ("--json status old", 0),
+        ("status nothing", 8),
+        ("--json status nothing", 8),
+        ("log", 0),
+        ("--json log -n 5", 0),
+        ("voices", 0),
+        ("--json voices --language en", 0),
+        ("voices --language xx", 1),
+        ("set", 0),
+        ("--json set", 0),
+        ("set --rate 450", 0),
+        ("set --rate 9999", 2),
+        ("set --voice nobody", 2),
+        ("pause", 0),
+        ("--json pause", 0),
+        ("resume", 0),
+        ("--json resume", 0),
+        ("wait", 0),
+        ("wait old", 0),
+        ("--json wait -f old", 0),
+        ("wait old nothing", 8),
+        ("cancel", 0),
+        ("cancel old", 0),
+        ("--json cancel --key door", 0),
+        ("cancel nothing", 8),
+        ("say --rate 9999 hello", 2),
+        ("say -w --id old hello", 0),
+        ("--json say -wf --id old hello", 0),
+        ("say --id -x hello", 2),
+        ("-q say --throttle 60 --key door hello", 0),
+    ],
+)
+def test_a_command_says_what_it_says_at_the_robot(open_robot: Robot, line: str, code: int) -> None:
+    done = assert_alike(open_robot, *line.split())
+    assert done.code == code, done
+
+
+def test_what_is_said_is_told_alike_while_it_is_spoken(open_robot: Robot) -> None:
+    """But for its id and the times of its words."""
+    shown: list[tuple[int, str, str]] = []
+    for client in (open_robot.talk, Desk(open_robot.broker, env={"TALK_ROBOT": "anna"})):
+        with contextlib.nullcontext(client) if isinstance(client, Talk) else client:
+            for line in ("say -w", "say -wf", "say -w -"):
+                goal = f"goal-{len(shown)}"
+                text = [] if line.endswith("-") else ["--", "go on"]
+                stdin = None if text else "go on\n"
+                done = client.run(*line.split(), "--id", goal, *text, stdin=stdin)
+                assert done.code == 0, done
+                shown.append((done.code, re.sub(rf"{goal}|\d+\.\d+", "", done.out), done.err))
+    half = len(shown) // 2
+    assert shown[half:] == shown[:half]
+
+
+def test_programs_are_told_the_same_events(open_robot: Robot) -> None:
+    """Of the goals of two commands all but ids, times, and who asked is alike."""
+
+    def events(done: Finished) -> list[tuple[Any, ...]]:
+        assert done.code == 0, done
+        lines = [json.loads(each) for each in done.out.splitlines()]
+        return [(*sorted(each), each.get("event"), each.get("state"), each.get("word")) for each in lines]
+
+    words = ["--json", "say", "--wait", "--feedback", "--", "the door opens"]
+    found = events(open_robot.desk(*words))
+    assert found == events(open_robot.talk.run(*words))
+    assert [each[-1] for each in found if each[-1]] == ["the", "door", "opens"]
+
+
+def test_watchers_at_both_ends_see_the_same(open_robot: Robot) -> None:
+    talk = open_robot.talk
+    with Desk(open_robot.broker) as somebody:
+        watchers: list[tuple[Clients, Process]] = [
+            (talk, talk.start("--json", "watch")),
+            (somebody, somebody.start("--robot", "anna", "--json", "watch")),
+        ]
+        seen: list[list[str]] = []
+        for _, each in watchers:
+            assert each.stdout
+            seen.append([each.stdout.readline()])
+        assert talk.run("say", "--wait", "--", "the door opens").code == 0
+        for (client, each), lines in zip(watchers, seen, strict=True):
+            assert each.stdout
+            while len(lines) == 1 or '"SUCCEEDED"' not in lines[-1]:
+                lines.append(each.stdout.readline())
+            each.send_signal(signal.SIGINT)
+            assert client.finish(each).code == 130
+    at_home, afar = seen
+    assert json.loads(afar[0]).keys() == json.loads(at_home[0]).keys()  # how many clients there are is another number
+    assert afar[1:] == at_home[1:]
+    assert len([each for each in afar if '"event": "word"' in each]) == 3
+
+
+def test_lines_are_spoken_in_their_order_though_they_are_more_than_the_robots_share(
+    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
+) -> None:
+    talk = make_talk(scripted=True)
+    make_bridge(talk, broker, "anna")
+    lines = [f"length=0.01 {n}" for n in range(25)]
+    for words in (["--wait"], []):
+        with Desk(broker) as somebody:
+            done = somebody.run("--robot", "anna", "say", "--lines", *words, stdin="\n".join(lines))
+        assert done.code == 0, done
+        assert len(done.out.splitlines()) == len(lines)
+    assert talk.run("wait").code == 0
+    assert talk.watcher.texts("SUCCEEDED") == lines * 2
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("--robot anna --socket /tmp/s status", "leave out one of them"),
+        ("--robot anna serve", "serve"),
+        ("--robot anna bridge --name anna", "bridge"),
+        ("--robot anna completion bash", "completion"),
+        ("--robot anna say -o - hello", "--output"),
+        ("--robot an/na status", "an/na"),
+        ("--robot # status", "#"),
+        ("--robot= status", "empty"),
+    ],
+)
+def test_what_means_no_robot_is_a_usage_error(broker: Broker, line: str, words: str) -> None:
+    with Desk(broker) as somebody:
+        done = somebody.run(*line.split())
+    assert (done.code, done.out) == (2, ""), done
+    assert words in done.err
+
+
+def test_without_a_broker_a_robot_is_a_usage_error(broker: Broker) -> None:
+    with Desk(broker, env={"TALK_BROKER": ""}) as somebody:
+        done = somebody.run("--robot", "anna", "say", "hello")
+    assert (done.code, done.out) == (2, ""), done
+    assert "TALK_BROKER is not set" in done.err
+
+
+def test_a_robot_is_asked_and_never_this_machine(broker: Broker) -> None:
+    """Plain lines, which are sent before anything is imported, and others."""
+    lines = ("say hello", "say -w hello", "cancel", "status", "log", "--json status", "watch")
+    with short_directory() as home, socket.socket(socket.AF_UNIX) as local:
+        local.bind(f"{home}/s")
+        local.listen()
+        local.setblocking(False)
+        for words, env in ((["--robot", "nobody"], {}), ([], {"TALK_ROBOT": "nobody"})):
+            with Desk(broker, env={"TALK_SOCKET": f"{home}/s", **env}) as somebody:
+                for each in [somebody.start(*words, *line.split()) for line in lines]:
+                    done = somebody.finish(each)
+                    assert (done.code, "no robot 'nobody'" in done.err) == (3, True), done
+        with pytest.raises(BlockingIOError):  # nobody has connected
+            local.accept()
+
+
+def test_what_is_typed_goes_before_a_variable_and_a_robot_before_a_socket(open_robot: Robot) -> None:
+    variables = {"TALK_SOCKET": open_robot.talk.socket, "TALK_ROBOT": "nobody"}
+    with Desk(open_robot.broker, env=variables) as somebody:
+        assert somebody.run("status").code == 3
+        assert somebody.run("--robot", "anna", "status").code == 0
+        assert somebody.run("--socket", open_robot.talk.socket, "status").code == 0
+    with Desk(open_robot.broker, env=variables | {"TALK_BROKER": ""}) as somebody:
+        assert somebody.run("--socket", open_robot.talk.socket, "say", "--wait", "hello").code == 0
+
+
+def offered(robot: Robot, line: str, **env: str) -> list[str]:
+    """Return the values that fish is offered at the end of a line."""
+    asked = {"_TALK_COMPLETE": "fish_complete", "COMP_WORDS": line, "COMP_CWORD": ""}
+    with Desk(robot.broker, env={**env, **asked}) as somebody:
+        done = somebody.run()
+    assert done.err == "", done
+    return [each.removeprefix("plain,").partition("\t")[0] for each in done.out.splitlines() if each]
+
+
+def test_the_robots_that_are_there_are_offered_and_what_they_know(
+    robot: Robot, make_talk: MakeTalk, make_bridge: MakeBridge
+) -> None:
+    make_bridge(make_talk(scripted=True), robot.broker, "bert")
+    assert make_bridge(make_talk(scripted=True), robot.broker, "carl").terminate() == 0
+    assert robot.talk.run("say", "--id", "mine", "--", LONG).code == 0
+    assert offered(robot, "talk --robot ") == ["anna", "bert"]
+    assert offered(robot, "talk --robot b") == ["bert"]
+    assert offered(robot, "talk --robot anna wait ") == ["mine"]
+    assert offered(robot, "talk wait m", TALK_ROBOT="anna") == ["mine"]
+    assert offered(robot, "talk --robot carl wait ") == []
+    robot.broker.kill()
+    assert offered(robot, "talk --robot ") == []
+    robot.broker.start()

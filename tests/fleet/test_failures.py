@@ -1,0 +1,210 @@
+"""What is not to be spoken is not: for a robot that is away, twice, from long ago, or what is no request at all."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.fleet.asker import Asker
+from tests.fleet.robot import LONG, Robot
+from tests.support.bridge import desk
+from tests.support.mqtt import Listener, mosquitto
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.fleet.conftest import MakeBridge
+    from tests.support.broker import Broker
+    from tests.support.processes import Finished
+
+#: Seconds in which a desk knows that a robot is not there: that is "at once", for who waits at a prompt.
+AT_ONCE = 1.0
+#: Bytes of a request's line at most, its end included.
+LONGEST_LINE = 64 * 1024
+
+
+def assert_refused(done: Finished, code: int, words: str) -> None:
+    assert (done.code, done.out) == (code, ""), done
+    assert words in done.err, done
+
+
+def assert_spoken(robot: Robot, *texts: str) -> None:
+    """Assert that these were spoken and nothing else: what was sent before a control has come before that, too."""
+    assert robot.desk("say", "--wait", "control").code == 0
+    assert robot.spoken == [*texts, "control"]
+
+
+def test_a_robot_that_is_offline_is_told_at_once_and_speaks_nothing_of_it_when_it_comes(robot: Robot) -> None:
+    """robot offline"""
+    assert robot.bridge.terminate() == 0
+    with limits():
+        done = robot.desk("say", "--wait", "nobody hears this")
+        assert_within(done.seconds, AT_ONCE, "a say to a robot that is offline")
+    assert_refused(done, 3, "anna is offline: nothing was sent")
+    with Asker(robot.broker, "olga") as olga:  # who doesn't look first
+        olga.post("say", text="nor this")
+        olga.send("nor that", kind="say", response=None)
+        robot.bridge.start()
+        robot.bridge.await_online()
+        assert_spoken(robot)
+        assert olga.lines == []
+
+
+def test_a_robot_that_nobody_knows_is_told_at_once(broker: Broker) -> None:
+    """robot offline"""
+    with limits():
+        done = desk(broker, "nobody", "say", "hello")
+        assert_within(done.seconds, AT_ONCE, "a say to a robot that nobody knows")
+    assert_refused(done, 3, "no robot 'nobody' is known")
+
+
+def test_a_broker_that_is_not_there_is_told_and_nothing_is_spoken_when_it_is_back(robot: Robot) -> None:
+    """robot offline"""
+    robot.broker.kill()
+    assert_refused(robot.desk("say", "hello"), 3, f"no broker at {robot.broker.url}")
+    robot.broker.start()
+    robot.bridge.await_online(within=15)
+    assert_spoken(robot)
+
+
+def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:
+    """duplicates"""
+    line = '{"seq": %d, "request": "say", "id": "once", "text": "only once"}'
+    with Asker(robot.broker, "olga") as olga:
+        response = ["-D", "publish", "response-topic", olga.response]
+        for seq in (1, 2, 3):
+            words = ["-q", "1", "-t", "talk/robot/anna/request/olga", *response, "-m", line % seq]
+            assert mosquitto(robot.broker, "pub", *words).code == 0
+        olga.send(line % 4, to="talk/group/all")
+        replies = [olga.reply(seq) for seq in (1, 2, 3, 4)]
+    assert [(each["ok"], each["goal"]["id"], each.get("attached", False)) for each in replies] == [
+        (True, "once", False),
+        *[(True, "once", True)] * 3,
+    ]
+    done = robot.desk("say", "--wait", "--id", "once", "only once")
+    assert (done.code, done.id) == (0, "once")
+    assert robot.spoken == ["only once"]
+
+
+@pytest.mark.parametrize("bridge", ["the same", "another"])
+def test_a_goal_that_an_earlier_server_had_is_not_sent_to_the_next(robot: Robot, bridge: str) -> None:
+    """duplicates"""
+    assert robot.desk("say", "--wait", "--id", "mine", "only once").code == 0
+    if bridge == "another":
+        robot.bridge.kill()
+        robot.bridge.start()
+        robot.bridge.await_online()  # it has asked the server what was said
+    robot.talk.kill()
+    robot.talk.start_server()
+    with robot.listen() as listener:
+        listener.await_message(lambda each: robot.is_online(each) and each.json["server"]["pid"] == robot.talk.pid)
+    assert_refused(robot.desk("say", "--id", "mine", "only once"), 12, "it may have been spoken")
+    assert_spoken(robot)
+
+
+def test_a_retained_message_is_dropped_as_it_comes(robot: Robot) -> None:
+    """retained"""
+    robot.talk.run("say", "--id", "mine", "--", LONG)
+    robot.talk.watcher.wait_for("mine", "ACTIVE")
+    with Asker(robot.broker, "olga") as olga:
+        olga.send({"seq": 99, "request": "say", "text": "kept"}, retain=True)
+        for kind, text in (("say", "kept, too"), ("cancel", "all")):
+            olga.send(text, retain=True, kind=kind, response=None)
+        assert olga.ask("status", id="mine")["goal"]["state"] == "ACTIVE"
+        assert olga.ask("cancel")["ok"]
+        assert not [each for each in olga.lines if each.get("seq") == 99]
+    assert "retained" in robot.bridge.log
+    assert_spoken(robot, LONG)
+
+
+def test_what_the_broker_has_kept_for_a_robot_is_not_spoken_when_it_comes(
+    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
+) -> None:
+    """retained"""
+    talk = make_talk(scripted=True)
+    talk.run("say", "--id", "mine", "--", LONG)
+    with Asker(broker, "olga") as olga:
+        say = {"seq": 99, "request": "say", "text": "kept"}
+        for topic in ("robot/anna", "group/all", "group/warehouse"):
+            olga.listener.publish(f"talk/{topic}/request/olga", say, retain=True, response=olga.response)
+        for kind in ("say", "cancel"):
+            olga.send("kept", retain=True, kind=kind, response=None)
+        robot = Robot(talk, broker, make_bridge(talk, broker, "anna", groups=["warehouse"]))
+        talk.watcher.wait_for("mine", "ACTIVE")
+        assert robot.desk("cancel").out == "mine\n"  # so nothing had cancelled it
+        assert_spoken(robot, LONG)
+        assert olga.lines == []
+
+
+@pytest.mark.parametrize(
+    ("payload", "code"),
+    [
+        (b"{", "bad_json"),
+        (b"say hello", "bad_json"),
+        (b'["say", "hello"]', "bad_json"),
+        (b'{"request": "say", "text": "\xff"}', "bad_encoding"),
+        (b'{"text": "hello"}', "bad_request"),
+        (b'{"request": "shout", "text": "hello"}', "unknown_request"),
+        (b'{"request": "say", "text": "hello", "loud": true}', "unknown_field"),
+        (b'{"request": "say", "text": "hello", "rate": "fast"}', "bad_field"),
+        (b'{"request": "say"}', "bad_field"),
+        (b'{"request": "set", "rate": 200}', "not_allowed"),
+        (b'{"request": "say", "text": "hello"}'.ljust(LONGEST_LINE), "line_too_long"),
+        (b'{"request": "say", "text": "a"}\n{"request": "say", "text": "b"}', "bad_json"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_is_no_request_is_answered_with_the_error_of_the_wire(
+    lasting_robot: Robot, payload: bytes, code: str
+) -> None:
+    """wrong JSON, unknown field, request not allowed, 64 KiB"""
+    with Asker(lasting_robot.broker, "olga") as olga:
+        olga.send(payload)
+        answer = olga.line(lambda each: "ok" in each)
+        assert (answer["ok"], answer["error"]["code"]) == (False, code), answer
+        assert olga.ask("status")["ok"]  # it goes on
+    assert lasting_robot.spoken == []
+
+
+def test_the_longest_request_is_taken(lasting_robot: Robot) -> None:
+    """wrong JSON, unknown field, request not allowed, 64 KiB"""
+    with Asker(lasting_robot.broker, "olga") as olga:
+        olga.send(b'{"seq": 7, "request": "status"}'.ljust(LONGEST_LINE - 1))
+        assert olga.reply(7)["ok"]
+
+
+def test_a_desk_may_do_what_the_robot_allows_and_nothing_else(
+    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
+) -> None:
+    """wrong JSON, unknown field, request not allowed, 64 KiB"""
+    talk = make_talk(scripted=True)
+    robot = Robot(talk, broker, make_bridge(talk, broker, "anna"))
+    assert_refused(robot.desk("set", "--rate", "300"), 10, "anna: this robot takes no set from afar")
+    robot.bridge.terminate()
+    make_bridge(talk, broker, "anna", "--allow", "say,set")
+    assert robot.desk("set", "--rate", "300").code == 0
+    assert talk.request("set")["settings"]["rate"] == 300
+    assert_refused(robot.desk("cancel"), 10, "anna: this robot takes no cancel from afar")
+    assert_refused(robot.desk("status"), 10, "anna: this robot takes no status from afar")
+    assert robot.desk("say", "hello").code == 0
+
+
+def test_a_flood_from_afar_leaves_the_robots_own_scripts_their_places(robot: Robot) -> None:
+    """wrong JSON, unknown field, request not allowed, 64 KiB"""
+    robot.talk.run("say", "--id", "mine", "--", LONG)
+    robot.talk.watcher.wait_for("mine", "ACTIVE")
+    with Asker(robot.broker, "olga") as olga, Asker(robot.broker, "otto") as otto:
+        asked = [(each, each.post("say", text="much")) for _ in range(15) for each in (olga, otto)]
+        goals = [each.reply(seq)["goal"] for each, seq in asked]
+        assert Counter(each["state"] for each in goals) == {"PENDING": 20, "REJECTED": 10}
+        assert {(each["reason"], each["text"]) for each in goals if each["state"] == "REJECTED"} == {
+            ("queue_full", "much")
+        }
+        assert robot.desk("say", "--wait", "one too many").code == 5
+        assert robot.talk.run("say", "one of its own").code == 0
+        assert olga.ask("cancel")["ok"]
+    with Listener(robot.broker) as anybody:
+        anybody.publish("talk/robot/anna/say/olga", "after it")
+    robot.talk.watcher.wait_until(lambda _: "after it" in robot.spoken, what="room after the flood")

@@ -1,0 +1,150 @@
+"""What comes late is not spoken: a line that stalled, or a robot that was suspended, is found out without clocks."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.fleet.asker import Asker
+from tests.fleet.robot import LONG, Robot
+from tests.support.bridge import Desk
+from tests.support.proxy import Proxy
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from tests.conftest import MakeTalk
+    from tests.fleet.conftest import MakeBridge
+    from tests.support.broker import Broker
+
+#: Seconds after the newest echo that came back from which on nothing is spoken that comes.
+STALE = 6.0
+#: Seconds for which a line stalls whose messages are then too old, and are not, where an echo came just before.
+TOO_LONG, SHORT = STALE + 1.0, STALE / 2
+
+
+@pytest.fixture
+def stalled(make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge) -> Iterator[tuple[Robot, Proxy]]:
+    """A robot behind a network of its own, that has just come up."""
+    with Proxy(broker.port) as proxy:
+        talk = make_talk(scripted=True)
+        yield Robot(talk, broker, make_bridge(talk, broker, "anna", port=proxy.port)), proxy
+
+
+def assert_stale(robot: Robot, stall: Callable[[], object], go_on: Callable[[], object]) -> None:
+    """Stall it for too long, and assert that what is said meanwhile is refused, and what is said after that is not."""
+    with Asker(robot.broker, "olga") as olga, robot.listen("echo") as listener:
+        began = time.monotonic()
+        stall()
+        asked = olga.post("say", text="late")
+        for kind in ("say", "request"):
+            olga.send('{"request": "say", "text": "late, too"}', kind=kind, response=None)
+        time.sleep(began + TOO_LONG - time.monotonic())
+        go_on()
+        went_on = time.monotonic()
+        answer = olga.reply(asked)
+        assert answer["error"]["code"] == "stale", answer
+        # With the refusal an echo was sent, unless that was done within a second before; behind it nothing is old.
+        listener.await_message(lambda each: each.topic.endswith("/echo") and each.arrived > went_on - 1)
+        assert robot.desk("say", "--wait", "control").code == 0
+    assert robot.spoken == ["control"]
+
+
+@pytest.mark.slow
+def test_what_comes_while_a_robot_is_suspended_for_long_is_refused(robot: Robot) -> None:
+    """link stalls, robot suspends, then goes on"""
+    assert_stale(robot, robot.bridge.stop_process, robot.bridge.go_on)
+
+
+@pytest.mark.slow
+def test_what_comes_while_a_robot_is_suspended_for_a_moment_is_spoken(robot: Robot) -> None:
+    """link stalls, robot suspends, then goes on"""
+    with Desk(robot.broker) as somebody:
+        robot.bridge.stop_process()
+        asked = somebody.start("--robot", "anna", "say", "--wait", "in time")
+        time.sleep(SHORT)
+        robot.bridge.go_on()
+        done = somebody.finish(asked)
+    assert done.code == 0, done
+    assert robot.spoken == ["in time"]
+
+
+@pytest.mark.slow
+def test_what_a_line_has_held_for_long_is_refused(stalled: tuple[Robot, Proxy]) -> None:
+    """link stalls, robot suspends, then goes on"""
+    robot, proxy = stalled
+    assert_stale(robot, lambda: proxy.hold("to_client"), proxy.release)
+
+
+@pytest.mark.slow
+def test_where_no_echo_comes_back_nothing_is_spoken_that_may_be_old(stalled: tuple[Robot, Proxy]) -> None:
+    """link stalls, robot suspends, then goes on"""
+    robot, proxy = stalled
+    with Asker(robot.broker, "olga") as olga:
+        proxy.hold("to_broker")
+        early = olga.post("say", text="in time")
+        robot.talk.watcher.wait_for(None, "SUCCEEDED")
+        time.sleep(TOO_LONG)
+        late = olga.post("say", text="late")
+        assert olga.lines == []
+        proxy.release()
+        assert olga.reply(early)["ok"]
+        assert olga.reply(late)["error"]["code"] == "stale"
+    assert robot.spoken == ["in time"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["to_client", "to_broker"])
+def test_what_a_line_has_held_for_a_moment_is_spoken(stalled: tuple[Robot, Proxy], way: str) -> None:
+    """link stalls, robot suspends, then goes on"""
+    robot, proxy = stalled
+    with Desk(robot.broker) as somebody:
+        proxy.hold("to_client" if way == "to_client" else "to_broker")
+        asked = somebody.start("--robot", "anna", "say", "--wait", "in time")
+        time.sleep(SHORT)
+        proxy.release()
+        done = somebody.finish(asked)
+    assert done.code == 0, done
+    assert robot.spoken == ["in time"]
+
+
+def test_how_long_the_broker_keeps_a_sentence_counts_in_the_queue_of_the_robot_too(robot: Robot) -> None:
+    """link stalls, robot suspends, then goes on"""
+    robot.talk.run("say", "--", LONG)
+    robot.talk.watcher.wait_for(None, "ACTIVE")
+    with Asker(robot.broker, "olga") as olga:
+        olga.send({"seq": 1, "request": "say", "id": "short", "text": "a", "ttl": 100}, expiry=1)
+        olga.send({"seq": 2, "request": "say", "id": "shorter", "text": "b", "ttl": 0.2}, expiry=100)
+        olga.send("c", expiry=1, kind="say", response=None)
+        goals = [olga.reply(each)["goal"] for each in (1, 2)]
+        assert [each["ttl"] for each in goals] == [pytest.approx(1, abs=0.2), 0.2]
+        for each in goals:
+            assert robot.talk.watcher.wait_for_terminal(each["id"]) == "RECALLED"
+            assert robot.talk.goal(each["id"])["reason"] == "expired"
+        robot.talk.watcher.wait_until(lambda _: len(robot.talk.watcher.texts("RECALLED")) == 3)
+    first, *others = robot.talk.watcher.texts("RECALLED")
+    assert (first, {*others}) == ("b", {"a", "c"})  # these two are of two sessions
+    assert robot.spoken == [LONG]
+
+
+@pytest.mark.slow
+def test_a_sentence_that_the_line_has_held_begins_no_later_than_its_ttl_and_six_seconds(
+    stalled: tuple[Robot, Proxy],
+) -> None:
+    """link stalls, robot suspends, then goes on"""
+    robot, proxy = stalled
+    robot.talk.run("say", "--", LONG)
+    robot.talk.watcher.wait_for(None, "ACTIVE")
+    with Asker(robot.broker, "olga") as olga, contextlib.ExitStack() as stack:
+        stack.callback(proxy.release)
+        said = time.monotonic()
+        proxy.hold("to_client")
+        seq = olga.post("say", text="late", ttl=1, id="late")
+        time.sleep(SHORT)
+        proxy.release()
+        assert olga.reply(seq)["ok"]
+        expired = robot.talk.watcher.wait_for("late", "RECALLED")
+        assert robot.talk.watcher.arrived(expired) - said < 1 + STALE

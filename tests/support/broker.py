@@ -1,0 +1,206 @@
+"""A private broker: a real mosquitto on 127.0.0.1, which a test may kill and start again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import ssl
+import subprocess
+import time
+from typing import TYPE_CHECKING
+
+from tests.support.certificates import authority
+from tests.support.ports import HOST, Port
+from tests.support.surroundings import (
+    clean_environment,
+    dying_with_parent,
+    find_program,
+    needs,
+    short_directory,
+    stop_child,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+#: Seconds in which a broker must answer.
+_START = 10.0
+#: A client of MQTT 5 with a clean start and no name: length, protocol, level, flags, keepalive, no properties.
+_CONNECT = bytes([0x10, 13, 0, 4, *b"MQTT", 5, 2, 0, 60, 0, 0, 0])
+#: What the answer to it begins with; that it may be a refusal is no matter.
+_CONNACK = 0x20
+
+
+class Broker(contextlib.AbstractContextManager["Broker"]):
+    """A running broker, which keeps nothing on disk; `close()` or `with` ends it and removes its directory.
+
+    `secure`: by TLS alone. `users`: their passwords by their names; then nobody else is let in, unless `anonymous`.
+    `certificates`: clients come with a certificate (and so `secure`), whose name is the user. `acl`: the text of an
+    access control list. `max_packet`: bytes. `expired`: so is its certificate. `settings`: more lines of mosquitto's
+    configuration.
+    """
+
+    def __init__(
+        self,
+        *,
+        secure: bool = False,
+        users: Mapping[str, str] | None = None,
+        anonymous: bool | None = None,
+        certificates: bool = False,
+        acl: str | None = None,
+        max_packet: int | None = None,
+        expired: bool = False,
+        settings: Sequence[str] = (),
+    ) -> None:
+        needs("mosquitto")
+        self.secure = secure or certificates or expired
+        self._certificates = certificates
+        self._users = dict(users or {})
+        self._process: subprocess.Popen[bytes] | None = None
+        with contextlib.ExitStack() as stack:
+            self.directory = stack.enter_context(short_directory("broker-"))
+            self.port = stack.enter_context(Port()).number
+            lines = [f"listener {self.port} {HOST}", "log_dest stderr", "log_type all", "persistence false", *settings]
+            if anonymous is None:
+                anonymous = not (users or certificates)
+            lines.append(f"allow_anonymous {str(anonymous).lower()}")
+            if os.getuid() == 0:  # else it becomes the user mosquitto, who may read nothing here
+                lines.append("user root")
+            if max_packet is not None:
+                lines.append(f"max_packet_size {max_packet}")
+            if users:
+                lines.append(f"password_file {self._write_passwords(users)}")
+            if acl is not None:
+                lines.append(f"acl_file {self._write('acl', acl)}")
+            if self.secure:
+                own = authority().expired if expired else authority().server
+                lines += [f"certfile {own.file}", f"keyfile {own.key}"]
+            if certificates:
+                lines += [f"cafile {authority().file}", "require_certificate true", "use_identity_as_username true"]
+            self._settings = self._write("mosquitto.conf", "\n".join(lines) + "\n")
+            stack.callback(self._end)
+            self.start()
+            self._stack = stack.pop_all()
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the broker and remove its directory; a second time is nothing."""
+        self._stack.close()
+
+    @property
+    def url(self) -> str:
+        """What a client is told of it."""
+        return self.url_at(self.port)
+
+    @property
+    def log(self) -> str:
+        """What the broker wrote so far."""
+        with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as file:
+            return file.read()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the broker."""
+        return self._running().pid
+
+    def url_at(self, port: int) -> str:
+        """Return what a client is told of it that is to come by another port, as a `Proxy` has one."""
+        return f"mqtts://localhost:{port}" if self.secure else f"mqtt://{HOST}:{port}"
+
+    def env(self, user: str | None = None, password: str | bool = True, cert: str | None = None) -> dict[str, str]:
+        """Return the variables of a client: as a user with the user's password, none (False) or another one.
+
+        `cert`: the name of a client with a certificate.
+        """
+        result = {"TALK_BROKER": self.url}
+        if self.secure:
+            result["TALK_MQTT_CA"] = authority().file
+        if user is not None:
+            result["TALK_MQTT_USER"] = user
+            if password is not False:
+                told = self._users[user] if password is True else password
+                result["TALK_MQTT_PASSWORD_FILE"] = self._write(f"{user}.password", f"{told}\n")
+        if cert is not None:
+            own = authority().client(cert)
+            result |= {"TALK_MQTT_CERT": own.file, "TALK_MQTT_KEY": own.key}
+        return result
+
+    def start(self) -> None:
+        """Start the broker and wait until it answers; again, at the same port, after `kill()`."""
+        with open(f"{self.directory}/log", "ab") as log:
+            self._process = subprocess.Popen(
+                dying_with_parent([find_program("mosquitto") or "mosquitto", "-c", self._settings]),
+                env=clean_environment(self.directory),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        end = time.monotonic() + _START
+        while not self._answers():
+            code = self._process.poll()
+            assert code is None, f"mosquitto ended with {code}: {self.log}"
+            assert time.monotonic() < end, f"mosquitto does not answer within {_START} s: {self.log}"
+            time.sleep(0.005)  # it says nowhere when it begins to listen
+
+    def kill(self) -> None:
+        """Kill the broker, as if it had crashed: its clients' connections end, all that it kept is gone."""
+        self._running().kill()
+        self._running().wait()
+        self._process = None
+
+    def stop_process(self) -> None:
+        """Stop the broker's process as it is (SIGSTOP); it has stopped when this returns."""
+        stop_child(self.pid)
+
+    def go_on(self) -> None:
+        """Let a broker that was stopped go on (SIGCONT)."""
+        os.kill(self.pid, signal.SIGCONT)
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        if self._process is None:
+            raise RuntimeError("the broker was killed, and not started again")
+        return self._process
+
+    def _answers(self) -> bool:
+        """Return whether it answers a client; one that it has no reason to let in is answered, too."""
+        with contextlib.suppress(OSError), self._connect() as connection:
+            connection.sendall(_CONNECT)
+            answer = connection.recv(1)
+            assert answer in (b"", bytes([_CONNACK])), answer
+            return bool(answer)
+        return False
+
+    def _connect(self) -> socket.socket:
+        plain = socket.create_connection((HOST, self.port), _START)
+        if not self.secure:
+            return plain
+        context = ssl.create_default_context()
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE  # an expired certificate is none of its business
+        if self._certificates:
+            own = authority().client("probe")
+            context.load_cert_chain(own.file, own.key)
+        with plain:
+            return context.wrap_socket(plain)
+
+    def _write_passwords(self, users: Mapping[str, str]) -> str:
+        needs("mosquitto_passwd")
+        path = self._write("passwords", "".join(f"{name}:{password}\n" for name, password in users.items()))
+        subprocess.run(
+            [find_program("mosquitto_passwd") or "", "-U", path], check=True, capture_output=True, timeout=_START
+        )
+        return path
+
+    def _write(self, name: str, text: str) -> str:
+        path = f"{self.directory}/{name}"
+        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
+            file.write(text)
+        return path
+
+    def _end(self) -> None:
+        if self._process is not None:
+            self.kill()
