@@ -44,6 +44,12 @@ def taken(pids: Iterable[int]) -> Taken:
     return Taken(switches, processor)
 
 
+def megabytes(pid: int, kind: str) -> float:
+    """Return what a process has of the memory: "Rss", all of it, or "Pss", what it shares as its part of that."""
+    with open(f"/proc/{pid}/smaps_rollup", encoding="utf-8") as file:
+        return next(int(each.split()[1]) for each in file if each.startswith(f"{kind}:")) / 1024
+
+
 def settle(pids: Iterable[int]) -> None:
     """Wait until a server stands still: what it owes to clients that are gone has its own time."""
     pids = list(pids)
@@ -66,19 +72,20 @@ def idle(stage: Stage) -> list[Row]:
         time.sleep(stage.options.idle)
         seconds = time.monotonic() - began
         found = taken(server.pids).since(before)
-    share = found.processor / seconds * 100
-    where = f"idle for {seconds:.0f} s"
     return [
-        Row(
-            "idle",
-            f"{where}: context switches of server and engine a second",
-            "/s",
-            (found.switches / seconds,),
-            limits=(Limit("median", 1),),
-        ),
-        # 0.0 as `top` shows it.
-        Row("idle", f"{where}: processor time of both", "%", (share,), limits=(Limit("median", 0.05),)),
+        *rest(f"idle for {seconds:.0f} s", "server and engine", found, seconds),
         Row("idle", "memory of server and engine process (Pss)", "MB", (memory,), limits=(Limit("median", 28),)),
+    ]
+
+
+def rest(where: str, whose: str, found: Taken, seconds: float) -> list[Row]:
+    """Return the rows of what processes took in so many seconds, in which nothing was asked of them."""
+    share = found.processor / seconds * 100
+    switches = (found.switches / seconds,)
+    return [
+        Row("idle", f"{where}: context switches of {whose} a second", "/s", switches, limits=(Limit("median", 1),)),
+        # 0.0 as `top` shows it.
+        Row("idle", f"{where}: processor time of {whose}", "%", (share,), limits=(Limit("median", 0.05),)),
     ]
 
 

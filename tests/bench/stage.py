@@ -9,7 +9,7 @@ import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from tests.bench.dispatcher import dispatcher
 from tests.bench.ear import fine_blocks
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from tests.bench.installed import Server
+
+_Stage = TypeVar("_Stage", bound="SinkStage")
 
 #: What to install for a program that is missing.
 PACKAGES = {
@@ -56,13 +58,15 @@ def missing(*, peers: bool) -> dict[str, str]:
     return {each: PACKAGES[each] for each in wanted if shutil.which(each) is None}
 
 
-class Stage(contextlib.AbstractContextManager["Stage"]):
-    """Gives what a row needs; `close` or `with` ends all of it."""
+class SinkStage:
+    """A sink, and chance; `with` ends all that was entered."""
 
-    def __init__(self, options: Options) -> None:
-        self.options = options
-        self._chance = random.Random(5)
+    def __init__(self, seed: int) -> None:
+        self._chance = random.Random(seed)
         self._stack = contextlib.ExitStack()
+
+    def __enter__(self: _Stage) -> _Stage:  # noqa: PYI019 - Self is in typing from Python 3.11 on
+        return self
 
     def __exit__(self, *_error: object) -> None:
         self._stack.close()
@@ -73,6 +77,22 @@ class Stage(contextlib.AbstractContextManager["Stage"]):
         found = self._stack.enter_context(Sink())
         self._stack.enter_context(fine_blocks(found))
         return found
+
+    def jitter(self, most: float = 0.02) -> float:
+        """Return some seconds: two blocks of the sink, so that no row is measured at always the same moment of one."""
+        return self._chance.random() * most
+
+    def shuffled(self, names: Sequence[str]) -> list[str]:
+        """Return the names in another order each time, and in the same ones each run."""
+        return self._chance.sample(names, len(names))
+
+
+class Stage(SinkStage):
+    """Gives what a row needs; `close` or `with` ends all of it."""
+
+    def __init__(self, options: Options) -> None:
+        super().__init__(5)
+        self.options = options
 
     @cached_property
     def plain(self) -> dict[str, str]:
@@ -109,11 +129,3 @@ class Stage(contextlib.AbstractContextManager["Stage"]):
     def scripted(self, *options: str) -> list[str]:
         """Return the command of a server of the installed talk whose engine is scripted."""
         return [self.installed.python, _SCRIPTED, *options]
-
-    def jitter(self, most: float = 0.02) -> float:
-        """Return some seconds: two blocks of the sink, so that no row is measured at always the same moment of one."""
-        return self._chance.random() * most
-
-    def shuffled(self, names: Sequence[str]) -> list[str]:
-        """Return the names in another order each time, and in the same ones each run."""
-        return self._chance.sample(names, len(names))

@@ -59,12 +59,18 @@ def test_a_row_measures_something(stage: Stage, group: str, monkeypatch: pytest.
     ):
         monkeypatch.setattr(module, name, less)
     rows = measure(group, stage)
+    assert_measured(rows, ROWS.get(group, 1))
+    for row in rows:
+        assert _form(row.name, row.goal) in KNOWN, f"the table in {SPEED.name} is of an older benchmark"
+
+
+def assert_measured(rows: list[Row], many: int) -> None:
+    """Assert that there are so many rows, and that each has values in its unit."""
     assert [each.failure for each in rows if each.failure] == []
-    assert len(rows) == ROWS.get(group, 1)
+    assert len(rows) == many
     for row in rows:
         assert row.values
         assert row.cells()[2].endswith(row.unit)
-        assert _form(row.name, row.goal) in KNOWN, f"the table in {SPEED.name} is of an older benchmark"
 
 
 def test_readme_tells_what_the_table_has() -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from talkcli import Client, State
 from tests.bench.arithmetic import first_sound
 from tests.bench.failure import FailedError
-from tests.bench.idle import settle, taken
+from tests.bench.idle import megabytes, rest, settle, taken
 from tests.bench.onset import milliseconds
 from tests.bench.table import Limit, Row
 from tests.bench.voices_heard import HEARD, pauses
@@ -75,18 +75,7 @@ def idle(stage: VoiceStage) -> list[Row]:
         time.sleep(stage.options.idle)
         seconds = time.monotonic() - began
         found = taken(engines).since(before)
-    where = f"idle for {seconds:.0f} s, joe loaded"
-    share = found.processor / seconds * 100
-    return [
-        Row(
-            "idle",
-            f"{where}: context switches of the engine a second",
-            "/s",
-            (found.switches / seconds,),
-            limits=(Limit("median", 1),),
-        ),
-        Row("idle", f"{where}: processor time of the engine", "%", (share,), limits=(Limit("median", 0.05),)),
-    ]
+    return rest(f"idle for {seconds:.0f} s, joe loaded", "the engine", found, seconds)
 
 
 def memory(stage: VoiceStage) -> list[Row]:
@@ -101,7 +90,7 @@ def memory(stage: VoiceStage) -> list[Row]:
                 ended = client.say(LONG_TEXT).wait(_PATIENCE)
                 if ended.state is not State.SUCCEEDED:
                     raise FailedError(f"{ended.state}: {ended.message}")
-                after.append(_megabytes(engine, "Pss"))
+                after.append(megabytes(engine, "Pss"))
         rows += _memory(f"after {len(after)} texts of 10,000 characters", engine, _AFTER)
     grown = after[-1] - after[len(after) // 2]
     name = "Pss of the engine: growth in the second half of these texts"
@@ -143,13 +132,8 @@ def _memory(when: str, engine: int, limit: float) -> list[Row]:
             "memory",
             f"{kind} of the engine {when}",
             "MB",
-            (_megabytes(engine, kind),),
+            (megabytes(engine, kind),),
             limits=(Limit("median", limit),),
         )
         for kind in ("Pss", "Rss")
     ]
-
-
-def _megabytes(pid: int, kind: str) -> float:
-    with open(f"/proc/{pid}/smaps_rollup", encoding="utf-8") as file:
-        return next(int(each.split()[1]) for each in file if each.startswith(f"{kind}:")) / 1024

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import random
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
-from tests.bench.ear import fine_blocks
+from tests.bench.stage import SinkStage
 from tests.support.census import descendants
 from tests.support.loaded import await_loaded
 from tests.support.processes import Talk
 from tests.support.real_voice import REAL_VOICE
-from tests.support.sink import Sink
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
 #: By its id: "en" is the language, and in such a server the neural voice of it.
 ESPEAK = "gmw/en"
@@ -35,24 +32,13 @@ class VoiceOptions:
     idle: float = 10.0  # seconds
 
 
-class VoiceStage(contextlib.AbstractContextManager["VoiceStage"]):
+class VoiceStage(SinkStage):
     """Gives what a row needs; `with` ends all of it."""
 
     def __init__(self, options: VoiceOptions) -> None:
+        super().__init__(18)
         self.options = options
-        self._chance = random.Random(18)
-        self._stack = contextlib.ExitStack()
         self._home = self._stack.enter_context(short_directory("voices-"))
-
-    def __exit__(self, *_error: object) -> None:
-        self._stack.close()
-
-    @cached_property
-    def sink(self) -> Sink:
-        """A sound server with one null sink, listened to from its start."""
-        found = self._stack.enter_context(Sink())
-        self._stack.enter_context(fine_blocks(found))
-        return found
 
     @contextlib.contextmanager
     def server(self, *options: str, heard: bool = True, env: dict[str, str] | None = None) -> Iterator[Talk]:
@@ -66,14 +52,6 @@ class VoiceStage(contextlib.AbstractContextManager["VoiceStage"]):
             talk.stop()
         finally:
             talk.close()
-
-    def jitter(self, most: float = 0.02) -> float:
-        """Return some seconds: so that no row is measured at always the same moment of a block."""
-        return self._chance.random() * most
-
-    def shuffled(self, names: Sequence[str]) -> list[str]:
-        """Return the names in another order each time, and in the same ones each run."""
-        return self._chance.sample(names, len(names))
 
 
 def engine_of(talk: Talk) -> int:
