@@ -19,7 +19,7 @@ INTERNAL = {"TALK_LIVENESS_FD"}
 _ENVIRONMENT = {"environ", "environment"}
 _NAME = re.compile(r"_?[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
 #: Commands that stand in sentences and tables, on one line.
-_BEFORE = r"talk (?:--socket \S+ |--json |-q )*"
+_BEFORE = r"talk (?:--socket \S+ |--robot \S+ |--json |-q )*"
 IN_PASSING = sorted(
     {
         each

@@ -27,12 +27,6 @@ def speaking(make_talk: MakeTalk) -> Talk:
     return make_talk("--player", "null", "--rate", "450")
 
 
-def texts(talk: Talk, *states: str) -> list[str]:
-    """Return the texts of the goals that reached one of these states, in that order."""
-    told = [each for each in talk.watcher.events() if each.get("state") in states]
-    return [talk.goal(each["id"])["text"] for each in told]
-
-
 def assert_serves(options: list[str], talk: Talk) -> None:
     """Start a server beside the one of the test, and end it."""
     with short_directory() as place:
@@ -64,7 +58,7 @@ def test_first_page(speaking: Talk, shell: Shell) -> None:
     done = shell.run("\n".join(commands("talk")))
     assert (done.returncode, done.stderr) == (0, "")
     assert "SUCCEEDED" in done.stdout
-    assert texts(speaking, "PENDING") == ["battery low", "stop"]
+    assert speaking.watcher.texts("PENDING") == ["battery low", "stop"]
 
 
 @runs("A tour: Speak")
@@ -72,7 +66,7 @@ def test_speak(speaking: Talk, shell: Shell) -> None:
     shell.program("dmesg", "printf 'first\\nusb 1-1: new device\\n'")
     done = shell.run("\n".join(commands("A tour: Speak")), text="-5 degrees")
     assert (done.returncode, done.stderr, len(done.stdout.split())) == (0, "", 3)
-    assert texts(speaking, "PENDING") == ["moving to the charger", "-5 degrees", "usb 1-1: new device"]
+    assert speaking.watcher.texts("PENDING") == ["moving to the charger", "-5 degrees", "usb 1-1: new device"]
 
 
 @runs("A tour: Wait")
@@ -82,7 +76,7 @@ def test_wait(speaking: Talk, shell: Shell) -> None:
     done = shell.run("\n".join(commands("A tour: Wait")))
     assert (done.returncode, done.stderr) == (0, "")
     assert (len(shell.calls("move_arm")), len(shell.calls("close_door"))) == (1, 1)
-    assert texts(speaking, "SUCCEEDED") == ["please step back", "the door is closing"]
+    assert speaking.watcher.texts("SUCCEEDED") == ["please step back", "the door is closing"]
 
 
 @runs("A tour: Preempt")
@@ -93,7 +87,7 @@ def test_preempt(speaking: Talk, shell: Shell) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     *_, last = done.stdout.split()
     assert speaking.watcher.wait_for_terminal(last) == "SUCCEEDED"
-    assert texts(speaking, "SUCCEEDED")[-1] == "emergency stop"
+    assert speaking.watcher.texts("SUCCEEDED")[-1] == "emergency stop"
 
 
 @runs("A tour: Priority and time")
