@@ -20,8 +20,7 @@ from talkcli.terminal.goals import NOT_KEPT
 from talkcli.terminal.text import Screen, Sentence, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from types import FrameType
+    from collections.abc import Callable, Sequence
 
     from talkcli.cli.show import Common
     from talkcli.goals.goal import Goal
@@ -93,7 +92,7 @@ class _Light(Feedback):
         #: held while the terminal is written to
         self._painting = threading.Lock()
         self._stale = False
-        self._before = signal.signal(signal.SIGWINCH, self._on_resize)
+        self._resizes = _Resizes(self._paint)
 
     def begin(self, goals: Sequence[Goal]) -> None:
         going = [each for each in goals if not each.state.terminal]
@@ -126,7 +125,7 @@ class _Light(Feedback):
 
     def close(self) -> None:
         """Leave the line whole, as it stands, if there is one."""
-        signal.signal(signal.SIGWINCH, self._before)
+        self._resizes.close()
         if self._line:
             self._leave(self._line)
             self._line = None
@@ -148,7 +147,7 @@ class _Light(Feedback):
             _write(f"{_AGAIN}{printable(line.goal.id)}  {name}  {before}{_AHEAD}{after}{_PLAIN}\n")
 
     def _paint(self) -> None:
-        # Whoever paints sees to what came meanwhile, from another thread or from a resize that interrupted this one.
+        # Whoever paints sees to what came meanwhile, from another thread.
         self._stale = True
         while self._stale and self._painting.acquire(blocking=False):
             try:
@@ -158,8 +157,37 @@ class _Light(Feedback):
             finally:
                 self._painting.release()
 
-    def _on_resize(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        self._paint()
+
+class _Resizes(threading.Thread):
+    """Paints anew whenever the terminal gets another size. Where the system forgets a signal that nobody handles, as
+    macOS does, the next event paints it so.
+
+    Not by a handler: a signal that has one ends the waiting for goals, see `interrupts`.
+    """
+
+    def __init__(self, paint: Callable[[], None]) -> None:
+        super().__init__(name="resizes", daemon=True)
+        self._paint = paint
+        self._over = False
+        self._held = {signal.SIGWINCH} - signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGWINCH})
+        try:
+            self.start()
+        except RuntimeError:  # no thread can be had: as where it is forgotten
+            self._over = True
+
+    def run(self) -> None:
+        """Wait for one after the other."""
+        while signal.sigwait({signal.SIGWINCH}) and not self._over:
+            self._paint()
+
+    def close(self) -> None:
+        """Paint no more."""
+        if not self._over:
+            self._over = True
+            assert self.ident
+            signal.pthread_kill(self.ident, signal.SIGWINCH)
+            self.join()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, self._held)
 
 
 class _Line:
@@ -200,7 +228,7 @@ def _is_spoken(event: Event) -> bool:
 
 
 def _write(text: str) -> None:
-    """Write to the terminal past Python's buffer, in which a resize that interrupts a write could not write itself."""
+    """Write to the terminal past Python's buffer, where it can be waited for if it takes nothing at the moment."""
     data = text.encode(errors="backslashreplace")
     fd = sys.stdout.fileno()
     while data:

@@ -83,6 +83,9 @@ class Interrupts:
         self._descriptor, self._write = os.pipe()
         os.set_blocking(self._write, False)
         self.watched = {self._descriptor: select.POLLIN, **(watched_output() if self._output else {})}
+        # Python calls a handler between two steps of the main thread: a signal that comes in the last moment before
+        # that waits, or that the kernel gives another thread, would end no wait. What the system writes here does.
+        self._woken_before = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
         # A shell starts background commands with SIGINT ignored: what is ignored stays so.
         self._before = {
             each: signal.signal(each, self._caught) for each in _CAUGHT if signal.getsignal(each) != signal.SIG_IGN
@@ -103,6 +106,7 @@ class Interrupts:
             signal.setitimer(signal.ITIMER_REAL, 0)
         for each, handler in self._before.items():
             signal.signal(each, handler)
+        signal.set_wakeup_fd(self._woken_before)
         os.close(self._descriptor)
         os.close(self._write)
         return kind is Interrupted
@@ -112,7 +116,8 @@ class Interrupts:
         self.gone = self.gone or (OUTPUT in self.watched and not has_reader())
 
     def clear(self) -> None:
-        """Have nothing end the waiting that has; no other signal will."""
+        """Have nothing end the waiting that has; of the signals, only a first one still will."""
+        signal.set_wakeup_fd(-1)  # a second SIGHUP means nothing
         self.look()
         self.watched.pop(OUTPUT, None)
         os.set_blocking(self._descriptor, False)
