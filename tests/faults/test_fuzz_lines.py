@@ -1,4 +1,4 @@
-"""Mutated requests: a seed that never changes, and a slow one of today; that is a minute in CI, else some seconds."""
+"""Mutated requests: a seed that never changes, and a slow one of today; that is half a minute in CI, else some seconds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from tests.faults.fuzz_lines import fuzz
 
-SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (60 if os.environ.get("CI") else 8))
+SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 8))
 
 
 @pytest.mark.parametrize("count", [2_000, pytest.param(20_000, marks=pytest.mark.slow)])

@@ -26,9 +26,9 @@ def test_random_goals_with_a_fault_every_few_seconds() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(int(SECONDS) + 400)
 def test_engines_that_are_killed_again_and_again_cost_no_more_than_a_goal_each() -> None:
-    report = soak(SECONDS, seed=random.randrange(1 << 30), every=None)
+    report = soak(SECONDS / 2, seed=random.randrange(1 << 30), every=None)
     print(report)
     assert not report.failures, str(report)
-    assert report.goals > SECONDS
+    assert report.goals > SECONDS / 2
     assert report.deaths
     assert report.lost <= report.deaths

@@ -15,7 +15,7 @@ from talkcli.engine.synthesizers.guard import guarded
 from tests.faults.fuzz_texts import fuzz, list_voices, speak_all
 from tests.faults.fuzz_texts_generator import Case, cases, crashers, dated
 
-SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (60 if os.environ.get("CI") else 10))
+SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 10))
 #: Texts of each known kind that are made anew each day.
 OF_TODAY = 12
 

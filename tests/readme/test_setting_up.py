@@ -219,7 +219,7 @@ def test_ci_runs_the_second_command() -> None:
     done = subprocess.run(["bash", "-c", f'{finds}; echo "$test_command"'], cwd=ROOT, capture_output=True, check=True)
     assert done.stdout.decode() == block("Start #3")
     steps = [each for each in ci.splitlines() if each and not each.startswith("step ")]
-    assert steps[-2:] == ['eval "$test_command"', '"$bin/pytest" -n 3 -m slow']
+    assert steps[-2:] == ['eval "$test_command"', '"$bin/pytest" -n 4 -m slow']
     before = README.text[: README.text.index(block("Start #3"))].rpartition("passes the tests (")[2]
     assert "pulseaudio" in _packages(before) <= _packages(ci)
 

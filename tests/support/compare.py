@@ -102,7 +102,10 @@ def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> l
         assert found is not None, f"sentence {number} of {len(references)} was not heard: {_told(samples, result)}"
         start = cursor + found[0]
         each = _next(samples, wanted, start)
-        assert each.same, f"sentence {number} of {len(references)} was not heard as it should: {_told(samples, [each])}"
+        assert each.same, (
+            f"sentence {number} of {len(references)} was not heard as it should: {_told(samples, [each])}; "
+            f"sample by sample (heard at, its own, so many): {_walk(samples, wanted, start)} of {len(wanted)}"
+        )
         cursor = min(len(samples), each.end + _SLACK)
         result.append(each)
     assert extent(samples[cursor:]) is None, (

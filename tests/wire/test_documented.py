@@ -304,6 +304,6 @@ def test_readme_has_the_setup_commands_as_they_were() -> None:
             '{ talk serve & sleep 3; talk say "talk is ready" --wait; }\n',
             "python3 -m venv .venv && . .venv/bin/activate && pip install . && "
             '{ talk serve --player file:ready.wav & sleep 3; talk say "talk is ready" --wait; }\n',
-            "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest -n 3\n",
+            "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest -n 4\n",
         ]
     )
