@@ -1,4 +1,4 @@
-"""Mutated requests: a seed that never changes, and a slow one of today; that is half a minute in CI, else some seconds."""
+"""Mutated requests: a seed that never changes, and a slow one of today: half a minute of it in CI, else some seconds."""
 
 from __future__ import annotations
 
