@@ -1,4 +1,4 @@
-"""Mutated requests: a seed that never changes, and a slow one of today: half a minute of it in CI, else some seconds."""
+"""Mutated requests: a seed that never changes, and a slow one of today: half a minute in CI, else seconds."""
 
 from __future__ import annotations
 
