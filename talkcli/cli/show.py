@@ -89,10 +89,10 @@ class Common:
     def _reach(self, robot: str, **options: Any) -> Connection:
         """Return a connection to a robot of a fleet."""
         broker = self.broker()
-        from talkcli.fleet.robot import RobotConnection
+        from talkcli.fleet.robot import reach
 
         options.pop("urgent", None)  # a broker keeps no places for that
-        return RobotConnection(robot, broker, **options)
+        return reach(robot, broker, **options)
 
 
 def need_fleet() -> None:

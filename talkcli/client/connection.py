@@ -207,19 +207,39 @@ class BaseConnection:
     def request(
         self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
     ) -> tuple[JsonObject, list[JsonObject]]:
-        exchange = Exchange(next(self._numbers), request, on_reply)
-        self._exchanges[exchange.number] = exchange
         # A goal whose sender was interrupted before it knew the goal's id could not be cancelled any more. One that
         # waits for room isn't accepted yet: who hangs up takes it back.
         interruptible = slow or not isinstance(request, Say)
+        exchange = self.begin(request, on_reply)
         try:
-            self._send(exchange.number, request)
             late, deadline = 0.0, -1.0
             while not exchange.over and self.ended is None and late != deadline:
                 late, deadline = deadline, self._answer_by(exchange)
                 self.wait_until(lambda: exchange.over, None if slow else deadline, interruptible=interruptible)
         finally:
-            del self._exchanges[exchange.number]
+            self.forget(exchange)
+        return self.answer(exchange)
+
+    def begin(self, request: Request, on_reply: OnReply | None = None) -> Exchange:
+        """Send a request whose answer is taken in as it comes; `forget` it at last."""
+        exchange = Exchange(next(self._numbers), request, on_reply)
+        self._exchanges[exchange.number] = exchange
+        try:
+            self._send(exchange.number, request)
+        except BaseException:
+            self.forget(exchange)
+            raise
+        return exchange
+
+    def forget(self, exchange: Exchange) -> None:
+        """Wait for an answer no more."""
+        del self._exchanges[exchange.number]
+
+    def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
+        """Return the reply, and the lines of its list, to a request that nothing more is waited for; errors as of
+        `request`.
+        """
+        request = exchange.request
         if exchange.error is not None:
             raise exchange.error
         if exchange.reply is None and not exchange.sent:

@@ -26,7 +26,7 @@ from talkcli.errors import BadRequest, ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, from_environment, is_here, user
 from talkcli.fleet.link import NOT_AUTHORIZED, PATIENCE, Link
-from talkcli.fleet.robot import RobotConnection
+from talkcli.fleet.robot import reach
 from talkcli.fleet.roster import roster
 from talkcli.frozen import frozen, replace
 from talkcli.protocol.lines import decode
@@ -229,9 +229,7 @@ class Examination:
     def _answer(self, broker: Broker) -> Finding:
         end = time.monotonic() + _LIMIT
         try:
-            connection = RobotConnection(
-                self._robot, broker, name=_NAME, interrupt=self._interrupt, patience=PATIENCE, end=end
-            )
+            connection = reach(self._robot, broker, name=_NAME, interrupt=self._interrupt, patience=PATIENCE, end=end)
             with Client.over(connection) as client:
                 began = time.monotonic()
                 server = client.status().server

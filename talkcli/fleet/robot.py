@@ -8,14 +8,12 @@ only where the robot has never heard of it. What has happened by then to goals t
 from __future__ import annotations
 
 import os
-import random
-import select
 import time
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from talkcli import __version__
-from talkcli.client.connect import ANSWER_LIMIT, ready, sender
+from talkcli.client.connect import ANSWER_LIMIT, sender
 from talkcli.client.connection import BaseConnection, Exchange
 from talkcli.errors import (
     AccessDenied,
@@ -28,8 +26,8 @@ from talkcli.errors import (
     UsageError,
 )
 from talkcli.fleet import topics
-from talkcli.fleet.broker import user
-from talkcli.fleet.link import KEEPALIVE, NOT_AUTHORIZED, REFUSED, TICK, Link, Opening, boottime
+from talkcli.fleet.desk import ABSENCE_LIMIT, Desk
+from talkcli.fleet.link import REFUSED, boottime
 from talkcli.frozen import replace
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Cancel, Say, Set
@@ -44,17 +42,11 @@ if TYPE_CHECKING:
 
     from talkcli.client.connection import OnReply
     from talkcli.fleet.broker import Broker
+    from talkcli.fleet.link import Link
     from talkcli.fleet.message import Message
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
-#: Seconds after which a broker or a robot that went away counts as gone, and what was waited for as lost: bridges are
-#: back within 15 s of their broker, and systemd starts one again after two.
-ABSENCE_LIMIT = 30.0
-#: Seconds between two tries to reach a broker that went away: any time up to the first, doubled up to the second.
-_FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
-#: Seconds for which a robot's presence is awaited that the broker keeps: some send it a moment after the rest.
-_GRACE = 0.3
 #: Seconds for which the broker keeps anything but a sentence for a robot: what is later, nobody waits for.
 _EXPIRY = 5
 #: Seconds after which one who waits says again that it is there: a bridge lets go of who says nothing for 90.
@@ -77,20 +69,17 @@ class RobotConnection(BaseConnection):
     def __init__(
         self,
         robot: str,
-        broker: Broker,
+        desk: Desk,
         *,
         name: str | None = None,
         interrupt: Mapping[int, int] | None = None,
         patience: float = ANSWER_LIMIT,
         end: float | None = None,
     ) -> None:
-        """Connect, and find the robot there.
+        """A robot that `desk` will tell of, see `reach`; what is asked before that waits.
 
         `robot`: its name; `name`, `interrupt`, `patience`: as of `SocketConnection`; `end`: until when an answer is
-        waited for at most, by the monotonic clock, absences included.
-
-        ServerUnavailable where there is no broker, or no such robot, or that has no server: nothing was sent then.
-        AccessDenied where the broker doesn't let this user in, or may not be trusted; UsageError for what can't be.
+        waited for at most, by the monotonic clock, absences included. UsageError for names that can't be.
         """
         super().__init__(patience)
         fault = topics.fault(robot)
@@ -99,50 +88,29 @@ class RobotConnection(BaseConnection):
         self._name = sender(name)
         if self._name and len(self._name) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(self._name)} characters, the longest is {MAX_NAME}")
-        self._robot, self._broker, self._user = robot, broker, user(broker)
-        self.path = f"{robot} ({broker.url})"
+        self._robot, self._desk = robot, desk
+        self.path = f"{robot} ({desk.broker.url})"
         self._interrupt, self._end = interrupt, end
-        #: by which the broker and the bridge tell this connection from others of the user's
-        self._session = os.urandom(8).hex()
-        self._link: Link | None = None
-        self._opening: Opening | None = None
-        #: what went wrong last on the way to the broker
-        self._failure: TalkError | None = None
-        self._tries = 0
-        self._next_try = self._served_at = self._signed_at = time.monotonic()
-        self._wake, self._write = os.pipe()
-        for each in (self._wake, self._write):
-            os.set_blocking(each, False)
-        #: what has come and is not taken in yet, in its order
-        self._inbox: deque[Message] = deque()
+        self._signed_at = time.monotonic()
         self._splitter = LineSplitter()
-        #: the robot's presence, as it is known on this link; and when the link's own marker came back
+        #: the robot's presence, as it is known on this connection to the broker
         self._presence: JsonObject = {}
-        self._marked_at: float | None = None
         #: the bridge that was asked, by its session; None where it has to be asked anew
         self._bridge: object = None
         #: since when there is nobody to ask, by the monotonic clock; None while there is
-        self._absent_since: float | None = self._served_at
+        self._absent_since: float | None = self._signed_at
         #: goals that are followed, and whether each of their words is
         self._goals: dict[str, bool] = {}
         #: goals to be asked for, and those that are being asked for: by number, the id and who waits for it
         self._to_ask: deque[tuple[str, Exchange | None]] = deque()
         self._asked: dict[int, tuple[str, Exchange | None]] = {}
-        try:
-            self._greet()
-        except BaseException:
-            self.close()
-            raise
 
     # -- requests
 
-    def request(
-        self, request: Request, on_reply: OnReply | None = None, *, slow: bool = False
-    ) -> tuple[JsonObject, list[JsonObject]]:
+    def begin(self, request: Request, on_reply: OnReply | None = None) -> Exchange:
         if isinstance(request, Say) and request.id is None:
-            # By it the goal can be asked for; it is not of the form of a server's own.
-            request = replace(request, id=f"{self._user[:_OF_USER]}:{os.urandom(5).hex()}")
-        return super().request(request, on_reply, slow=slow)
+            request = replace(request, id=new_id(self._desk))
+        return super().begin(request, on_reply)
 
     def post(self, request: Request) -> None:
         if not self._publish(next(self._numbers), request):
@@ -155,17 +123,17 @@ class RobotConnection(BaseConnection):
                 exchange.latest = boottime() + request.ttl
             exchange.sent = self._publish(number, request, exchange)
         if not exchange.sent:
-            self._wake_up()  # it goes out as soon as there is somebody to ask
+            self._desk.wake()  # it goes out as soon as there is somebody to ask
 
     def _publish(self, number: int, request: Request, exchange: Exchange | None = None) -> bool:
         """Send a request to the robot, and return whether that was possible."""
-        link = self._link
+        link = self._desk.link
         if link is None or self.ended is not None or self._absent_since is not None:
             return False
 
         def acknowledged(code: int) -> None:
             if exchange is not None and code >= REFUSED:
-                exchange.error = self._refused(code, f"ask {self._robot} for anything")
+                exchange.error = self._desk.refused(code, f"ask {self._robot} for anything")
 
         line = request_line({"seq": number, **write_request(request)})
         if len(line) > link.room:
@@ -174,8 +142,8 @@ class RobotConnection(BaseConnection):
                 exchange.error = RequestRefused(words, "too_long")
             return False
         self._signed_at = time.monotonic()
-        topic = topics.robot(self._robot, topics.REQUEST, self._user)
-        response = topics.reply(self._user, self._session, self._robot)
+        topic = topics.robot(self._robot, topics.REQUEST, self._desk.user)
+        response = self._desk.answers(self._robot)
         expiry = (request.ttl or None) if isinstance(request, Say) else _EXPIRY
         return link.publish(topic, line, expiry=expiry, response=response, acknowledged=acknowledged)
 
@@ -200,88 +168,41 @@ class RobotConnection(BaseConnection):
     # -- what comes
 
     def _fill(self, timeout: float, interruptible: bool) -> None:
-        link = self._link
-        now = time.monotonic()
-        if link is not None and (link.ended or now - self._served_at > 2 * KEEPALIVE):
-            self._lose_link(link)
-            link = None
-        due = self._see_to(link, now)
-        watched = {self._wake: select.POLLIN}
-        descriptor = -1 if link is None else link.fileno()
-        if link is not None and descriptor >= 0:  # another thread may have found out that it has ended
-            watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
-        found = ready(watched, min(timeout, due), self._interrupt if interruptible else None)
-        if self._wake in found:
-            os.read(self._wake, 4096)
-        self._served_at = time.monotonic()
-        if link is not None and descriptor in found:
-            link.read()
-        with self.changed:
-            self._take()
+        self.sign()
+        self._desk.serve(timeout, self._interrupt if interruptible else None)
 
-    def _see_to(self, link: Link | None, now: float) -> float:
-        """Do what is due without anybody's word, and return the seconds until more is."""
-        if link is None:
-            opening = self._opening
-            if opening is None and now >= self._next_try:
-                self._opening = Opening(self._new_link(), self._wake_up)
-            elif opening is not None and opening.done:
-                self._opened(opening)
-                return 0.0
-            return TICK if self._opening else max(0.0, self._next_try - now)
-        if now - self._signed_at > _SIGN_OF_LIFE:
+    def sign(self) -> None:
+        """Say that one still waits, where that is due."""
+        if time.monotonic() - self._signed_at > _SIGN_OF_LIFE:
             self._publish(next(self._numbers), Hello(self._name))
-        link.tick()
-        return TICK if self._marked_at is None or self._presence else min(TICK, _GRACE)
 
-    def _new_link(self) -> Link:
-        return Link(self._broker, f"talk-desk-{self._user}-{self._session}", self._inbox.append)
+    # -- what the desk tells
 
-    def _opened(self, opening: Opening) -> None:
-        """Take over the connection to the broker, or try again after a while."""
-        self._opening = None
-        if opening.error is not None:
-            self._tries += 1
-            longest = min(_LONGEST_PAUSE, _FIRST_PAUSE * 2**self._tries)
-            self._next_try = time.monotonic() + random.uniform(0, longest)
-            self._failure, self._absent = opening.error, str(opening.error)
-            return
-        self._link, self._tries, self._served_at = opening.link, 0, time.monotonic()
-        self._inbox.clear()
-        self._splitter = LineSplitter()
-        # The marker comes back behind all that the broker keeps.
-        marker = topics.reply(self._user, self._session, topics.MARKER)
-        answers = topics.reply(self._user, self._session, self._robot)
-        opening.link.subscribe(marker, answers, retained=False)
-        opening.link.subscribe(topics.robot(self._robot, topics.PRESENCE), retained=True)
-        opening.link.publish(marker, b"\n", acknowledged=self._marker_taken)
+    def came_up(self, link: Link) -> None:
+        """Have the robot's answers come, and its presence."""
+        link.subscribe(self._desk.answers(self._robot), retained=False)
+        link.subscribe(topics.robot(self._robot, topics.PRESENCE), retained=True)
 
-    def _marker_taken(self, code: int) -> None:
-        if code >= REFUSED:
-            self._failure = self._refused(code, f"write to {topics.reply(self._user, '+', '+')}")
+    def went_down(self, why: str) -> None:
+        """Take the robot for absent until the broker tells of it again."""
+        with self.changed:
+            self._splitter = LineSplitter()
+            self._presence, self._bridge = {}, None
+            self._away(why)
 
-    def _lose_link(self, link: Link) -> None:
-        link.close()
-        self._link, self._presence, self._marked_at, self._bridge = None, {}, None, None
-        self._next_try = time.monotonic() + random.uniform(0, _FIRST_PAUSE)
-        self._away(f"the broker at {self._broker.url} went away")
+    def hear(self, message: Message) -> None:
+        """Take in the robot's presence, or lines of its server's."""
+        with self.changed:
+            if message.topic == topics.robot(self._robot, topics.PRESENCE):
+                self._be_present(message.payload)
+            else:
+                self._heard = time.monotonic()
+                self._lines.extend(self._splitter.feed(message.payload))
 
     def _away(self, why: str) -> None:
         self._absent = why
         if self._absent_since is None:
             self._absent_since = time.monotonic()
-
-    def _take(self) -> None:
-        """Take in what has come, in its order; under `changed`."""
-        while self._inbox:
-            message = self._inbox.popleft()
-            if message.topic == topics.robot(self._robot, topics.PRESENCE):
-                self._be_present(message.payload)
-            elif message.topic.endswith(f"/{topics.MARKER}"):
-                self._marked_at = time.monotonic()
-            else:
-                self._heard = time.monotonic()
-                self._lines.extend(self._splitter.feed(message.payload))
 
     def _be_present(self, payload: bytes) -> None:
         """Take up what the robot's bridge, or its will, says of the robot."""
@@ -304,42 +225,29 @@ class RobotConnection(BaseConnection):
 
     # -- the beginning
 
-    def _greet(self) -> None:
-        """Wait until the broker has told of the robot."""
+    def greet(self) -> None:
+        """Wait until the broker has told of the robot; errors as of `reach`."""
+        desk = self._desk
         end = time.monotonic() + self._patience
-        while not (self._presence and self._marked_at):
-            if self._failure is not None:
-                raise self._failure
-            now = time.monotonic()
-            if self._marked_at is not None and now > self._marked_at + _GRACE:
+        while not (self._presence and desk.marked_at):
+            if desk.failure is not None:
+                raise desk.failure
+            if desk.told:
                 break
+            now = time.monotonic()
             if now >= end:
-                raise self._unanswered()
-            self._fill(end - now, interruptible=True)
+                raise desk.unanswered(self._patience)
+            desk.serve(end - now, self._interrupt)
         if not self._presence:
-            words = f"no robot '{self._robot}' is known at {self._broker.url}: nothing was sent"
+            words = f"no robot '{self._robot}' is known at {desk.broker.url}: nothing was sent"
             raise ServerUnavailable(f"{words}; on the robot: talk bridge --name {self._robot}")
+        self.check()
+
+    def check(self) -> None:
+        """Raise what keeps the robot from being asked: ServerUnavailable, ProtocolMismatch."""
         check_greeting(self._presence, __version__)
         if self._absent_since is not None:
             raise ServerUnavailable(f"{self._absent}: nothing was sent")
-        if self._name:
-            self._publish(next(self._numbers), Hello(self._name))
-
-    def _unanswered(self) -> TalkError:
-        """Return what is wrong where the broker tells nothing of the robot."""
-        if self._link is None or self._marked_at is not None:
-            return ServerUnavailable(f"the broker at {self._broker.url} does not answer within {self._patience:g} s")
-        return self._forbidden(f"read {topics.reply(self._user, '+', '+')}")
-
-    def _refused(self, code: int, what: str) -> TalkError:
-        """Return the error for a reason of the broker's for which it has taken nothing."""
-        if code == NOT_AUTHORIZED:
-            return self._forbidden(what)
-        return ServerUnavailable(f"nothing was sent: the broker at {self._broker.url} refuses it, reason 0x{code:02x}")
-
-    def _forbidden(self, what: str) -> AccessDenied:
-        words = f"the broker at {self._broker.url} does not let '{self._user}' {what}"
-        return AccessDenied(f"{words}: its ACL needs the lines of an operator, see 'talk bridge --print-acl'")
 
     # -- after an absence
 
@@ -463,33 +371,43 @@ class RobotConnection(BaseConnection):
 
     # -- the end
 
-    def _wake_up(self) -> None:
-        """Have the thread that waits look around, from any thread."""
-        if self._write < 0:
-            return
-        try:
-            os.write(self._write, b"\0")
-        except BlockingIOError:
-            pass  # it is awake
+    def hang_up(self) -> None:
+        """Have the bridge let its own connection for this one go, by an empty line."""
+        link = self._desk.link
+        if link is not None and self._bridge is not None:
+            topic = topics.robot(self._robot, topics.REQUEST, self._desk.user)
+            link.publish(topic, b"", 0, response=self._desk.answers(self._robot))
 
     def _hang_up(self) -> None:
-        link = self._link
-        if link is not None and self._bridge is not None:
-            # An empty line, by which the bridge lets its own connection for this one go.
-            topic = topics.robot(self._robot, topics.REQUEST, self._user)
-            link.publish(topic, b"", 0, response=topics.reply(self._user, self._session, self._robot))
-        self._wake_up()
+        self.hang_up()
+        self._desk.wake()
 
     def _drop(self) -> None:
-        child = os.getpid() != self._process
-        if self._opening is not None and not child:
-            self._opening.give_up()
-        if self._link is not None:
-            self._link.drop() if child else self._link.close()
-        descriptors, self._wake, self._write = (self._wake, self._write), -1, -1
-        for each in descriptors:
-            if each >= 0:
-                os.close(each)
+        if os.getpid() != self._process:
+            self._desk.drop()
+        else:
+            self._desk.close()
+
+
+def reach(robot: str, broker: Broker, **options: Any) -> RobotConnection:
+    """Connect to a robot's server by a desk of its own, and find the robot there; the options are RobotConnection's.
+
+    ServerUnavailable where there is no broker, or no such robot, or that has no server: nothing was sent then.
+    AccessDenied where the broker doesn't let this user in, or may not be trusted; UsageError for what can't be.
+    """
+    desk = Desk(broker)
+    try:
+        desk.visitor = connection = RobotConnection(robot, desk, **options)
+        connection.greet()
+    except BaseException:
+        desk.close()
+        raise
+    return connection
+
+
+def new_id(desk: Desk) -> str:
+    """Return an id for a sentence, by which it can be asked for; it is not of the form of a server's own."""
+    return f"{desk.user[:_OF_USER]}:{os.urandom(5).hex()}"
 
 
 def _state(goal: JsonObject) -> State:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import Client
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.robot import RobotConnection
+from talkcli.fleet.robot import reach
 from tests.fleet.robot import Robot
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
@@ -43,7 +43,7 @@ class Site:
 
     def desk(self) -> Client:
         """Return a connection by the broker."""
-        return Client.over(RobotConnection(ROBOT, from_environment(self.env), name="bench"))
+        return Client.over(reach(ROBOT, from_environment(self.env), name="bench"))
 
     def local(self) -> Client:
         """Return a connection to the robot's own socket."""

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import Client
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.robot import RobotConnection
+from talkcli.fleet.robot import reach
 from talkcli.goals.states import State
 from tests.fleet.soak_desks import RATE, Desks, Ledger
 from tests.fleet.soak_faults import Faults
@@ -194,7 +194,7 @@ class Soak:
         goal = self.report.ledger.new()
         began = time.monotonic()
         broker = from_environment(self._broker.env("calm", password=False))
-        with Client.over(RobotConnection(ROBOT, broker)) as client:
+        with Client.over(reach(ROBOT, broker)) as client:
             found = client.say(goal.text, id=goal.id, rate=RATE).wait(BACK)
         took = time.monotonic() - began
         self.report.ledger.end(goal, found.state.name)

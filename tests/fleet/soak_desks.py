@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from talkcli import Client
 from talkcli.errors import Lost, RequestRefused, ServerUnavailable, UnknownGoal
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.robot import RobotConnection
+from talkcli.fleet.robot import reach
 from talkcli.protocol.events import Result
 from tests.support.bridge import Desk
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Callable, Iterator
 
+    from talkcli.client.connection import Connection
     from talkcli.client.goal import GoalHandle
     from tests.support.broker import Broker
     from tests.support.processes import Process
@@ -189,12 +190,12 @@ class Desks:
                 if found:
                     self._ledger.end(found[0], _end(found[1], chance))
 
-    def _connections(self, name: str) -> Iterator[tuple[Client, RobotConnection]]:
+    def _connections(self, name: str) -> Iterator[tuple[Client, Connection]]:
         """Yield a connection, another where that is done with, until all is over."""
         broker = from_environment(self._broker.env(name, password=False))
         while not self._over.is_set():
             try:
-                connection = RobotConnection(self._robot, broker, name="soak")
+                connection = reach(self._robot, broker, name="soak")
             except ServerUnavailable:
                 self._ledger.turn_away()
                 self._over.wait(_AGAIN)

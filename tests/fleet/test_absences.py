@@ -119,10 +119,10 @@ def desk_of(robot: Robot, port: int) -> Client:
     """Return a client of the robot, which comes to the broker by that port."""
     needs_packages("paho")
     from talkcli.fleet.broker import from_environment
-    from talkcli.fleet.robot import RobotConnection
+    from talkcli.fleet.robot import reach
 
     found = from_environment({"TALK_BROKER": robot.broker.url_at(port), "TALK_MQTT_USER": "olga"})
-    return Client.over(RobotConnection(robot.name, found))
+    return Client.over(reach(robot.name, found))
 
 
 @pytest.mark.slow

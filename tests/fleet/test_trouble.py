@@ -11,7 +11,7 @@ import pytest
 from talkcli import Client, State
 from talkcli.errors import Lost
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.robot import RobotConnection
+from talkcli.fleet.robot import reach
 from tests.support.bridge import Bridge, Desk, desk
 from tests.support.broker import Broker
 from tests.support.mqtt import Listener
@@ -31,7 +31,7 @@ TOO_LONG = "word " * 1_200
 def client(lasting_robot: Robot) -> Iterator[Client]:
     """A desk of this process's own."""
     broker = from_environment(lasting_robot.broker.env())
-    with Client.over(RobotConnection("anna", broker)) as client:
+    with Client.over(reach("anna", broker)) as client:
         yield client
 
 
@@ -49,7 +49,7 @@ def test_a_cancel_whose_answer_is_lost_ends_nothing_that_came_later(robot: Robot
     robot.talk.run("say", "--id", "old", "old")
     with Proxy(robot.broker.port) as proxy, Desk(robot.broker, port=proxy.port) as somebody:
         broker = from_environment(somebody.env)
-        with Client.over(RobotConnection("anna", broker)) as client, ThreadPoolExecutor(1) as thread:
+        with Client.over(reach("anna", broker)) as client, ThreadPoolExecutor(1) as thread:
             with Listener(robot.broker, "talk/reply/+/+/anna") as listener:
                 proxy.hold("to_client")
                 asked = thread.submit(client.cancel)

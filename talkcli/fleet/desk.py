@@ -1,0 +1,197 @@
+"""A desk's way to the broker: one user's connection, made anew wherever it breaks, until the desk goes home.
+
+Who has one waits in `serve`, and is told by that of what has come. Nothing is kept while the broker is away. Nothing
+here knows what is asked of whom.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import select
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Protocol
+
+from talkcli.client.connect import ready
+from talkcli.errors import AccessDenied, ServerUnavailable, TalkError
+from talkcli.fleet import topics
+from talkcli.fleet.broker import user
+from talkcli.fleet.link import KEEPALIVE, NOT_AUTHORIZED, REFUSED, TICK, Link, Opening
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from talkcli.fleet.broker import Broker
+    from talkcli.fleet.message import Message
+
+#: Seconds after which a broker or a robot that went away counts as gone, and what was waited for as lost: bridges are
+#: back within 15 s of their broker, and systemd starts one again after two.
+ABSENCE_LIMIT = 30.0
+#: Seconds for which presence is awaited that the broker keeps: some send it a moment after the rest.
+GRACE = 0.3
+#: Seconds between two tries to reach a broker that went away: any time up to the first, doubled up to the second.
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
+
+
+class Visitor(Protocol):
+    """Whoever has a desk, and is told by it, in `Desk.serve`, of what happens."""
+
+    def came_up(self, link: Link) -> None:
+        """Subscribe to what is wanted, on a connection that has just been made."""
+
+    def went_down(self, why: str) -> None:
+        """Take note that there is no connection any more."""
+
+    def hear(self, message: Message) -> None:
+        """Take what has come."""
+
+
+class Desk:
+    """A connection to the broker that comes back. `serve` is called by one thread at a time, the rest by any."""
+
+    #: who is told; to be there before `serve`
+    visitor: Visitor
+
+    def __init__(self, broker: Broker) -> None:
+        """UsageError where the user's name can't be in a topic. It connects in `serve`."""
+        self.broker, self.user = broker, user(broker)
+        #: by which the broker and the bridges tell this desk from others of the user's
+        self.session = os.urandom(8).hex()
+        #: the connection; None while there is none
+        self.link: Link | None = None
+        #: why the broker was not to be had, the last time; or what it refuses
+        self.failure: TalkError | None = None
+        #: when what this desk had sent itself came back on this connection, behind all that the broker keeps
+        self.marked_at: float | None = None
+        self._inbox: deque[Message] = deque()
+        self._opening: Opening | None = None
+        self._tries = 0
+        self._next_try = self._served_at = time.monotonic()
+        self._wake, self._write = os.pipe()
+        for each in (self._wake, self._write):
+            os.set_blocking(each, False)
+
+    @property
+    def told(self) -> bool:
+        """Whether the broker has had the time to tell all that it keeps."""
+        return self.marked_at is not None and time.monotonic() > self.marked_at + GRACE
+
+    def answers(self, robot: str) -> str:
+        """Return the topic on which this desk is answered by a robot."""
+        return topics.reply(self.user, self.session, robot)
+
+    def serve(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> None:
+        """Wait so many seconds at most until something happens, and tell of it; Interrupted as of `connect.ready`."""
+        link = self.link
+        now = time.monotonic()
+        if link is not None and (link.ended or now - self._served_at > 2 * KEEPALIVE):
+            self._lose(link)
+            link = None
+        due = self._see_to(link, now)
+        watched = {self._wake: select.POLLIN}
+        descriptor = -1 if link is None else link.fileno()
+        if link is not None and descriptor >= 0:  # another thread may have found out that it has ended
+            watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
+        found = ready(watched, min(timeout, due), interrupt)
+        if self._wake in found:
+            os.read(self._wake, 4096)
+        self._served_at = time.monotonic()
+        if link is not None and descriptor in found:
+            link.read()
+        while self._inbox:
+            message = self._inbox.popleft()
+            if message.topic == self.answers(topics.MARKER):
+                self.marked_at = time.monotonic()
+            else:
+                self.visitor.hear(message)
+
+    def wake(self) -> None:
+        """Have the thread that waits look around, from any thread."""
+        if self._write < 0:
+            return
+        try:
+            os.write(self._write, b"\0")
+        except BlockingIOError:
+            pass  # it is awake
+
+    def close(self) -> None:
+        """End it."""
+        if self._opening is not None:
+            self._opening.give_up()
+        if self.link is not None:
+            self.link.close()
+        self._close_descriptors()
+
+    def drop(self) -> None:
+        """Close this process's copies of the descriptors, as a child does: the connection is its parent's."""
+        if self.link is not None:
+            self.link.drop()
+        self._close_descriptors()
+
+    def refused(self, code: int, what: str) -> TalkError:
+        """Return the error for a reason of the broker's for which it has taken nothing; `what`: what it was to let."""
+        if code == NOT_AUTHORIZED:
+            return self.forbidden(what)
+        return ServerUnavailable(f"nothing was sent: the broker at {self.broker.url} refuses it, reason 0x{code:02x}")
+
+    def forbidden(self, what: str) -> AccessDenied:
+        """Return the error for what the broker's rules don't let this user do."""
+        words = f"the broker at {self.broker.url} does not let '{self.user}' {what}"
+        return AccessDenied(f"{words}: its ACL needs the lines of an operator, see 'talk bridge --print-acl'")
+
+    def unanswered(self, patience: float) -> TalkError:
+        """Return what is wrong where the broker has told nothing in so many seconds."""
+        if self.link is None or self.marked_at is not None:
+            return ServerUnavailable(f"the broker at {self.broker.url} does not answer within {patience:g} s")
+        return self.forbidden(f"read {topics.reply(self.user, '+', '+')}")
+
+    def _see_to(self, link: Link | None, now: float) -> float:
+        """Do what is due without anybody's word, and return the seconds until more is."""
+        if link is None:
+            opening = self._opening
+            if opening is None and now >= self._next_try:
+                self._opening = Opening(self._new_link(), self.wake)
+            elif opening is not None and opening.done:
+                self._opened(opening)
+                return 0.0
+            return TICK if self._opening else max(0.0, self._next_try - now)
+        link.tick()
+        return TICK if self.marked_at is None or self.told else GRACE
+
+    def _new_link(self) -> Link:
+        return Link(self.broker, f"talk-desk-{self.user}-{self.session}", self._inbox.append)
+
+    def _opened(self, opening: Opening) -> None:
+        """Take over the connection to the broker, or try again after a while."""
+        self._opening = None
+        if opening.error is not None:
+            self._tries += 1
+            longest = min(_LONGEST_PAUSE, _FIRST_PAUSE * 2**self._tries)
+            self._next_try = time.monotonic() + random.uniform(0, longest)
+            self.failure = opening.error
+            self.visitor.went_down(str(opening.error))
+            return
+        link, self._tries, self._served_at = opening.link, 0, time.monotonic()
+        self.link = link
+        self._inbox.clear()
+        link.subscribe(self.answers(topics.MARKER), retained=False)
+        self.visitor.came_up(link)
+        # It comes back behind all that the broker keeps.
+        link.publish(self.answers(topics.MARKER), b"\n", acknowledged=self._marker_taken)
+
+    def _marker_taken(self, code: int) -> None:
+        if code >= REFUSED:
+            self.failure = self.refused(code, f"write to {topics.reply(self.user, '+', '+')}")
+
+    def _lose(self, link: Link) -> None:
+        link.close()
+        self.link, self.marked_at = None, None
+        self._next_try = time.monotonic() + random.uniform(0, _FIRST_PAUSE)
+        self.visitor.went_down(f"the broker at {self.broker.url} went away")
+
+    def _close_descriptors(self) -> None:
+        descriptors, self._wake, self._write = (self._wake, self._write), -1, -1
+        for each in descriptors:
+            if each >= 0:
+                os.close(each)
