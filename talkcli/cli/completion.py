@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from talkcli.cli.show import Common
     from talkcli.client.client import Client
+    from talkcli.fleet.presence import Presence
     from talkcli.goals.goal import Goal, JsonObject
 
     Items = list[CompletionItem[str]]
@@ -216,13 +217,12 @@ def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items
         found = roster(broker, PATIENCE)
     except (TalkError, OSError, ValueError):
         return []
-    there = [(name, ", ".join(_groups(said)) or "robot") for name, said in sorted(found.items()) if said.get("online")]
+    there = [(name, ", ".join(_groups(each)) or "robot") for name, each in sorted(found.items()) if each.online]
     return _items(there, incomplete)
 
 
-def _groups(presence: JsonObject) -> list[str]:
-    groups = presence.get("groups")
-    return [printable(str(each), _MAX_TEXT) for each in groups] if isinstance(groups, list) else []
+def _groups(presence: Presence) -> list[str]:
+    return [printable(each, _MAX_TEXT) for each in presence.groups]
 
 
 def files(_: click.Context, __: click.Parameter, incomplete: str) -> Items:

@@ -22,14 +22,14 @@ from talkcli.client.client import Client
 from talkcli.client.connect import ready
 from talkcli.doctor.report import ADMITTED, ANSWERED, FAILED, Finding, done, failed, some, warning
 from talkcli.doctor.server import span, summary
-from talkcli.errors import BadRequest, ServerUnavailable, TalkError, UsageError
+from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, from_environment, is_here, user
 from talkcli.fleet.link import NOT_AUTHORIZED, PATIENCE, Link
+from talkcli.fleet.presence import Presence
 from talkcli.fleet.robot import reach
 from talkcli.fleet.roster import roster
 from talkcli.frozen import frozen, replace
-from talkcli.protocol.lines import decode
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -86,8 +86,8 @@ class Way:
 class Allowed:
     """What the broker did with all that was tried on it."""
 
-    #: the robot's presence; empty where the broker keeps none, or tells none
-    presence: JsonObject
+    #: the robot's presence; None where the broker keeps none, or tells none
+    presence: Presence | None
     #: topics to which this user may not publish, and those from which nothing came back
     unwritten: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
@@ -151,8 +151,8 @@ class Examination:
             yield judge_anonymous(self._closed_to_anybody(broker))
             allowed = self._try(link, name)
         rights = judge_rights(name, allowed)
-        if allowed.presence:
-            there = judge_name(self._robot, allowed.presence, time.time())
+        if allowed.presence is not None:
+            there = judge_name(allowed.presence, time.time())
         elif self._itself:
             there = judge_free(self._robot)
         else:
@@ -202,13 +202,14 @@ class Examination:
             link.publish(topic, payload, acknowledged=partial(codes.__setitem__, topic))
         now = time.monotonic()
         end, taken = now + PATIENCE, False
-        said: JsonObject = {}
+        said: Presence | None = None
         back = False
         while link.ended is None and now < end and not (taken and back and said):
             if link.fileno() in ready(_watched(link), end - now, self._interrupt):
                 link.read()
             back = back or any(each.topic == mark and each.payload == _MARK for each in self._inbox)
-            said = _presence([each for each in self._inbox if each.topic == presence]) or said
+            told = [each.payload for each in self._inbox if each.topic == presence]
+            said = Presence.read(self._robot, told[-1]) if told else said
             self._inbox.clear()
             now = time.monotonic()
             if not taken and len(codes) == len(tried):
@@ -296,14 +297,6 @@ def _watched(link: Link) -> dict[int, int]:
     return {link.fileno(): select.POLLIN | (select.POLLOUT if link.wants_write else 0)}
 
 
-def _presence(told: list[Message]) -> JsonObject:
-    """Return what the last of these messages says of the robot; empty where none says anything."""
-    try:
-        return decode(told[-1].payload.strip()) if told else {}
-    except BadRequest:
-        return {}  # somebody has cleared it
-
-
 def judge_settings(words: str, *, named: bool) -> Finding:
     """Judge variables that name no broker; `named`: whether TALK_BROKER is set."""
     if not named:
@@ -381,19 +374,20 @@ def judge_anonymous(refusal: str | None) -> Finding:
     return warning("anonymous", words, "allow_anonymous false in mosquitto.conf, and: talk bridge --print-acl")
 
 
-def judge_name(robot: str, presence: JsonObject, now: float) -> Finding:
+def judge_name(presence: Presence, now: float) -> Finding:
     """Judge what the broker keeps of the robot's presence."""
-    if presence.get("online") is not True:
+    robot = presence.name
+    if not presence.online:
         step = f"see on {robot}: systemctl status talk-bridge; it has lost its network, its power, or its bridge"
         return failed("name", f"{robot} is offline", step)
-    groups, since, server = presence.get("groups"), presence.get("since"), presence.get("server")
     words = f"{robot} is online"
-    if isinstance(since, int | float):
-        words += f" for {span(now - since)}"
-    words += f", session {presence.get('session')}"
-    if isinstance(groups, list) and groups:
-        words += f", of {some(tuple(map(str, groups)))}"
-    if not isinstance(server, dict):
+    if presence.since is not None:
+        words += f" for {span(now - presence.since)}"
+    words += f", session {presence.session}"
+    if presence.groups:
+        words += f", of {some(presence.groups)}"
+    server = presence.server
+    if server is None:
         return failed("name", f"{words}; it has no talk server", f"on {robot}: systemctl status talk; talk doctor")
     return done("name", f"{words}; its server is talk {server.get('version')}, process {server.get('pid')}")
 

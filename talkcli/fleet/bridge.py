@@ -386,7 +386,8 @@ class Bridge:
             log.seldom("rights", f"the broker doesn't let this robot publish all that it says: {_RIGHTS}")
 
     def _absence(self) -> bytes:
-        return encode({"talk": 1, "online": False, "session": self._session})
+        gone: JsonObject = {"talk": 1, "online": False, "session": self._session, "groups": list(self._groups)}
+        return encode(gone)
 
     def _server_changed(self) -> None:
         self._systemd.changed()

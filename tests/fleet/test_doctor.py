@@ -312,7 +312,7 @@ def test_without_tls_another_machine_s_broker_is_warned_of() -> None:
 
 
 def test_a_broker_that_hangs_up_on_what_is_not_allowed_is_told_from_one_that_refuses() -> None:
-    found = judging.judge_rights("olga", Allowed({}, (), ("talk/reply/olga/1/_",), "the broker went away"))
+    found = judging.judge_rights("olga", Allowed(None, (), ("talk/reply/olga/1/_",), "the broker went away"))
     assert (found.state, found.message) == ("failed", "what 'olga' may do can't be found out: the broker went away")
 
 

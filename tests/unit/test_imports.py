@@ -40,6 +40,9 @@ PURE = [
     "engine.words",
     "fleet.message",
     "fleet.policy",
+    "fleet.presence",
+    "fleet.selection",
+    "fleet.status",
     "fleet.topics",
 ]
 IMPURE = {
@@ -319,6 +322,7 @@ JUDGING = ["machine", "voice", "neural", "sound", "server", "sentence", "broker"
 #: What the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
     "talkcli.engine.players",
+    "talkcli.fleet.presence",
     "talkcli.goals.options",
     "talkcli.goals.states",
     "talkcli.terminal.goals",

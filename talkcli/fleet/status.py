@@ -1,0 +1,75 @@
+"""What a robot's status says of its goals: what is spoken, what waits, what ended last. Pure.
+
+As of its presence: what is not of the form that it should be is taken as not said.
+"""
+
+from __future__ import annotations
+
+from talkcli.errors import BadRequest
+from talkcli.frozen import TYPE_CHECKING, fields, frozen
+from talkcli.goals.states import State
+from talkcli.protocol.lines import decode
+
+if TYPE_CHECKING:
+    from talkcli.goals.goal import JsonObject
+
+
+@frozen
+class LastGoal:
+    """The goal that ended last."""
+
+    id: str
+    state: State
+    reason: str | None = None
+    #: None where it is not told
+    text: str | None = None
+    #: when it ended, in seconds since 1970 UTC by the robot's clock
+    at: float | None = None
+
+
+@frozen
+class Status:
+    """What a robot says of its goals."""
+
+    #: the id of the goal that is spoken, and its text; None where none is, or it is not told
+    active: str | None = None
+    text: str | None = None
+    #: how many goals wait
+    pending: int = 0
+    paused: bool = False
+    last: LastGoal | None = None
+
+    @classmethod
+    def read(cls, payload: bytes) -> Status | None:
+        """Return what the broker keeps of it; None where somebody has cleared it."""
+        try:
+            said = decode(payload.strip())
+        except BadRequest:
+            return None
+        pending = said.get("pending")
+        return cls(
+            _text(said.get("active")),
+            _text(said.get("text")),
+            max(0, pending) if isinstance(pending, int) else 0,
+            said.get("paused") is True,
+            _last(said.get("last")),
+        )
+
+    def to_json(self) -> JsonObject:
+        """Return it as an object, for programs."""
+        last = self.last
+        return {**fields(self), "last": None if last is None else {**fields(last), "state": last.state.name}}
+
+
+def _last(said: object) -> LastGoal | None:
+    if not isinstance(said, dict):
+        return None
+    goal_id, state, at = _text(said.get("id")), _text(said.get("state")), said.get("at")
+    if goal_id is None or state not in State.__members__:
+        return None
+    when = float(at) if isinstance(at, int | float) and not isinstance(at, bool) else None
+    return LastGoal(goal_id, State[str(state)], _text(said.get("reason")), _text(said.get("text")), when)
+
+
+def _text(value: object) -> str | None:
+    return value if isinstance(value, str) else None
