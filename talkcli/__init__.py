@@ -10,6 +10,9 @@ TYPE_CHECKING = False  # `typing` takes as long to import as a server to answer
 if TYPE_CHECKING:
     from talkcli.client.client import Client
     from talkcli.client.goal import GoalHandle
+    from talkcli.fleet.fleet import Fleet
+    from talkcli.fleet.outcome import Outcome
+    from talkcli.fleet.presence import Presence
     from talkcli.goals.goal import Goal
     from talkcli.goals.states import State
     from talkcli.protocol.events import Canceled, PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard
@@ -18,9 +21,12 @@ __version__ = "0.1.0"
 __all__ = [
     "Canceled",
     "Client",
+    "Fleet",
     "Goal",
     "GoalHandle",
+    "Outcome",
     "PausedChanged",
+    "Presence",
     "Result",
     "ServerStatus",
     "Snapshot",
@@ -36,6 +42,9 @@ def __getattr__(name: str) -> object:
         from talkcli.client import client
 
         return getattr(client, name)
+    if name in {"Fleet", "Outcome", "Presence"}:
+        module = __import__(f"talkcli.fleet.{name.lower()}", fromlist=[name])
+        return getattr(module, name)
     if name in {"Goal", "State"}:
         from talkcli.goals import goal
 

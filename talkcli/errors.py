@@ -10,6 +10,7 @@ from __future__ import annotations
 EXIT_OK = 0
 EXIT_ERROR = 1
 EXIT_USAGE = 2
+EXIT_DIFFER = 13
 EXIT_TIMEOUT = 124  # as timeout(1)
 EXIT_SIGNAL = 128  # plus the signal's number, as a shell reports it
 EXIT_SIGINT = EXIT_SIGNAL + 2

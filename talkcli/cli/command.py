@@ -8,8 +8,10 @@ It knows no single command; those are in `commands`. Pure; it is imported before
 
 from __future__ import annotations
 
+from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.option import FLAG, ID, INTEGER, NUMBER, PATH, SECONDS, WORD, Kind, Option
+from talkcli.paths import named_robot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -36,9 +38,11 @@ ASKING: Codes = {
     10: "permission denied",
     12: "lost: it was sent, then nothing more was heard; it may have an effect all the same",
 }
+#: … and of those that may ask several robots at once.
+ASKING_SEVERAL: Codes = {**ASKING, 13: "robots differ: those that did not do it failed in more than one way"}
 #: All of them, as the README's table has them; each command's help says which are its own.
 ALL_EXIT_CODES: Codes = {
-    **ASKING,
+    **ASKING_SEVERAL,
     0: "accepted; with --wait succeeded: all of it was played",
     1: "anything not named here; a bug says so, and TALK_DEBUG=1 where",
     2: "usage",
@@ -81,6 +85,8 @@ class Command:
     plain: bool = True
     #: whether it means a server, which may be a robot's of a fleet, and not this machine alone
     asks: bool = True
+    #: whether it may be asked of several robots at once: by the function of its name in `several`
+    several: bool = False
     rule: Rule | None = None
 
     def fault(
@@ -90,27 +96,40 @@ class Command:
 
         `robot`, `socket`: the options of every command that say whom it means, as they were typed.
         """
-        if robot is not None and (stray := self._stray(given, robot, socket)):
-            return stray
+        if robot is not None and (fault := self._stray(given, robot, socket)):
+            return fault
         refused = (words for each in self.options if (words := each.refusal(given[each.name])))
         return next(refused, None) or (self.rule(given, typed) if self.rule else None)
 
     def _stray(self, given: Mapping[str, Any], robot: str, socket: str | None) -> str | None:
-        """Return what is wrong with naming a robot, or None."""
-        from talkcli.fleet import topics
+        """Return what is wrong with naming a robot, or several, or None."""
+        from talkcli.fleet.selection import Selection, several
 
         if socket:
             return "--robot is a robot of a fleet, --socket a server of this machine: leave out one of them"
         if not self.asks or given.get("output") is not None:
             what = f"{self.name} --output" if self.asks else self.name
             return f"'talk {what}' is of this machine alone: leave out --robot"
-        fault = topics.fault(robot)
-        return f"no robot can be called '{robot}': a name {fault}" if fault else None
+        if several(robot):
+            lone = [f"--{each}" for each in ("lines", "feedback") if given.get(each)]
+            if not self.several or lone:
+                what = " ".join([self.name, *lone])
+                return (
+                    f"'talk {what}' is of one robot: name it; 'talk fleet status' and 'talk fleet watch' show several"
+                )
+        return Selection(robot).fault
 
     def carry_out(self, options: Common, given: Mapping[str, Any]) -> int | None:
         """Carry it out with what was given, and return the exit code; None for 0."""
         options.urgent = self.urgent
         module, _, name = self.runs.partition(":")
+        robot = named_robot(options.robot, options.socket) if self.asks and given.get("output") is None else None
+        if robot:
+            if fault := self._stray(given, robot, None):
+                raise UsageError(fault)
+            from talkcli.fleet.selection import several
+
+            module = "several" if several(robot) else module
         run: Callable[..., int | None] = getattr(__import__(f"talkcli.cli.{module}", fromlist=[name]), name)
         return run(options, **given)
 
@@ -132,7 +151,8 @@ COMMON = (
     option(
         "--robot",
         WORD,
-        "A robot of a fleet, by its broker (TALK_BROKER); not this machine.  [env var: TALK_ROBOT]",
+        "A robot of a fleet, by its broker (TALK_BROKER), not this machine; or several: 'GLOB', @GROUP, @all.  "
+        "[env var: TALK_ROBOT]",
         metavar="NAME",
         offers="robots",
     ),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 
-from talkcli.cli.command import ASKING, FILE, Command, option, spelt
+from talkcli.cli.command import ASKING, ASKING_SEVERAL, FILE, Command, option, spelt
 from talkcli.cli.daemons import BRIDGE, SERVE
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.option import FLAG, ID, IDS, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
@@ -98,8 +98,9 @@ _ROWS = (
         talk say -o hello.wav "hello"           needs no server
         talk say -o - "hello" | aplay
         """,
+        several=True,
         exit_codes={
-            **ASKING,
+            **ASKING_SEVERAL,
             0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
             4: "aborted: engine or audio failed; 'talk doctor' says more",
             5: "rejected: never queued (bad text, full queue or full server)",
@@ -128,8 +129,9 @@ _ROWS = (
         move_back
         talk wait "$id"
         """,
+        several=True,
         exit_codes={
-            **ASKING,
+            **ASKING_SEVERAL,
             0: "all succeeded; or no ID was given, and all have ended",
             4: "aborted; 4 to 7 are those of the first goal in order that did not succeed",
             5: "rejected; or the server has as many clients as it takes",
@@ -161,8 +163,9 @@ _ROWS = (
         talk cancel --key battery   what was sent with --key battery
         talk cancel 12 13           these goals of this server
         """,
+        several=True,
         exit_codes={
-            **ASKING,
+            **ASKING_SEVERAL,
             0: "it is silent, or was already",
             8: "an ID is unknown; the others are cancelled all the same",
         },
@@ -180,7 +183,8 @@ _ROWS = (
         talk status 12                          goal 12 of this server
         talk --json status | jq .active.text
         """,
-        exit_codes={**ASKING, 0: "the server runs", 8: "unknown goal"},
+        several=True,
+        exit_codes={**ASKING_SEVERAL, 0: "the server runs", 8: "unknown goal"},
         argument=Option("goal_id", ID, metavar="[ID]", offers="known_ids"),
         urgent=True,
     ),
@@ -237,8 +241,9 @@ _ROWS = (
         """,
         runs="ask:pause",
         examples="talk pause; listen_to_the_operator; talk resume",
+        several=True,
         exit_codes={
-            **ASKING,
+            **ASKING_SEVERAL,
             0: "speech is held, and it is silent",
             1: "speech is held, but that it is silent was not known within 2 seconds",
         },
@@ -249,7 +254,8 @@ _ROWS = (
         about="Go on where 'talk pause' held speech. Twice is success, and so is without a pause.",
         runs="ask:resume",
         examples="talk resume",
-        exit_codes={**ASKING, 0: "speech goes on"},
+        several=True,
+        exit_codes={**ASKING_SEVERAL, 0: "speech goes on"},
     ),
     Command(
         name="set",
@@ -266,8 +272,9 @@ _ROWS = (
         talk set --rate 150 --volume 0.5
         talk set --voice en-us --no-preempt
         """,
+        several=True,
         exit_codes={
-            **ASKING,
+            **ASKING_SEVERAL,
             0: "changed, or printed",
             2: "usage: a value out of its range, or an unknown voice; nothing was changed",
         },

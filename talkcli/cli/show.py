@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from talkcli.client.connect import Begun
     from talkcli.client.connection import Connection
     from talkcli.fleet.broker import Broker
+    from talkcli.fleet.crowd import Crowd
     from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.events import Event
     from talkcli.terminal.text import Screen
@@ -78,6 +79,20 @@ class Common:
         from talkcli.client.connection import SocketConnection
 
         return Client.over(SocketConnection(self.socket, begun=self.begun, **{"urgent": self.urgent, **options}))
+
+    def crowd(self, timeout: float | None = None, **options: Any) -> Crowd:
+        """Return the robots of a fleet that were named, connected to their broker; the options are `Crowd`'s.
+
+        `timeout`: seconds that all may take, and so the longest that an answer is waited for.
+        """
+        from talkcli.client.connect import ANSWER_LIMIT
+        from talkcli.fleet.selection import Selection
+
+        broker = self.broker()
+        from talkcli.fleet.crowd import Crowd
+
+        to = Selection(paths.named_robot(self.robot, self.socket) or "")
+        return Crowd(broker, to, patience=min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), **options)
 
     def broker(self) -> Broker:
         """Return the broker of the fleet; UsageError where that, or what it needs, is not there."""

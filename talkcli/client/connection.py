@@ -182,7 +182,7 @@ class BaseConnection:
         self._process = os.getpid()
         self._patience = patience
         self._exchanges: dict[int, Exchange] = {}
-        self._numbers = itertools.count(FIRST)
+        self._numbers: Iterator[int] = itertools.count(FIRST)
         self._lines: deque[bytes] = deque()
         self._reading = False
         self._closing = False
@@ -214,7 +214,7 @@ class BaseConnection:
         try:
             late, deadline = 0.0, -1.0
             while not exchange.over and self.ended is None and late != deadline:
-                late, deadline = deadline, self._answer_by(exchange)
+                late, deadline = deadline, self.answer_by(exchange)
                 self.wait_until(lambda: exchange.over, None if slow else deadline, interruptible=interruptible)
         finally:
             self.forget(exchange)
@@ -274,7 +274,7 @@ class BaseConnection:
                 if self.ended is not None:
                     return False
                 now = time.monotonic()
-                quiet, why = self._silent_by(began)
+                quiet, why = self.silent_by(began)
                 rest = (quiet if deadline is None else min(deadline, quiet)) - now
                 if last and rest <= 0:
                     if deadline is None or quiet < deadline:
@@ -313,11 +313,11 @@ class BaseConnection:
         """Close this process's descriptors, whoever else has them open."""
         raise NotImplementedError
 
-    def _answer_by(self, exchange: Exchange) -> float:
+    def answer_by(self, exchange: Exchange) -> float:
         """Return until when an answer is waited for, by the monotonic clock, as far as it is known now."""
         return exchange.touched + self._patience
 
-    def _silent_by(self, began: float) -> tuple[float, str]:
+    def silent_by(self, began: float) -> tuple[float, str]:
         """Return when the server counts as gone that says nothing, to one who waits since then, and why."""
         return max(began, self._heard) + SILENCE_LIMIT, f"it has said nothing for {SILENCE_LIMIT:g} s"
 
@@ -335,6 +335,10 @@ class BaseConnection:
         """Read what there is, or wait for it, and hand it out."""
         if not self._lines:
             self._fill(timeout, interruptible)
+        self.hand_out()
+
+    def hand_out(self) -> None:
+        """Hand out what has come, each to whom it is for."""
         while self._lines:
             try:
                 message = decode(self._lines.popleft())

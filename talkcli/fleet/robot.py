@@ -38,7 +38,7 @@ from talkcli.protocol.requests import Hello, Pause, Resume, Wait, Watch
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from talkcli.client.connection import OnReply
     from talkcli.fleet.broker import Broker
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from talkcli.protocol.requests import Request
 
 #: Seconds for which the broker keeps anything but a sentence for a robot: what is later, nobody waits for.
-_EXPIRY = 5
+EXPIRY = 5
 #: Seconds after which one who waits says again that it is there: a bridge lets go of who says nothing for 90.
 _SIGN_OF_LIFE = 30.0
 #: Times that a request goes out again after an absence: a broker may end the connection because of it.
@@ -75,11 +75,13 @@ class RobotConnection(BaseConnection):
         interrupt: Mapping[int, int] | None = None,
         patience: float = ANSWER_LIMIT,
         end: float | None = None,
+        numbers: Iterator[int] | None = None,
     ) -> None:
         """A robot that `desk` will tell of, see `reach`; what is asked before that waits.
 
         `robot`: its name; `name`, `interrupt`, `patience`: as of `SocketConnection`; `end`: until when an answer is
-        waited for at most, by the monotonic clock, absences included. UsageError for names that can't be.
+        waited for at most, by the monotonic clock, absences included; `numbers`: those of requests, where others of the
+        desk have some, too. UsageError for names that can't be.
         """
         super().__init__(patience)
         fault = topics.fault(robot)
@@ -89,6 +91,7 @@ class RobotConnection(BaseConnection):
         if self._name and len(self._name) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(self._name)} characters, the longest is {MAX_NAME}")
         self._robot, self._desk = robot, desk
+        self._numbers = numbers or self._numbers
         self.path = f"{robot} ({desk.broker.url})"
         self._interrupt, self._end = interrupt, end
         self._signed_at = time.monotonic()
@@ -111,6 +114,11 @@ class RobotConnection(BaseConnection):
         if isinstance(request, Say) and request.id is None:
             request = replace(request, id=new_id(self._desk))
         return super().begin(request, on_reply)
+
+    def expect(self, exchange: Exchange) -> None:
+        """Take in the answer to a request that was sent to a group of which this robot is one."""
+        self._exchanges[exchange.number] = exchange
+        self._signed_at = time.monotonic()
 
     def post(self, request: Request) -> None:
         if not self._publish(next(self._numbers), request):
@@ -144,19 +152,19 @@ class RobotConnection(BaseConnection):
         self._signed_at = time.monotonic()
         topic = topics.robot(self._robot, topics.REQUEST, self._desk.user)
         response = self._desk.answers(self._robot)
-        expiry = (request.ttl or None) if isinstance(request, Say) else _EXPIRY
+        expiry = (request.ttl or None) if isinstance(request, Say) else EXPIRY
         return link.publish(topic, line, expiry=expiry, response=response, acknowledged=acknowledged)
 
-    def _answer_by(self, exchange: Exchange) -> float:
+    def answer_by(self, exchange: Exchange) -> float:
         if self._absent_since is None:
-            by = super()._answer_by(exchange)
+            by = super().answer_by(exchange)
         else:
             by = self._absent_since + (ABSENCE_LIMIT if self._patience >= ANSWER_LIMIT else self._patience)
         return by if self._end is None else min(by, max(self._end, exchange.touched))
 
-    def _silent_by(self, began: float) -> tuple[float, str]:
+    def silent_by(self, began: float) -> tuple[float, str]:
         if self._absent_since is None:
-            return super()._silent_by(began)
+            return super().silent_by(began)
         return self._absent_since + ABSENCE_LIMIT, f"{self._absent}, for {ABSENCE_LIMIT:g} s"
 
     def _refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:

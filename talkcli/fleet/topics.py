@@ -42,9 +42,9 @@ def group(name: str, *levels: str) -> str:
     return "/".join((PREFIX, "group", name, *levels))
 
 
-def reply(user: str, session: str, name: str) -> str:
-    """Return where a robot answers a session of this user's."""
-    return "/".join((PREFIX, "reply", user, session, name))
+def reply(user: str, session: str, *name: str) -> str:
+    """Return where a robot answers a session of this user's; without a name what stands for any robot."""
+    return "/".join((PREFIX, "reply", user, session, *name))
 
 
 @frozen
