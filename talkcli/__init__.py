@@ -43,8 +43,9 @@ def __getattr__(name: str) -> object:
 
         return getattr(client, name)
     if name in {"Fleet", "Outcome", "Presence"}:
-        module = __import__(f"talkcli.fleet.{name.lower()}", fromlist=[name])
-        return getattr(module, name)
+        from talkcli.fleet import fleet, outcome, presence
+
+        return {"Fleet": fleet.Fleet, "Outcome": outcome.Outcome, "Presence": presence.Presence}[name]
     if name in {"Goal", "State"}:
         from talkcli.goals import goal
 

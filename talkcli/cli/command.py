@@ -85,8 +85,8 @@ class Command:
     plain: bool = True
     #: whether it means a server, which may be a robot's of a fleet, and not this machine alone
     asks: bool = True
-    #: whether it may be asked of several robots at once: by the function of its name in `several`
-    several: bool = False
+    #: the function that asks several robots at once, as `runs` has its own; "" where one alone can be asked
+    several: str = ""
     rule: Rule | None = None
 
     def fault(
@@ -122,14 +122,15 @@ class Command:
     def carry_out(self, options: Common, given: Mapping[str, Any]) -> int | None:
         """Carry it out with what was given, and return the exit code; None for 0."""
         options.urgent = self.urgent
-        module, _, name = self.runs.partition(":")
+        runs = self.runs
         robot = named_robot(options.robot, options.socket) if self.asks and given.get("output") is None else None
         if robot:
             if fault := self._stray(given, robot, None):
                 raise UsageError(fault)
             from talkcli.fleet.selection import several
 
-            module = "several" if several(robot) else module
+            runs = self.several if several(robot) else runs
+        module, _, name = runs.partition(":")
         run: Callable[..., int | None] = getattr(__import__(f"talkcli.cli.{module}", fromlist=[name]), name)
         return run(options, **given)
 
@@ -151,8 +152,7 @@ COMMON = (
     option(
         "--robot",
         WORD,
-        "A robot of a fleet, by its broker (TALK_BROKER), not this machine; or several: 'GLOB', @GROUP, @all.  "
-        "[env var: TALK_ROBOT]",
+        "A robot of a fleet, by its broker (TALK_BROKER); or several: a glob, @GROUP, @all.  [env var: TALK_ROBOT]",
         metavar="NAME",
         offers="robots",
     ),

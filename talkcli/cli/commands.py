@@ -88,6 +88,7 @@ _ROWS = (
         With --lines its exit code is that of the first line that did not succeed.
         """,
         runs="say:say",
+        several="several:say",
         examples="""
         talk say "battery low"
         talk say --wait -- "$text" || echo "nobody heard it"
@@ -98,7 +99,6 @@ _ROWS = (
         talk say -o hello.wav "hello"           needs no server
         talk say -o - "hello" | aplay
         """,
-        several=True,
         exit_codes={
             **ASKING_SEVERAL,
             0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
@@ -124,12 +124,12 @@ _ROWS = (
         It only watches: Ctrl-C and --timeout cancel nothing. A goal that has ended already is answered at once.
         """,
         runs="wait:wait",
+        several="several:wait",
         examples="""
         id=$(talk say "moving back")
         move_back
         talk wait "$id"
         """,
-        several=True,
         exit_codes={
             **ASKING_SEVERAL,
             0: "all succeeded; or no ID was given, and all have ended",
@@ -157,13 +157,13 @@ _ROWS = (
         Prints the ids of the goals that ended because of it. Nothing to cancel is success. Selectors add up.
         """,
         runs="ask:cancel",
+        several="several:cancel",
         examples="""
         talk cancel                 everything, now
         talk cancel --current       this sentence; the next one follows
         talk cancel --key battery   what was sent with --key battery
         talk cancel 12 13           these goals of this server
         """,
-        several=True,
         exit_codes={
             **ASKING_SEVERAL,
             0: "it is silent, or was already",
@@ -178,12 +178,12 @@ _ROWS = (
         summary="What is being said, what will be, what was.",
         about="Show what is being said, what will be and what was; with an ID, all that is known of that goal.",
         runs="ask:status",
+        several="several:status",
         examples="""
         talk status
         talk status 12                          goal 12 of this server
         talk --json status | jq .active.text
         """,
-        several=True,
         exit_codes={**ASKING_SEVERAL, 0: "the server runs", 8: "unknown goal"},
         argument=Option("goal_id", ID, metavar="[ID]", offers="known_ids"),
         urgent=True,
@@ -240,8 +240,8 @@ _ROWS = (
         Nothing is spoken until then, whoever sends it and however urgent it is. Goals can be sent and cancelled.
         """,
         runs="ask:pause",
+        several="several:pause",
         examples="talk pause; listen_to_the_operator; talk resume",
-        several=True,
         exit_codes={
             **ASKING_SEVERAL,
             0: "speech is held, and it is silent",
@@ -253,8 +253,8 @@ _ROWS = (
         summary="Go on where speech was held.",
         about="Go on where 'talk pause' held speech. Twice is success, and so is without a pause.",
         runs="ask:resume",
+        several="several:resume",
         examples="talk resume",
-        several=True,
         exit_codes={**ASKING_SEVERAL, 0: "speech goes on"},
     ),
     Command(
@@ -267,12 +267,12 @@ _ROWS = (
         the next one that is sent. A server that is started anew has those of its command line.
         """,
         runs="ask:change",
+        several="several:change",
         examples="""
         talk set
         talk set --rate 150 --volume 0.5
         talk set --voice en-us --no-preempt
         """,
-        several=True,
         exit_codes={
             **ASKING_SEVERAL,
             0: "changed, or printed",

@@ -197,7 +197,8 @@ def test_every_module_says_what_it_is_and_is_no_longer_than_one_can_keep_in_mind
 def test_every_module_is_used() -> None:
     """By the command, by the engine process, or by a module that is itself run."""
     used: set[str] = set()
-    new = {"__main__", "engine.main", *(f"cli.{each.runs.partition(':')[0]}" for each in COMMANDS.values())}
+    runs = {each for command in COMMANDS.values() for each in (command.runs, command.several) if each}
+    new = {"__main__", "engine.main", "", *(f"cli.{each.partition(':')[0]}" for each in runs)}
     while new:
         used |= new
         new = {name for module in new for name, _ in inside(module)} - used
@@ -259,7 +260,7 @@ def test_the_server_is_imported_by_the_serve_command_alone() -> None:
 
 
 #: What is the fleet's own among the commands and the doctor's modules: nobody else pays for what they import.
-OF_THE_FLEET = {"cli.bridge", "cli.fleet", "doctor.broker"}
+OF_THE_FLEET = {"cli.bridge", "cli.fleet", "cli.several", "doctor.broker"}
 
 
 def test_the_fleet_stands_beside_the_server_and_is_imported_only_where_it_is_asked_for() -> None:
@@ -269,7 +270,7 @@ def test_the_fleet_stands_beside_the_server_and_is_imported_only_where_it_is_ask
             if part(module) == "fleet":
                 assert part(name) not in {"server", "engine"}, where
             elif part(name) == "fleet" or name in OF_THE_FLEET:
-                assert part(module) in {"cli", "doctor"}, where
+                assert part(module) in {"", "cli", "doctor"}, where
                 assert each.function or each.typing or module in OF_THE_FLEET, where
 
 
