@@ -82,14 +82,26 @@ def bridge(settings: Settings, reread: Callable[[], Broker]) -> int:
     """
 
     async def run() -> None:
-        await Bridge(settings, reread).run()
+        loop, one = asyncio.get_running_loop(), Bridge(settings, reread)
+
+        def on_signal(number: signal.Signals) -> None:
+            log.line(f"{number.name}: ending")
+            one.end()
+
+        loop.set_exception_handler(log.loop_bug)
+        # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
+        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+            loop.add_signal_handler(signal.SIGINT, on_signal, signal.SIGINT)
+        loop.add_signal_handler(signal.SIGTERM, on_signal, signal.SIGTERM)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the robot along
+        await one.run()
 
     asyncio.run(run())
     return EXIT_OK
 
 
 class Bridge:
-    """One robot on the broker. All but the connecting is done in its event loop's thread."""
+    """One robot on the broker. All but the connecting is done in its event loop's thread; signals are the process's."""
 
     def __init__(self, settings: Settings, reread: Callable[[], Broker]) -> None:
         self._settings = settings
@@ -123,14 +135,8 @@ class Bridge:
         self._fatal: BaseException | None = None
 
     async def run(self) -> None:
-        """Be there until it is told to end."""
+        """Be there until it is told to `end`."""
         link = self._new_link()
-        self._loop.set_exception_handler(log.loop_bug)
-        # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
-        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-            self._loop.add_signal_handler(signal.SIGINT, self._on_signal, signal.SIGINT)
-        self._loop.add_signal_handler(signal.SIGTERM, self._on_signal, signal.SIGTERM)
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the robot along
         log.line(f"robot {self._settings.name}, by the broker at {self._settings.broker.url}")
         self._systemd.ready()
         work = [asyncio.create_task(each) for each in (self._stay_connected(link), self._news.run())]
@@ -360,7 +366,7 @@ class Bridge:
                 self._be_present()  # somebody's will, which came late
         elif _age(said) < (self._since, self._session):
             words = f"another bridge is '{self._settings.name}' already: session {log.shown(str(said.get('session')))}"
-            self._end(AddressInUse(f"{words}; each robot has a name of its own, give another --name"))
+            self.end(AddressInUse(f"{words}; each robot has a name of its own, give another --name"))
         else:
             self._settle()
             self._be_present()  # so that the younger one hears of this
@@ -438,16 +444,18 @@ class Bridge:
         goals = f"{pending} goal{'' if pending == 1 else 's'} pending"
         return f"{self._settings.name} at {self._settings.broker.url}: {broker}, {there}, {goals}"
 
-    def _on_signal(self, number: signal.Signals) -> None:
-        log.line(f"{signal.Signals(number).name}: ending")
-        self._end()
+    @property
+    def ready(self) -> bool:
+        """Whether it can be asked: it is online, and a server is there."""
+        return self._settled and self._link is not None and self._news.server is not None
 
     def _on_done(self, work: asyncio.Task[None]) -> None:
         """End where what should go on for ever has not: somebody starts it anew."""
         if not work.cancelled() and (error := work.exception()):
-            self._end(error)
+            self.end(error)
 
-    def _end(self, error: BaseException | None = None) -> None:
+    def end(self, error: BaseException | None = None) -> None:
+        """Have `run` say goodbye, and return, or raise this error."""
         self._fatal = self._fatal or error
         self._ended.set()
 
