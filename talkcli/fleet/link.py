@@ -201,13 +201,7 @@ class Link:
         `expiry`: seconds after which the broker need not deliver it any more; `acknowledged`: called, by who reads,
         with the reason of the broker's acknowledgement, of QoS 1; `NOT_AUTHORIZED` is one.
         """
-        properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
-        if expiry is not None:
-            properties.MessageExpiryInterval = max(1, math.ceil(min(expiry, 2**31)))
-        if response is not None:
-            properties.ResponseTopic = response
-        if correlation is not None:
-            properties.CorrelationData = correlation
+        properties = _properties(expiry, response, correlation)
         with self._using:
             if self.ended is not None:
                 return False
@@ -297,6 +291,8 @@ class Link:
         self, _client: paho.Client, _data: object, _flags: object, code: ReasonCode, properties: Properties | None
     ) -> None:
         self._answer = code
+        # What it logs is of use for a login that fails alone, and takes a tenth of the processor time of each packet.
+        self._paho.on_log = None
         most = getattr(properties, "MaximumPacketSize", MAX_PACKET)
         self.room = max(0, min(MAX_PACKET, most) - MAX_HEAD)
 
@@ -328,6 +324,23 @@ class Link:
         # Where TLS 1.3 wants a client's certificate, that comes with the first read, and paho says it here alone.
         if "ALERT" in words and self._answer is None:
             self._alert = words.rpartition("] ")[2].partition(" (")[0]
+
+
+def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties | None:
+    """Return what a message has besides topic and payload, if anything: paho takes its time to make none."""
+    given: dict[str, object] = {}
+    if expiry is not None:
+        given["MessageExpiryInterval"] = max(1, math.ceil(min(expiry, 2**31)))
+    if response is not None:
+        given["ResponseTopic"] = response
+    if correlation is not None:
+        given["CorrelationData"] = correlation
+    if not given:
+        return None
+    properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+    for name, value in given.items():
+        setattr(properties, name, value)
+    return properties
 
 
 class Opening:
