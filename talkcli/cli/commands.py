@@ -332,6 +332,37 @@ _ROWS = (
     ),
     BRIDGE,
     Command(
+        name="fleet",
+        summary="The robots of a fleet: who is there, what each says.",
+        about="""
+        Show the robots of a fleet, by its broker (TALK_BROKER): who is there, and what each says.
+
+        'status' is a table: whether a robot is there, its server's version, what it speaks, how many goals wait, how
+        the last one ended and how long ago, and since when it is there. 'watch' goes on with what happens.
+
+        --robot picks some of them: a name, a glob such as 'wh-*', or a group as @warehouse.
+        """,
+        runs="fleet:fleet",
+        several="fleet:fleet",
+        examples="""
+        talk fleet status
+        talk --robot @warehouse fleet status
+        talk --json fleet status | jq -r 'select(.presence.online | not).robot'
+        talk fleet watch
+        """,
+        exit_codes={
+            0: "shown",
+            1: "anything not named here; a bug says so",
+            2: "usage: a setting that is wrong or missing, or paho-mqtt is",
+            3: "no broker, or it knows no robot, or none of those that are meant",
+            9: "the broker does not speak MQTT 5",
+            10: "the broker doesn't let this user in, or ask; or it is not to be trusted",
+            12: "lost: 'watch' has found no broker for 30 seconds",
+            "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
+        },
+        argument=Option("what", WORD, metavar="WHAT", choices=("status", "watch")),
+    ),
+    Command(
         name="completion",
         summary="Print the completion script of a shell.",
         about="""

@@ -114,7 +114,9 @@ def _complete(
     argument = command.argument
     if argument:
         many = argument.metavar.endswith("...")
-        if len(words) > 1 and not many:
+        if (len(words) > 1 and not many) or (
+            argument.choices and words[:1] not in ([each] for each in argument.choices)
+        ):
             return None
         given[argument.name] = tuple(words) if many else next(iter(words), None)
     elif words:

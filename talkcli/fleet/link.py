@@ -45,6 +45,9 @@ MAX_HEAD = 1024
 #: Messages of QoS 1 that the broker has not acknowledged yet; more wait here. HiveMQ's cloud takes 10, others more, and
 #: paho can't obey what this one says when it answers.
 _IN_FLIGHT = 10
+#: Messages of QoS 1 that may be on their way to who hears of all robots, the most that MQTT knows. mosquitto by itself
+#: sends 20, has 1,000 more wait for each client, and drops what is past that without a word, of what it keeps, too.
+MANY_AT_ONCE = 65_535
 #: Reasons of MQTT 5 for which one is not let in, and that of another protocol.
 _DENIED = (0x86, 0x87, 0x8A, 0x8C)
 _OTHER_PROTOCOL = 0x84
@@ -77,11 +80,17 @@ class Link:
         hear: Callable[[Message], None],
         will: Will | None = None,
         most: int = MAX_PACKET,
+        at_once: int | None = None,
     ) -> None:
-        """`most`: bytes of a packet that may come. UsageError where what TLS needs can't be read."""
+        """Make one; it connects with `open`. UsageError where what TLS needs can't be read.
+
+        `most`: bytes of a packet that may come; `at_once`: messages of QoS 1 that may come before the first of them is
+        acknowledged, None for as many as the broker thinks best.
+        """
         self._broker = broker
         self._hear = hear
         self._most = most
+        self._at_once = at_once
         #: why nothing more comes, once that is so
         self.ended: str | None = None
         #: bytes that the broker has not taken yet, or not acknowledged
@@ -125,6 +134,8 @@ class Link:
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = 0
         properties.MaximumPacketSize = self._most
+        if self._at_once is not None:
+            properties.ReceiveMaximum = self._at_once
         self._paho.connect_timeout = PATIENCE
         try:
             self._paho.connect(self._broker.host, self._broker.port, KEEPALIVE, clean_start=True, properties=properties)

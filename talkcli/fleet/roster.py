@@ -11,7 +11,7 @@ from talkcli.client.connect import ready
 from talkcli.errors import AccessDenied, ServerUnavailable
 from talkcli.fleet import topics
 from talkcli.fleet.broker import user
-from talkcli.fleet.link import NOT_AUTHORIZED, Link
+from talkcli.fleet.link import MANY_AT_ONCE, NOT_AUTHORIZED, Link
 from talkcli.fleet.presence import Presence
 from talkcli.fleet.status import Status
 from talkcli.frozen import frozen
@@ -91,7 +91,7 @@ def _ask(broker: Broker, patience: float, hear: Callable[[str, str, bytes], None
         _, _, name, kind = message.topic.split("/")
         hear(name, kind, message.payload)
 
-    link = Link(broker, f"talk-desk-{asker}-{session}", take)
+    link = Link(broker, f"talk-desk-{asker}-{session}", take, at_once=MANY_AT_ONCE)
     link.open()
     end = time.monotonic() + patience
     try:

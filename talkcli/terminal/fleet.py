@@ -1,0 +1,132 @@
+"""The robots of a fleet as a table: `talk fleet status`.
+
+Pure, as all that shows something: how wide the terminal is, and what time it is, its caller says.
+"""
+
+from __future__ import annotations
+
+from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.goals.states import State
+from talkcli.terminal.text import GAP, Screen, cut, id_room, pad, printable, shortened, width
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    #: What stands in a column, and the state in whose colour; None for none.
+    Cell = tuple[str, State | None]
+
+#: The columns. Where a line of a terminal has no room for so much of the texts, or for all of a shorter one, other
+#: columns are left out, these first.
+_ROBOT, _ONLINE, _SERVER, _SPEAKING, _QUEUE, _LAST, _SINCE = HEADS = (
+    *("ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE"),
+)
+_LEAST_TEXT = 12
+_LEFT_OUT = (_SINCE, _LAST, _SERVER, _QUEUE)
+#: Columns of a text, at most, by which what follows lines up where nothing has to fit.
+_USUAL_TEXT = 40
+#: Characters of a server's version.
+_MAX_VERSION = 12
+#: Stands for nothing, and for what is not known.
+_NOTHING: Cell = ("-", None)
+
+
+@frozen
+class Robot:
+    """A robot as the table shows it."""
+
+    name: str
+    online: bool
+    #: the version of its server; None where there is none
+    server: str | None = None
+    #: the goal that is spoken, None where none is; and its text, None where that is not told
+    active: str | None = None
+    text: str | None = None
+    pending: int = 0
+    paused: bool = False
+    #: how the last goal ended, and when; since when the robot is there: both times in seconds since 1970
+    last: State | None = None
+    last_at: float | None = None
+    since: float | None = None
+
+
+def robot_lines(robots: Sequence[Robot], screen: Screen, now: float) -> list[str]:
+    """Return a head, and a line for each robot; `now`: seconds since 1970, for how long ago something was.
+
+    On a terminal none is wider than that: first the texts are cut, then columns are left out.
+    """
+    rows = [_cells(each, screen, now) for each in robots]
+    widths = {head: max(map(width, (head, *(cells[place][0] for cells in rows)))) for place, head in enumerate(HEADS)}
+    _fit(widths, screen.room(0))
+    lines = [screen.painted(_line({head: (head, None) for head in HEADS}, widths, Screen()), None)]
+    return lines + [_line(dict(zip(HEADS, cells, strict=True)), widths, screen) for cells in rows]
+
+
+def _cells(robot: Robot, screen: Screen, now: float) -> list[Cell]:
+    """Return what stands in the columns of a robot's line."""
+    serving = robot.online and robot.server is not None
+    return [
+        (cut(printable(robot.name), id_room(screen)), None),
+        ("yes", None) if robot.online else ("OFFLINE", State.LOST),
+        _server(robot),
+        _speaking(robot) if serving else _NOTHING,
+        (str(robot.pending), None) if serving else _NOTHING,
+        _last(robot, now),
+        _NOTHING if robot.since is None or not robot.online else (_age(now - robot.since), None),
+    ]
+
+
+def _server(robot: Robot) -> Cell:
+    if not robot.online:
+        return _NOTHING
+    return ("none", State.LOST) if robot.server is None else (printable(robot.server, _MAX_VERSION), None)
+
+
+def _speaking(robot: Robot) -> Cell:
+    said = _NOTHING[0]
+    if robot.active is not None:
+        said = printable(robot.active) if robot.text is None else f'"{printable(robot.text)}"'
+    if robot.paused:
+        return ("PAUSED" if robot.active is None else f"PAUSED {said}"), State.PREEMPTING
+    return said, None if robot.active is None else State.ACTIVE
+
+
+def _last(robot: Robot, now: float) -> Cell:
+    if robot.last is None:
+        return _NOTHING
+    age = "" if robot.last_at is None else f" {_age(now - robot.last_at)}"
+    return f"{robot.last.name}{age}", robot.last
+
+
+def _age(seconds: float) -> str:
+    """Return a length of time in its largest unit. The robot's clock may be ahead of this one."""
+    whole = max(0, int(seconds))
+    for size, name in ((86400, "d"), (3600, "h"), (60, "min")):
+        if whole >= size:
+            return f"{whole // size} {name}"
+    return f"{whole} s"
+
+
+def _fit(widths: dict[str, int], room: int | None) -> None:
+    """Make the column of the texts narrower, and leave others out, so that a line has no more than `room`."""
+    longest = widths[_SPEAKING]
+    if room is None:
+        widths[_SPEAKING] = min(longest, _USUAL_TEXT)
+        return
+    for head in (None, *_LEFT_OUT):
+        if head is not None:
+            del widths[head]
+        left = room - len(GAP) * (len(widths) - 1) - (sum(widths.values()) - widths[_SPEAKING])
+        widths[_SPEAKING] = max(0, min(longest, left))
+        if left >= min(longest, _LEAST_TEXT):
+            return
+
+
+def _line(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str:
+    shown = []
+    for head, columns in widths.items():
+        text, state = cells[head]
+        if head == _SPEAKING and screen.width is not None:
+            text = shortened(text, columns)
+        text = pad(text, columns)
+        shown.append(text if state is None else screen.painted(text, state))
+    return GAP.join(shown).rstrip()
