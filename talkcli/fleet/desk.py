@@ -17,7 +17,7 @@ from talkcli.client.connect import ready
 from talkcli.errors import AccessDenied, ServerUnavailable, TalkError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import user
-from talkcli.fleet.link import KEEPALIVE, NOT_AUTHORIZED, REFUSED, TICK, Link, Opening
+from talkcli.fleet.link import KEEPALIVE, MANY_AT_ONCE, NOT_AUTHORIZED, REFUSED, TICK, Link, Opening
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -160,7 +160,8 @@ class Desk:
         return TICK if self.marked_at is None or self.told else GRACE
 
     def _new_link(self) -> Link:
-        return Link(self.broker, f"talk-desk-{self.user}-{self.session}", self._inbox.append)
+        name = f"talk-desk-{self.user}-{self.session}"
+        return Link(self.broker, name, self._inbox.append, at_once=MANY_AT_ONCE)  # a thousand robots may answer at once
 
     def _opened(self, opening: Opening) -> None:
         """Take over the connection to the broker, or try again after a while."""
