@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 def bridge(options: Common, print_unit: str | None, print_acl: bool, **given: Any) -> int:
     """Run the bridge, or print a unit that would, or the broker's rules; return the exit code."""
+    _check_names("--name", [] if given["name"] is None else [given["name"]])
     if print_acl:
-        show(topics.access())
+        show(topics.access(homeassistant=given["homeassistant"], name=given["name"]))
         return 0
-    _check_names("--name", [given["name"]])
     groups = _listed(given["group"])
     _check_names("--group", groups)
     allow = _listed(given["allow"])
@@ -40,7 +40,13 @@ def bridge(options: Common, print_unit: str | None, print_acl: bool, **given: An
     from talkcli.fleet import bridge
 
     settings = bridge.Settings(
-        given["name"], found, tuple(allow), tuple(groups), options.socket, with_text=not given["no_text"]
+        given["name"],
+        found,
+        tuple(allow),
+        tuple(groups),
+        options.socket,
+        with_text=not given["no_text"],
+        homeassistant=given["homeassistant"],
     )
     return bridge.bridge(settings, options.broker)
 

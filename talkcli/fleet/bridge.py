@@ -17,7 +17,7 @@ from talkcli import __version__
 from talkcli.daemon import log
 from talkcli.daemon.systemd import Systemd
 from talkcli.errors import EXIT_OK, AddressInUse, BadRequest, TalkError
-from talkcli.fleet import topics
+from talkcli.fleet import homeassistant, topics
 from talkcli.fleet.askers import Askers
 from talkcli.fleet.link import NOT_AUTHORIZED, Link, Will, boottime
 from talkcli.fleet.local import apart
@@ -51,11 +51,13 @@ SOFT_OUTPUT, HARD_OUTPUT = 256 * 1024, 4 * 1024 * 1024
 #: Bytes of a packet from the broker: a request's longest line, and what is a little longer, so that it is told so. paho
 #: takes seconds over a packet of 250 kB of nothing but properties, and a fourth of that is a tenth of a second.
 MAX_INPUT = MAX_LINE + 8 * 1024
+#: Seconds in which all robots are told of to a Home Assistant that has begun: not all at once.
+TOLD_WITHIN = 3.0
 #: Seconds in which the broker takes the goodbye.
 _GOODBYE = 1.0
 #: What is asked on the echo's topic: which other bridge of this name is there.
 _WHO = b"? "
-_RIGHTS = "may its user do there what 'talk bridge --print-acl' has?"
+_RIGHTS = "may its user do there what 'talk bridge --print-acl' has for these options?"
 
 
 @frozen
@@ -72,6 +74,8 @@ class Settings:
     socket: str | None = None
     #: whether everybody may read what is said
     with_text: bool = True
+    #: whether Home Assistant is told of it
+    homeassistant: bool = False
 
 
 def bridge(settings: Settings, reread: Callable[[], Broker]) -> int:
@@ -131,6 +135,8 @@ class Bridge:
         self._unanswered: float | None = None
         #: by the same: when it was last said that the robot is there
         self._present = 0.0
+        #: when Home Assistant, which has begun, is told of this robot
+        self._telling: asyncio.TimerHandle | None = None
         self._ended = asyncio.Event()
         self._fatal: BaseException | None = None
 
@@ -215,8 +221,10 @@ class Bridge:
         name = self._settings.name
         own = [topics.robot(name, each, "+") for each in (topics.REQUEST, topics.SAY, topics.CANCEL)]
         groups = [topics.group(each, topics.REQUEST, "+") for each in self._groups]
-        self._link.subscribe(*own, *groups, retained=False)
+        births = [topics.BIRTH] if self._settings.homeassistant else []
+        self._link.subscribe(*own, *groups, *births, retained=False)
         self._be_present()
+        self._tell_homeassistant()
         self._news.tell()
         self._systemd.changed()
         log.line(f"online, at {self._settings.broker.url}")
@@ -316,6 +324,8 @@ class Bridge:
         if message.topic == topics.robot(name, topics.PRESENCE):
             self._hear_presence(message.payload)
             return
+        if message.topic == topics.BIRTH and message.payload == homeassistant.ONLINE and self._telling is None:
+            self._telling = self._loop.call_later(random.uniform(0, TOLD_WITHIN), self._tell_homeassistant)
         asked = topics.asked(message.topic)
         if asked is None or not self._settled:
             return
@@ -386,6 +396,13 @@ class Bridge:
         }
         topic = topics.robot(settings.name, topics.PRESENCE)
         self._publish(topic, encode(presence), retain=True, expiry=PRESENCE_EXPIRY, acknowledged=self._check_right)
+
+    def _tell_homeassistant(self) -> None:
+        """Tell Home Assistant of this robot, if it is to know; the broker keeps that for a later one."""
+        self._telling = None
+        if self._settings.homeassistant and self._settled:
+            topic, device = homeassistant.device(self._settings.name, self._settings.allow, __version__)
+            self._publish(topic, device, retain=True, acknowledged=self._check_right)
 
     def _check_right(self, reason: int) -> None:
         if reason == NOT_AUTHORIZED:

@@ -24,6 +24,11 @@ _NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{LONGEST - 1}}}")
 REQUEST, SAY, CANCEL = "request", "say", "cancel"
 PRESENCE, STATUS, EVENT, ECHO = "presence", "status", "event", "echo"
 
+#: What Home Assistant logs in as, and so who asks in the topics that it is told of; and the prefix of its own topics.
+HOMEASSISTANT = "homeassistant"
+#: Where it says that it has begun, or that it is gone.
+BIRTH = f"{HOMEASSISTANT}/status"
+
 
 def fault(name: str) -> str | None:
     """Return what is wrong with a name of a robot, a group or a user, for people; None where it can be one level."""
@@ -45,6 +50,18 @@ def group(name: str, *levels: str) -> str:
 def reply(user: str, session: str, *name: str) -> str:
     """Return where a robot answers a session of this user's; without a name what stands for any robot."""
     return "/".join((PREFIX, "reply", user, session, *name))
+
+
+def device(name: str) -> str:
+    """Return where Home Assistant is told of a robot: a topic of each robot's own, in none of whose levels is a dot.
+
+    The name is a level of its own, since that alone can an ACL's pattern tie to a login. One with a dot is written in
+    another way, below another level, and no two of these alike.
+    """
+    if "." not in name:
+        return "/".join((HOMEASSISTANT, "device", PREFIX, name, "config"))
+    written = name.replace("_", "__").replace(".", "_d")
+    return "/".join((HOMEASSISTANT, "device", f"{PREFIX}-dots", written, "config"))
 
 
 @frozen
@@ -79,12 +96,15 @@ def answer(response: str, user: str, name: str) -> str | None:
     return reply(user, levels[3], name) if levels[4:] in ([], [name]) else None
 
 
-def access(operators: tuple[str, ...] = ("OPERATOR",)) -> str:
+def access(operators: tuple[str, ...] = ("OPERATOR",), *, homeassistant: bool = False, name: str | None = None) -> str:
     """Return what mosquitto's `acl_file` has for all robots, each of which logs in by its own name, and for these.
 
     An operator's lines are by name: mosquitto applies its patterns to everybody who logs in, so that with a pattern for
     operators each robot could command the others. What the patterns for robots give to an operator is a robot of the
     operator's own name, which there is none of, and to read what groups are asked.
+
+    `homeassistant`: with what Home Assistant does, and the robots that it is told of; `name`: one of these, which has a
+    line of its own where its name has a dot, since no pattern is for it.
     """
     lines = [
         "# Robots: each logs in by its own name, %u, and is heard under that alone.",
@@ -98,6 +118,8 @@ def access(operators: tuple[str, ...] = ("OPERATOR",)) -> str:
         f"pattern write {robot('%u', EVENT, '+')}",
         f"pattern write {reply('+', '+', '%u')}",
     ]
+    if homeassistant:
+        lines += [f"pattern write {device('%u')}", f"pattern read {BIRTH}"]
     for each in operators:
         lines += [
             "",
@@ -112,4 +134,18 @@ def access(operators: tuple[str, ...] = ("OPERATOR",)) -> str:
             f"topic read {robot('+', EVENT, '+')}",
             f"topic readwrite {reply(each, '+', '+')}",
         ]
+    if homeassistant:
+        lines += [
+            "",
+            "# Home Assistant, which may have every robot speak and be silent; its own topics are its own.",
+            f"user {HOMEASSISTANT}",
+            f"topic write {robot('+', SAY, HOMEASSISTANT)}",
+            f"topic write {robot('+', CANCEL, HOMEASSISTANT)}",
+            f"topic read {robot('+', PRESENCE)}",
+            f"topic read {robot('+', STATUS)}",
+            f"topic readwrite {HOMEASSISTANT}/#",
+        ]
+    if homeassistant and name is not None and "." in name:
+        words = "# A robot of which Home Assistant is told elsewhere: no level of a topic there may have a dot."
+        lines += ["", words, f"user {name}", f"topic write {device(name)}"]
     return "\n".join(lines)
