@@ -153,9 +153,10 @@ def test_the_systems_unit_has_the_network_the_servers_socket_and_little_else(hom
 
 @pytest.mark.parametrize("name", ["user", "system"])
 def test_a_units_command_has_the_options_that_were_given(home: str, name: str) -> None:
-    command = command_of(printed(home, name, "--group", "a,b", "--no-text", "--insecure", "--socket", "/run/other"))
+    flags = ["--no-text", "--homeassistant"]
+    command = command_of(printed(home, name, "--group", "a,b", *flags, "--insecure", "--socket", "/run/other"))
     assert os.path.isabs(command[0])
-    assert command[-6:] == ["bridge", "--insecure", "--socket=/run/other", "--name=anna", "--group=a,b", "--no-text"]
+    assert command[-7:] == ["bridge", "--insecure", "--socket=/run/other", "--name=anna", "--group=a,b", *flags]
     assert command_of(printed(home, name))[-2:] == ["bridge", "--name=anna"]
 
 

@@ -38,6 +38,7 @@ PURE = [
     "engine.synthesizers.phonemes",
     "engine.synthesizers.vits",
     "engine.words",
+    "fleet.homeassistant",
     "fleet.message",
     "fleet.policy",
     "fleet.presence",
