@@ -123,7 +123,7 @@ _BRIDGE = (
         metavar="LIST",
     ),
     option("--no-text", FLAG, "Leave what is said out of status and events."),
-    option("--homeassistant", FLAG, "Tell Home Assistant of the robot, so that it has it as a device."),
+    option("--homeassistant", FLAG, "Be a device of Home Assistant's as well."),
     option(
         "--print-unit",
         TEXT,

@@ -170,6 +170,9 @@ class HomeAssistant(Listener):
         super().__init__(broker, "homeassistant/device/+/config", "homeassistant/device/+/+/config", **more)
         self._followed: set[str] = set()
 
+    def __enter__(self) -> HomeAssistant:
+        return self
+
     def announcements(self) -> list[Message]:
         """Return all that it was told of devices, in the order of their coming."""
         return [each for each in self.messages if TOPIC.fullmatch(each.topic)]

@@ -15,7 +15,7 @@ from tests.fleet.homeassistant import BIRTH, UNAVAILABLE, HomeAssistant
 from tests.fleet.robot import Robot
 from tests.support.bridge import Bridge
 from tests.support.broker import Broker
-from tests.support.mqtt import NO_SUBSCRIBERS, NOT_AUTHORIZED, SUCCESS, Listener
+from tests.support.mqtt import NO_SUBSCRIBERS, NOT_AUTHORIZED, SUCCESS, Listener, mosquitto
 from tests.support.processes import Talk, run_talk
 from tests.support.surroundings import clean_environment, short_directory
 
@@ -105,7 +105,7 @@ def test_a_broker_that_has_forgotten_it_is_told_again(told_of: Robot) -> None:
         home.await_state(device, lambda state: state("state") == "idle")
 
 
-def test_a_device_is_unavailable_without_its_server_and_without_its_robot_and_stays_a_device(
+def test_a_device_is_unavailable_without_its_server_or_its_robot_and_stays_until_it_is_cleared(
     make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
 ) -> None:
     talk = make_talk(scripted=True)
@@ -126,6 +126,12 @@ def test_a_device_is_unavailable_without_its_server_and_without_its_robot_and_st
     with HomeAssistant(broker) as later:
         device = later.device()
         later.await_state(device, lambda state: state("state") == UNAVAILABLE)
+    assert mosquitto(broker, "pub", "-r", "-n", "-t", ANNA).code == 0
+    with HomeAssistant(broker) as home:
+        assert home.subscribe(BIRTH[0]) <= 1
+        home.publish(BIRTH[0], "the last")
+        home.await_message(lambda each: each.text == "the last")
+        assert home.announcements() == []
 
 
 def test_it_is_told_of_no_robot_that_is_not_to_be_a_device(robot: Robot) -> None:
