@@ -37,9 +37,10 @@ def bridge(options: Common, print_unit: str | None, print_acl: bool, **given: An
         units.print_bridge(options, print_unit, given)
         return 0
     found = options.broker()
-    from talkcli.fleet import bridge
+    from talkcli.fleet import run
+    from talkcli.fleet.bridge import Settings
 
-    settings = bridge.Settings(
+    settings = Settings(
         given["name"],
         found,
         tuple(allow),
@@ -48,7 +49,7 @@ def bridge(options: Common, print_unit: str | None, print_acl: bool, **given: An
         with_text=not given["no_text"],
         homeassistant=given["homeassistant"],
     )
-    return bridge.bridge(settings, options.broker)
+    return run.bridge(settings, options.broker)
 
 
 def _listed(value: str | None) -> list[str]:

@@ -1,4 +1,4 @@
-"""`talk bridge`, from the first connection to the goodbye: one robot on the broker, as its server's client.
+"""A bridge, from the first connection to the goodbye: one robot on the broker, as its server's client.
 
 It holds the connection to the broker, and makes another where it breaks; it says that the robot is there, and measures
 how old what comes may be. What is asked is judged in `policy`, and carried out by `askers`; `news` watches the server.
@@ -9,14 +9,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
-import signal
 import time
 from typing import TYPE_CHECKING
 
 from talkcli import __version__
 from talkcli.daemon import log
 from talkcli.daemon.systemd import Systemd
-from talkcli.errors import EXIT_OK, AddressInUse, BadRequest, TalkError
+from talkcli.errors import AddressInUse, BadRequest, TalkError
 from talkcli.fleet import homeassistant, topics
 from talkcli.fleet.askers import Askers
 from talkcli.fleet.link import NOT_AUTHORIZED, Link, Will, boottime
@@ -76,32 +75,6 @@ class Settings:
     with_text: bool = True
     #: whether Home Assistant is told of it
     homeassistant: bool = False
-
-
-def bridge(settings: Settings, reread: Callable[[], Broker]) -> int:
-    """Be the robot on the broker until SIGTERM or SIGINT, and return the exit code.
-
-    `reread` returns the broker as it is to be connected to from now on: a password may be another. UsageError where
-    what TLS needs can't be read; AddressInUse where an older bridge of this name is there.
-    """
-
-    async def run() -> None:
-        loop, one = asyncio.get_running_loop(), Bridge(settings, reread)
-
-        def on_signal(number: signal.Signals) -> None:
-            log.line(f"{number.name}: ending")
-            one.end()
-
-        loop.set_exception_handler(log.loop_bug)
-        # A shell without job control starts what is in the background with SIGINT ignored: so it stays.
-        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-            loop.add_signal_handler(signal.SIGINT, on_signal, signal.SIGINT)
-        loop.add_signal_handler(signal.SIGTERM, on_signal, signal.SIGTERM)
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that goes away doesn't take the robot along
-        await one.run()
-
-    asyncio.run(run())
-    return EXIT_OK
 
 
 class Bridge:
