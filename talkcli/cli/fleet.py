@@ -1,4 +1,4 @@
-"""`talk fleet status`: all robots of a broker at one look. It alone of the commands imports what that takes."""
+"""`talk fleet`: all robots of a broker, at one look or as it happens; what that takes is imported for it alone."""
 
 from __future__ import annotations
 
@@ -6,17 +6,23 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli import paths
-from talkcli.cli.show import screen, show_found
+from talkcli.cli.show import note, screen, show_found
 from talkcli.client.connect import ANSWER_LIMIT
-from talkcli.errors import ServerUnavailable
+from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable, UsageError
 from talkcli.fleet.selection import Selection, several
+from talkcli.fleet.sighting import Away, Back, Begun, Changed, Happened, Missed
 from talkcli.frozen import replace
-from talkcli.terminal.fleet import Robot, robot_lines
+from talkcli.terminal.fleet import FleetTranscript, Robot, robot_lines
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from talkcli.cli.show import Common
     from talkcli.fleet.broker import Broker
-    from talkcli.fleet.roster import Standing
+    from talkcli.fleet.presence import Presence
+    from talkcli.fleet.sighting import Sighting
+    from talkcli.fleet.status import Standing
+    from talkcli.goals.goal import JsonObject
 
 
 def fleet(options: Common, what: str) -> int | None:
@@ -24,7 +30,12 @@ def fleet(options: Common, what: str) -> int | None:
     broker = options.broker()
     text = paths.named_robot(options.robot, options.socket)
     selection = None if text is None else Selection(text)
-    return {"status": _status}[what](options, broker, selection)
+    if selection and selection.fault:  # of the variable: what is typed has been looked at
+        raise UsageError(selection.fault)
+    if what == "watch":
+        return _watch(options, broker, selection)
+    _status(options, broker, selection)
+    return None
 
 
 def _status(options: Common, broker: Broker, selection: Selection | None) -> None:
@@ -44,11 +55,74 @@ def _status(options: Common, broker: Broker, selection: Selection | None) -> Non
     )
 
 
+def _watch(options: Common, broker: Broker, selection: Selection | None) -> int:
+    """Show what happens, and which robots come and go; return the exit code."""
+    from talkcli.cli.interrupts import Interrupts, has_reader
+    from talkcli.fleet.lookout import Lookout
+
+    if not has_reader():
+        return EXIT_SIGPIPE
+    teller = _Teller(options, broker, FleetTranscript(full=screen().width is None))
+    # The reader of its output, too, ends it: the next event may be far.
+    with Interrupts(output=True) as interrupts:
+        for seen in Lookout(broker, selection).follow(interrupts.watched):
+            teller.tell(seen)
+    return interrupts.exit_code
+
+
+class _Teller:
+    """Shows what happens to a fleet, for people or for programs."""
+
+    def __init__(self, options: Common, broker: Broker, transcript: FleetTranscript) -> None:
+        self._options, self._broker, self._transcript = options, broker, transcript
+
+    def tell(self, seen: Sighting) -> None:
+        """Show what has happened; what the broker itself does is said on standard error."""
+        if not isinstance(seen, Away | Back):
+            show_found(self._options, _objects(seen), lambda: self._lines(seen))
+        elif self._options.quiet:
+            return
+        elif isinstance(seen, Away):
+            note(f"{seen.why}; it is tried again for {seen.limit:g} s")
+        else:
+            note(f"the broker at {self._broker.url} is back, after {seen.after:.1f} s")
+
+    def _lines(self, seen: Begun | Changed | Happened | Missed) -> list[str]:
+        transcript, now = self._transcript, time.time()
+        if isinstance(seen, Begun):
+            robots = [_shown(each) for each in seen.standings]
+            return transcript.begin(robots, self._broker.url, screen(), now)
+        if isinstance(seen, Changed):
+            robot = Robot(seen.name, online=False) if seen.now is None else _there(seen.now)
+            before = None if seen.before is None else _there(seen.before)
+            return transcript.change(before, robot, screen(), now)
+        if isinstance(seen, Happened):
+            return transcript.lines(seen.name, seen.event, screen(), now)
+        name = seen.standing.presence.name
+        return [line for each in seen.events for line in transcript.lines(name, each, screen(), now)]
+
+
+def _objects(seen: Begun | Changed | Happened | Missed) -> Iterator[JsonObject]:
+    """Make the objects that programs are shown."""
+    if isinstance(seen, Begun | Missed):
+        for each in seen.standings if isinstance(seen, Begun) else [seen.standing]:
+            yield {"robot": each.presence.name, "event": "snapshot", **each.to_json()}
+    elif isinstance(seen, Changed):
+        presence = None if seen.now is None else seen.now.to_json()
+        yield {"robot": seen.name, "event": "presence", "presence": presence}
+    else:
+        yield {"robot": seen.name, **seen.message}
+
+
+def _there(presence: Presence) -> Robot:
+    """Return a robot as it is shown, of whose goals nothing is known."""
+    server = None if presence.server is None else str(presence.server.get("version") or "?")
+    return Robot(presence.name, presence.online, server, since=presence.since)
+
+
 def _shown(standing: Standing) -> Robot:
     """Return a robot as the table shows it."""
-    presence, status = standing.presence, standing.status
-    server = None if presence.server is None else str(presence.server.get("version") or "?")
-    there = Robot(presence.name, presence.online, server, since=presence.since)
+    there, status = _there(standing.presence), standing.status
     if status is None:
         return there
     last = status.last

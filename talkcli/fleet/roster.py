@@ -13,34 +13,18 @@ from talkcli.fleet import topics
 from talkcli.fleet.broker import user
 from talkcli.fleet.link import MANY_AT_ONCE, NOT_AUTHORIZED, Link
 from talkcli.fleet.presence import Presence
-from talkcli.fleet.status import Status
-from talkcli.frozen import frozen
+from talkcli.fleet.status import Standing, Status
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.message import Message
-    from talkcli.goals.goal import JsonObject
 
 #: Stands for any robot in a topic that is subscribed to.
 _ANY = "+"
 #: Seconds for which a first robot is awaited that the broker keeps: some send it a moment after the rest.
 _GRACE = 0.3
-
-
-@frozen
-class Standing:
-    """A robot as it stands: whether it is there, and what it told of its goals last."""
-
-    presence: Presence
-    #: None where it has told nothing; that of one that is gone is what it told before
-    status: Status | None
-
-    def to_json(self) -> JsonObject:
-        """Return it as an object, for programs."""
-        status = None if self.status is None else self.status.to_json()
-        return {"robot": self.presence.name, "presence": self.presence.to_json(), "status": status}
 
 
 def roster(broker: Broker, patience: float) -> dict[str, Presence]:

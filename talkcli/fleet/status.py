@@ -1,4 +1,4 @@
-"""What a robot's status says of its goals: what is spoken, what waits, what ended last. Pure.
+"""What a robot's status says of its goals: what is spoken, what waits, what ended last; and how it so stands. Pure.
 
 As of its presence: what is not of the form that it should be is taken as not said.
 """
@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from talkcli.errors import BadRequest
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
+from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
+from talkcli.protocol.events import StateChanged
 from talkcli.protocol.lines import decode
 
 if TYPE_CHECKING:
+    from talkcli.fleet.presence import Presence
     from talkcli.goals.goal import JsonObject
 
 
@@ -55,10 +58,35 @@ class Status:
             _last(said.get("last")),
         )
 
+    def events(self) -> list[StateChanged]:
+        """Return the events by which it came to stand so: how the last goal ended, and that the next is spoken."""
+        last, found = self.last, []
+        if last:
+            ended = Goal(last.id, last.state, last.text, last.reason, ended_at=last.at)
+            found.append(StateChanged(last.id, last.state, last.at, goal=ended))
+        if self.active is not None:
+            spoken = Goal(self.active, State.ACTIVE, self.text)
+            found.append(StateChanged(self.active, State.ACTIVE, goal=spoken))
+        return found
+
     def to_json(self) -> JsonObject:
         """Return it as an object, for programs."""
         last = self.last
         return {**fields(self), "last": None if last is None else {**fields(last), "state": last.state.name}}
+
+
+@frozen
+class Standing:
+    """A robot as it stands: whether it is there, and what it told of its goals last."""
+
+    presence: Presence
+    #: None where it has told nothing; that of one that is gone is what it told before
+    status: Status | None
+
+    def to_json(self) -> JsonObject:
+        """Return it as an object, for programs."""
+        status = None if self.status is None else self.status.to_json()
+        return {"robot": self.presence.name, "presence": self.presence.to_json(), "status": status}
 
 
 def _last(said: object) -> LastGoal | None:

@@ -1,4 +1,4 @@
-"""The robots of a fleet as a table: `talk fleet status`.
+"""The robots of a fleet: as a table, `talk fleet status`, and what happens to all of them in lines, `talk fleet watch`.
 
 Pure, as all that shows something: how wide the terminal is, and what time it is, its caller says.
 """
@@ -7,10 +7,14 @@ from __future__ import annotations
 
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
+from talkcli.terminal.goals import clock
 from talkcli.terminal.text import GAP, Screen, cut, id_room, pad, printable, shortened, width
+from talkcli.terminal.transcript import Columns, Transcript
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from talkcli.protocol.events import Event
 
     #: What stands in a column, and the state in whose colour; None for none.
     Cell = tuple[str, State | None]
@@ -130,3 +134,45 @@ def _line(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str
         text = pad(text, columns)
         shown.append(text if state is None else screen.painted(text, state))
     return GAP.join(shown).rstrip()
+
+
+class FleetTranscript:
+    """Turns what robots tell into lines, as a transcript does for each, with the robot's name behind the time."""
+
+    def __init__(self, *, full: bool) -> None:
+        """`full`: as of `Transcript`."""
+        self._full = full
+        self._columns = Columns()
+        self._transcripts: dict[str, Transcript] = {}
+
+    def begin(self, robots: Sequence[Robot], where: str, screen: Screen, now: float) -> list[str]:
+        """Return what is said of all robots in the beginning; `where`: of which broker they are."""
+        for each in robots:
+            self._columns.robot(each.name, screen)  # so that all lines line up
+        gone = sum(not each.online for each in robots)
+        alone = sum(each.online and each.server is None for each in robots)
+        parts = [f"{len(robots)} robot{'' if len(robots) == 1 else 's'}"]
+        parts += [f"{gone} OFFLINE"] if gone else []
+        parts += [f"{alone} without a server"] if alone else []
+        return [cut(f"{clock(now)}{GAP}{', '.join(parts)}; {printable(where)}", screen.room(0))]
+
+    def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
+        """Return what is to be shown of an event of a robot's; `now`: as of `Transcript.lines`."""
+        if name not in self._transcripts:
+            self._transcripts[name] = Transcript(full=self._full, words=False, robot=name, columns=self._columns)
+        return self._transcripts[name].lines(event, screen, now)
+
+    def change(self, before: Robot | None, robot: Robot, screen: Screen, now: float) -> list[str]:
+        """Return what is to be shown of a robot that has come or gone, or its server has; of its goals none is left."""
+        self._transcripts.pop(robot.name, None)
+        server = "no server" if robot.server is None else f"talk {printable(robot.server, _MAX_VERSION)}"
+        if not robot.online:
+            word, state, more = "OFFLINE", State.LOST, ""
+        elif robot.server is None and before and before.online:
+            word, state, more = server, State.LOST, ""
+        elif before and before.online and before.since == robot.since:
+            word, state, more = "server", State.SUCCEEDED, server
+        else:
+            word, state, more = "online", State.SUCCEEDED, server
+        name = self._columns.robot(robot.name, screen)
+        return [GAP.join((clock(now), name, screen.painted(pad(word, 10), state), more)).rstrip()]

@@ -1,7 +1,7 @@
 """What happens to goals and what happened to them, in lines for people: `talk watch` and `talk log`.
 
 Pure: events and goals go in, lines come out; times are shown in the local time zone. Every line has its columns in the
-same order: time, state, id, text, who sent it, why it ended.
+same order: time, state, id, text, who sent it, why it ended; behind the time the robot, where there are several.
 """
 
 from __future__ import annotations
@@ -38,23 +38,42 @@ _TEXT_COLUMNS = 40
 _LEAST_TEXT = 16
 #: Columns of a server's ids, until it has given more than 999.
 _USUAL_ID = 8
-#: Where a line begins that goes on from the one before it: under the state.
+#: Where a line begins that goes on from the one before it: under what is behind the time.
 _INDENT = 10
+#: Columns of a robot's name, at first.
+_USUAL_ROBOT = 8
+
+
+class Columns:
+    """How wide the columns are so far: the lines of all transcripts that share them line up."""
+
+    def __init__(self) -> None:
+        self.ids = _USUAL_ID
+        self.robots = _USUAL_ROBOT
+
+    def robot(self, name: str, screen: Screen) -> str:
+        """Return a robot's name as it is shown: on a terminal, in a sixth of the line."""
+        room = screen.room(0)
+        shown = cut(printable(name), None if room is None else max(_USUAL_ROBOT, room // 6))
+        self.robots = max(self.robots, min(width(shown), LONGEST_ID))
+        return pad(shown, self.robots)
 
 
 class Transcript:
     """Turns a server's events into lines, one after the other. It knows what it has been told, and no more.
 
     `full`: a line for each event; else what is over at once is left out: that a goal waits where nothing is before it,
-    and that one is being stopped. `words`: a line for each word that is heard, too.
+    and that one is being stopped. `words`: a line for each word that is heard, too. `robot`: the name of the robot that
+    these are the events of, where there are several; `columns`: those that all of them share.
     """
 
-    def __init__(self, *, full: bool, words: bool) -> None:
+    def __init__(self, *, full: bool, words: bool, robot: str | None = None, columns: Columns | None = None) -> None:
         self._full = full
         self._with_words = words
         self._goals: dict[str, Goal] = {}
         self._paused = False
-        self._id_columns = _USUAL_ID
+        self._robot = robot
+        self._columns = columns or Columns()
 
     def lines(self, event: Event, screen: Screen, now: float) -> list[str]:
         """Return what is to be shown of an event; `now`: when it happened, where the event doesn't tell."""
@@ -140,12 +159,13 @@ class Transcript:
 
     def _head(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
         shown = self._make_room(goal_id, screen)
-        return GAP.join((clock(at), screen.painted(pad(word, 10), state), pad(shown, self._id_columns), ""))
+        robot = [] if self._robot is None else [self._columns.robot(self._robot, screen)]
+        return GAP.join((clock(at), *robot, screen.painted(pad(word, 10), state), pad(shown, self._columns.ids), ""))
 
     def _make_room(self, goal_id: str, screen: Screen) -> str:
         """Widen the column of the ids for this one, and return it as it is shown."""
         shown = cut(printable(goal_id), id_room(screen))
-        self._id_columns = max(self._id_columns, min(width(shown), LONGEST_ID))
+        self._columns.ids = max(self._columns.ids, min(width(shown), LONGEST_ID))
         return shown
 
 

@@ -43,6 +43,7 @@ PURE = [
     "fleet.policy",
     "fleet.presence",
     "fleet.selection",
+    "fleet.sighting",
     "fleet.status",
     "fleet.topics",
 ]
