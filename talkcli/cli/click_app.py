@@ -251,7 +251,7 @@ def _first_screen(context: click.Context) -> str:
     with formatter.indentation():
         _write_lines(_EXAMPLES, formatter)
     talk.format_commands(context, formatter)
-    formatter.write("\n'talk COMMAND --help' says more of each, 'talk --help' has the exit codes.")
+    formatter.write("'talk COMMAND --help' says more of each, 'talk --help' has the exit codes.")
     return formatter.getvalue()
 
 

@@ -346,7 +346,7 @@ _ROWS = (
         several="fleet:fleet",
         examples="""
         talk fleet status
-        talk --robot @warehouse fleet status
+        talk fleet status --robot @warehouse
         talk --json fleet status | jq -r 'select(.presence.online | not).robot'
         talk fleet watch
         """,
