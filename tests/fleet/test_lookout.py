@@ -1,0 +1,286 @@
+"""Who looks at all robots: what is seen, and what of it after the broker was away. The robots are told of alone."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from talkcli.client.connect import Interrupted
+from talkcli.errors import AccessDenied, Lost, ServerUnavailable
+from talkcli.fleet.broker import from_environment
+from talkcli.fleet.selection import Selection
+from talkcli.fleet.sighting import Away, Back, Begun, Changed, Happened, Missed
+from talkcli.goals.states import State
+from talkcli.protocol.events import StateChanged
+from tests.fleet import told
+from tests.support.connection import PATIENCE
+from tests.support.mqtt import Listener
+from tests.support.ports import Port
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from talkcli.fleet.sighting import Sighting
+    from tests.support.broker import Broker
+
+
+class Looking(contextlib.AbstractContextManager["Looking"]):
+    """A lookout in a thread of its own, which `with` ends; it has begun where that is left to it."""
+
+    def __init__(self, broker: Broker, selection: str | None = None, *, user: str | None = None) -> None:
+        from talkcli.fleet.lookout import Lookout  # which needs paho
+
+        where = from_environment(broker.env(user))
+        self._lookout = Lookout(where, None if selection is None else Selection(selection))
+        self._changed = threading.Condition()
+        self._seen: list[Sighting] = []
+        self._error: Exception | None = None
+        self._wake, self._write = os.pipe()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Looking:
+        self.find(Begun)
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        os.write(self._write, b"\0")
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive()
+        os.close(self._wake)
+        os.close(self._write)
+
+    @property
+    def seen(self) -> list[Sighting]:
+        """All that it has seen since it began."""
+        with self._changed:
+            return self._seen[1:]
+
+    def find(self, kind: type[Any], wanted: Callable[[Any], bool] = lambda _: True, within: float = PATIENCE) -> Any:
+        """Wait until something of a kind is seen, and return the first; raise what has ended it instead."""
+
+        def found() -> list[Sighting]:
+            return [each for each in self._seen if isinstance(each, kind) and wanted(each)]
+
+        with self._changed:
+            self._changed.wait_for(lambda: found() or self._error, within)
+            if not found() and self._error:
+                raise self._error
+            assert found(), f"only this was seen: {self._seen}"
+            return found()[0]
+
+    def _look(self) -> None:
+        try:
+            for each in self._lookout.follow({self._wake: select.POLLIN}):
+                self._keep(each)
+        except Interrupted:
+            pass
+        except Exception as error:  # noqa: BLE001 - the test's own thread raises it
+            self._keep(None, error)
+
+    def _keep(self, sighting: Sighting | None, error: Exception | None = None) -> None:
+        with self._changed:
+            self._error = error
+            if sighting:
+                self._seen.append(sighting)
+            self._changed.notify_all()
+
+
+@pytest.fixture
+def robots(broker: Broker) -> Iterator[Listener]:
+    """Who publishes for the robots."""
+    with Listener(broker) as publisher:
+        yield publisher
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A desk that comes back soon after its broker."""
+    from talkcli.fleet import desk
+
+    monkeypatch.setattr(desk, "_LONGEST_PAUSE", 0.1)
+
+
+def names(sightings: list[Sighting]) -> list[str]:
+    return [each.name for each in sightings if isinstance(each, Changed | Happened)]
+
+
+def test_it_begins_with_how_all_stand(broker: Broker, robots: Listener) -> None:
+    told.presence(robots, "bert", online=False)
+    told.presence(robots, "anna")
+    told.status(robots, "anna", active="a-2", text="hello", last="a-1")
+    with Looking(broker) as looking:
+        begun = looking.find(Begun)
+        anna, bert = begun.standings
+        assert (anna.presence.name, anna.presence.online, anna.status.text) == ("anna", True, "hello")
+        assert (bert.presence.name, bert.presence.online, bert.status) == ("bert", False, None)
+        assert looking.seen == []
+
+
+def test_without_a_robot_it_begins_as_well(broker: Broker, robots: Listener) -> None:
+    with Looking(broker) as looking:
+        assert looking.find(Begun).standings == ()
+        told.presence(robots, "anna")
+        change = looking.find(Changed)
+        assert (change.name, change.before, change.now.online) == ("anna", None, True)
+
+
+def test_it_sees_who_comes_and_goes_and_whose_server_does_but_not_that_all_is_as_before(
+    broker: Broker, robots: Listener
+) -> None:
+    told.presence(robots, "anna")
+    with Looking(broker) as looking:
+        told.presence(robots, "anna")  # as a bridge does every minute
+        told.presence(robots, "anna", server=None)
+        told.presence(robots, "anna", server={**told.SERVER, "boot": "8abc"})
+        told.presence(robots, "anna", online=False)
+        robots.publish("talk/robot/anna/presence", "", retain=True)  # cleared: it is gone already
+        told.presence(robots, "anna", session="6666")
+        looking.find(Changed, lambda each: each.now and each.now.session == "6666")
+        changes = [each for each in looking.seen if isinstance(each, Changed)]
+        assert [(each.now and each.now.online, bool(each.now and each.now.server)) for each in changes] == [
+            (True, False),
+            (True, True),
+            (False, False),
+            (True, True),
+        ]
+
+
+def test_what_happens_is_seen_as_it_was_told(broker: Broker, robots: Listener) -> None:
+    told.presence(robots, "anna")
+    with Looking(broker) as looking:
+        told.event(robots, "anna", "a-1", "PENDING", "hello")
+        told.event(robots, "anna", "a-1", "ACTIVE")
+        told.event(robots, "anna", "a-1", "SUCCEEDED", "hello")
+        ended = looking.find(Happened, lambda each: each.event.state.terminal)
+        assert (ended.name, ended.event.id, ended.message["goal"]["text"]) == ("anna", "a-1", "hello")
+        events = [each.event for each in looking.seen if isinstance(each, Happened)]
+        states = [each.state for each in events if isinstance(each, StateChanged)]
+        assert states == [State.PENDING, State.ACTIVE, State.SUCCEEDED]
+
+
+@pytest.mark.parametrize(
+    "payload", ["", "hello", "[]", "{}", '{"event": "state"}', '{"event": "snapshot"}', '{"event": "state", "id": 3}']
+)
+def test_what_is_no_event_is_left_out(broker: Broker, robots: Listener, payload: str) -> None:
+    with Looking(broker) as looking:
+        robots.publish("talk/robot/anna/event/state", payload)
+        robots.publish("talk/robot/anna/event/more/levels", payload)
+        told.event(robots, "anna", "a-1", "ACTIVE")
+        looking.find(Happened)
+        assert len(looking.seen) == 1
+
+
+@pytest.mark.parametrize(("text", "picked"), [("anna", ["anna"]), ("wh-*", ["wh-1"]), ("@night", ["anna", "wh-1"])])
+def test_it_looks_at_those_that_are_picked(broker: Broker, robots: Listener, text: str, picked: list[str]) -> None:
+    told.presence(robots, "anna", groups=["night"])
+    with Looking(broker, text) as looking:
+        told.presence(robots, "bert")
+        told.presence(robots, "wh-1", groups=["night"])
+        for name in ("bert", "anna", "wh-1"):
+            told.event(robots, name, "a-1", "ACTIVE")
+        looking.find(Happened, lambda each: each.name == picked[-1])
+        assert {*names(looking.seen)} == {*picked}
+
+
+@pytest.mark.usefixtures("quick")
+def test_after_a_break_it_tells_what_has_changed_and_nothing_twice(broker: Broker, robots: Listener) -> None:
+    for name in ("anna", "bert", "carl", "dora"):
+        told.presence(robots, name)
+        told.status(robots, name, last=f"{name}-1")
+    with Looking(broker) as looking:
+        told.event(robots, "bert", "bert-2", "SUCCEEDED", "heard of")
+        looking.find(Happened)
+        broker.kill()
+        away = looking.find(Away)
+        assert "went away" in away.why
+        broker.start()
+        with Listener(broker) as again:
+            told.presence(again, "anna")
+            told.status(again, "anna", last="anna-2", active="anna-3", text="now")
+            told.presence(again, "bert", server=None)
+            told.status(again, "bert", last="bert-2")
+            told.presence(again, "dora")
+            told.status(again, "dora", last="dora-1")
+            told.presence(again, "carl", online=False)
+            looking.find(Changed, lambda each: each.name == "carl" and not each.now.online)
+            looking.find(Missed)
+            told.event(again, "dora", "dora-2", "ACTIVE")
+            looking.find(Happened, lambda each: each.name == "dora")
+        missed = [each for each in looking.seen if isinstance(each, Missed)]
+        assert [[(one.id, one.state.name) for one in each.events] for each in missed] == [
+            [("anna-2", "SUCCEEDED"), ("anna-3", "ACTIVE")]
+        ]
+        assert looking.find(Back).after > 0
+        changes = [each for each in looking.seen if isinstance(each, Changed)]
+        assert sorted(each.name for each in changes) == ["bert", "carl"]
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_robot_that_does_not_come_back_with_its_broker_is_gone(
+    broker: Broker, robots: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from talkcli.fleet import lookout
+
+    monkeypatch.setattr(lookout, "BACK_WITHIN", 0.5)
+    told.presence(robots, "anna")
+    told.presence(robots, "bert", online=False)
+    with Looking(broker) as looking:
+        broker.kill()
+        broker.start()
+        gone = looking.find(Changed)
+        assert (gone.name, gone.before.online, gone.now) == ("anna", True, None)
+        with Listener(broker) as again:
+            told.presence(again, "anna")
+            assert looking.find(Changed, lambda each: each.now).before is None
+        assert names(looking.seen) == ["anna", "anna"]
+
+
+def test_a_robot_that_was_away_tells_what_it_has_spoken_meanwhile(broker: Broker, robots: Listener) -> None:
+    told.presence(robots, "anna")
+    told.status(robots, "anna", last="a-1")
+    with Looking(broker) as looking:
+        told.presence(robots, "anna", online=False)
+        told.presence(robots, "anna")
+        told.status(robots, "anna", last="a-2", state="ABORTED")
+        missed = looking.find(Missed)
+        assert [(each.id, each.state) for each in missed.events] == [("a-2", State.ABORTED)]
+        told.event(robots, "anna", "a-3", "ACTIVE")
+        told.status(robots, "anna", last="a-2", active="a-3")
+        told.event(robots, "anna", "a-3", "SUCCEEDED", "hello")
+        looking.find(Happened, lambda each: each.event.state.terminal)
+        assert sum(isinstance(each, Missed) for each in looking.seen) == 1
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_broker_that_stays_away_is_lost(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
+    from talkcli.fleet import lookout
+
+    monkeypatch.setattr(lookout, "ABSENCE_LIMIT", 0.5)
+    with Looking(broker) as looking:
+        broker.kill()
+        with pytest.raises(Lost, match=r"was away for 0\.5 s: no broker at"):
+            looking.find(Back)
+        assert looking.find(Away).limit == 0.5
+
+
+def test_without_a_broker_it_does_not_begin() -> None:
+    from talkcli.fleet.broker import Broker as Somewhere
+    from talkcli.fleet.lookout import Lookout
+
+    with Port() as port:
+        looking = Lookout(Somewhere("127.0.0.1", port.number, tls=False)).follow()
+        with pytest.raises(ServerUnavailable, match="no broker at"):
+            next(looking)
+
+
+def test_one_who_may_not_ask_is_told_so(secure_broker: Broker) -> None:
+    looking = Looking(secure_broker, user="otto")
+    with pytest.raises(AccessDenied, match="does not let 'otto' write to"):
+        looking.find(Begun)
+    looking.__exit__()
