@@ -94,8 +94,8 @@ class _Teller:
             return transcript.begin(robots, self._broker.url, screen(), now)
         if isinstance(seen, Changed):
             robot = Robot(seen.name, online=False) if seen.now is None else _there(seen.now)
-            before = None if seen.before is None else _there(seen.before)
-            return transcript.change(before, robot, screen(), now)
+            same = seen.before is not None and seen.now is not None and seen.before.session == seen.now.session
+            return transcript.change(_there(seen.before) if seen.before and same else None, robot, screen(), now)
         if isinstance(seen, Happened):
             return transcript.lines(seen.name, seen.event, screen(), now)
         name = seen.standing.presence.name

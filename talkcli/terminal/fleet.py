@@ -163,16 +163,19 @@ class FleetTranscript:
         return self._transcripts[name].lines(event, screen, now)
 
     def change(self, before: Robot | None, robot: Robot, screen: Screen, now: float) -> list[str]:
-        """Return what is to be shown of a robot that has come or gone, or its server has; of its goals none is left."""
+        """Return what is to be shown of a robot that has come or gone, or its server has; of its goals none is left.
+
+        `before`: how the same bridge of it stood, None where it is another one's, or there was none.
+        """
         self._transcripts.pop(robot.name, None)
         server = "no server" if robot.server is None else f"talk {printable(robot.server, _MAX_VERSION)}"
         if not robot.online:
             word, state, more = "OFFLINE", State.LOST, ""
-        elif robot.server is None and before and before.online:
-            word, state, more = server, State.LOST, ""
-        elif before and before.online and before.since == robot.since:
-            word, state, more = "server", State.SUCCEEDED, server
-        else:
+        elif before is None or not before.online:
             word, state, more = "online", State.SUCCEEDED, server
-        name = self._columns.robot(robot.name, screen)
-        return [GAP.join((clock(now), name, screen.painted(pad(word, 10), state), more)).rstrip()]
+        elif robot.server is None:
+            word, state, more = server, State.LOST, ""
+        else:
+            word, state, more = "server", State.SUCCEEDED, server
+        name, shown = self._columns.robot(robot.name, screen), pad(word, 10) if more else word
+        return [GAP.join((clock(now), name, screen.painted(shown, state), *filter(None, [more])))]

@@ -1,0 +1,340 @@
+"""`talk fleet`: the table of a fleet's robots, and what happens to them, at a desk; in a pipe, and on a terminal."""
+
+from __future__ import annotations
+
+import json
+import signal
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.conformance.bareserve import TALK
+from tests.fleet import told
+from tests.fleet.robot import LONG
+from tests.support.bridge import Desk
+from tests.support.connection import PATIENCE
+from tests.support.mqtt import Listener
+from tests.support.ports import Port
+from tests.support.terminal import Terminal
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.fleet.robot import Robot
+    from tests.support.broker import Broker
+    from tests.support.processes import Finished, Process
+
+
+@pytest.fixture
+def robots(broker: Broker) -> Iterator[Listener]:
+    """Who publishes for the robots: three, one of which is gone, and one has no server."""
+    with Listener(broker) as publisher:
+        told.presence(publisher, "wh-2", online=False, groups=["warehouse"])
+        told.presence(publisher, "wh-1", groups=["warehouse"])
+        told.status(publisher, "wh-1", active="a-2", text="please step back", pending=2, last="a-1")
+        told.presence(publisher, "anna", server=None)
+        yield publisher
+
+
+def run(broker: Broker, *words: str, user: str | None = None, **env: str) -> Finished:
+    with Desk(broker, user=user, env=env) as somebody:
+        return somebody.run(*words)
+
+
+def listed(done: Finished) -> list[str]:
+    """Return the robots that a table lists."""
+    assert done.code == 0, done
+    head, *lines = done.out.splitlines()
+    assert head.startswith("ROBOT ")
+    return [each.split()[0] for each in lines]
+
+
+# talk fleet status
+
+
+@pytest.mark.usefixtures("robots")
+def test_a_table_says_how_each_robot_stands(broker: Broker) -> None:
+    done = run(broker, "fleet", "status")
+    assert (done.code, done.err) == (0, "")
+    assert [each.split() for each in done.out.splitlines()] == [
+        ["ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE"],
+        ["anna", "yes", "none", "-", "-", "-", "2", "h"],
+        ["wh-1", "yes", "0.1.0", '"please', "step", 'back"', "2", "SUCCEEDED", "1", "h", "2", "h"],
+        ["wh-2", "OFFLINE", "-", "-", "-", "-", "-"],
+    ]
+
+
+@pytest.mark.usefixtures("robots")
+def test_for_programs_each_robot_is_an_object(broker: Broker) -> None:
+    anna, first, second = (json.loads(each) for each in run(broker, "--json", "fleet", "status").out.splitlines())
+    assert (anna["robot"], anna["presence"]["online"], anna["presence"]["server"]) == ("anna", True, None)
+    assert anna["status"] is None
+    assert first["presence"]["groups"] == ["all", "warehouse"]
+    assert (first["status"]["text"], first["status"]["last"]["state"]) == ("please step back", "SUCCEEDED")
+    assert (second["robot"], second["presence"]["online"]) == ("wh-2", False)
+
+
+def test_of_a_robot_it_is_what_its_bridge_says(robot: Robot) -> None:
+    assert robot.desk("say", "--wait", "--", "battery low").code == 0
+    with robot.listen("status") as listener:
+        listener.await_message(lambda each: each.topic.endswith("/status") and bool(each.json["last"]))
+    found = json.loads(run(robot.broker, "--json", "fleet", "status").out)
+    assert found["status"]["last"]["text"] == "battery low"
+    assert found["presence"]["server"]["pid"] == robot.talk.pid
+    robot.bridge.kill()
+    with Listener(robot.broker, robot.presence) as listener:
+        listener.await_message(robot.is_offline)
+    done = run(robot.broker, "fleet", "status")
+    assert "anna   OFFLINE" in done.out
+
+
+@pytest.mark.parametrize(
+    ("text", "picked"),
+    [
+        ("anna", ["anna"]),
+        ("wh-*", ["wh-1", "wh-2"]),
+        ("@warehouse", ["wh-1", "wh-2"]),
+        ("@all", ["anna", "wh-1", "wh-2"]),
+    ],
+)
+@pytest.mark.usefixtures("robots")
+def test_a_name_a_glob_or_a_group_picks(broker: Broker, text: str, picked: list[str]) -> None:
+    assert listed(run(broker, "--robot", text, "fleet", "status")) == picked
+    assert listed(run(broker, "fleet", "status", TALK_ROBOT=text)) == picked
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("bert", "no robot 'bert' is known at"),
+        ("x*", "no robot 'x*' is known at"),
+        ("@night", "no robot of the group 'night' is known at"),
+    ],
+)
+@pytest.mark.usefixtures("robots")
+def test_where_none_is_meant_it_ends_with_3(broker: Broker, text: str, words: str) -> None:
+    done = run(broker, "fleet", "status", "--robot", text)
+    assert (done.code, done.out) == (3, "")
+    assert words in done.err
+
+
+def test_where_none_is_known_it_says_what_to_do(broker: Broker) -> None:
+    done = run(broker, "fleet", "status")
+    assert (done.code, done.out) == (3, "")
+    assert f"no robot is known at {broker.url}; on each robot: talk bridge --name NAME" in done.err
+
+
+@pytest.mark.parametrize("what", ["status", "watch"])
+def test_without_a_broker_it_ends_with_3(broker: Broker, what: str) -> None:
+    with Port() as port, Desk(broker, port=port.number) as somebody:
+        done = somebody.run("fleet", what)
+    assert (done.code, done.out) == (3, "")
+    assert "talk: no broker at mqtt://" in done.err
+
+
+@pytest.mark.parametrize("what", ["status", "watch"])
+@pytest.mark.parametrize(("password", "words"), [(True, "does not let 'otto'"), ("wrong", "let 'otto' in")])
+def test_one_who_may_not_ask_is_told_so_with_10(
+    secure_broker: Broker, what: str, password: str | bool, words: str
+) -> None:
+    with Desk(secure_broker, user="otto", password=password) as somebody:
+        done = somebody.run("fleet", what)
+    assert (done.code, done.out) == (10, "")
+    assert words in done.err
+
+
+@pytest.mark.parametrize(
+    ("words", "env", "said"),
+    [
+        (["fleet"], {}, "WHAT is missing: one of status, watch"),
+        (["fleet", "list"], {}, "'list' is not one of 'status', 'watch'"),
+        (["--robot", "@", "fleet", "status"], {}, "no group can be called ''"),
+        (["--robot", "a b*", "fleet", "watch"], {}, "the glob 'a b*' matches no robot's name"),
+        (["fleet", "status"], {"TALK_ROBOT": "a/b"}, "no robot can be called 'a/b'"),
+        (["fleet", "status"], {"TALK_BROKER": ""}, "which broker? TALK_BROKER is not set"),
+        (["--robot", "wh-*", "log"], {}, "'talk log' is of one robot: name it, instead of 'wh-*'"),
+    ],
+)
+def test_what_is_wrong_is_named(broker: Broker, words: list[str], env: dict[str, str], said: str) -> None:
+    done = run(broker, *words, **env)
+    assert (done.code, done.out) == (2, "")
+    assert said in done.err
+
+
+def test_all_are_told_of_more_robots_than_a_broker_keeps_messages_back_for_one(broker: Broker) -> None:
+    """mosquitto has 20 on their way to a client and keeps 1,000; more it drops, unless that takes more at once."""
+    with Listener(broker) as publisher:
+        for number in range(600):
+            told.presence(publisher, f"wh-{number:03}")
+            told.status(publisher, f"wh-{number:03}", last="a-1")
+    done = run(broker, "fleet", "status")
+    assert listed(done) == [f"wh-{number:03}" for number in range(600)]
+    assert done.out.count("SUCCEEDED") == 600
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_on_a_terminal_it_fits(broker: Broker, robots: Listener, columns: int) -> None:
+    for number in range(40):
+        name = f"robot-{number}-of-the-warehouse"
+        told.presence(robots, name, online=number % 7 > 0, server=told.SERVER if number % 5 else None)
+        told.status(robots, name, active="a-2", text="请往后退，门即将关闭 " * 9, last="a-1", paused=number % 9 == 0)
+    with Desk(broker) as somebody, Terminal([*TALK, "fleet", "status"], somebody.env, columns) as terminal:
+        assert terminal.finish() == 0
+        lines = terminal.screen.lines
+    assert terminal.screen.wraps == 0
+    assert len([each for each in lines if each]) == 44
+    assert "PAUSED" in terminal.text
+    # Names that have no room are cut, but not what tells that a robot is not there.
+    assert sum("OFFLINE" in each for each in lines) == 7
+
+
+# talk fleet watch
+
+
+class Watching:
+    """A `talk fleet watch` that has begun, and what it has written so far."""
+
+    def __init__(self, somebody: Desk, *words: str) -> None:
+        self._desk = somebody
+        self.process: Process = somebody.start(*words, "fleet", "watch")
+        self.lines: list[str] = []
+        self.until("")
+
+    def until(self, words: str) -> str:
+        """Read lines until one has these words, and return it."""
+        assert self.process.stdout
+        for line in self.process.stdout:
+            self.lines.append(line.rstrip("\n"))
+            if words in line:
+                return self.lines[-1]
+        raise AssertionError(f"it ended without '{words}': {self.lines}")
+
+    def end(self) -> Finished:
+        """Press Ctrl-C, and return how it ended."""
+        self.process.send_signal(signal.SIGINT)
+        return self._desk.finish(self.process)
+
+
+@pytest.fixture
+def somebody(broker: Broker) -> Iterator[Desk]:
+    with Desk(broker) as result:
+        yield result
+
+
+def test_each_event_is_a_line_with_its_robot(robot: Robot, somebody: Desk) -> None:
+    watching = Watching(somebody)
+    assert robot.desk("say", "--wait", "--id", "b-1", "--", "battery low").code == 0
+    watching.until("SUCCEEDED")
+    assert robot.desk("say", "--id", "b-2", "--", LONG).code == 0
+    watching.until("b-2")
+    assert robot.desk("pause").code == robot.desk("resume").code == robot.desk("cancel").code == 0
+    watching.until("PREEMPTED")
+    head, *lines = watching.lines
+    assert head.endswith(f"1 robot; {robot.broker.url}")
+    assert [each.split()[1:4] for each in lines] == [
+        ["anna", "PENDING", "b-1"],
+        ["anna", "ACTIVE", "b-1"],
+        ["anna", "SUCCEEDED", "b-1"],
+        ["anna", "PENDING", "b-2"],
+        ["anna", "ACTIVE", "b-2"],
+        ["anna", "paused", "b-2"],
+        ["anna", "resumed", "b-2"],
+        ["anna", "PREEMPTING", "b-2"],
+        ["anna", "PREEMPTED", "b-2"],
+    ]
+    assert '"battery low"' in lines[0]
+    assert "canceled by" in lines[-1]
+    assert (watching.end().code, watching.process.stderr and watching.process.stderr.closed) == (130, True)
+
+
+def test_robots_that_come_and_go_and_their_servers_are_lines(broker: Broker, robots: Listener, somebody: Desk) -> None:
+    watching = Watching(somebody)
+    assert watching.lines[0].split("  ")[1] == f"3 robots, 1 OFFLINE, 1 without a server; {broker.url}"
+    told.presence(robots, "wh-2", session="1")
+    told.presence(robots, "wh-1", server=None)
+    told.presence(robots, "wh-1")
+    told.presence(robots, "wh-1", session="another")
+    told.presence(robots, "anna", online=False)
+    told.presence(robots, "bert", server=None)
+    watching.until("bert")
+    assert [each.split()[1:] for each in watching.lines[1:]] == [
+        ["wh-2", "online", "talk", "0.1.0"],
+        ["wh-1", "no", "server"],
+        ["wh-1", "server", "talk", "0.1.0"],
+        ["wh-1", "online", "talk", "0.1.0"],
+        ["anna", "OFFLINE"],
+        ["bert", "online", "no", "server"],
+    ]
+    assert watching.end().code == 130
+
+
+def test_for_programs_each_is_an_object_with_its_robot(robots: Listener, somebody: Desk) -> None:
+    watching = Watching(somebody, "--json", "--robot", "wh-*")
+    told.event(robots, "anna", "c-1", "ACTIVE")
+    told.event(robots, "wh-1", "a-2", "SUCCEEDED", "please step back")
+    watching.until('SUCCEEDED", "text": "please')
+    told.presence(robots, "wh-1", online=False)
+    watching.until('"presence", ')
+    found: list[dict[str, Any]] = [json.loads(each) for each in watching.lines]
+    assert [(each["robot"], each["event"]) for each in found] == [
+        ("wh-1", "snapshot"),
+        ("wh-2", "snapshot"),
+        ("wh-1", "state"),
+        ("wh-1", "presence"),
+    ]
+    assert found[0]["status"]["active"] == "a-2"
+    assert found[2]["goal"]["text"] == "please step back"
+    assert found[3]["presence"]["online"] is False
+    assert watching.end().code == 130
+
+
+@pytest.mark.usefixtures("robots")
+def test_a_broker_that_goes_and_comes_is_told_on_standard_error_and_what_has_changed(
+    broker: Broker, somebody: Desk
+) -> None:
+    watching = Watching(somebody)
+    quiet = Watching(somebody, "-q")
+    broker.kill()
+    broker.start()
+    with Listener(broker) as again:
+        told.presence(again, "anna", server=None)
+        told.presence(again, "wh-1", groups=["warehouse"])
+        told.status(again, "wh-1", last="a-2", state="ABORTED")
+        told.presence(again, "bert")
+        for each in (watching, quiet):
+            while not any("ABORTED" in line for line in each.lines) or not any("bert" in line for line in each.lines):
+                each.until("")
+    assert sorted(" ".join(each.split()[1:4]) for each in watching.lines[1:]) == [
+        "bert online talk",
+        "wh-1 ABORTED a-2",
+    ]
+    assert quiet.end().err == ""
+    done = watching.end()
+    assert done.code == 130
+    gone, back = done.err.splitlines()
+    assert gone == f"talk: the broker at {broker.url} went away; it is tried again for 30 s"
+    assert back.startswith(f"talk: the broker at {broker.url} is back, after ")
+
+
+@pytest.mark.usefixtures("robots")
+def test_a_reader_that_goes_away_ends_it_with_141(somebody: Desk) -> None:
+    watching = Watching(somebody)
+    assert watching.process.stdout
+    watching.process.stdout.close()
+    assert watching.process.wait(PATIENCE) == 141
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_on_a_terminal_no_line_is_broken(robots: Listener, somebody: Desk, columns: int) -> None:
+    long = "a-robot-of-the-warehouse-in-the-north"
+    told.presence(robots, long)
+    with Terminal([*TALK, "fleet", "watch"], somebody.env, columns) as terminal:
+        terminal.wait_for("4 robots")
+        told.event(robots, "wh-1", "a-3", "ACTIVE", "please step back " * 9)
+        told.event(robots, long, "its-own-id-which-is-long", "ABORTED", "请往后退，门即将关闭 " * 9)
+        told.presence(robots, long, online=False)
+        terminal.wait_for("OFFLINE\n")
+        terminal.type(b"\x03")
+        assert terminal.finish() == 130
+    assert terminal.screen.wraps == 0
+    assert "a-robot-of-t" in terminal.text
