@@ -14,6 +14,7 @@ import ssl
 import struct
 import threading
 import time
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from paho.mqtt import client as paho
@@ -337,8 +338,9 @@ class Link:
             self._alert = words.rpartition("] ")[2].partition(" (")[0]
 
 
+@lru_cache(maxsize=32)
 def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties | None:
-    """Return what a message has besides topic and payload, if anything: paho takes its time to make none."""
+    """Return what a message has besides topic and payload, if anything; events have the same, and paho takes time."""
     given: dict[str, object] = {}
     if expiry is not None:
         given["MessageExpiryInterval"] = max(1, math.ceil(min(expiry, 2**31)))

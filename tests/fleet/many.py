@@ -184,7 +184,8 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
     def spoken(self) -> list[Spoken]:
         """What was begun to be spoken so far, by its time."""
         with open(f"{self._directory}/spoken", encoding="utf-8") as file:
-            return sorted((Spoken(**json.loads(line)) for line in file), key=lambda each: each.at)
+            *lines, _ = file.read().split("\n")  # the last of them may be in the middle of being written
+        return sorted((Spoken(**json.loads(line)) for line in lines), key=lambda each: each.at)
 
     def await_there(self, within: float = THERE_LIMIT) -> None:
         """Wait until all can be asked for the first time."""

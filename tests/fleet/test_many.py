@@ -13,7 +13,7 @@ from tests.fleet.many import RealRobots, Roll, SimulatedRobots
 from tests.fleet.robot import LONG
 from tests.support.bridge import Desk
 from tests.support.broker import Broker
-from tests.support.mqtt import mosquitto
+from tests.support.mqtt import Listener, mosquitto
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -152,7 +152,9 @@ def test_a_robot_that_goes_in_mid_sentence_and_stays_away_is_lost(
     robots: RealRobots, desk: Desk, broker: Broker
 ) -> None:
     killed, *others = TWENTY
-    waiting = desk.start("say", "--wait", "--id", "stays-away", "--", "length=1 one stays away")
+    with Listener(broker, f"talk/reply/+/+/{killed}") as answers:
+        waiting = desk.start("say", "--wait", "--id", "stays-away", "--", "length=1 one stays away")
+        answers.await_message(lambda each: b'"ok": true' in each.payload)
     await_active(robots, "stays-away")
     robots[killed].bridge.kill()
     done = desk.finish(waiting, timeout=ABSENCE + 10)

@@ -19,7 +19,7 @@ from tests.bench.failure import FailedError
 from tests.bench.idle import megabytes, taken
 from tests.bench.table import Limit, Row, as_markdown, as_text
 from tests.fleet.many import RealRobots, Roll, SimulatedRobots
-from tests.support.bridge import Desk
+from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
 from tests.support.mqtt import Listener
 
@@ -124,11 +124,11 @@ class Stage(contextlib.AbstractContextManager["Stage"]):
         """Start a command."""
         return Asked(self.env, words)
 
-    def say(self, seconds: float, to: str = "@all") -> tuple[str, Asked]:
-        """Start a command that has a sentence of so many seconds said, and waits for its end; with the goal's id."""
+    def say(self, seconds: float, *, wait: bool = True) -> tuple[str, Asked]:
+        """Start a command that has all say a sentence of so many seconds, and return the goal's id with it."""
         self._goals += 1
         goal = f"goal-{self._goals}"
-        words = ["--robot", to, "say", "--wait", "--id", goal, "--ttl", f"{_TTL:g}", "--"]
+        words = ["--robot", "@all", "say", *(["--wait"] if wait else []), "--id", goal, "--ttl", f"{_TTL:g}", "--"]
         return goal, self.talk(*words, f"length={seconds:g} {goal}")
 
     def await_spoken(self, goal: str) -> None:
@@ -155,10 +155,13 @@ class Stage(contextlib.AbstractContextManager["Stage"]):
 
 def memory(stage: Stage) -> list[Row]:
     """Measure what is there, and a desk while all speak."""
-    found = {"the broker": stage.broker.pid}
-    if stage.real.names:
-        found["a real bridge"] = stage.real[stage.real.names[0]].bridge.pid
-    rows = [_memory(name, pid) for name, pid in found.items()]
+    rows = [_memory("the broker", stage.broker.pid)]
+    # One that is no fork, and so shares nothing with the program that measures: an interpreter's setting is its own.
+    talk = stage.real[stage.real.names[0]].talk
+    with Bridge(talk, stage.broker, "measured", env={"PYTHONHASHSEED": "0"}) as bridge:
+        bridge.await_online()
+        rows.append(_memory("a bridge", bridge.pid))
+        bridge.terminate()
     each = sum(megabytes(pid, "Pss") for pid in stage.simulated.pids) / len(stage.simulated.names)
     rows.append(Row("memory", "memory of a simulated robot, its part of its process", "MB", (each,)))
     goal, asked = stage.say(2)
@@ -192,24 +195,32 @@ def presences(stage: Stage) -> list[Row]:
 
 
 def cancel(stage: Stage) -> list[Row]:
-    """Measure a cancel of all, while all speak."""
-    whole, last = [], []
+    """Measure a cancel of all while all speak: where nobody waits for that, and where another desk does."""
+    alone, alone_whole = _cancelled(stage, wait=False)
+    both, _ = _cancelled(stage, wait=True)
+    return [
+        _row("cancel", "`talk --robot @all cancel`: on its way → last acknowledgement", alone, 1),
+        _row("cancel", "… start to end of the command", alone_whole),
+        _row("cancel", "… on its way → last acknowledgement, where another desk waits for all ends", both),
+    ]
+
+
+def _cancelled(stage: Stage, *, wait: bool) -> tuple[list[float], list[float]]:
+    """Return the seconds from the message to the last line of the command, and those of the whole command."""
+    last, whole = [], []
     with Listener(stage.broker, "talk/group/all/request/+") as witness:
         for _ in range(stage.options.rounds):
-            goal, speaking = stage.say(60)
+            goal, speaking = stage.say(60, wait=wait)
             stage.await_spoken(goal)
             stage.rest()
             asked = stage.talk("--robot", "@all", "cancel").finish()
             sent = witness.await_message(lambda each, asked=asked: each.arrived > asked.began)  # type: ignore[misc]
-            speaking.finish(7)
+            speaking.finish(7 if wait else 0)
             stage.check(goal, speaking)
-            whole.append(asked.ended - asked.began)
             last.append(asked.last - sent.arrived)
+            whole.append(asked.ended - asked.began)
             stage.rest()
-    return [
-        _row("cancel", "`talk --robot @all cancel`: on its way → last acknowledgement", last, 1),
-        _row("cancel", "… start to end of the command", whole),
-    ]
+    return last, whole
 
 
 def say(stage: Stage) -> list[Row]:
