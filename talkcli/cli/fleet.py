@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from talkcli import paths
 from talkcli.cli.show import note, screen, show_found
 from talkcli.client.connect import ANSWER_LIMIT
-from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable, UsageError
+from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable
 from talkcli.fleet.selection import Selection, several
 from talkcli.fleet.sighting import Away, Back, Begun, Changed, Happened, Missed
 from talkcli.frozen import replace
@@ -30,8 +30,6 @@ def fleet(options: Common, what: str) -> int | None:
     broker = options.broker()
     text = paths.named_robot(options.robot, options.socket)
     selection = None if text is None else Selection(text)
-    if selection and selection.fault:  # of the variable: what is typed has been looked at
-        raise UsageError(selection.fault)
     if what == "watch":
         return _watch(options, broker, selection)
     _status(options, broker, selection)

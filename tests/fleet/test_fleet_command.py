@@ -152,7 +152,7 @@ def test_one_who_may_not_ask_is_told_so_with_10(
         (["--robot", "a b*", "fleet", "watch"], {}, "the glob 'a b*' matches no robot's name"),
         (["fleet", "status"], {"TALK_ROBOT": "a/b"}, "no robot can be called 'a/b'"),
         (["fleet", "status"], {"TALK_BROKER": ""}, "which broker? TALK_BROKER is not set"),
-        (["--robot", "wh-*", "log"], {}, "'talk log' is of one robot: name it, instead of 'wh-*'"),
+        (["--robot", "wh-*", "log"], {}, "'talk log' is of one robot: name it; 'talk fleet status' and"),
     ],
 )
 def test_what_is_wrong_is_named(broker: Broker, words: list[str], env: dict[str, str], said: str) -> None:
