@@ -68,7 +68,7 @@ def test_help_of_talk_has_all_exit_codes() -> None:
     assert (code, too_wide(out)) == (0, [])
     classes = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.TalkError)]
     used = {each.exit_code for each in classes} | set(states.EXIT_CODES.values())
-    used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_TIMEOUT}
+    used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_DIFFER, errors.EXIT_TIMEOUT}
     shown = re.findall(r"(?m)^  (\S+) +\S", out.partition("\nExit codes:\n")[2])
     assert shown == [*map(str, sorted(used)), f"{errors.EXIT_SIGNAL}+n"]
     assert "TALK_SOCKET" in out
