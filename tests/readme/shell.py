@@ -76,6 +76,9 @@ for line in sys.stdin:
         print(each["word"], flush=True)
     elif wanted == ".server.socket":
         print(each["server"]["socket"])
+    elif wanted.startswith("select(.exit_code != 0)"):
+        if each["exit_code"]:
+            print(each["robot"], each["error"]["message"])
     elif wanted.startswith(".recent[]"):
         for goal in each["recent"]:
             print(goal["state"], goal["client"]["parent"], goal["text"])

@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.fleet import topics
-from tests.readme.blocks import block, runs
+from tests.fleet.many import RealRobots
+from tests.readme.blocks import block, commands, runs
 from tests.readme.shell import Shell, wait_until
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
 from tests.support.certificates import authority
+from tests.support.documents import ROOT
 from tests.support.mqtt import Listener
 from tests.support.surroundings import clean_environment, find_program, needs, needs_packages, short_directory
 
@@ -154,6 +156,47 @@ def test_readmes_robot_and_its_desk(tmp_path: Path, place: str) -> None:
         done = shell.run(block("A fleet: A desk"), TALK_SOCKET="/nowhere")
         assert done.stdout == "anna: exit code 3\n"
         assert "anna is offline: nothing was sent" in done.stderr
+
+
+@runs("A fleet: Several", "A fleet: Several #2")
+def test_several_robots(tmp_path: Path, place: str) -> None:
+    """A glob, a group, everybody and one that is offline; and the same by the library."""
+    needs_packages("paho")
+    say, cancel, status, table, follow = commands("A fleet: Several")
+    with contextlib.ExitStack() as stack:
+        broker = stack.enter_context(Broker())
+        robots = stack.enter_context(RealRobots(broker, ["bert", "wh-1", "wh-2"], ["warehouse"]))
+        env = clean_environment(place) | {"TALK_BROKER": broker.url}
+        shell = stack.enter_context(contextlib.closing(Shell(tmp_path, env)))
+        watching = shell.start(follow)
+        assert watching.stdout
+        assert "  3 robots; mqtt://" in watching.stdout.readline()
+
+        done = shell.run(say)
+        assert (done.returncode, done.stderr) == (0, "talk: 2 of 2 as asked\n")
+        found = sorted(line.split() for line in done.stdout.splitlines())
+        assert [(robot, *rest) for robot, _, *rest in found] == [(f"wh-{n}", "SUCCEEDED", "0") for n in (1, 2)]
+        assert '"the shift is over"' in watching.stdout.readline()
+
+        done = shell.run(cancel)
+        assert (done.returncode, done.stderr) == (0, "talk: 3 of 3 as asked\n")
+        assert sorted(done.stdout.splitlines()) == [f"{each} - IDLE 0" for each in robots.names]
+
+        code = block("A fleet: Several #2").replace("mqtts://broker", broker.url)
+        python = shell.directory / "several.py"
+        python.write_text(code, encoding="utf-8")
+        done = shell.run(f"{sys.executable} several.py", PYTHONPATH=str(ROOT))
+        assert (done.returncode, done.stderr) == (0, "")
+        assert sorted(done.stdout.splitlines()) == [f"{each} SUCCEEDED 0" for each in robots.names]
+        assert robots.spoken() == {each: ["the shift is over"] * (2 if "wh" in each else 1) for each in robots.names}
+
+        assert robots["bert"].bridge.terminate() == 0
+        done = shell.run(status)
+        assert (done.returncode, done.stdout) == (0, "bert bert is offline: nothing was sent\n")
+        assert done.stderr.splitlines()[-1] == "talk: 2 of 3 as asked"
+        assert [line.split()[:2] for line in shell.run(table).stdout.splitlines()[1:]] == [
+            ["bert", "OFFLINE"], ["wh-1", "yes"], ["wh-2", "yes"],
+        ]  # fmt: skip
 
 
 @runs("A site")

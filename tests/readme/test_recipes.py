@@ -129,19 +129,15 @@ def test_cron(speaking: Talk, shell: Shell) -> None:
 
 @runs("Recipes: ssh")
 def test_ssh(speaking: Talk, shell: Shell) -> None:
-    """One robot, and several; what is said with their server gone."""
+    """What is said, and what with the server gone."""
     shell.ssh()
     done = shell.run(block("Recipes: ssh"), text=AWKWARD)
     assert (done.returncode, done.stderr) == (0, "")
     assert "not heard" not in done.stdout
-    assert said(speaking) == ["hello from the office", AWKWARD, *["the shift is over"] * 3]
-    calls = shell.calls("ssh")
-    assert calls[0] == ["robot", "talk", "status"]
-    assert [each[:2] for each in calls[3:]] == [["-n", each] for each in ("anna", "bert", "carl")]
+    assert said(speaking) == ["hello from the office", AWKWARD]
+    assert shell.calls("ssh")[0] == ["robot", "talk", "status"]
     speaking.stop()
-    gone = shell.run(block("Recipes: ssh"), text=AWKWARD).stdout
-    assert "not heard\n" in gone
-    assert "bert: exit code 3\n" in gone
+    assert "not heard\n" in shell.run(block("Recipes: ssh"), text=AWKWARD).stdout
 
 
 @runs("Recipes: The socket, forwarded")

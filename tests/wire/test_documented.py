@@ -258,7 +258,7 @@ def test_exit_codes_are_in_the_table() -> None:
     assert rows[-1] == f"{errors.EXIT_SIGNAL}+n"
     classes = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.TalkError)]
     used = {each.exit_code for each in classes} | set(states.EXIT_CODES.values())
-    used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_TIMEOUT}
+    used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_DIFFER, errors.EXIT_TIMEOUT}
     assert sorted(map(int, rows[:-1])) == sorted(used)
 
 
