@@ -81,7 +81,7 @@ class Crowd:
         self.desk = Desk(broker)
         self.desk.visitor = self
         try:
-            self._greet()
+            self.desk.await_kept(patience, interrupt=interrupt)
         except BaseException:
             self.close()
             raise
@@ -133,16 +133,6 @@ class Crowd:
             found = RobotConnection(name, self.desk, name=self._name, patience=self.patience, numbers=self._numbers)
             self._robots[name] = found
         return found
-
-    def _greet(self) -> None:
-        end = time.monotonic() + self.patience
-        while self.desk.marked_at is None:
-            if self.desk.failure is not None:
-                raise self.desk.failure
-            left = end - time.monotonic()
-            if left <= 0:
-                raise self.desk.unanswered(self.patience)
-            self.serve(left)
 
     # -- what the desk tells
 

@@ -20,7 +20,7 @@ from talkcli.fleet.broker import user
 from talkcli.fleet.link import KEEPALIVE, MANY_AT_ONCE, NOT_AUTHORIZED, REFUSED, TICK, Link, Opening
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.message import Message
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 #: Seconds after which a broker or a robot that went away counts as gone, and what was waited for as lost: bridges are
 #: back within 15 s of their broker, and systemd starts one again after two.
 ABSENCE_LIMIT = 30.0
-#: Seconds for which presence is awaited that the broker keeps: some send it a moment after the rest.
+#: Seconds for which what the broker keeps is awaited: some send it a moment after the rest.
 GRACE = 0.3
 #: Seconds between two tries to reach a broker that went away: any time up to the first, doubled up to the second.
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
@@ -105,6 +105,23 @@ class Desk:
                 self.marked_at = time.monotonic()
             else:
                 self.visitor.hear(message)
+
+    def await_kept(
+        self, patience: float, enough: Callable[[], bool] = lambda: True, interrupt: Mapping[int, int] | None = None
+    ) -> None:
+        """Wait until the broker has told what it keeps, and a moment longer where that is not yet `enough`.
+
+        ServerUnavailable where it does not within `patience` seconds, AccessDenied where it doesn't let this user ask;
+        Interrupted as of `serve`.
+        """
+        end = time.monotonic() + patience
+        while not (self.told or (self.marked_at is not None and enough())):
+            if self.failure is not None:
+                raise self.failure
+            left = end - time.monotonic()
+            if left <= 0:
+                raise self.unanswered(patience)
+            self.serve(left, interrupt)
 
     def wake(self) -> None:
         """Have the thread that waits look around, from any thread."""

@@ -235,19 +235,9 @@ class RobotConnection(BaseConnection):
 
     def greet(self) -> None:
         """Wait until the broker has told of the robot; errors as of `reach`."""
-        desk = self._desk
-        end = time.monotonic() + self._patience
-        while not (self._presence and desk.marked_at):
-            if desk.failure is not None:
-                raise desk.failure
-            if desk.told:
-                break
-            now = time.monotonic()
-            if now >= end:
-                raise desk.unanswered(self._patience)
-            desk.serve(end - now, self._interrupt)
+        self._desk.await_kept(self._patience, lambda: bool(self._presence), self._interrupt)
         if not self._presence:
-            words = f"no robot '{self._robot}' is known at {desk.broker.url}: nothing was sent"
+            words = f"no robot '{self._robot}' is known at {self._desk.broker.url}: nothing was sent"
             raise ServerUnavailable(f"{words}; on the robot: talk bridge --name {self._robot}")
         self.check()
 
