@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 FILE = Kind("string", (str,), "must be a string")
 MODE = Kind("string", (str,), "must be a string", "MODE")
 
+#: Options that go with one robot, or with none, and not with several.
+_OF_ONE = ("lines", "feedback", "output")
+
 #: Exit codes of every command that asks the server for something; a command says more of those that mean more to it.
 ASKING: Codes = {
     1: "anything not named here; a bug says so",
@@ -85,7 +88,8 @@ class Command:
     plain: bool = True
     #: whether it means a server, which may be a robot's of a fleet, and not this machine alone
     asks: bool = True
-    #: the function that asks several robots at once, as `runs` has its own; "" where one alone can be asked
+    #: the function that asks several robots at once, as `runs`, without the options that don't go with several; "" where
+    #: none of it does
     several: str = ""
     rule: Rule | None = None
 
@@ -111,7 +115,7 @@ class Command:
             what = f"{self.name} --output" if self.asks else self.name
             return f"'talk {what}' is of this machine alone: leave out --robot"
         if several(robot):
-            lone = [f"--{each}" for each in ("lines", "feedback") if given.get(each)]
+            lone = [f"--{each}" for each in _OF_ONE if given.get(each)]
             if not self.several or lone:
                 what = " ".join([self.name, *lone])
                 return (
@@ -129,7 +133,9 @@ class Command:
                 raise UsageError(fault)
             from talkcli.fleet.selection import several
 
-            runs = self.several if several(robot) else runs
+            if several(robot):
+                runs = self.several
+                given = {name: value for name, value in given.items() if name not in _OF_ONE}
         module, _, name = runs.partition(":")
         run: Callable[..., int | None] = getattr(__import__(f"talkcli.cli.{module}", fromlist=[name]), name)
         return run(options, **given)

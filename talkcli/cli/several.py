@@ -40,9 +40,7 @@ def say(
     name: str | None,
     **chosen: Any,
 ) -> int:
-    """Have all of them speak a text, and return the exit code; the arguments are those of `say.say`."""
-    for each in ("feedback", "lines", "output"):
-        del chosen[each]
+    """Have all of them speak a text, and return the exit code; the arguments are as those of `say.say`."""
     end = None if timeout is None else options.began + timeout
     give_up_unread()
     sentence = " ".join(text)
@@ -64,7 +62,7 @@ def say(
     return _ask(options, Say(sentence, wait=wait, **chosen), timeout, name)
 
 
-def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:  # noqa: ARG001
+def wait(options: Common, ids: tuple[str, ...], timeout: float | None) -> int:
     """Wait until these goals have ended on all of them, or all of theirs; return the exit code."""
     give_up_unread()
     return _ask(options, Wait(ids or None), timeout)
