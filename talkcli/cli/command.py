@@ -88,8 +88,8 @@ class Command:
     plain: bool = True
     #: whether it means a server, which may be a robot's of a fleet, and not this machine alone
     asks: bool = True
-    #: the function that asks several robots at once, as `runs`, without the options that don't go with several; "" where
-    #: none of it does
+    #: the function that asks several robots at once, as `runs` one, without the options that don't go with that; ""
+    #: where the command does not
     several: str = ""
     rule: Rule | None = None
 

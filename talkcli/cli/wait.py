@@ -13,7 +13,7 @@ from talkcli.cli.show import Feedback, give_up_failed, give_up_output, reader_is
 from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.states import EXIT_CODES, State
+from talkcli.goals.states import State
 from talkcli.protocol.events import Result
 
 if TYPE_CHECKING:
@@ -128,9 +128,7 @@ def report(goal: Goal, options: Common, shown: Feedback, where: str = "") -> int
         if goal.state is State.ABORTED and goal.reason != "nothing_to_say":
             words += "; see 'talk doctor'"
         shown.aside(f"{where}{words}")
-    if goal.reason == "throttled":
-        return EXIT_OK  # not speaking was what the sender asked for
-    return EXIT_CODES.get(goal.state, EXIT_TIMEOUT)
+    return EXIT_TIMEOUT if goal.exit_code is None else goal.exit_code
 
 
 def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:

@@ -32,7 +32,7 @@ from talkcli.fleet.robot import EXPIRY, RobotConnection, new_id
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say, Set
-from talkcli.goals.states import EXIT_CODES, State
+from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, goal_in, goals
 from talkcli.protocol.lines import request_line, write_request
 from talkcli.protocol.requests import Pause, Resume, Status, Wait
@@ -405,8 +405,8 @@ class _Part:
             if not (handle.state.terminal or handle._lose()):
                 break
             self._told += 1
-            counts = isinstance(self._request, Say) or self._request.ids is not None  # type: ignore[union-attr]
-            code = exit_code(handle.goal) if counts or handle.state is State.LOST else EXIT_OK
+            whatever = isinstance(self._request, Wait) and self._request.ids is None and handle.state is not State.LOST
+            code = EXIT_OK if whatever else handle.goal.exit_code or EXIT_OK
             last = self._told == len(self._handles)
             found.append(Outcome(self._name, handle.state.name, code, handle.goal, last=last))
         return found
@@ -423,7 +423,7 @@ class _Part:
         if isinstance(request, Set):
             return [Outcome(name, SET, said={"settings": reply.get("settings")})]
         if goal is not None:
-            return [Outcome(name, goal.state.name, exit_code(goal) if isinstance(request, Say) else EXIT_OK, goal)]
+            return [Outcome(name, goal.state.name, (isinstance(request, Say) and goal.exit_code) or EXIT_OK, goal)]
         if isinstance(request, Status):
             status = ServerStatus.from_reply(reply, items)
             state = status.active.state.name if status.active else IDLE
@@ -434,10 +434,3 @@ class _Part:
     def _canceled(self, done: Canceled, *, last: bool = True) -> list[Outcome]:
         every = (*done.canceled, *done.ended)
         return [Outcome(self._name, each.state.name, EXIT_OK, each, last=last and each is every[-1]) for each in every]
-
-
-def exit_code(goal: Goal) -> int:
-    """Return what a command ends with that has sent this goal, as it stands."""
-    if goal.reason == "throttled":
-        return EXIT_OK  # not speaking was what the sender asked for
-    return EXIT_CODES.get(goal.state, EXIT_OK)

@@ -8,7 +8,7 @@ know; requests, where that would drop what somebody asked for, are in `options` 
 from __future__ import annotations
 
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
-from talkcli.goals.states import State
+from talkcli.goals.states import EXIT_CODES, State
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -109,6 +109,12 @@ class Goal:
     voice: str | None = None
     #: None where it can't be known
     output: Output | None = None
+
+    @property
+    def exit_code(self) -> int | None:
+        """What a command ends with whose goal this is; None until it has ended."""
+        # That it is not said again is what the sender of a throttled one has asked for.
+        return 0 if self.reason == "throttled" else EXIT_CODES.get(self.state)
 
     def to_json(self) -> JsonObject:
         # Written out: each goal is told of two or three times, and a busy server does little else.
