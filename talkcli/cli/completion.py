@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from typing import TYPE_CHECKING, TypeVar
 
 import click
@@ -208,7 +209,7 @@ def voices(context: click.Context, _: click.Parameter, incomplete: str) -> Items
 
 
 def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Return the robots of the fleet that are there."""
+    """Return the robots of the fleet that are there, and then their groups."""
     options: Common = context.find_root().obj
     try:
         broker = options.broker()
@@ -217,8 +218,10 @@ def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items
         found = roster(broker, PATIENCE)
     except (TalkError, OSError, ValueError):
         return []
-    there = [(name, ", ".join(_groups(each)) or "robot") for name, each in sorted(found.items()) if each.online]
-    return _items(there, incomplete)
+    there = [each for _, each in sorted(found.items()) if each.online]
+    members = Counter(f"@{group}" for each in there for group in {*each.groups})
+    groups = [(name, f"{count} robot{'' if count == 1 else 's'}") for name, count in sorted(members.items())]
+    return _items([*((each.name, ", ".join(_groups(each)) or "robot") for each in there), *groups], incomplete)
 
 
 def _groups(presence: Presence) -> list[str]:

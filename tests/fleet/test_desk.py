@@ -235,8 +235,9 @@ def test_the_robots_that_are_there_are_offered_and_what_they_know(
     make_bridge(make_talk(scripted=True), robot.broker, "bert")
     assert make_bridge(make_talk(scripted=True), robot.broker, "carl").terminate() == 0
     assert robot.talk.run("say", "--id", "mine", "--", LONG).code == 0
-    assert offered(robot, "talk --robot ") == ["anna", "bert"]
+    assert offered(robot, "talk --robot ") == ["anna", "bert", "@all"]
     assert offered(robot, "talk --robot b") == ["bert"]
+    assert offered(robot, "talk fleet status --robot @") == ["@all"]
     assert offered(robot, "talk --robot anna wait ") == ["mine"]
     assert offered(robot, "talk wait m", TALK_ROBOT="anna") == ["mine"]
     assert offered(robot, "talk --robot carl wait ") == []
