@@ -15,7 +15,7 @@ from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, sho
 from talkcli.cli.wait import SILENCE, regardless, rest, show_if_possible
 from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, TalkError, UsageError
-from talkcli.goals.options import Cancel, Say, Set, bad_key
+from talkcli.goals.options import Cancel, Say, Set
 from talkcli.protocol.requests import Pause, Resume, Status, Wait
 from talkcli.terminal.goals import ending, setting_lines
 from talkcli.terminal.text import printable
@@ -70,8 +70,6 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None) -> int:
 
 def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
     """Cancel on all of them what these select, or everything; return the exit code."""
-    if key is not None and (fault := bad_key(key)):
-        raise UsageError(fault)
     return _ask(options, Cancel(ids or None, current, before, key))
 
 

@@ -298,16 +298,10 @@ class Client:
     # -- inside
 
     def _full_id(self, goal_id: str) -> str:
-        """Return the whole id for a number alone, which means a goal of this server.
-
-        UsageError for an empty id, UnknownGoal for one that no goal can have.
-        """
-        if not goal_id:
-            raise UsageError("an id is empty: is the variable set that it comes from?")
+        """Return the whole id for a number alone, which means a goal of this server; what `check_id` raises."""
         if goal_id.isascii() and goal_id.isdecimal():
             goal_id = f"{self._connection.boot}-{goal_id}"
-        if len(goal_id) > MAX_ID:
-            raise UnknownGoal(f"no goal {goal_id[:MAX_ID]!a}… is known: an id has at most {MAX_ID} characters")
+        check_id(goal_id)
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
@@ -318,6 +312,14 @@ class Client:
         if buffer.overrun:
             raise Lost(f"more than {MAX_STATES} events waited and none was taken: watch again, and take them faster")
         raise Lost(f"nothing more is heard of the server at {self.path}: {self._connection.ended}")
+
+
+def check_id(goal_id: str) -> None:
+    """UsageError for an empty id, UnknownGoal for one that no goal can have."""
+    if not goal_id:
+        raise UsageError("an id is empty: is the variable set that it comes from?")
+    if len(goal_id) > MAX_ID:
+        raise UnknownGoal(f"no goal {goal_id[:MAX_ID]!a}… is known: an id has at most {MAX_ID} characters")
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:

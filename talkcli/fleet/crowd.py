@@ -11,7 +11,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from talkcli.client.client import check, too_long
+from talkcli.client.client import batches, check, check_id, too_long
 from talkcli.client.connect import ANSWER_LIMIT, FIRST
 from talkcli.client.connection import Exchange
 from talkcli.client.goal import GoalHandle
@@ -31,7 +31,7 @@ from talkcli.fleet.presence import Presence
 from talkcli.fleet.robot import EXPIRY, RobotConnection, new_id
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.options import Cancel, Say, Set, bad_key
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, goal_in, goals
 from talkcli.protocol.lines import request_line, write_request
@@ -105,9 +105,10 @@ class Crowd:
         self.desk.close()
 
     def ask(self, request: Request) -> Round:
-        """Ask all of them, and return what becomes of that; UsageError for what can't be."""
-        if isinstance(request, Cancel | Wait) and any(each.isdecimal() for each in request.ids or ()):
-            raise UsageError("a number is a goal of one server: to several robots name the goal by its whole id")
+        """Ask all of them, and return what becomes of that; UsageError for what can't be, UnknownGoal as `check_id`."""
+        _check_ids(request)
+        if isinstance(request, Cancel) and request.key is not None and (fault := bad_key(request.key)):
+            raise UsageError(fault)
         if isinstance(request, Set):
             check(request)
         if isinstance(request, Say):
@@ -434,3 +435,15 @@ class _Part:
     def _canceled(self, done: Canceled, *, last: bool = True) -> list[Outcome]:
         every = (*done.canceled, *done.ended)
         return [Outcome(self._name, each.state.name, EXIT_OK, each, last=last and each is every[-1]) for each in every]
+
+
+def _check_ids(request: Request) -> None:
+    """Raise UsageError for goals that can't be named to several robots, UnknownGoal for an id that none can have."""
+    ids = (request.ids if isinstance(request, Cancel | Wait) else None) or ()
+    other = request.before if isinstance(request, Cancel) else request.id if isinstance(request, Status) else None
+    for each in (*ids, *(() if other is None else (other,))):
+        check_id(each)
+        if each.isdecimal():
+            raise UsageError("a number is a goal of one server: to several robots name the goal by its whole id")
+    if len(batches(ids)) > 1:
+        raise UsageError(f"{len(ids):,} ids do not fit into one request: to several robots name fewer, or none for all")
