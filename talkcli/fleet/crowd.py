@@ -116,9 +116,6 @@ class Crowd:
                 request, id=request.id or new_id(self.desk), ttl=TTL if request.ttl is None else request.ttl
             )
             check(request)
-            rejected = too_long(request)
-            if rejected is not None:
-                raise RequestRefused(str(rejected.message), rejected.reason)
         self._round = Round(self, request, next(self._numbers))
         self._round.begin(self._presences.values())
         return self._round
@@ -186,6 +183,8 @@ class Round:
         #: whether all are known that it is asked of
         self._complete = False
         self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
+        #: the goal that each would make of a sentence that fits into no request
+        self._rejected = too_long(request) if isinstance(request, Say) else None
 
     def __iter__(self) -> Iterator[Outcome]:
         return self.results()
@@ -250,7 +249,7 @@ class Round:
 
     def begin(self, presences: Iterable[Presence]) -> None:
         """Ask those that are known to be there."""
-        if self._crowd.to.group is not None:
+        if self._crowd.to.group is not None and self._rejected is None:
             self._publish(self.request, self._number)
         for each in list(presences):
             if self._crowd.to.picks(each):
@@ -270,7 +269,9 @@ class Round:
         robot = self._crowd.robot(name)
         part = self._parts[name] = _Part(robot, name, self.request)
         group = self._crowd.to.group is not None
-        if not presence.online:
+        if (goal := self._rejected) is not None:
+            self._take([Outcome(name, goal.state.name, exit_code(goal), goal)], part)
+        elif not presence.online:
             self._take([failed(name, ServerUnavailable(f"{name} is offline: nothing was sent"), OFFLINE)], part)
         elif group:
             part.expect(self._number, self._latest)
