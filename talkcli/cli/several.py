@@ -227,7 +227,7 @@ class _Count:
     def clear(self) -> None:
         """Leave the line empty."""
         if self._there:
-            self._write("\r\x1b[K")
+            self._write("\r\x1b[2K")
             self._there = False
 
     def _write(self, text: str) -> None:
