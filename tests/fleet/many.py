@@ -22,10 +22,11 @@ from tests.support.processes import Talk
 from tests.support.surroundings import clean_environment, dying_with_parent, short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from tests.support.broker import Broker
     from tests.support.mqtt import Message
+    from tests.support.processes import Finished
 
 #: Seconds in which robots are there that were just started: some have to share two processors.
 THERE_LIMIT = 30.0
@@ -75,8 +76,11 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
     What is still there at the end of a block that went well is ended in peace, and must have gone well, too.
     """
 
-    def __init__(self, broker: Broker, names: Sequence[str], groups: Sequence[str] = ()) -> None:
-        self._broker, self._groups = broker, groups
+    def __init__(
+        self, broker: Broker, names: Sequence[str], groups: Sequence[str] = (), options: Sequence[str] = ()
+    ) -> None:
+        """`groups` and `options` are those of each bridge."""
+        self._broker, self._groups, self._options = broker, groups, options
         self._by_name: dict[str, Robot] = {}
         with contextlib.ExitStack() as stack:
             self._stack = stack.enter_context(contextlib.ExitStack())
@@ -116,7 +120,7 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
         # Both are forks of a process that lives as long as the tests; one that dies with the thread that has started it
         # would be gone with this.
         talk = self._stack.enter_context(contextlib.closing(Talk(scripted=True)))
-        bridge = self._stack.enter_context(Bridge(talk, self._broker, name, groups=self._groups))
+        bridge = self._stack.enter_context(Bridge(talk, self._broker, name, *self._options, groups=self._groups))
         return Robot(talk, self._broker, bridge)
 
 
@@ -232,3 +236,22 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
             each.wait()
             assert each.stdout
             each.stdout.close()
+
+
+def told(done: Finished) -> dict[str, tuple[str, str, int]]:
+    """Return what a desk was told of each robot: id, state, code; each is told of once."""
+    lines = [line.split() for line in done.out.splitlines()]
+    found = {robot: (goal_id, state, int(code)) for robot, goal_id, state, code in lines}
+    assert len(found) == len(lines), f"a robot twice: {done.out}"
+    return found
+
+
+def alike(names: Sequence[str], goal_id: str, state: str, code: int) -> dict[str, tuple[str, str, int]]:
+    """Return what a desk is told where all of these end alike."""
+    return dict.fromkeys(names, (goal_id, state, code))
+
+
+def assert_told(done: Finished, code: int, wanted: Mapping[str, tuple[str, str, int]], summary: str) -> None:
+    """Assert what a desk was told of each robot, its exit code, and how many did as they were asked."""
+    assert told(done) == wanted, done
+    assert (done.code, done.err.splitlines()[-1:]) == (code, [f"talk: {summary}"]), done

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.fleet.asker import Asker
-from tests.fleet.many import RealRobots, Roll, SimulatedRobots
+from tests.fleet.many import RealRobots, Roll, SimulatedRobots, alike, assert_told, told
 from tests.fleet.robot import LONG
 from tests.support.bridge import Desk
 from tests.support.broker import Broker
@@ -17,9 +17,7 @@ from tests.support.mqtt import Listener, mosquitto
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from tests.support.processes import Finished
+    from collections.abc import Iterator
 
 TWENTY = [f"robot-{number:02d}" for number in range(1, 21)]
 GROUP = "warehouse"
@@ -47,24 +45,6 @@ def desk(broker: Broker) -> Iterator[Desk]:
     """Somebody who asks all of them."""
     with Desk(broker, env={"TALK_ROBOT": "@all"}) as result:
         yield result
-
-
-def told(done: Finished) -> dict[str, tuple[str, str, int]]:
-    """Return what a desk was told of each robot: id, state, code; each is told of once."""
-    lines = [line.split() for line in done.out.splitlines()]
-    found = {robot: (goal_id, state, int(code)) for robot, goal_id, state, code in lines}
-    assert len(found) == len(lines), f"a robot twice: {done.out}"
-    return found
-
-
-def alike(names: Sequence[str], goal_id: str, state: str, code: int) -> dict[str, tuple[str, str, int]]:
-    """Return what a desk is told where all of these end alike."""
-    return dict.fromkeys(names, (goal_id, state, code))
-
-
-def assert_told(done: Finished, code: int, wanted: Mapping[str, tuple[str, str, int]], summary: str) -> None:
-    assert told(done) == wanted, done
-    assert (done.code, done.err.splitlines()[-1:]) == (code, [f"talk: {summary}"]), done
 
 
 def await_active(robots: RealRobots, goal_id: str) -> None:
