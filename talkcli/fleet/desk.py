@@ -174,7 +174,7 @@ class Desk:
                 return 0.0
             return TICK if self._opening else max(0.0, self._next_try - now)
         link.tick()
-        return TICK if self.marked_at is None or self.told else GRACE
+        return TICK if self.marked_at is None or self.told else self.marked_at + GRACE - now
 
     def _new_link(self) -> Link:
         name = f"talk-desk-{self.user}-{self.session}"
