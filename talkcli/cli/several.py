@@ -207,7 +207,7 @@ def _reasons(failures: list[Outcome]) -> list[str]:
 def _why(outcome: Outcome) -> str:
     """Return in words why a robot did not do it."""
     if outcome.error is not None:
-        return outcome.error.message
+        return outcome.error.message.removeprefix(f"{outcome.robot}: ")  # who it is stands before it
     return ending(outcome.goal) if outcome.goal else outcome.state
 
 

@@ -377,7 +377,9 @@ class _Part:
             except UnknownGoal as error:
                 return [*self._canceled(Canceled.from_items(error.items), last=False), failed(self._name, error)]
             except TalkError as error:
-                return [failed(self._name, error)]
+                refused = (exchange.reply or {}).get("error")
+                serverless = isinstance(refused, dict) and refused.get("code") == ServerUnavailable.code
+                return [failed(self._name, error, NO_SERVER if serverless else None)]
             if not self._handles:
                 return self._answered(reply, items)
         quiet, why = robot.silent_by(self._since)

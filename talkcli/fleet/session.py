@@ -244,7 +244,7 @@ class Session:
         except TalkError as error:
             code = Busy.code if isinstance(error, Busy) else "no_server"
             while self._queue:
-                self._refuse(self._queue.popleft(), code, f"{house.name}: {' '.join(str(error).split())}")
+                self._refuse(self._queue.popleft(), code, " ".join(str(error).split()))
             return
         while self._queue:
             self._take(self._queue.popleft())
@@ -252,7 +252,7 @@ class Session:
             self._hear(lines)
             await house.flowing.wait()
         for each in self._mine():
-            self._refuse(each, "no_server", f"{house.name}: {_GONE}")
+            self._refuse(each, "no_server", _GONE)
         self._tell_end(_GONE)
 
     def _hear(self, lines: Iterable[bytes]) -> None:
