@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import pytest
 
 from talkcli.fleet import topics
+from talkcli.fleet.policy import ASKABLE
+from tests.fleet.many import RealRobots
 from tests.fleet.robot import Robot
 from tests.support.bridge import Bridge
 from tests.support.broker import Broker
@@ -98,3 +100,14 @@ def lasting_robot() -> Iterator[Robot]:
             yield Robot(talk, broker, bridge)
             assert bridge.terminate() == 0, bridge.log
         talk.stop()
+
+
+@pytest.fixture(scope="module")
+def pair() -> Iterator[RealRobots]:
+    """Two robots at a broker of their own, wh-1 and wh-2 of the group warehouse, of which all may be asked.
+
+    They are for all tests of a module: each leaves them silent, and with nothing to say.
+    """
+    allowed = ("--allow", ",".join(sorted(ASKABLE)))
+    with Broker() as broker, RealRobots(broker, ["wh-1", "wh-2"], ["warehouse"], allowed) as result:
+        yield result

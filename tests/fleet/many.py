@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from tests.support.broker import Broker
     from tests.support.mqtt import Message
-    from tests.support.processes import Finished
+    from tests.support.processes import Clients, Finished
 
 #: Seconds in which robots are there that were just started: some have to share two processors.
 THERE_LIMIT = 30.0
@@ -80,7 +80,8 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
         self, broker: Broker, names: Sequence[str], groups: Sequence[str] = (), options: Sequence[str] = ()
     ) -> None:
         """`groups` and `options` are those of each bridge."""
-        self._broker, self._groups, self._options = broker, groups, options
+        self.broker = broker
+        self._groups, self._options = groups, options
         self._by_name: dict[str, Robot] = {}
         with contextlib.ExitStack() as stack:
             self._stack = stack.enter_context(contextlib.ExitStack())
@@ -120,8 +121,8 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
         # Both are forks of a process that lives as long as the tests; one that dies with the thread that has started it
         # would be gone with this.
         talk = self._stack.enter_context(contextlib.closing(Talk(scripted=True)))
-        bridge = self._stack.enter_context(Bridge(talk, self._broker, name, *self._options, groups=self._groups))
-        return Robot(talk, self._broker, bridge)
+        bridge = self._stack.enter_context(Bridge(talk, self.broker, name, *self._options, groups=self._groups))
+        return Robot(talk, self.broker, bridge)
 
 
 def _end(robot: Robot) -> None:
@@ -238,12 +239,28 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
             each.stdout.close()
 
 
+def request(robots: RealRobots, name: str, **fields: Any) -> None:
+    """Ask the server of each for something, at the robot."""
+    for reply in robots.each(lambda each: each.talk.request(name, **fields)):
+        assert reply["ok"], reply
+
+
+def at_once(clients: Clients, *lines: Sequence[str]) -> list[Finished]:
+    """Run these commands beside each other: each waits, most of its time, for what the broker may still tell."""
+    return [clients.finish(each) for each in [clients.start(*line) for line in lines]]
+
+
 def told(done: Finished) -> dict[str, tuple[str, str, int]]:
     """Return what a desk was told of each robot: id, state, code; each is told of once."""
     lines = [line.split() for line in done.out.splitlines()]
     found = {robot: (goal_id, state, int(code)) for robot, goal_id, state, code in lines}
     assert len(found) == len(lines), f"a robot twice: {done.out}"
     return found
+
+
+def objects(done: Finished) -> dict[str, dict[str, Any]]:
+    """Return what a desk was told of each robot, for programs."""
+    return {each["robot"]: each for each in map(json.loads, done.out.splitlines())}
 
 
 def alike(names: Sequence[str], goal_id: str, state: str, code: int) -> dict[str, tuple[str, str, int]]:
