@@ -270,7 +270,7 @@ class Round:
         part = self._parts[name] = _Part(robot, name, self.request)
         group = self._crowd.to.group is not None
         if (goal := self._rejected) is not None:
-            self._take([Outcome(name, goal.state.name, exit_code(goal), goal)], part)
+            self._take([Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal)], part)
         elif not presence.online:
             self._take([failed(name, ServerUnavailable(f"{name} is offline: nothing was sent"), OFFLINE)], part)
         elif group:
