@@ -6,7 +6,7 @@ import re
 import time
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from talkcli.engine.synthesizers.phonemes import LONGEST, Piece, pieces
@@ -127,6 +127,7 @@ def test_a_long_sentence_is_parted_at_a_comma_and_without_a_pause() -> None:
 
 
 @given(st.lists(st.sampled_from(["word", "a", "x" * 70, "y" * 600, "in the", "one,", "two.", "?"]), max_size=120))
+@example(["y" * 104, "x" * 70, "x" * 70, "one,"])  # 250 sounds, and then a comma
 def test_no_piece_is_longer_than_its_limit_and_nothing_is_lost(words: list[str]) -> None:
     text = " ".join(words)
     found = list(pieces(Spelt("in the"), text))

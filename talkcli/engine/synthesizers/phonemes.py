@@ -81,7 +81,8 @@ def pieces(speller: Speller, text: str) -> Iterator[Piece]:
         if len(begun.sounds) > _LONG:
             yield begun.piece(ends=False)
         for group, words in _spoken(speller, clause, groups, offset):
-            if begun.sounds and len(begun.sounds) + len(group) >= LONGEST:
+            # A blank goes between them, and a stop may follow.
+            if begun.sounds and len(begun.sounds) + 1 + len(group) >= LONGEST:
                 yield begun.piece(ends=False)
             yield from begun.add(group, words)
         stop = _STOP.search(clause) if groups else None
