@@ -70,6 +70,10 @@ class ProtocolMismatch(TalkError):
     exit_code = 9
 
 
+class Unreadable(ProtocolMismatch, ValueError):
+    """What a server sent is no message of the protocol, or has no goal where it should have one."""
+
+
 class RequestRefused(TalkError):
     """The server answered a request with an error; `code` is the server's, `items` what it listed before."""
 

@@ -213,13 +213,14 @@ def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items
     options: Common = context.find_root().obj
     try:
         broker = options.broker()
+        from talkcli.fleet import topics
         from talkcli.fleet.roster import roster
 
         found = roster(broker, PATIENCE)
     except (TalkError, OSError, ValueError):
         return []
     there = [each for _, each in sorted(found.items()) if each.online]
-    members = Counter(f"@{group}" for each in there for group in {*each.groups})
+    members = Counter(f"@{group}" for each in there for group in {*each.groups} if not topics.fault(group))
     groups = [(name, f"{count} robot{'' if count == 1 else 's'}") for name, count in sorted(members.items())]
     return _items([*((each.name, ", ".join(_groups(each)) or "robot") for each in there), *groups], incomplete)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from talkcli.errors import BadRequest
 from talkcli.fleet import topics
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
+from talkcli.goals.goal import seconds
 from talkcli.protocol.lines import decode
 
 if TYPE_CHECKING:
@@ -45,12 +46,12 @@ class Presence:
             return None
         if topics.fault(name):
             return None
-        since, server = said.get("since"), said.get("server")
+        server = said.get("server")
         return cls(
             name,
             said.get("online") is True,
             _text(said.get("session")),
-            float(since) if isinstance(since, int | float) and not isinstance(since, bool) else None,
+            seconds(said.get("since")),
             _texts(said.get("groups")),
             _texts(said.get("allow")),
             server if isinstance(server, dict) else None,

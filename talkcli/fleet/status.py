@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from talkcli.errors import BadRequest
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
-from talkcli.goals.goal import Goal
+from talkcli.goals.goal import Goal, known
 from talkcli.goals.states import State
 from talkcli.protocol.events import StateChanged
 from talkcli.protocol.lines import decode
@@ -92,11 +92,8 @@ class Standing:
 def _last(said: object) -> LastGoal | None:
     if not isinstance(said, dict):
         return None
-    goal_id, state, at = _text(said.get("id")), _text(said.get("state")), said.get("at")
-    if goal_id is None or state not in State.__members__:
-        return None
-    when = float(at) if isinstance(at, int | float) and not isinstance(at, bool) else None
-    return LastGoal(goal_id, State[str(state)], _text(said.get("reason")), _text(said.get("text")), when)
+    found = known(LastGoal, said)
+    return LastGoal(**found) if "id" in found and "state" in found else None
 
 
 def _text(value: object) -> str | None:

@@ -7,6 +7,7 @@ know; requests, where that would drop what somebody asked for, are in `options` 
 
 from __future__ import annotations
 
+from talkcli.errors import Unreadable
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.states import EXIT_CODES, State
 
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from typing import Any
 
 JsonObject = dict[str, object]
+
+#: Seconds in some thirty million years: what is longer, no calendar can show.
+_LONGEST = 1e15
 
 
 @frozen
@@ -144,12 +148,10 @@ class Goal:
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
-        """Return the goal in a server's message; ValueError where it is none. Fields not known here are ignored."""
-        if not isinstance(value, dict):
-            raise ValueError("a goal is a JSON object")
-        found = known(cls, value)
-        if "id" not in found or "state" not in found:
-            raise ValueError("a goal has an id and a state")
+        """Return the goal in a server's message; Unreadable where it is none. Fields not known here are ignored."""
+        found = known(cls, value if isinstance(value, dict) else {})
+        if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are shown as they are
+            raise Unreadable("what the server sent for a goal has no id that can be one, or an unknown state")
         return cls(**found)
 
 
@@ -167,15 +169,17 @@ def _of(kind: type) -> Callable[[object], object]:
     return lambda value: value if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)) else None
 
 
-def _seconds(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+def seconds(value: object) -> float | None:
+    """Return a time, or a length of time, that somebody else tells; None for what is none, or past all calendars."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if number and abs(value) <= _LONGEST else None  # type: ignore[arg-type]
 
 
 #: What reads a field, by its annotation; None for what is of another kind.
 _READ: dict[str, Callable[[object], object]] = {
     "str": _of(str),
     "int": _of(int),
-    "float": _seconds,
+    "float": seconds,
     "bool": _of(bool),
     "JsonObject": _of(dict),
     "State": lambda value: State.__members__.get(value) if isinstance(value, str) else None,

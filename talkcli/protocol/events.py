@@ -8,7 +8,7 @@ know. A change that an older peer could not read needs another PROTOCOL number; 
 
 from __future__ import annotations
 
-from talkcli.errors import BadRequest, Busy, ProtocolMismatch
+from talkcli.errors import BadRequest, Busy, ProtocolMismatch, Unreadable
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.goal import By, Goal, known
 
@@ -44,7 +44,7 @@ class ServerStatus:
 
     @classmethod
     def from_json(cls, message: JsonObject) -> ServerStatus:
-        """Return the status in an object; ValueError where one of its goals is none."""
+        """Return the status in an object; Unreadable where one of its goals is none."""
         server, pending, recent = message.get("server"), message.get("pending"), message.get("recent")
         return cls(
             server if isinstance(server, dict) else {},
@@ -164,7 +164,7 @@ _KINDS: dict[str, type[StateChanged | WordHeard | PausedChanged | Result]] = {
 
 
 def from_json(message: JsonObject) -> Event | None:
-    """Return the event in a message; None for a kind that is not known here; ValueError where its fields are wrong."""
+    """Return the event in a message; None for a kind that is not known here; Unreadable where its fields are wrong."""
     kind = str(message.get("event"))
     if kind == "snapshot":
         return Snapshot(ServerStatus.from_json(message))
@@ -175,7 +175,7 @@ def from_json(message: JsonObject) -> Event | None:
     for name, annotation in event.__annotations__.items():
         value = message.get(name)
         if name not in found and (value is not None or not annotation.endswith(" | None")):
-            raise ValueError(f"the {name!r} of a {kind!a} event is {value!a}")
+            raise Unreadable(f"the {name!r} of a {kind!a} event is {value!a}")
     return event(**found)
 
 
@@ -192,7 +192,7 @@ def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
 
 
 def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
-    """Return the goal in a reply, None where it is null; ValueError where it is no goal."""
+    """Return the goal in a reply, None where it is null; Unreadable where it is no goal."""
     return None if reply.get(name) is None else Goal.from_json(reply[name])
 
 
