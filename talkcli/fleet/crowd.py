@@ -13,29 +13,25 @@ from typing import TYPE_CHECKING
 
 from talkcli.client.client import batches, check, check_id, too_long
 from talkcli.client.connect import ANSWER_LIMIT, FIRST
-from talkcli.client.connection import Exchange
-from talkcli.client.goal import GoalHandle
 from talkcli.errors import (
     EXIT_OK,
+    Lost,
     RequestRefused,
     ServerUnavailable,
     TalkError,
-    UnknownGoal,
     UsageError,
 )
 from talkcli.fleet import topics
 from talkcli.fleet.desk import Desk
 from talkcli.fleet.link import REFUSED, boottime
-from talkcli.fleet.outcome import IDLE, NO_SERVER, OFFLINE, PAUSED, RESUMED, SET, Outcome, failed
+from talkcli.fleet.outcome import NO_SERVER, OFFLINE, Outcome, failed
+from talkcli.fleet.part import Part
 from talkcli.fleet.presence import Presence
 from talkcli.fleet.robot import EXPIRY, RobotConnection, new_id
 from talkcli.frozen import replace
-from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say, Set, bad_key
-from talkcli.goals.states import State
-from talkcli.protocol.events import Canceled, ServerStatus, goal_in, goals
 from talkcli.protocol.lines import request_line, write_request
-from talkcli.protocol.requests import Pause, Resume, Status, Wait
+from talkcli.protocol.requests import Status, Wait
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -44,14 +40,16 @@ if TYPE_CHECKING:
     from talkcli.fleet.link import Link
     from talkcli.fleet.message import Message
     from talkcli.fleet.selection import Selection
-    from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
 #: Seconds in which a sentence to several robots must have begun, unless it names its own: what was true for all of them
 #: a minute ago is not what the last of them should say.
 TTL = 10.0
-#: Seconds between two looks at who has not answered in time.
-_LOOK = 0.25
+#: Seconds between two looks at who has not answered in time; and messages that are read before that, which may have
+#: come while this process was stopped.
+_LOOK, _READ = 0.25, 5000
+#: Seconds in which the broker must have taken what was asked by one who does not wait for what becomes of it.
+_TAKEN = 1.0
 
 
 class Crowd:
@@ -93,15 +91,17 @@ class Crowd:
         self.close()
 
     def close(self) -> None:
-        """End it: what was asked is carried out all the same."""
+        """End it: what was asked is carried out all the same. It may be called again."""
+        asked, self._round = self._round, None
+        if asked is not None:
+            self.desk.flush(_TAKEN)
         link = self.desk.link
-        if self.to.group is not None and link is not None:
+        if asked is not None and link is not None and self.to.group is not None:
             topic = topics.group(self.to.group, topics.REQUEST, self.desk.user)
             link.publish(topic, b"", 0, response=topics.reply(self.desk.user, self.desk.session))
-        elif self._round is not None:
-            for each in self._round.asked:
+        elif asked is not None:
+            for each in asked.asked:
                 each.hang_up()
-        self._round = None
         self.desk.close()
 
     def ask(self, request: Request) -> Round:
@@ -120,9 +120,14 @@ class Crowd:
         self._round.begin(self._presences.values())
         return self._round
 
-    def serve(self, timeout: float) -> None:
-        """Wait so long at most for what comes, and take it in; Interrupted."""
-        self.desk.serve(timeout, self._interrupt)
+    def serve(self, timeout: float) -> bool:
+        """Wait so long at most for what comes, take it in, and return whether something came; Interrupted."""
+        return self.desk.serve(timeout, self._interrupt)
+
+    def picks(self, name: str) -> bool:
+        """Whether a robot is one of them, by what it said of itself last."""
+        presence = self._presences.get(name)
+        return presence is not None and self.to.picks(presence)
 
     def robot(self, name: str) -> RobotConnection:
         """Return the connection to a robot."""
@@ -140,17 +145,18 @@ class Crowd:
         link.subscribe(topics.robot("+", topics.PRESENCE), retained=True)
 
     def went_down(self, why: str) -> None:
-        """Take all for absent."""
+        """Take all for absent; of others than are known by now, the broker will not tell in time."""
+        if self._round:
+            self._round.is_complete()
         for each in self._robots.values():
             each.went_down(why)
 
     def hear(self, message: Message) -> None:
         """Take in a robot's presence, or lines of its server's."""
-        levels = message.topic.split("/")
-        if levels[-1] != topics.PRESENCE:
-            self._answered(levels[-1], message)
+        _, kind, *_, name, last = message.topic.split("/")
+        if kind != topics.ROBOT:
+            self._answered(last, message)
             return
-        name = levels[-2]
         presence = Presence.read(name, message.payload)
         if presence is None:
             return  # cleared, or it is none
@@ -167,24 +173,35 @@ class Crowd:
         self._round.answering(name)
         robot.hear(message)
         robot.hand_out()
-        self._round.look(name)
+        self._round.look(name, judge=False)
 
 
 class Round:
-    """One request to all of them. Iterate over what becomes of it, or take it from `results`, until it is done."""
+    """One request to all of them. Iterate over what becomes of it, or take it from `results`, until it is done.
+
+    It has a connection, which ends with the last of it, with `with`, or by `close`.
+    """
 
     def __init__(self, crowd: Crowd, request: Request, number: int) -> None:
         self.request = request
         self._crowd, self._number = crowd, number
-        self._parts: dict[str, _Part] = {}
+        self._parts: dict[str, Part] = {}
+        #: those of them, by name, of which not all is known
+        self._open: set[str] = set()
         self._found: deque[Outcome] = deque()
         #: why the broker has taken nothing that was for the group
         self._refused: TalkError | None = None
-        #: whether all are known that it is asked of
-        self._complete = False
+        #: whether all are known that it is asked of; whether it is cancelled; whether it is over
+        self._complete = self._canceled = self._closed = False
         self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
         #: the goal that each would make of a sentence that fits into no request
         self._rejected = too_long(request) if isinstance(request, Say) else None
+
+    def __enter__(self) -> Round:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def __iter__(self) -> Iterator[Outcome]:
         return self.results()
@@ -198,8 +215,19 @@ class Round:
         """The robots that were asked."""
         return [each.robot for each in self._parts.values() if each.was_asked]
 
+    @property
+    def open(self) -> list[str]:
+        """The names of the robots of which not all is known yet, sorted."""
+        return sorted(self._open)
+
+    @property
+    def away(self) -> str | None:
+        """Why nothing can be sent at this moment; None where it can."""
+        broker = self._crowd.desk.broker
+        return None if self._crowd.desk.link else f"the broker at {broker.url} went away"
+
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
-        """Yield what has become of it at each robot, as it comes.
+        """Yield what has become of it at each robot, as it comes; nothing more once it is closed.
 
         TimeoutError after so many seconds, Interrupted as the crowd is; it may be called again then. ServerUnavailable
         where there is no such robot, AccessDenied where the broker lets this user ask none of them.
@@ -209,41 +237,64 @@ class Round:
         while True:
             while self._found:
                 yield self._found.popleft()
+            if self._closed:
+                return
             if self._refused is not None:
+                self.close()
                 raise self._refused
             self._complete = self._complete or self._crowd.desk.told
-            if self._complete and all(each.done for each in self._parts.values()):
+            if self._complete and not self._open:
                 self.close()
                 break
             now = time.monotonic()
             if end is not None and now >= end:
-                done = sum(each.done for each in self._parts.values())
+                done = len(self) - len(self._open)
                 raise TimeoutError(f"{done} of {len(self)} robots are done after {round(timeout or 0.0, 1):g} s")
             self._crowd.serve(min(look_at, end or look_at) - now)
             if time.monotonic() >= look_at:
-                for name in list(self._parts):
-                    self.look(name)
+                self._look_at_all()
                 look_at = time.monotonic() + _LOOK
         if not self._parts:
-            to, broker = self._crowd.to, self._crowd.desk.broker.url
-            which = f"is in the group '{to.group}'" if to.group is not None else f"matches '{to.text}'"
-            raise ServerUnavailable(f"no robot {which} at {broker}: nothing was sent; 'talk fleet status' lists all")
+            raise self._nobody()
 
     def cancel(self) -> None:
-        """Ask those that have not ended to cancel it: what becomes of that, `results` tells."""
+        """Have a sentence be cancelled wherever it has not ended, also at robots that are away and come back: what
+        becomes of that, `results` tells. UsageError once that has told all: cancel the goal by its id then.
+        """
         if not isinstance(self.request, Say):
             return
-        cancel = Cancel((str(self.request.id),))
-        if self._crowd.to.group is not None:
-            self._publish(cancel, next(self._crowd._numbers))
-            return
-        for each in self._parts.values():
-            if not each.done:
-                each.cancel(cancel)
+        if self._closed:
+            raise UsageError("all outcomes have been taken: cancel the goal by its id")
+        self._canceled = True
+        to, link = self._crowd.to, self._crowd.desk.link
+        if to.group is not None and link is not None:
+            self._publish(Cancel((str(self.request.id),)), next(self._crowd._numbers))
+        for name in self._open:
+            # One that has left the group is told by itself.
+            self._parts[name].withdraw(told=to.group is not None and self._crowd.picks(name))
 
     def close(self) -> None:
-        """Wait for no more of it: the connection to the broker ends."""
+        """Wait for no more of it: the connection to the broker ends. What was asked is carried out all the same."""
+        self._closed = True
         self._crowd.close()
+
+    def _look_at_all(self) -> None:
+        """See how far all are, once what has come by now was heard."""
+        for _ in range(_READ):
+            if not self._crowd.serve(0.0):
+                break
+        for name in list(self._open):
+            self.look(name)
+
+    def _nobody(self) -> TalkError:
+        """Return what is wrong where nobody was there to be asked."""
+        to, broker = self._crowd.to, self._crowd.desk.broker.url
+        if to.group is not None and self.away:
+            return Lost(
+                f"{self.request.kind} was sent to the group '{to.group}', but {self.away}; it may be carried out"
+            )
+        which = f"is in the group '{to.group}'" if to.group is not None else f"matches '{to.text}'"
+        return ServerUnavailable(f"no robot {which} at {broker}: nothing was sent; 'talk fleet status' lists all")
 
     # -- what the crowd tells
 
@@ -255,48 +306,59 @@ class Round:
             if self._crowd.to.picks(each):
                 self.present(each)
 
+    def is_complete(self) -> None:
+        """Ask nobody more."""
+        self._complete = True
+
     def present(self, presence: Presence) -> None:
         """Ask a robot that the broker has just told of, or tell that it can't be asked.
 
-        One that comes later is asked nothing: it was not there.
+        One that comes once all are known is asked nothing: it was not there. Of a group, one may come in the moment
+        between the request and that; it is waited for as the others are, since some brokers tell of all of them then.
         """
         name = presence.name
         if name in self._parts:
-            self.look(name)
+            self.look(name, judge=False)
             return
         if self._complete:
             return
-        robot = self._crowd.robot(name)
-        part = self._parts[name] = _Part(robot, name, self.request)
+        part = self._add(name)
         group = self._crowd.to.group is not None
         if (goal := self._rejected) is not None:
-            self._take([Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal)], part)
+            self._take([Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal)])
         elif not presence.online:
-            self._take([failed(name, ServerUnavailable(f"{name} is offline: nothing was sent"), OFFLINE)], part)
+            self._take([failed(name, ServerUnavailable(f"{name} is offline: nothing was sent"), OFFLINE)])
         elif group:
             part.expect(self._number, self._latest)
         elif presence.server is None:
             words = f"{name} has no talk server at this moment: nothing was sent"
-            self._take([failed(name, ServerUnavailable(words), NO_SERVER)], part)
+            self._take([failed(name, ServerUnavailable(words), NO_SERVER)])
         else:
-            self._take(part.ask(), part)
+            self._take(part.ask())
 
     def answering(self, name: str) -> None:
         """Have a robot count that answers, be it that it was taken for absent or that nobody has told of it yet."""
         part = self._parts.get(name)
         if self._crowd.to.group is not None and (part is None or not part.was_asked):
-            part = self._parts[name] = _Part(self._crowd.robot(name), name, self.request)
+            part = self._add(name)
             part.expect(self._number, self._latest)
+            if self._canceled:
+                part.withdraw(told=False)
 
-    def look(self, name: str) -> None:
-        """See how far it is at a robot."""
-        part = self._parts.get(name)
-        if part is not None and not part.done:
-            self._take(part.look(), part)
+    def look(self, name: str, *, judge: bool = True) -> None:
+        """See how far it is at a robot; `judge`: whether it counts as lost where its time is over."""
+        if name in self._open:
+            self._take(self._parts[name].look(judge=judge))
 
-    def _take(self, found: list[Outcome], part: _Part) -> None:
+    def _add(self, name: str) -> Part:
+        """Have a robot count."""
+        part = self._parts[name] = Part(self._crowd.robot(name), name, self.request)
+        self._open.add(name)
+        return part
+
+    def _take(self, found: list[Outcome]) -> None:
         self._found += found
-        part.done = part.done or any(each.last for each in found)
+        self._open -= {each.robot for each in found if each.last}
 
     def _publish(self, request: Request, number: int) -> None:
         """Send a request to the group."""
@@ -317,127 +379,6 @@ class Round:
         expiry = (request.ttl or None) if isinstance(request, Say) else EXPIRY
         topic, response = topics.group(group, topics.REQUEST, desk.user), topics.reply(desk.user, desk.session)
         link.publish(topic, line, expiry=expiry, response=response, acknowledged=acknowledged)
-
-
-class _Part:
-    """The request at one robot."""
-
-    def __init__(self, robot: RobotConnection, name: str, request: Request) -> None:
-        self.robot = robot
-        #: whether all is known of it
-        self.done = False
-        self._name, self._request = name, request
-        self._exchange: Exchange | None = None
-        #: the goals that are waited for, since when, and those of them that were told of
-        self._handles: list[GoalHandle] = []
-        self._since = time.monotonic()
-        self._told = 0
-
-    @property
-    def was_asked(self) -> bool:
-        """Whether the robot was asked, or may have been."""
-        return self._exchange is not None
-
-    def ask(self) -> list[Outcome]:
-        """Ask it alone, and return what is known at once."""
-        try:
-            self.robot.check()
-            self._exchange = self.robot.begin(self._request, self._accepted)
-        except TalkError as error:
-            return [failed(self._name, error)]
-        return []
-
-    def expect(self, number: int, latest: float | None) -> None:
-        """Await its answer: it was asked as one of a group, by this number."""
-        self._exchange = Exchange(number, self._request, self._accepted)
-        self._exchange.latest = latest
-        self.robot.expect(self._exchange)
-
-    def cancel(self, cancel: Cancel) -> None:
-        """Ask it to cancel; where it is absent, that it is told as lost is all that can be done."""
-        try:
-            self.robot.post(cancel)
-        except ServerUnavailable:
-            pass
-
-    def look(self) -> list[Outcome]:
-        """Return what has become of it since, as far as it is new."""
-        exchange, robot = self._exchange, self.robot
-        assert exchange is not None
-        robot.sign()
-        now = time.monotonic()
-        if not self._handles:
-            slow = isinstance(self._request, Pause)
-            late = now > (robot.silent_by(self._since)[0] if slow else robot.answer_by(exchange))
-            if not (exchange.over or robot.ended is not None or late):
-                return []
-            robot.forget(exchange)
-            try:
-                reply, items = robot.answer(exchange)
-            except UnknownGoal as error:
-                return [*self._canceled(Canceled.from_items(error.items), last=False), failed(self._name, error)]
-            except TalkError as error:
-                refused = (exchange.reply or {}).get("error")
-                serverless = isinstance(refused, dict) and refused.get("code") == ServerUnavailable.code
-                return [failed(self._name, error, NO_SERVER if serverless else None)]
-            if not self._handles:
-                return self._answered(reply, items)
-        quiet, why = robot.silent_by(self._since)
-        if now > quiet:
-            robot.ended = robot.ended or why
-        return self._ended()
-
-    def _accepted(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Follow the goals that are to be waited for."""
-        request = self._request
-        if isinstance(request, Say) and request.wait:
-            found = [Goal.from_json(reply.get("goal"))]
-        elif isinstance(request, Wait):
-            found = list(goals(items, "goal"))
-        else:
-            return
-        self._since = time.monotonic()
-        self._handles = [GoalHandle(self.robot, each) for each in found]
-        for each in self._handles:
-            each._listen(feedback=False)
-
-    def _ended(self) -> list[Outcome]:
-        """Return those of its goals that have ended, in their order."""
-        found = []
-        while self._told < len(self._handles):
-            handle = self._handles[self._told]
-            if not (handle.state.terminal or handle._lose()):
-                break
-            self._told += 1
-            whatever = isinstance(self._request, Wait) and self._request.ids is None and handle.state is not State.LOST
-            code = EXIT_OK if whatever else handle.goal.exit_code or EXIT_OK
-            last = self._told == len(self._handles)
-            found.append(Outcome(self._name, handle.state.name, code, handle.goal, last=last))
-        return found
-
-    def _answered(self, reply: JsonObject, items: list[JsonObject]) -> list[Outcome]:
-        """Return what a reply says of a robot that has nothing more to tell."""
-        name, request = self._name, self._request
-        goal = goal_in(reply)
-        if isinstance(request, Cancel):
-            return self._canceled(Canceled.from_items(items)) or [Outcome(name, IDLE)]
-        if isinstance(request, Pause | Resume):
-            paused = isinstance(request, Pause)
-            return [Outcome(name, PAUSED if paused else RESUMED, goal=goal, said={"paused": paused})]
-        if isinstance(request, Set):
-            return [Outcome(name, SET, said={"settings": reply.get("settings")})]
-        if goal is not None:
-            return [Outcome(name, goal.state.name, (isinstance(request, Say) and goal.exit_code) or EXIT_OK, goal)]
-        if isinstance(request, Status):
-            status = ServerStatus.from_reply(reply, items)
-            state = status.active.state.name if status.active else IDLE
-            state = PAUSED if status.server.get("paused") is True else state
-            return [Outcome(name, state, goal=status.active, said={"status": status.to_json()})]
-        return [Outcome(name, IDLE)]
-
-    def _canceled(self, done: Canceled, *, last: bool = True) -> list[Outcome]:
-        every = (*done.canceled, *done.ended)
-        return [Outcome(self._name, each.state.name, EXIT_OK, each, last=last and each is every[-1]) for each in every]
 
 
 def _check_ids(request: Request) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import random
 import select
+import socket
 import time
 from collections import deque
 from typing import TYPE_CHECKING, Protocol
@@ -68,9 +69,10 @@ class Desk:
         self._opening: Opening | None = None
         self._tries = 0
         self._next_try = self._served_at = time.monotonic()
-        self._wake, self._write = os.pipe()
+        # Sockets, and no pipe: where nobody has this any more, they are closed.
+        self._wake, self._write = socket.socketpair()
         for each in (self._wake, self._write):
-            os.set_blocking(each, False)
+            each.setblocking(False)
 
     @property
     def told(self) -> bool:
@@ -81,30 +83,35 @@ class Desk:
         """Return the topic on which this desk is answered by a robot."""
         return topics.reply(self.user, self.session, robot)
 
-    def serve(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> None:
-        """Wait so many seconds at most until something happens, and tell of it; Interrupted as of `connect.ready`."""
+    def serve(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
+        """Wait so many seconds at most until something happens, tell of it, and return whether something was heard;
+        Interrupted as of `connect.ready`.
+        """
         link = self.link
         now = time.monotonic()
         if link is not None and (link.ended or now - self._served_at > 2 * KEEPALIVE):
             self._lose(link)
             link = None
         due = self._see_to(link, now)
-        watched = {self._wake: select.POLLIN}
+        wake = self._wake.fileno()
+        watched = {wake: select.POLLIN}
         descriptor = -1 if link is None else link.fileno()
         if link is not None and descriptor >= 0:  # another thread may have found out that it has ended
             watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
         found = ready(watched, min(timeout, due), interrupt)
-        if self._wake in found:
-            os.read(self._wake, 4096)
+        if wake in found:
+            self._wake.recv(4096)
         self._served_at = time.monotonic()
         if link is not None and descriptor in found:
             link.read()
+        heard = bool(self._inbox)
         while self._inbox:
             message = self._inbox.popleft()
             if message.topic == self.answers(topics.MARKER):
                 self.marked_at = time.monotonic()
             else:
                 self.visitor.hear(message)
+        return heard
 
     def await_kept(
         self, patience: float, enough: Callable[[], bool] = lambda: True, interrupt: Mapping[int, int] | None = None
@@ -125,12 +132,16 @@ class Desk:
 
     def wake(self) -> None:
         """Have the thread that waits look around, from any thread."""
-        if self._write < 0:
-            return
         try:
-            os.write(self._write, b"\0")
-        except BlockingIOError:
-            pass  # it is awake
+            self._write.send(b"\0")
+        except OSError:
+            pass  # it is awake, or this is closed
+
+    def flush(self, patience: float) -> None:
+        """Wait until the broker has taken what was sent, so many seconds at most."""
+        end = time.monotonic() + patience
+        while self.link is not None and self.link.outstanding and (left := end - time.monotonic()) > 0:
+            self.serve(left)
 
     def close(self) -> None:
         """End it."""
@@ -209,7 +220,5 @@ class Desk:
         self.visitor.went_down(f"the broker at {self.broker.url} went away")
 
     def _close_descriptors(self) -> None:
-        descriptors, self._wake, self._write = (self._wake, self._write), -1, -1
-        for each in descriptors:
-            if each >= 0:
-                os.close(each)
+        self._wake.close()
+        self._write.close()

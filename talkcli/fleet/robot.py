@@ -104,6 +104,8 @@ class RobotConnection(BaseConnection):
         self._absent_since: float | None = self._signed_at
         #: goals that are followed, and whether each of their words is
         self._goals: dict[str, bool] = {}
+        #: goals that are cancelled, whoever is there to hear it
+        self._withdrawn: set[str] = set()
         #: goals to be asked for, and those that are being asked for: by number, the id and who waits for it
         self._to_ask: deque[tuple[str, Exchange | None]] = deque()
         self._asked: dict[int, tuple[str, Exchange | None]] = {}
@@ -123,6 +125,13 @@ class RobotConnection(BaseConnection):
     def post(self, request: Request) -> None:
         if not self._publish(next(self._numbers), request):
             raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended or self._absent}")
+
+    def withdraw(self, goal_id: str, *, told: bool) -> None:
+        """Cancel a goal, and again after each absence, and send it no more; `told`: not now, the robot knows of it."""
+        with self.changed:
+            self._withdrawn.add(goal_id)
+            if not told:
+                self._publish(next(self._numbers), Cancel((goal_id,)))
 
     def _send(self, number: int, request: Request) -> None:
         with self.changed:  # so that nobody asks again for what is just being sent
@@ -253,6 +262,8 @@ class RobotConnection(BaseConnection):
         """Ask again for what was not answered, and for what became of the goals that are followed."""
         if self._name:
             self._publish(next(self._numbers), Hello(self._name))
+        if self._withdrawn:
+            self._publish(next(self._numbers), Cancel(tuple(self._withdrawn)))
         for number in self._asked:
             del self._exchanges[number]
         self._asked.clear()
@@ -275,8 +286,10 @@ class RobotConnection(BaseConnection):
         request = exchange.request
         left = 0.0 if exchange.latest is None else exchange.latest - boottime()
         exchange.tries += 1
+        why = "its time was over before an answer came" if left < 0 else f"{self._absent}, {_MAX_TRIES} times"
+        if isinstance(request, Say) and request.id in self._withdrawn:
+            left, why = -1.0, "it was cancelled before the robot had heard of it"
         if left < 0 or exchange.tries > _MAX_TRIES:
-            why = "its time was over before an answer came" if left < 0 else f"{self._absent}, {_MAX_TRIES} times"
             exchange.error = self._lost(exchange, why)
             return
         if isinstance(request, Say) and left:

@@ -12,6 +12,8 @@ from talkcli.frozen import frozen
 from talkcli.goals.option import MAX_NAME
 
 PREFIX = "talk"
+#: What stands below it.
+ROBOT, GROUP, REPLY = "robot", "group", "reply"
 #: The group that every robot is in.
 EVERYBODY = "all"
 #: What a session's own marker is called, in the place of a robot: no robot can be.
@@ -39,17 +41,17 @@ def fault(name: str) -> str | None:
 
 def robot(name: str, *levels: str) -> str:
     """Return a topic of a robot's."""
-    return "/".join((PREFIX, "robot", name, *levels))
+    return "/".join((PREFIX, ROBOT, name, *levels))
 
 
 def group(name: str, *levels: str) -> str:
     """Return a topic of a group's."""
-    return "/".join((PREFIX, "group", name, *levels))
+    return "/".join((PREFIX, GROUP, name, *levels))
 
 
 def reply(user: str, session: str, *name: str) -> str:
     """Return where a robot answers a session of this user's; without a name what stands for any robot."""
-    return "/".join((PREFIX, "reply", user, session, *name))
+    return "/".join((PREFIX, REPLY, user, session, *name))
 
 
 def device(name: str) -> str:
