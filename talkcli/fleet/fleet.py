@@ -34,11 +34,12 @@ class Fleet:
 
     Whom a method means, its `to`, is a robot's name, a glob over the names of those that are there (`wh-*`), or a
     group, `@warehouse`; `@all` is everybody. What it returns is iterated over: an Outcome for each robot as it comes,
-    or for each goal of its that this is about; it has been asked by then. A robot that is offline is among them, with
-    exit code 3: nothing is kept for it.
+    or for each goal of its that this is about. A robot that is offline is among them, with exit code 3: nothing is
+    kept for it.
 
-    Each call has a connection of its own, which ends with its last outcome, or by `close` of what was returned. One
-    thread uses that; several may use the fleet.
+    Each call has a connection of its own, which ends with its last outcome, or by `close` of what was returned: what
+    robots have not answered by then may never reach them, so iterate where it matters. One thread uses that; several
+    may use the fleet.
     """
 
     def __init__(self, broker: str | None = None, *, name: str | None = None, insecure: bool = False) -> None:

@@ -40,6 +40,7 @@ PURE = [
     "engine.words",
     "fleet.homeassistant",
     "fleet.message",
+    "fleet.outcome",
     "fleet.policy",
     "fleet.presence",
     "fleet.selection",

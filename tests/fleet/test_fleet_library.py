@@ -1,0 +1,270 @@
+"""The library for a fleet: who is there, one robot as a client, several at once, and what it says of itself."""
+
+from __future__ import annotations
+
+import os
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli import Fleet, State
+from talkcli.errors import AccessDenied, ServerUnavailable, UnknownGoal, UsageError
+from tests.fleet import told
+from tests.fleet.many import request
+from tests.fleet.robot import LONG
+from tests.support.mqtt import Listener
+from tests.support.ports import Port
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+    from typing import Any
+
+    from talkcli import Outcome
+    from tests.fleet.many import RealRobots
+    from tests.support.broker import Broker
+
+PAIR = ["wh-1", "wh-2"]
+#: Whatever picks both, and one alone.
+BOTH, PICKS = ("wh-*", "@warehouse"), (("wh-*", PAIR), ("@warehouse", PAIR), ("wh-2", ["wh-2"]))
+
+
+@pytest.fixture
+def fleet(pair: RealRobots, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
+    """The fleet of two robots; what a test has left to be said is cancelled in the end."""
+    for each in [name for name in os.environ if name.startswith("TALK_")]:
+        monkeypatch.delenv(each)
+    yield Fleet(pair.broker.url)
+    request(pair, "resume")
+    request(pair, "cancel")
+
+
+def found(outcomes: Iterable[Outcome]) -> dict[str, tuple[str, int]]:
+    """Return the state and the code of each robot, which is told of once."""
+    every = list(outcomes)
+    assert all(each.last for each in every)
+    assert len({each.robot for each in every}) == len(every)
+    return {each.robot: (each.state, each.exit_code) for each in every}
+
+
+def alike(state: str, code: int = 0, names: Iterable[str] = PAIR) -> dict[str, tuple[str, int]]:
+    return dict.fromkeys(names, (state, code))
+
+
+def said(outcome: Outcome) -> Any:
+    return outcome.said
+
+
+# who is there
+
+
+def test_all_robots_that_the_broker_knows_are_listed_by_name(fleet: Fleet, pair: RealRobots) -> None:
+    with Listener(pair.broker) as publisher:
+        told.presence(publisher, "anna", online=False, groups=["night"])
+        anna, *others = fleet.robots()
+        publisher.publish("talk/robot/anna/presence", b"", retain=True)
+    assert (anna.name, anna.online, anna.groups, anna.server) == ("anna", False, ("all", "night"), None)
+    assert [(each.name, each.online, each.groups) for each in others] == [
+        (name, True, ("all", "warehouse")) for name in PAIR
+    ]
+    assert "say" in others[0].allow
+    assert others[0].server is not None
+    assert others[0].server["pid"] == pair["wh-1"].talk.pid
+
+
+def test_one_robot_is_a_client(fleet: Fleet, pair: RealRobots) -> None:
+    with fleet.robot("wh-1") as client:
+        goal = client.say("the door opens", feedback=True)
+        assert [each.word for each in goal.feedback(5)] == ["the", "door", "opens"]
+        assert goal.wait(5).state is State.SUCCEEDED
+        assert client.status().server["pid"] == pair["wh-1"].talk.pid
+
+
+# several at once
+
+
+@pytest.mark.parametrize(("to", "names"), PICKS)
+def test_a_sentence_ends_on_each_with_one_id(fleet: Fleet, to: str, names: list[str]) -> None:
+    outcomes = list(fleet.say(to, "hello", key="door", priority=3))
+    assert found(outcomes) == alike("SUCCEEDED", names=names)
+    goals = [each.goal for each in outcomes if each.goal]
+    assert len({each.id for each in goals}) == 1
+    for goal in goals:
+        assert (goal.text, goal.key, goal.priority) == ("hello", "door", 3)
+        assert goal.ttl
+        assert 5 < goal.ttl <= 10
+
+
+@pytest.mark.parametrize("to", BOTH)
+def test_an_outcome_comes_as_soon_as_its_robot_is_done(fleet: Fleet, pair: RealRobots, to: str) -> None:
+    assert pair["wh-1"].talk.request("say", text=LONG)["ok"]
+    outcomes = fleet.say(to, "hello", id=f"soon-{BOTH.index(to)}")
+    first = next(iter(outcomes))
+    assert (first.robot, first.state, len(outcomes)) == ("wh-2", "SUCCEEDED", 2)
+    assert pair["wh-1"].talk.goal(f"soon-{BOTH.index(to)}")["state"] == "PENDING"
+    request(pair, "cancel")
+    assert found(outcomes) == {"wh-1": ("RECALLED", 6)}
+
+
+@pytest.mark.parametrize("to", BOTH)
+def test_what_was_begun_is_cancelled_everywhere(fleet: Fleet, pair: RealRobots, to: str) -> None:
+    goal = f"given-up-{BOTH.index(to)}"
+    assert pair["wh-1"].talk.request("say", id=f"before-{goal}", text=LONG)["ok"]
+    outcomes = fleet.say(to, LONG, id=goal)
+    pair["wh-2"].talk.watcher.wait_for(goal, "ACTIVE")
+    pair["wh-1"].talk.watcher.wait_for(goal, "PENDING")
+    outcomes.cancel()
+    assert found(outcomes) == {"wh-1": ("RECALLED", 6), "wh-2": ("PREEMPTED", 7)}
+    assert pair["wh-1"].talk.goal(f"before-{goal}")["state"] == "ACTIVE"
+
+
+def test_who_does_not_wait_is_told_that_it_was_accepted(fleet: Fleet, pair: RealRobots) -> None:
+    assert found(fleet.say("@all", "hello", wait=False, id="accepted", ttl=0)) == alike("PENDING")
+    assert found(fleet.wait("@all", ["accepted"])) == alike("SUCCEEDED")
+    assert pair["wh-1"].talk.goal("accepted")["ttl"] is None
+
+
+def test_what_is_not_done_in_time_can_be_waited_for_again(fleet: Fleet, pair: RealRobots) -> None:
+    outcomes = fleet.say("wh-*", LONG, id="in-time")
+    with pytest.raises(TimeoutError, match=r"0 of 2 robots are done after 0\.1 s"):
+        list(outcomes.results(0.1))
+    pair.each(lambda each: each.talk.watcher.wait_for("in-time", "ACTIVE"))
+    outcomes.cancel()
+    assert found(outcomes.results(5)) == alike("PREEMPTED", 7)
+
+
+def test_who_closes_it_hears_no_more_and_leaves_it_to_be_spoken(fleet: Fleet, pair: RealRobots) -> None:
+    outcomes = fleet.say("wh-*", "length=0.3 go on", id="left")
+    pair.each(lambda each: each.talk.watcher.wait_for("left", "ACTIVE"))
+    outcomes.close()
+    assert pair.each(lambda each: each.talk.watcher.wait_for_terminal("left")) == ["SUCCEEDED"] * 2
+
+
+def test_the_other_requests_are_those_of_a_client(fleet: Fleet, pair: RealRobots) -> None:
+    to, goal = "@warehouse", "held"
+    request(pair, "say", id=goal, text=LONG, key="door")
+    paused = list(fleet.pause(to))
+    assert found(paused) == alike("PAUSED")
+    assert [each.goal and each.goal.id for each in paused] == [goal] * 2
+    status = list(fleet.status(to))
+    assert found(status) == alike("PAUSED")
+    assert [said(each)["status"]["active"]["id"] for each in status] == [goal] * 2
+    assert found(fleet.resume(to)) == alike("RESUMED")
+    settings = list(fleet.set(to, rate=222))
+    assert found(settings) == alike("SET")
+    assert [said(each)["settings"]["rate"] for each in settings] == [222] * 2
+    assert found(fleet.cancel(to, key="window")) == alike("IDLE")
+    assert found(fleet.cancel(to, key="door")) == alike("PREEMPTED")
+    assert found(fleet.wait(to, [goal])) == alike("PREEMPTED", 7)
+    assert found(fleet.wait(to)) == found(fleet.cancel(to)) == alike("IDLE")
+
+
+def test_several_threads_use_one_fleet(fleet: Fleet) -> None:
+    every: list[dict[str, tuple[str, int]]] = []
+    threads = [
+        threading.Thread(target=lambda n=n: every.append(found(fleet.say(BOTH[n % 2], "hello", id=f"by-{n}"))))
+        for n in range(4)
+    ]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join(10)
+    assert every == [alike("SUCCEEDED")] * 4
+
+
+def test_who_asks_is_known_by_the_name_that_was_given(pair: RealRobots) -> None:
+    for to in (*BOTH, "wh-1"):
+        for each in Fleet(pair.broker.url, name="shift-plan").say(to, "length=0"):
+            assert each.goal
+            assert each.goal.client
+            assert str(each.goal.client.name).endswith(" shift-plan")
+
+
+def test_nothing_of_it_is_left_open(fleet: Fleet) -> None:
+    assert found(fleet.status("wh-*"))  # what is imported once, opens what stays open
+    before = len(os.listdir("/proc/self/fd"))
+    for to in BOTH:
+        assert found(fleet.say(to, "length=0")) == alike("SUCCEEDED")
+        fleet.status(to).close()
+        with pytest.raises(UsageError):
+            fleet.say(to, "hello", rate=9)
+        with pytest.raises(ServerUnavailable):
+            list(fleet.status("nobody*"))
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+# errors
+
+
+def test_what_a_robot_did_not_do_is_an_outcome_with_its_error(fleet: Fleet) -> None:
+    for each in fleet.wait("@all", ["nobodys"]):
+        assert (each.state, each.exit_code, each.goal) == ("UNKNOWN", 8, None)
+        assert isinstance(each.error, UnknownGoal)
+        assert each.to_json()["error"] == {"code": "unknown_goal", "message": str(each.error)}
+    rejected = list(fleet.say("@all", "x" * 70_000))
+    assert found(rejected) == alike("REJECTED", 5)
+    assert [each.goal and each.goal.reason for each in rejected] == ["text_too_long"] * 2
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda fleet: fleet.say("@all", "hello", rate=9), "the rate 9 is not within 80 to 450"),
+        (lambda fleet: fleet.say("@all", b"hello"), "'text' must be a string"),
+        (lambda fleet: fleet.set("@all", rate="fast"), "'rate' must be an integer"),
+        (lambda fleet: fleet.wait("@all", ["12"]), "a number is a goal of one server"),
+        (lambda fleet: fleet.cancel("@all", [""]), "an id is empty"),
+        (lambda fleet: fleet.cancel("@all", key=""), "a key has 1 to 64 characters"),
+        (lambda fleet: fleet.say("", "hello"), "no robot can be called ''"),
+        (lambda fleet: fleet.say("a/b", "hello"), "no robot can be called 'a/b'"),
+        (lambda fleet: fleet.say("@", "hello"), "no group can be called ''"),
+        (lambda fleet: fleet.robot("wh-*"), "no robot can be called 'wh-*'"),
+    ],
+)
+def test_what_can_not_be_asked_is_raised_before_anybody_is(
+    fleet: Fleet, ask: Callable[[Fleet], Any], words: str
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        ask(fleet)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("to", "words"),
+    [
+        ("nobody", "no robot matches 'nobody'"),
+        ("x*", "no robot matches 'x*'"),
+        ("@night", "no robot is in the group 'night'"),
+    ],
+)
+def test_where_nobody_is_meant_that_is_raised(fleet: Fleet, to: str, words: str) -> None:
+    with pytest.raises(ServerUnavailable) as caught:
+        list(fleet.say(to, "hello"))
+    assert words in str(caught.value)
+
+
+def test_a_robot_that_is_not_there_is_no_client(fleet: Fleet) -> None:
+    with pytest.raises(ServerUnavailable, match="no robot 'nobody'"):
+        fleet.robot("nobody")
+
+
+def test_without_a_broker_nothing_can_be_asked(fleet: Fleet) -> None:
+    with Port() as port:
+        nowhere = Fleet(f"mqtt://127.0.0.1:{port.number}")
+        for ask in (nowhere.robots, lambda: nowhere.robot("wh-1"), lambda: nowhere.say("@all", "hello")):
+            with pytest.raises(ServerUnavailable, match="no broker at"):
+                ask()
+    with pytest.raises(UsageError, match="TALK_BROKER is not set"):
+        Fleet()
+    with pytest.raises(UsageError):
+        Fleet("http://127.0.0.1")
+    assert fleet.robots()
+
+
+def test_one_who_may_not_ask_is_told_so(secure_broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in secure_broker.env("otto").items():
+        monkeypatch.setenv(name, value)
+    fleet = Fleet()
+    for ask in (fleet.robots, lambda: list(fleet.say("@all", "hello")), lambda: list(fleet.cancel("*"))):
+        with pytest.raises(AccessDenied, match="does not let 'otto'"):
+            ask()

@@ -1,0 +1,212 @@
+"""Commands to several robots that take a while: interrupted, out of time, unread, and what a terminal shows."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import signal
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.conformance.bareserve import TALK
+from tests.fleet.many import alike, assert_told, request
+from tests.fleet.robot import LONG
+from tests.support.bridge import Desk
+from tests.support.mqtt import Listener
+from tests.support.terminal import Terminal
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from tests.conftest import MakeTalk
+    from tests.fleet.conftest import MakeBridge
+    from tests.fleet.many import RealRobots
+    from tests.fleet.robot import Robot
+
+PAIR = ["wh-1", "wh-2"]
+#: Whatever picks both.
+PICKS = ("wh-*", "@warehouse")
+#: Seconds in which it is told that a robot is offline, while others speak.
+AT_ONCE = 1.0
+#: What wipes the count off a terminal's line.
+WIPED = "\r\x1b[2K"
+
+
+@pytest.fixture
+def desk(pair: RealRobots) -> Iterator[Desk]:
+    """Somebody who asks; what is still to be said is cancelled in the end."""
+    with Desk(pair.broker) as result:
+        yield result
+    request(pair, "cancel")
+
+
+def await_state(pair: RealRobots, goal_id: str, state: str) -> None:
+    pair.each(lambda each: each.talk.watcher.wait_for(goal_id, state))
+
+
+def states(pair: RealRobots, goal_id: str) -> list[str]:
+    """Return how this goal stands at each robot."""
+    return [each["state"] for each in pair.each(lambda each: each.talk.goal(goal_id))]
+
+
+@pytest.mark.parametrize("to", PICKS)
+def test_ctrl_c_cancels_on_all_that_took_it(pair: RealRobots, desk: Desk, to: str) -> None:
+    """On one it is spoken, on the other it waits behind something else, which goes on."""
+    before, goal = (f"{each}-{PICKS.index(to)}" for each in ("before", "interrupted"))
+    assert pair["wh-2"].talk.request("say", id=before, text=LONG)["ok"]
+    waiting = desk.start("--robot", to, "say", "--wait", "--id", goal, "--", LONG)
+    pair["wh-1"].talk.watcher.wait_for(goal, "ACTIVE")
+    pair["wh-2"].talk.watcher.wait_for(goal, "PENDING")
+    waiting.send_signal(signal.SIGINT)
+    done = desk.finish(waiting)
+    wanted = {"wh-1": (goal, "PREEMPTED", 7), "wh-2": (goal, "RECALLED", 6)}
+    assert_told(done, 130, wanted, "0 of 2 as asked")
+    assert done.seconds < 1, "it waited for more than the silence of both"
+    assert states(pair, goal) == ["PREEMPTED", "RECALLED"]
+    assert pair["wh-2"].talk.goal(before)["state"] == "ACTIVE"
+
+
+def test_ctrl_c_takes_nothing_from_a_robot_that_is_done(pair: RealRobots, desk: Desk) -> None:
+    assert pair["wh-2"].talk.request("say", text=LONG)["ok"]
+    waiting = desk.start("--robot", "wh-*", "say", "--wait", "--id", "done-on-one", "hello")
+    assert waiting.stdout
+    assert waiting.stdout.readline() == "wh-1 done-on-one SUCCEEDED 0\n"
+    waiting.send_signal(signal.SIGINT)
+    done = desk.finish(waiting)
+    assert (done.code, done.out) == (130, "wh-2 done-on-one RECALLED 6\n")
+    assert done.err.splitlines()[-1] == "talk: 1 of 2 as asked"
+    assert states(pair, "done-on-one") == ["SUCCEEDED", "RECALLED"]
+
+
+@pytest.mark.parametrize("to", PICKS)
+def test_what_is_not_done_in_time_is_cancelled_with_124(pair: RealRobots, desk: Desk, to: str) -> None:
+    goal = f"late-{PICKS.index(to)}"
+    done = desk.run("--robot", to, "say", "--wait", "--timeout", "0.6", "--id", goal, "--", LONG)
+    assert_told(done, 124, alike(PAIR, goal, "PREEMPTED", 7), "0 of 2 as asked")
+    assert states(pair, goal) == ["PREEMPTED", "PREEMPTED"]
+
+
+def test_who_waits_for_what_others_said_leaves_it_alone(pair: RealRobots, desk: Desk) -> None:
+    request(pair, "say", id="others", text=LONG)
+    late = desk.start("--robot", "wh-*", "wait", "--timeout", "0.6", "others")
+    with Listener(pair.broker, "talk/reply/+/+/+") as answers:
+        interrupted = desk.start("--robot", "@warehouse", "wait")
+        assert answers.find(lambda _: sum(b'"ok": true' in each.payload for each in answers.messages) >= 2, 5)
+    interrupted.send_signal(signal.SIGINT)
+    done = desk.finish(interrupted)
+    assert (done.code, done.out, done.err) == (130, "", "talk: 0 of 2 as asked\n")
+    done = desk.finish(late)
+    assert (done.code, done.out, done.err) == (124, "", "talk: 0 of 2 as asked\n")
+    assert states(pair, "others") == ["ACTIVE", "ACTIVE"]
+
+
+def test_where_the_reader_of_the_output_goes_away_it_is_cancelled_with_141(pair: RealRobots, desk: Desk) -> None:
+    waiting = desk.start("--robot", "@warehouse", "say", "--wait", "--id", "unread", "--", LONG)
+    await_state(pair, "unread", "ACTIVE")
+    assert waiting.stdout
+    assert waiting.stderr
+    waiting.stdout.close()
+    assert waiting.wait(5) == 141
+    assert waiting.stderr.read().splitlines()[-1] == "talk: 0 of 2 as asked"
+    assert states(pair, "unread") == ["PREEMPTED", "PREEMPTED"]
+
+
+def test_where_nobody_could_ever_read_it_all_is_spoken_all_the_same(pair: RealRobots, desk: Desk) -> None:
+    waiting = desk.start("--robot", "wh-*", "say", "--id", "never-read", "hello")
+    assert waiting.stdout
+    waiting.stdout.close()
+    assert waiting.wait(5) in (0, 141)  # by when it looks
+    for name in PAIR:
+        assert pair[name].talk.watcher.wait_for_terminal("never-read") == "SUCCEEDED"
+
+
+# robots that are offline
+
+
+def test_one_that_is_offline_is_told_at_once_and_never_speaks_it(
+    robot: Robot, make_talk: MakeTalk, make_bridge: MakeBridge
+) -> None:
+    goals = {"*": "by-a-glob", "@all": "by-a-group"}
+    talk = make_talk(scripted=True)
+    late = make_bridge(talk, robot.broker, "late")
+    with Listener(robot.broker, "talk/robot/late/presence") as listener, Desk(robot.broker) as somebody:
+        assert late.terminate() == 0
+        listener.await_message(lambda each: each.json["online"] is False)
+        with limits():
+            began = time.monotonic()
+            waiting = [
+                somebody.start("--robot", to, "say", "--wait", "--id", goal, "--", LONG) for to, goal in goals.items()
+            ]
+            for each in waiting:
+                assert each.stdout
+                assert each.stdout.readline() == "late - OFFLINE 3\n"
+                assert_within(time.monotonic() - began, AT_ONCE, "that a robot is offline, while another speaks")
+        late.start()
+        late.await_online()
+        for goal in goals.values():
+            robot.talk.watcher.wait_for(goal, "PENDING")
+        assert somebody.run("--robot", "anna", "cancel").code == 0
+        assert [somebody.finish(each).code for each in waiting] == [13, 13]
+        assert somebody.run("--robot", "late", "say", "--wait", "this alone").code == 0
+    assert talk.watcher.texts("PENDING") == ["this alone"]
+
+
+# terminals
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_a_terminal_counts_the_robots_that_are_done_and_is_left_clean(
+    pair: RealRobots, desk: Desk, columns: int
+) -> None:
+    goal = f"counted-{columns}"
+    assert pair["wh-2"].talk.request("say", text=LONG)["ok"]
+    command = [*TALK, "--robot", "@warehouse", "say", "--wait", "--id", goal, "hello"]
+    with Terminal(command, desk.env, columns) as terminal:
+        terminal.wait_for("\r0 of 2")
+        terminal.wait_for(f"{goal} SUCCEEDED 0\n")
+        terminal.wait_until(lambda screen: screen.last == "1 of 2")
+        request(pair, "cancel")
+        assert terminal.finish() == 6
+    written = terminal.raw.decode()
+    assert list(dict.fromkeys(re.findall(r"\r(\d of \d)", written))) == ["0 of 2", "1 of 2", "2 of 2"]
+    assert terminal.screen.wraps == 0
+    *lines, last = terminal.screen.lines
+    assert lines[:2] == [f"wh-1 {goal} SUCCEEDED 0", f"wh-2 {goal} RECALLED 6"]
+    assert (lines[2].startswith(f"talk: RECALLED: wh-2: {goal}: "), lines[-1], last) == (
+        True,
+        "talk: 1 of 2 as asked",
+        "",
+    )
+
+
+@pytest.mark.usefixtures("pair")
+def test_only_the_terminal_of_standard_error_counts(desk: Desk, tmp_path: Path) -> None:
+    command = shlex.join([sys.executable, "-m", "talkcli", "--robot", "wh-*", "status"])
+    cases = {
+        f"{command} > {tmp_path}/out": True,
+        f"{command} 2> {tmp_path}/err": False,
+        f"{command} -q": False,
+        f"{command} 2>&1 | cat": False,
+    }
+    terminals = [(Terminal(["sh", "-c", each], desk.env), counts) for each, counts in cases.items()]
+    for terminal, counts in terminals:
+        assert terminal.finish() == 0
+        assert (b"\r0 of" in terminal.raw, WIPED.encode() in terminal.raw) == (counts, counts)
+    assert sorted((tmp_path / "out").read_text().splitlines()) == ["wh-1 - IDLE 0", "wh-2 - IDLE 0"]
+    assert (tmp_path / "err").read_text() == "talk: 2 of 2 as asked\n"
+
+
+def test_ctrl_c_on_a_terminal_leaves_no_count_behind(pair: RealRobots, desk: Desk) -> None:
+    command = [*TALK, "--robot", "@warehouse", "say", "--wait", "--id", "typed", "--", LONG]
+    with Terminal(command, desk.env) as terminal:
+        await_state(pair, "typed", "ACTIVE")
+        terminal.wait_for("\r0 of 2")
+        terminal.type(b"\x03")
+        assert terminal.finish() == 130
+    assert terminal.screen.lines[-2:] == ["talk: 0 of 2 as asked", ""]
+    assert not [each for each in terminal.screen.lines if re.search(r"\d of 2$", each)]
