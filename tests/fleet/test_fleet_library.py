@@ -32,6 +32,9 @@ BOTH, PICKS = ("wh-*", "@warehouse"), (("wh-*", PAIR), ("@warehouse", PAIR), ("w
 @pytest.fixture
 def fleet(pair: RealRobots, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
     """The fleet of two robots; what a test has left to be said is cancelled in the end."""
+    from talkcli.fleet import desk  # which needs paho
+
+    monkeypatch.setattr(desk, "GRACE", 0.05)  # mosquitto tells at once all that it keeps
     for each in [name for name in os.environ if name.startswith("TALK_")]:
         monkeypatch.delenv(each)
     yield Fleet(pair.broker.url)
@@ -172,6 +175,7 @@ def test_several_threads_use_one_fleet(fleet: Fleet) -> None:
     assert every == [alike("SUCCEEDED")] * 4
 
 
+@pytest.mark.usefixtures("fleet")
 def test_who_asks_is_known_by_the_name_that_was_given(pair: RealRobots) -> None:
     for to in (*BOTH, "wh-1"):
         for each in Fleet(pair.broker.url, name="shift-plan").say(to, "length=0"):

@@ -69,48 +69,52 @@ def asked_in_vain(*names: str) -> dict[str, tuple[str, str, int]]:
     return {each: kinds.get(each, ("-", "IDLE", 0)) for each in names}
 
 
-@pytest.mark.parametrize(
-    ("glob", "group", "names", "code", "summary"),
-    [
-        ("off-*", None, OFFLINE, 3, "0 of 7 as asked"),
-        (None, "@night", [*BOTH, *OFFLINE], 3, "2 of 9 as asked"),
-        ("wh-4*", "@lonely", ["wh-4"], 3, "0 of 1 as asked"),
-        ("wh-[124]", None, [*BOTH, "wh-4"], 3, "2 of 3 as asked"),
-        ("wh-[123]", "@day", [*BOTH, "wh-3"], 10, "2 of 3 as asked"),
-        ("wh-?", None, [*BOTH, "wh-3", "wh-4"], 13, "2 of 4 as asked"),
-        ("*", "@all", [*BOTH, "wh-3", "wh-4", *OFFLINE], 13, "2 of 11 as asked"),
-    ],
-)
-def test_failures_alike_are_the_exit_code_and_others_make_it_13(
-    desk: Desk, glob: str | None, group: str | None, names: list[str], code: int, summary: str
-) -> None:
-    lines = [["--robot", to, *form, "cancel"] for to in (glob, group) if to for form in ([], ["-q"], ["--json"])]
-    for done in at_once(desk, *lines):
-        if "-q" in done.command:
-            assert (done.code, done.out, done.err) == (code, "", "")
-        elif "--json" in done.command:
-            found = {name: ("-", each["state"], each["exit_code"]) for name, each in objects(done).items()}
-            assert (done.code, found) == (code, asked_in_vain(*names))
-        else:
-            assert_told(done, code, asked_in_vain(*names), summary)
+#: What is picked, who that is, the exit code of all of them, and how many do as they are asked.
+MIXED: list[tuple[str, list[str], int, int]] = [
+    ("off-*", OFFLINE, 3, 0),
+    ("@night", [*BOTH, *OFFLINE], 3, 2),
+    ("wh-[4]", ["wh-4"], 3, 0),
+    ("@lonely", ["wh-4"], 3, 0),
+    ("wh-[124]", [*BOTH, "wh-4"], 3, 2),
+    ("wh-[123]", [*BOTH, "wh-3"], 10, 2),
+    ("@day", [*BOTH, "wh-3"], 10, 2),
+    ("wh-?", [*BOTH, "wh-3", "wh-4"], 13, 2),
+    ("*", [*BOTH, "wh-3", "wh-4", *OFFLINE], 13, 2),
+    ("@all", [*BOTH, "wh-3", "wh-4", *OFFLINE], 13, 2),
+]
 
 
-@pytest.mark.parametrize(
-    ("to", "name", "code", "words"),
-    [
-        ("off-1*", "off-1", "no_server", "off-1 is offline: nothing was sent"),
-        ("@lonely", "wh-4", "no_server", "wh-4: no server, tried: "),
-        ("wh-[4]", "wh-4", "no_server", "wh-4 has no talk server at this moment: nothing was sent"),
-        ("wh-[3]", "wh-3", "permission_denied", "this robot takes no pause from afar: see its --allow"),
-        ("@day", "wh-3", "permission_denied", "this robot takes no resume from afar: see its --allow"),
-    ],
-)
-def test_why_is_told_in_words_and_by_a_code(desk: Desk, to: str, name: str, code: str, words: str) -> None:
-    command = "resume" if "resume" in words else "pause"
-    plain, for_programs = at_once(desk, ["--robot", to, command], ["--robot", to, "--json", command])
-    error = objects(for_programs)[name]["error"]
-    assert (error["code"], words in error["message"]) == (code, True), error
-    assert f": {name}: {error['message'].removeprefix(f'{name}: ')}\n" in plain.err
+def test_failures_alike_are_the_exit_code_and_others_make_it_13(desk: Desk) -> None:
+    found = at_once(desk, *(["--robot", to, "cancel"] for to, _, _, _ in MIXED))
+    for done, (_, names, code, count) in zip(found, MIXED, strict=True):
+        assert_told(done, code, asked_in_vain(*names), f"{count} of {len(names)} as asked")
+
+
+def test_programs_and_who_wants_no_words_are_told_the_same(desk: Desk) -> None:
+    _, names, code, _ = MIXED[-1]
+    for_programs, quiet = at_once(desk, *(["--robot", "@all", form, "cancel"] for form in ("--json", "-q")))
+    found = {name: ("-", each["state"], each["exit_code"]) for name, each in objects(for_programs).items()}
+    assert (for_programs.code, found) == (code, asked_in_vain(*names))
+    assert (quiet.code, quiet.out, quiet.err) == (code, "", "")
+
+
+#: What is picked, one of those, and why it does nothing.
+WHY = [
+    ("off-1*", "off-1", "no_server", "off-1 is offline: nothing was sent"),
+    ("@lonely", "wh-4", "no_server", "wh-4: no server, tried: "),
+    ("wh-[4]", "wh-4", "no_server", "wh-4 has no talk server at this moment: nothing was sent"),
+    ("wh-[3]", "wh-3", "permission_denied", "wh-3: this robot takes no pause from afar: see its --allow"),
+    ("@day", "wh-3", "permission_denied", "wh-3: this robot takes no pause from afar: see its --allow"),
+]
+
+
+def test_why_is_told_in_words_and_by_a_code(robots: RealRobots, desk: Desk) -> None:
+    found = at_once(desk, *(["--robot", to, *form, "pause"] for form in ([], ["--json"]) for to, *_ in WHY))
+    request(robots, "resume")
+    for told_so, told_in_json, (_, name, code, words) in zip(found, found[len(WHY) :], WHY, strict=False):
+        error = objects(told_in_json)[name]["error"]
+        assert (error["code"], words in error["message"]) == (code, True), error
+        assert f": {name}: {words.removeprefix(f'{name}: ')}" in told_so.err
 
 
 def test_of_many_that_fail_alike_five_are_named(desk: Desk) -> None:
@@ -159,10 +163,10 @@ def test_a_queue_that_is_full_rejects_it(robots: RealRobots, desk: Desk, broker:
         assert [each["goal"]["reason"] for each in objects(done).values()] == ["queue_full"] * 2
 
 
-@pytest.mark.parametrize("to", PICKS)
-def test_a_goal_that_nobody_knows_makes_it_8(desk: Desk, to: str) -> None:
-    commands = ["wait nobodys", "status nobodys", "cancel nobodys", "--json wait nobodys"]
-    *plain, for_programs = at_once(desk, *(["--robot", to, *each.split()] for each in commands))
+def test_a_goal_that_nobody_knows_makes_it_8(desk: Desk) -> None:
+    commands = ["wait nobodys", "status nobodys", "cancel nobodys"]
+    lines = [["--robot", to, *each.split()] for to in PICKS for each in commands]
+    *plain, for_programs = at_once(desk, *lines, ["--robot", PICKS[0], "--json", "wait", "nobodys"])
     for done in plain:
         assert_told(done, 8, alike(BOTH, "-", "UNKNOWN", 8), "0 of 2 as asked")
     assert (for_programs.code, [each["error"]["code"] for each in objects(for_programs).values()]) == (
@@ -187,15 +191,18 @@ def test_a_goal_that_only_one_robot_knows_is_told_of_that_one(robots: RealRobots
 
 
 def test_how_a_sentence_ended_is_the_exit_code(robots: RealRobots, desk: Desk) -> None:
-    """Of those that ended otherwise, 13: one is cancelled, the other fails."""
-    waiting = desk.start("--robot", PICKS[0], "say", "--wait", "--id", "mixed", "--", LONG)
-    robots.each(lambda each: each.talk.watcher.wait_for("mixed", "ACTIVE"))
+    waiting = desk.start("--robot", PICKS[0], "say", "--wait", "--id", "cancelled", "--", LONG)
+    robots.each(lambda each: each.talk.watcher.wait_for("cancelled", "ACTIVE"))
     request(robots, "cancel")
-    assert_told(desk.finish(waiting), 7, alike(BOTH, "mixed", "PREEMPTED", 7), "0 of 2 as asked")
-    done = desk.run("--robot", PICKS[1], "say", "--wait", "--id", "fails", "--", "fail=engine_failed")
-    assert_told(done, 4, alike(BOTH, "fails", "ABORTED", 4), "0 of 2 as asked")
-    assert "talk: ABORTED: " in done.err
-    assert robots["wh-1"].talk.run("say", "--wait", "--id", "differs", "length=0").code == 0
-    assert robots["wh-2"].talk.run("say", "--wait", "--id", "differs", "fail=engine_failed").code == 4
-    wanted = {"wh-1": ("differs", "SUCCEEDED", 0), "wh-2": ("differs", "ABORTED", 4)}
-    assert_told(desk.run("--robot", PICKS[1], "wait", "differs"), 4, wanted, "1 of 2 as asked")
+    assert robots["wh-1"].talk.run("say", "--wait", "--id", "fails-on-one", "length=0").code == 0
+    assert robots["wh-2"].talk.run("say", "--wait", "--id", "fails-on-one", "fail=engine_failed").code == 4
+    fails, differs = at_once(
+        desk,
+        ["--robot", PICKS[1], "say", "--wait", "--id", "fails", "--", "fail=engine_failed"],
+        ["--robot", PICKS[1], "wait", "fails-on-one"],
+    )
+    assert_told(desk.finish(waiting), 7, alike(BOTH, "cancelled", "PREEMPTED", 7), "0 of 2 as asked")
+    assert_told(fails, 4, alike(BOTH, "fails", "ABORTED", 4), "0 of 2 as asked")
+    assert "talk: ABORTED: " in fails.err
+    wanted = {"wh-1": ("fails-on-one", "SUCCEEDED", 0), "wh-2": ("fails-on-one", "ABORTED", 4)}
+    assert_told(differs, 4, wanted, "1 of 2 as asked")
