@@ -115,6 +115,7 @@ def test_why_is_told_in_words_and_by_a_code(robots: RealRobots, desk: Desk) -> N
         error = objects(told_in_json)[name]["error"]
         assert (error["code"], words in error["message"]) == (code, True), error
         assert f": {name}: {words.removeprefix(f'{name}: ')}" in told_so.err
+        assert f"{name}: {name}: " not in told_so.err
 
 
 def test_of_many_that_fail_alike_five_are_named(desk: Desk) -> None:
