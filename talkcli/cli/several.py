@@ -97,7 +97,7 @@ def _ask(options: Common, request: Request, timeout: float | None = None, name: 
     """Ask all of them, show what becomes of it, and return the exit code; `timeout`: seconds for all of it."""
     owns = isinstance(request, Say) and request.wait
     end = None if timeout is None else options.began + timeout
-    found = _Tally(options, lists=request == Set())
+    found = _Tally(options, request)
     with (
         Interrupts(output=owns or isinstance(request, Wait)) as interrupts,
         options.crowd(timeout, name=name, interrupt=interrupts.watched) as crowd,
@@ -115,12 +115,12 @@ def _ask(options: Common, request: Request, timeout: float | None = None, name: 
                 interrupts.gone = True
             interrupts.look()
         if not (late or interrupts.gone or interrupts.number is not None):
-            return found.end(len(asked))
+            return found.end(asked)
         if interrupts.gone:
             give_up_output()
         if owns:
             _cancel(asked, interrupts, found)
-        found.end(len(asked))
+        found.end(asked, "not known to be silent" if owns else "not done")
         return EXIT_TIMEOUT if late else interrupts.exit_code
     return interrupts.exit_code
 
@@ -129,18 +129,20 @@ def _cancel(asked: Round, interrupts: Interrupts, found: _Tally) -> None:
     """Cancel it wherever it has not ended, and wait a moment for silence."""
     interrupts.clear()
     try:
-        asked.cancel()
+        if asked.open:
+            asked.cancel()
         regardless(found.take, asked, SILENCE)
-    except (TalkError, Interrupted, TimeoutError) as error:
-        note(f"cancelled, but it is not known whether all are silent: {str(error) or 'interrupted'}")
+    except (Interrupted, TimeoutError):
+        pass  # where it is not known, `end` tells
+    except TalkError as error:
+        note(f"could not be cancelled: {error}")
 
 
 class _Tally:
     """Shows what becomes of it, and counts."""
 
-    def __init__(self, options: Common, *, lists: bool) -> None:
-        """`lists`: whether the settings are what was asked for."""
-        self._options, self._lists = options, lists
+    def __init__(self, options: Common, request: Request) -> None:
+        self._options, self._request = options, request
         #: what has become of it at each robot, by its name; the first that is no success, where there are several
         self._found: dict[str, Outcome] = {}
         #: the robots that have more to tell
@@ -169,24 +171,30 @@ class _Tally:
         else:
             self._going.add(robot)
 
-    def end(self, asked: int) -> int:
-        """Tell how many did as they were asked, and why the others did not; return the exit code."""
+    def end(self, asked: Round, unknown: str = "not done") -> int:
+        """Tell how many did as they were asked, and why the others did not; return the exit code.
+
+        `unknown`: what is said of those of which not all is known.
+        """
         failures = [each for each in self._found.values() if each.exit_code]
+        done = [robot for robot, each in self._found.items() if not each.exit_code and robot not in self._going]
         if not self._options.quiet:
             for words in _reasons(failures)[:_NOTES]:
                 note(words)
-            note(f"{len(self._found) - len(failures)} of {asked} as asked")
+            if asked.open:
+                note(f"{unknown}: {_some(asked.open)}{f': {asked.away}' if asked.away else ''}")
+            note(f"{len(done)} of {len(asked)} as asked")
         codes = {each.exit_code for each in failures}
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
 
     def _show(self, outcome: Outcome) -> None:
         if self._options.json:
             show_if_possible(show_json, outcome.to_json())
-        elif outcome.said and self._lists:
+        elif outcome.said and self._request == Set():
             settings = outcome.said.get("settings")
             for line in setting_lines(settings if isinstance(settings, dict) else {}):
                 show_if_possible(show, f"{outcome.robot} {line}")
-        elif not self._options.quiet:
+        elif not self._options.quiet or isinstance(self._request, Status):
             goal = printable(outcome.goal.id) if outcome.goal and outcome.goal.id else "-"
             show_if_possible(show, f"{outcome.robot} {goal} {outcome.state} {outcome.exit_code}")
 
@@ -198,10 +206,14 @@ def _reasons(failures: list[Outcome]) -> list[str]:
         alike.setdefault((each.state, each.exit_code), []).append(each)
     found = []
     for (state, _), some in alike.items():
-        names = ", ".join(each.robot for each in some[:_NAMES])
-        more = f" and {len(some) - _NAMES} more" if len(some) > _NAMES else ""
-        found.append(f"{state}: {names}{more}: {_why(some[0])}")
+        found.append(f"{state}: {_some([each.robot for each in some])}: {_why(some[0])}")
     return found
+
+
+def _some(names: list[str]) -> str:
+    """Return the first of these names, and how many more there are."""
+    more = f" and {len(names) - _NAMES} more" if len(names) > _NAMES else ""
+    return ", ".join(names[:_NAMES]) + more
 
 
 def _why(outcome: Outcome) -> str:

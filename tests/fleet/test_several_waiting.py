@@ -103,9 +103,10 @@ def test_who_waits_for_what_others_said_leaves_it_alone(pair: RealRobots, desk: 
         assert answers.find(lambda _: sum(b'"ok": true' in each.payload for each in answers.messages) == 4, PATIENCE)
     interrupted.send_signal(signal.SIGINT)
     done = desk.finish(interrupted)
-    assert (done.code, done.out, done.err) == (130, "", "talk: 0 of 2 as asked\n")
+    told = "talk: not done: wh-1, wh-2\ntalk: 0 of 2 as asked\n"
+    assert (done.code, done.out, done.err) == (130, "", told)
     done = desk.finish(late)
-    assert (done.code, done.out, done.err) == (124, "", "talk: 0 of 2 as asked\n")
+    assert (done.code, done.out, done.err) == (124, "", told)
     assert states(pair, "others") == ["ACTIVE", "ACTIVE"]
 
 
