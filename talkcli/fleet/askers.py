@@ -72,10 +72,10 @@ class Askers:
             self.publish(topic, encode(message), 1, correlation)
 
     def hang_up(self, user: str, topic: str) -> None:
-        """End the session of an asker who says goodbye."""
+        """End the session of an asker who says goodbye, once the server has taken what it asked."""
         session = self._sessions.get((user, topic))
         if session:
-            session.hang_up()
+            session.leave()
 
     def hang_up_all(self) -> None:
         """End all sessions: nobody can be told anything more."""

@@ -16,11 +16,11 @@ from talkcli.errors import BadRequest, Busy, TalkError
 from talkcli.fleet.local import dial
 from talkcli.fleet.policy import SHARE, not_taken, sender, unworded
 from talkcli.goals.goal import By, Sender
-from talkcli.goals.options import Cancel, Say
+from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
 from talkcli.protocol.events import failure
 from talkcli.protocol.lines import MAX_LINE, decode, encode
-from talkcli.protocol.requests import Hello, Status, Wait, Watch
+from talkcli.protocol.requests import Hello, Pause, Resume, Status, Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -35,6 +35,10 @@ MAX_WAITING, MAX_HELD = 64, 4 * 1024 * 1024
 #: Seconds without a line of its own after which an asker is taken to be gone, whatever it waits for: MQTT doesn't tell.
 #: One that lives says hello every 30 s, and two of those may be lost.
 IDLE = 90.0
+#: Seconds in which the server must have taken what an asker wants who has said goodbye.
+_TAKEN = 5.0
+#: What is carried out, whoever hears of it.
+_LASTING = (Say, Cancel, Set, Pause, Resume)
 #: Characters of a robot's name in the ids that it gives: with what follows, an id has 64 at most.
 _OF_NAME = 48
 #: What lines begin with that may be lost on their way.
@@ -114,6 +118,8 @@ class Session:
         self._awaited: set[str] = set()
         self._watches = False
         self._task: asyncio.Task[None] | None = None
+        #: ends it, where its asker has said goodbye
+        self._leaving: asyncio.TimerHandle | None = None
 
     # -- what it is asked
 
@@ -130,6 +136,9 @@ class Session:
     def ask(self, ask: Ask) -> None:
         """Carry out a request, after those that came before it."""
         self.used = self._loop.time()
+        if self._leaving:  # and has thought better of it
+            self._leaving.cancel()
+            self._leaving, self.topic = None, ask.topic
         urgent = isinstance(ask.request, Cancel | Status)
         if len(self._open) + len(self._queue) + len(self._mine()) >= MAX_WAITING:
             self._refuse(ask, Busy.code, f"{MAX_WAITING} requests of yours are waiting already")
@@ -142,11 +151,23 @@ class Session:
             if self._task is None:
                 self._task = asyncio.create_task(self._run(urgent))
 
+    def leave(self) -> None:
+        """Tell the asker nothing more, and end as soon as the server has taken what was asked; goals that wait for room
+        are taken back.
+        """
+        self.topic = None
+        self._house.waiting = [each for each in self._house.waiting if each[1] is not self]
+        self._queue = deque(each for each in self._queue if _lasts(each))
+        self._leaving = self._leaving or self._loop.call_later(_TAKEN, self.hang_up)
+        self._leave()
+
     def hang_up(self, why: str | None = None) -> None:
         """Take back what can be taken back, and tell the asker nothing more; but `why`, if something is owed to it."""
         if why and not self.idle:
             self._tell_end(why)
         self.topic = None
+        if self._leaving:
+            self._leaving.cancel()
         if self._task:
             self._task.cancel()
         self._end()
@@ -166,6 +187,11 @@ class Session:
 
     def _mine(self) -> list[Ask]:
         return [each for each, session in self._house.waiting if session is self]
+
+    def _leave(self) -> None:
+        """End, if it is to end and nothing is left to be taken."""
+        if self._leaving and not self._queue and not any(_lasts(each.ask) for each in self._open.values()):
+            self.hang_up()
 
     def _take(self, ask: Ask) -> None:
         request = ask.request
@@ -248,8 +274,10 @@ class Session:
             return
         while self._queue:
             self._take(self._queue.popleft())
+        self._leave()
         while lines := await self._local.read():
             self._hear(lines)
+            self._leave()
             await house.flowing.wait()
         for each in self._mine():
             self._refuse(each, "no_server", _GONE)
@@ -372,3 +400,9 @@ class Session:
             self._local.close()
         house.left(self)
         house.look()
+
+
+def _lasts(ask: Ask) -> bool:
+    """Whether something is carried out that its asker hears nothing of; a goal that waits for room is taken back."""
+    request = ask.request
+    return isinstance(request, _LASTING) and not (isinstance(request, Say) and request.patient)

@@ -121,6 +121,37 @@ def test_an_asker_to_whom_nothing_is_owed_is_let_go_without_a_word(
     asyncio.run(run())
 
 
+# Who says goodbye
+
+
+def test_what_was_asked_before_a_goodbye_is_carried_out_but_what_waits_for_room(talk: Talk) -> None:
+    """Be it that there was no connection to the server yet; and one who thinks better of it is told again."""
+
+    async def run() -> None:
+        house = House(talk.socket)
+        before = talk.request("status")["server"]["clients"]
+        await house.ask({"seq": 1, "request": "hello"}, "s2")
+        for session in ("s1", "s2", "s3"):
+            house.post(say(2, id=f"of-{session}"), session)
+            if session != "s2":  # which the server would take at once
+                house.post(say(3, id=f"of-{session}-patient", patient=True), session)
+            house.post(b"", session)
+        assert (await house.ask({"seq": 4, "request": "hello"}, "s3"))["ok"]
+        await house.ask(say(5, id="last"), "s3")
+        house.post(b"", "s3")
+        end = time.monotonic() + 5
+        while (status := talk.request("status"))["server"]["clients"] > before:
+            assert time.monotonic() < end, "a connection to the server is kept"
+            await asyncio.sleep(0.01)  # the server tells nobody that a client has left
+        wanted = ["last", "of-s1", "of-s2", "of-s3"]
+        with talk.connect() as wire:
+            wire.request("status")
+            assert sorted(each["pending"]["id"] for each in wire.items) == wanted, status
+        assert house.lines("s1") == []
+
+    asyncio.run(run())
+
+
 # Who makes place
 
 
