@@ -9,7 +9,7 @@ from talkcli import paths
 from talkcli.cli.show import note, screen, show_found
 from talkcli.client.connect import ANSWER_LIMIT
 from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable
-from talkcli.fleet.selection import Selection, several
+from talkcli.fleet.selection import Selection
 from talkcli.fleet.sighting import Away, Back, Begun, Changed, Happened, Missed
 from talkcli.frozen import replace
 from talkcli.terminal.fleet import FleetTranscript, Robot, robot_lines
@@ -40,8 +40,7 @@ def _status(options: Common, broker: Broker, selection: Selection | None) -> Non
     """Show how each robot stands."""
     from talkcli.fleet.roster import standings
 
-    single = selection is not None and not several(selection.text)
-    found = standings(broker, ANSWER_LIMIT, *([selection.text] if selection and single else []))
+    found = standings(broker, ANSWER_LIMIT, selection.only if selection else None)
     picked = [each for _, each in sorted(found.items()) if selection is None or selection.picks(each.presence)]
     if not picked:
         raise _nobody(broker, selection)

@@ -192,8 +192,8 @@ class Bridge:
             return
         self._settled = True
         name = self._settings.name
-        own = [topics.robot(name, each, "+") for each in (topics.REQUEST, topics.SAY, topics.CANCEL)]
-        groups = [topics.group(each, topics.REQUEST, "+") for each in self._groups]
+        own = [topics.robot(name, each, topics.ANY) for each in (topics.REQUEST, topics.SAY, topics.CANCEL)]
+        groups = [topics.group(each, topics.REQUEST, topics.ANY) for each in self._groups]
         births = [topics.BIRTH] if self._settings.homeassistant else []
         self._link.subscribe(*own, *groups, *births, retained=False)
         self._be_present()

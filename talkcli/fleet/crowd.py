@@ -16,7 +16,6 @@ from talkcli.client.connect import ANSWER_LIMIT, FIRST
 from talkcli.errors import (
     EXIT_OK,
     Lost,
-    RequestRefused,
     ServerUnavailable,
     TalkError,
     UsageError,
@@ -141,8 +140,8 @@ class Crowd:
 
     def came_up(self, link: Link) -> None:
         """Have all answers come, and the presence of all robots."""
-        link.subscribe(topics.reply(self.desk.user, self.desk.session, "+"), retained=False)
-        link.subscribe(topics.robot("+", topics.PRESENCE), retained=True)
+        link.subscribe(topics.reply(self.desk.user, self.desk.session, topics.ANY), retained=False)
+        link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
 
     def went_down(self, why: str) -> None:
         """Take all for absent; of others than are known by now, the broker will not tell in time."""
@@ -373,9 +372,8 @@ class Round:
                 self._refused = desk.refused(code, f"ask the group {group} for anything")
 
         line = request_line({"seq": number, **write_request(request)})
-        if len(line) > link.room:
-            words = f"{request.kind} has {len(line):,} bytes, and the broker takes {link.room:,}: nothing was sent"
-            raise RequestRefused(words, "too_long")
+        if (refused := link.too_long(line, request.kind)) is not None:
+            raise refused
         expiry = (request.ttl or None) if isinstance(request, Say) else EXPIRY
         topic, response = topics.group(group, topics.REQUEST, desk.user), topics.reply(desk.user, desk.session)
         link.publish(topic, line, expiry=expiry, response=response, acknowledged=acknowledged)

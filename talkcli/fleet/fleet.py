@@ -37,9 +37,9 @@ class Fleet:
     or for each goal of its that this is about. A robot that is offline is among them, with exit code 3: nothing is
     kept for it.
 
-    Each call has a connection of its own, which ends with its last outcome, or by `close` of what was returned: what
-    robots have not answered by then may never reach them, so iterate where it matters. One thread uses that; several
-    may use the fleet.
+    Each call has a connection of its own, which ends with its last outcome, with `with`, or by `close` of what was
+    returned. One of these it needs: what is dropped without may never reach a robot. One thread uses what was returned;
+    several may use the fleet.
     """
 
     def __init__(self, broker: str | None = None, *, name: str | None = None, insecure: bool = False) -> None:
@@ -74,16 +74,25 @@ class Fleet:
         return Client.over(reach(name, self._broker, name=self._name))
 
     def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> Round:
-        """Have them speak: one goal at each, all with one id. The options are those of `Client.say`.
+        """Have them speak: one goal at each, all with one id. The options are those of `Client.say`, but `follow`.
 
         `wait`: an outcome is how the goal ended, else how it was accepted; `ttl`: seconds in which it must have begun
-        on each, None is 10, 0 is no limit. `cancel` of what is returned cancels it everywhere.
+        on each, None is 10, 0 is no limit. `cancel` of what is returned cancels it wherever it has not ended, until the
+        last outcome was taken; then `Fleet.cancel` does, by the goal's id.
         """
         return self._ask(to, Say(text, wait=wait, ttl=ttl, **options))
 
-    def cancel(self, to: str, ids: Iterable[str] | None = None, *, key: str | None = None) -> Round:
-        """Cancel these goals, those with this key, or everything; an outcome comes once the robot is silent."""
-        return self._ask(to, Cancel(None if ids is None else tuple(ids), key=key))
+    def cancel(
+        self,
+        to: str,
+        ids: Iterable[str] | None = None,
+        *,
+        current: bool = False,
+        before: str | None = None,
+        key: str | None = None,
+    ) -> Round:
+        """Cancel what these select, as of `Client.cancel`, or everything; an outcome comes once the robot is silent."""
+        return self._ask(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> Round:
         """Wait until these goals have ended, or all that have not."""

@@ -23,7 +23,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from talkcli.errors import AccessDenied, ProtocolMismatch, ServerUnavailable, TalkError
+from talkcli.errors import AccessDenied, ProtocolMismatch, RequestRefused, ServerUnavailable, TalkError
 from talkcli.fleet.message import Message
 from talkcli.frozen import frozen
 from talkcli.terminal.text import printable
@@ -228,6 +228,13 @@ class Link:
                     self._acknowledged[info.mid] = acknowledged
             self.write()
         return True
+
+    def too_long(self, line: bytes, kind: str) -> RequestRefused | None:
+        """Return the error for a request of this kind that is longer than what the broker takes; None where it fits."""
+        if len(line) <= self.room:
+            return None
+        words = f"{kind} has {len(line):,} bytes, and the broker takes {self.room:,}: nothing was sent"
+        return RequestRefused(words, "too_long")
 
     def subscribe(self, *wanted: str, retained: bool) -> None:
         """Have messages of these topics come; `retained`: those that the broker keeps, too.

@@ -16,7 +16,6 @@ from talkcli.errors import BadRequest, Lost
 from talkcli.fleet import topics
 from talkcli.fleet.desk import ABSENCE_LIMIT, Desk
 from talkcli.fleet.presence import Presence
-from talkcli.fleet.selection import several
 from talkcli.fleet.sighting import Away, Back, Begun, Changed, Happened, Missed
 from talkcli.fleet.status import Standing, Status
 from talkcli.goals.states import State
@@ -42,12 +41,12 @@ class Lookout:
     def __init__(self, broker: Broker, selection: Selection | None = None) -> None:
         """UsageError where the user's name can't be in a topic. It connects in `follow`."""
         self._broker, self._selection = broker, selection
-        self._wanted = selection.text if selection and not several(selection.text) else "+"
+        self._wanted = (selection and selection.only) or topics.ANY
         self._desk = Desk(broker)
         self._desk.visitor = self
         self._seen: deque[Sighting] = deque()
-        #: the robots that are known, by name; and of each the ids of the goals of which was told last that they have
-        #: ended (True), and that they are spoken (False)
+        #: the robots that are known, by name; and of each the goal of which was told last that it has ended (True), and
+        #: the one that it is spoken (False), by their ids
         self._known: dict[str, Presence] = {}
         self._told: dict[str, dict[bool, str]] = {}
         #: robots that may have spoken while nobody could hear of it, which their next status tells
@@ -81,7 +80,7 @@ class Lookout:
     def came_up(self, link: Link) -> None:
         """Ask for what the broker keeps, and for what happens."""
         self._arriving = _Arriving()
-        link.subscribe(topics.robot(self._wanted, topics.EVENT, "+"), retained=False)
+        link.subscribe(topics.robot(self._wanted, topics.EVENT, topics.ANY), retained=False)
         kept = (topics.robot(self._wanted, each) for each in (topics.PRESENCE, topics.STATUS))
         link.subscribe(*kept, retained=True)
 
@@ -107,11 +106,8 @@ class Lookout:
                 arriving.statuses[name] = Status.read(message.payload)
             elif name in self._unheard:  # of the others, events say more
                 self._catch_up(name, Status.read(message.payload))
-        elif arriving:
-            arriving.presences[name] = self._presence(name, message.payload)
         else:
-            self._missing.pop(name, None)
-            self._change(name, self._presence(name, message.payload))
+            self._be_present(name, message.payload)
 
     # -- inside
 
@@ -160,10 +156,18 @@ class Lookout:
         for each in arrived.events:
             self._happen(each)
 
-    def _presence(self, name: str, payload: bytes) -> Presence | None:
-        """Return what is said of a robot's presence; None, too, where it is not one of those that are looked at."""
+    def _be_present(self, name: str, payload: bytes) -> None:
+        """Take up what is said of a robot's presence; one that is not one of those that are looked at is none."""
         said = Presence.read(name, payload)
-        return said if said and (self._selection is None or self._selection.picks(said)) else None
+        if payload and said is None:
+            return  # what is no presence is no news of it
+        if said and self._selection and not self._selection.picks(said):
+            said = None
+        if self._arriving:
+            self._arriving.presences[name] = said
+        else:
+            self._missing.pop(name, None)
+            self._change(name, said)
 
     def _change(self, name: str, now: Presence | None) -> None:
         before = self._known.pop(name, None)

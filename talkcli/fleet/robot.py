@@ -19,7 +19,6 @@ from talkcli.errors import (
     AccessDenied,
     BadRequest,
     Lost,
-    RequestRefused,
     ServerUnavailable,
     TalkError,
     UnknownGoal,
@@ -153,10 +152,9 @@ class RobotConnection(BaseConnection):
                 exchange.error = self._desk.refused(code, f"ask {self._robot} for anything")
 
         line = request_line({"seq": number, **write_request(request)})
-        if len(line) > link.room:
+        if (refused := link.too_long(line, request.kind)) is not None:
             if exchange is not None:
-                words = f"{request.kind} has {len(line):,} bytes, and the broker takes {link.room:,}: nothing was sent"
-                exchange.error = RequestRefused(words, "too_long")
+                exchange.error = refused
             return False
         self._signed_at = time.monotonic()
         topic = topics.robot(self._robot, topics.REQUEST, self._desk.user)

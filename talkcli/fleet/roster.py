@@ -14,20 +14,17 @@ if TYPE_CHECKING:
     from talkcli.fleet.link import Link
     from talkcli.fleet.message import Message
 
-#: Stands for any robot in a topic that is subscribed to.
-_ANY = "+"
-
 
 def roster(broker: Broker, patience: float) -> dict[str, Presence]:
     """Return the presence of each robot that the broker knows, by name, those that are offline among them.
 
     `patience`: seconds in which the broker must have told; errors as of `Desk.await_kept`.
     """
-    kept = _kept(broker, patience, _ANY, topics.PRESENCE)
+    kept = _kept(broker, patience, None, topics.PRESENCE)
     return {name: each for name, told in kept.items() if (each := Presence.read(name, told[topics.PRESENCE]))}
 
 
-def standings(broker: Broker, patience: float, name: str = _ANY) -> dict[str, Standing]:
+def standings(broker: Broker, patience: float, name: str | None = None) -> dict[str, Standing]:
     """Return how each robot stands that the broker knows, or the one of this name; errors as of `roster`."""
     found = {}
     for each, told in _kept(broker, patience, name, topics.PRESENCE, topics.STATUS).items():
@@ -37,9 +34,9 @@ def standings(broker: Broker, patience: float, name: str = _ANY) -> dict[str, St
     return found
 
 
-def _kept(broker: Broker, patience: float, name: str, *kinds: str) -> dict[str, dict[str, bytes]]:
+def _kept(broker: Broker, patience: float, name: str | None, *kinds: str) -> dict[str, dict[str, bytes]]:
     """Return what the broker keeps of these kinds for a robot, or for any: by name and kind."""
-    reader = _Reader([topics.robot(name, each) for each in kinds])
+    reader = _Reader([topics.robot(name or topics.ANY, each) for each in kinds])
     desk = Desk(broker)
     desk.visitor = reader
     try:

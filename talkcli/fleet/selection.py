@@ -30,6 +30,8 @@ class Selection:
         self.text = text
         #: the group that it names, None where it names none
         self.group = text.removeprefix(_GROUP) if text.startswith(_GROUP) else None
+        #: the robot that it names, None where it may mean several
+        self.only = None if several(text) else text
         self._glob = re.compile(translate(text)) if self.group is None and several(text) else None
 
     @property
@@ -38,9 +40,9 @@ class Selection:
         if self.group is not None:
             fault = topics.fault(self.group)
             return fault and f"no group can be called '{self.group}': a name {fault}"
-        if self._glob is None:
-            fault = topics.fault(self.text)
-            return fault and f"no robot can be called '{self.text}': a name {fault}"
+        if self.only is not None:
+            fault = topics.fault(self.only)
+            return fault and f"no robot can be called '{self.only}': a name {fault}"
         if not _OF_GLOBS.fullmatch(self.text) or _is_open(self.text):
             return f"the glob '{self.text}' matches no robot's name: it has A-Z a-z 0-9 . _ - with *, ? and [ ] alone"
         return None

@@ -16,6 +16,8 @@ PREFIX = "talk"
 ROBOT, GROUP, REPLY = "robot", "group", "reply"
 #: The group that every robot is in.
 EVERYBODY = "all"
+#: Stands for any level in what is subscribed to.
+ANY = "+"
 #: What a session's own marker is called, in the place of a robot: no robot can be.
 MARKER = "_"
 #: Characters of a robot's, a group's or a user's name: a bridge calls itself "mqtt:" and that name at its server.

@@ -19,11 +19,10 @@ if TYPE_CHECKING:
     #: What stands in a column, and the state in whose colour; None for none.
     Cell = tuple[str, State | None]
 
-#: The columns. Where a line of a terminal has no room for so much of the texts, or for all of a shorter one, other
-#: columns are left out, these first.
-_ROBOT, _ONLINE, _SERVER, _SPEAKING, _QUEUE, _LAST, _SINCE = HEADS = (
-    *("ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE"),
-)
+#: The columns; and those that are left out, the first of them first, where a terminal has no room beside them for so
+#: many characters of the texts, or for the whole of shorter ones.
+HEADS = ("ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE")
+_ROBOT, _ONLINE, _SERVER, _SPEAKING, _QUEUE, _LAST, _SINCE = HEADS
 _LEAST_TEXT = 12
 _LEFT_OUT = (_SINCE, _LAST, _SERVER, _QUEUE)
 #: Columns of a text, at most, by which what follows lines up where nothing has to fit.

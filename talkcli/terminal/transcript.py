@@ -40,6 +40,8 @@ _LEAST_TEXT = 16
 _USUAL_ID = 8
 #: Where a line begins that goes on from the one before it: under what is behind the time.
 _INDENT = 10
+#: Goals that are remembered, until their end is told.
+_MOST = 1000
 #: Columns of a robot's name, at first.
 _USUAL_ROBOT = 8
 
@@ -107,6 +109,8 @@ class Transcript:
     def _changed(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
         if event.goal is not None:
             self._goals[event.id] = event.goal
+            if len(self._goals) > _MOST:  # of the oldest the end was missed, or its beginning tells all of it again
+                del self._goals[next(iter(self._goals))]
         at_once = not self._paused and len(self._goals) == 1
         goal = self._goals.get(event.id)
         if event.state.terminal:
