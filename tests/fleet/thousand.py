@@ -156,12 +156,6 @@ class Stage(contextlib.AbstractContextManager["Stage"]):
 def memory(stage: Stage) -> list[Row]:
     """Measure what is there, and a desk while all speak."""
     rows = [_memory("the broker", stage.broker.pid)]
-    # One that is no fork, and so shares nothing with the program that measures: an interpreter's setting is its own.
-    talk = stage.real[stage.real.names[0]].talk
-    with Bridge(talk, stage.broker, "measured", env={"PYTHONHASHSEED": "0"}) as bridge:
-        bridge.await_online()
-        rows.append(_memory("a bridge", bridge.pid))
-        bridge.terminate()
     each = sum(megabytes(pid, "Pss") for pid in stage.simulated.pids) / len(stage.simulated.names)
     rows.append(Row("memory", "memory of a simulated robot, its part of its process", "MB", (each,)))
     goal, asked = stage.say(2)
@@ -170,6 +164,12 @@ def memory(stage: Stage) -> list[Row]:
     asked.finish()
     rows.append(_memory("the broker after that", stage.broker.pid))
     stage.check(goal, asked)
+    # One that is no fork, and so shares nothing with the program that measures: an interpreter's setting is its own.
+    talk = stage.real[stage.real.names[0]].talk
+    with Bridge(talk, stage.broker, "measured", env={"PYTHONHASHSEED": "0"}) as bridge:
+        bridge.await_online()
+        rows.append(_memory("a bridge", bridge.pid))
+        bridge.terminate()
     return rows
 
 
