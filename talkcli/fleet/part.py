@@ -72,11 +72,9 @@ class Part:
                 return []
             robot.forget(exchange)
             try:
-                reply, items = robot.answer(exchange)
-                if not self._handles:
-                    return self._answered(reply, items)
-            except UnknownGoal as error:
-                return [*self._canceled(Canceled.from_items(error.items), last=False), failed(self._name, error)]
+                found = self._replied(exchange)
+                if found:
+                    return found
             except TalkError as error:
                 refused = (exchange.reply or {}).get("error")
                 serverless = isinstance(refused, dict) and refused.get("code") == ServerUnavailable.code
@@ -113,6 +111,14 @@ class Part:
             last = self._told == len(self._handles)
             found.append(Outcome(self._name, handle.state.name, code, handle.goal, last=last))
         return found
+
+    def _replied(self, exchange: Exchange) -> list[Outcome]:
+        """Return what an answer says, nothing where goals are waited for; errors as of `answer`."""
+        try:
+            reply, items = self.robot.answer(exchange)
+        except UnknownGoal as error:
+            return [*self._canceled(Canceled.from_items(error.items), last=False), failed(self._name, error)]
+        return [] if self._handles else self._answered(reply, items)
 
     def _answered(self, reply: JsonObject, items: list[JsonObject]) -> list[Outcome]:
         """Return what a reply says of a robot that has nothing more to tell."""
