@@ -18,7 +18,7 @@ from collections.abc import Callable
 from talkcli import paths, peers
 from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, hello, ready, sender
 from talkcli.client.following import Followed
-from talkcli.errors import BadRequest, Lost, ServerUnavailable, UsageError, refusal
+from talkcli.errors import BadRequest, Lost, ServerUnavailable, Unreadable, UsageError, refusal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Say
@@ -363,7 +363,12 @@ class BaseConnection:
             exchange.items.append(message)
             return
         if exchange.on_reply and message.get("ok") is True:
-            exchange.on_reply(message, exchange.items)
+            try:
+                exchange.on_reply(message, exchange.items)
+            except Unreadable as error:
+                if not isinstance(exchange.request, self.lasting):  # else what was sent may have had an effect
+                    exchange.error = error
+                raise
         exchange.reply = message  # now: what can't be understood is no reply
 
 
