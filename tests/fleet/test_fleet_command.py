@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -11,6 +10,7 @@ import pytest
 from tests.conformance.bareserve import TALK
 from tests.fleet import told
 from tests.fleet.robot import LONG
+from tests.fleet.watching import Watching
 from tests.support.bridge import Desk
 from tests.support.connection import PATIENCE
 from tests.support.mqtt import Listener
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from tests.fleet.robot import Robot
     from tests.support.broker import Broker
-    from tests.support.processes import Finished, Process
+    from tests.support.processes import Finished
 
 
 @pytest.fixture
@@ -189,30 +189,6 @@ def test_on_a_terminal_it_fits(broker: Broker, robots: Listener, columns: int) -
 
 
 # talk fleet watch
-
-
-class Watching:
-    """A `talk fleet watch` that has begun, and what it has written so far."""
-
-    def __init__(self, somebody: Desk, *words: str) -> None:
-        self._desk = somebody
-        self.process: Process = somebody.start(*words, "fleet", "watch")
-        self.lines: list[str] = []
-        self.until("")
-
-    def until(self, words: str) -> str:
-        """Read lines until one has these words, and return it."""
-        assert self.process.stdout
-        for line in self.process.stdout:
-            self.lines.append(line.rstrip("\n"))
-            if words in line:
-                return self.lines[-1]
-        raise AssertionError(f"it ended without '{words}': {self.lines}")
-
-    def end(self) -> Finished:
-        """Press Ctrl-C, and return how it ended."""
-        self.process.send_signal(signal.SIGINT)
-        return self._desk.finish(self.process)
 
 
 @pytest.fixture

@@ -40,6 +40,7 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
     def __init__(self, to: int) -> None:
         self._to = to
         self._held: set[Way] = set()
+        self._awaited: tuple[Way, bytes, threading.Event] | None = None
         self._pairs: list[_Pair] = []
         self._asked: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = queue.SimpleQueue()
         self._listening: socket.socket | None = None
@@ -75,6 +76,19 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
         That one side has ended does not pass either.
         """
         self._do(lambda: self._held.update(ways or WAYS))
+
+    def hold_from(self, way: Way, words: bytes) -> threading.Event:
+        """Hold this way as soon as something has come by it with these bytes, which do not pass either.
+
+        What is returned is set then.
+        """
+        held = threading.Event()
+
+        def begin() -> None:
+            self._awaited = way, words, held
+
+        self._do(begin)
+        return held
 
     def release(self) -> None:
         """Let all pass again, what was held first."""
@@ -175,11 +189,19 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
         try:
             if mask & selectors.EVENT_READ:
                 pair.take(way)
-                pair.hand_on(way)
+                self._hold_if_awaited(pair, way)
+                if way not in self._held:
+                    pair.hand_on(way)
             if mask & selectors.EVENT_WRITE:
                 pair.hand_on(_back(way))
         except OSError:  # one side has reset it
             self._drop(pair)
+
+    def _hold_if_awaited(self, pair: _Pair, way: Way) -> None:
+        if self._awaited and self._awaited[0] == way and pair.waits(way, self._awaited[1]):
+            self._held.add(way)
+            self._awaited[2].set()
+            self._awaited = None
 
     def _drop(self, pair: _Pair) -> None:
         self._pairs.remove(pair)
@@ -215,6 +237,10 @@ class _Pair:
     def has(self, way: Way) -> bool:
         """Whether there is something to hand on, the end included."""
         return bool(self._waiting[way]) or (way in self._ended and way not in self._closed)
+
+    def waits(self, way: Way, words: bytes) -> bool:
+        """Whether these bytes are among what was taken and not handed on."""
+        return words in self._waiting[way]
 
     def take(self, way: Way) -> None:
         with contextlib.suppress(BlockingIOError):

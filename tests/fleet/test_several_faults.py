@@ -1,0 +1,459 @@
+"""Commands to several robots while something goes wrong: the line, the broker, what one of them answers, who asks."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import signal
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from talkcli import Fleet
+from talkcli.errors import AccessDenied, UsageError
+from tests.fleet import told as robots_told
+from tests.fleet.asker import Asker
+from tests.fleet.many import RealRobots, alike, assert_told, at_once, request, told
+from tests.fleet.pretended import Pretended
+from tests.fleet.robot import LONG
+from tests.fleet.watching import Watching
+from tests.support.bridge import Desk
+from tests.support.broker import Broker
+from tests.support.connection import PATIENCE
+from tests.support.mqtt import Listener
+from tests.support.proxy import Proxy
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from tests.conftest import MakeTalk
+    from tests.fleet.conftest import MakeBridge
+    from tests.support.processes import Finished, Process
+
+PAIR = ["wh-1", "wh-2"]
+#: Whatever picks both.
+PICKS = ("wh-*", "@warehouse")
+#: Seconds after which what was asked counts as lost where the broker stays away.
+ABSENCE = 30.0
+#: Seconds of silence after which a robot counts as gone.
+SILENCE = 15.0
+#: Goals that may be pending from afar.
+PENDING = 20
+
+
+@pytest.fixture
+def desk(pair: RealRobots) -> Iterator[Desk]:
+    """Somebody who asks; what is still to be said is cancelled in the end."""
+    with Desk(pair.broker) as result:
+        yield result
+    request(pair, "cancel")
+
+
+@pytest.fixture
+def far(pair: RealRobots) -> Iterator[tuple[Desk, Proxy]]:
+    """Somebody who asks over a line that may stall and break; what is still to be said is cancelled in the end."""
+    with Proxy(pair.broker.port) as proxy, Desk(pair.broker, port=proxy.port) as result:
+        yield result, proxy
+        proxy.release()
+    request(pair, "cancel")
+
+
+@pytest.fixture
+def fleet(pair: RealRobots, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
+    """The library, of the two; what is still to be said is cancelled in the end."""
+    yield fleet_of(pair.broker, monkeypatch)
+    request(pair, "cancel")
+
+
+def fleet_of(broker: Broker, monkeypatch: pytest.MonkeyPatch, *, grace: float = 0.05, user: str | None = None) -> Fleet:
+    """Return the library for a broker; `grace`: seconds for which it may still tell what it keeps."""
+    from talkcli.fleet import desk  # which needs paho
+
+    monkeypatch.setattr(desk, "GRACE", grace)
+    for each in [name for name in os.environ if name.startswith("TALK_") and not name.startswith("TALK_TEST_")]:
+        monkeypatch.delenv(each)
+    if user:
+        monkeypatch.setenv("TALK_MQTT_USER", user)
+    return Fleet(broker.url)
+
+
+def speaking(desk: Desk, robots: RealRobots, to: str, goal_id: str) -> Process:
+    """Return a command that waits for what all of them speak."""
+    waiting = desk.start("--robot", to, "say", "--wait", "--id", goal_id, "--", LONG)
+    robots.each(lambda each: each.talk.watcher.wait_for(goal_id, "ACTIVE"))
+    return waiting
+
+
+def states(robots: RealRobots, goal_id: str) -> list[str]:
+    """Return how this goal stands at each robot."""
+    return [each["state"] for each in robots.each(lambda each: each.talk.goal(goal_id))]
+
+
+def line_of(process: Process) -> str:
+    """Return the next line that a command writes."""
+    assert process.stdout
+    return process.stdout.readline()
+
+
+# the line, and the broker
+
+
+@pytest.mark.parametrize("to", PICKS)
+def test_what_is_cancelled_before_it_has_left_is_never_spoken(
+    pair: RealRobots, far: tuple[Desk, Proxy], to: str
+) -> None:
+    desk, proxy = far
+    text = f"never to be heard by {to.strip('@*-')}"
+    stalled = proxy.hold_from("to_broker", text.encode())
+    waiting = desk.start("--robot", to, "say", "--wait", "--", text)
+    assert stalled.wait(PATIENCE)
+    waiting.send_signal(signal.SIGINT)
+    with Listener(pair.broker, "talk/reply/+/+/_") as back:
+        proxy.cut()
+        proxy.release()
+        # The desk is back, and asks robots of which it now hears.
+        assert back.find(lambda _: True, PATIENCE)
+    done = desk.finish(waiting)
+    assert done.code == 130, done
+    assert done.err.splitlines()[-1] == "talk: 0 of 2 as asked", done
+    for each in PAIR:
+        assert desk.run("--robot", each, "say", "--wait", "control").code == 0
+    assert not [each for spoken in pair.spoken().values() for each in spoken if each == text]
+
+
+@pytest.mark.parametrize("to", PICKS)
+def test_who_is_back_in_time_cancels_what_was_to_be_cancelled_meanwhile(
+    pair: RealRobots, far: tuple[Desk, Proxy], to: str
+) -> None:
+    desk, proxy = far
+    goal = f"back-in-time-{PICKS.index(to)}"
+    waiting = speaking(desk, pair, to, goal)
+    proxy.hold()  # so that it finds a way back, on which nothing comes through before it is released
+    proxy.cut()
+    waiting.send_signal(signal.SIGINT)
+    proxy.release()
+    done = desk.finish(waiting)
+    assert_told(done, 130, alike(PAIR, goal, "PREEMPTED", 7), "0 of 2 as asked")
+    assert states(pair, goal) == ["PREEMPTED", "PREEMPTED"]
+
+
+def test_where_the_broker_is_back_too_late_for_a_cancel_it_is_said_that_they_may_speak_on(broker: Broker) -> None:
+    with RealRobots(broker, PAIR, ["warehouse"]) as robots, Desk(broker) as desk:
+        goals = {to: f"speaks-on-{number}" for number, to in enumerate(PICKS)}
+        first = desk.start("--robot", PICKS[0], "say", "--wait", "--id", goals[PICKS[0]], "--", LONG)
+        robots.each(lambda each: each.talk.watcher.wait_for(goals[PICKS[0]], "ACTIVE"))
+        second = desk.start("--robot", PICKS[1], "say", "--wait", "--ttl", "0", "--id", goals[PICKS[1]], "--", LONG)
+        robots.each(lambda each: each.talk.watcher.wait_for(goals[PICKS[1]], "PENDING"))
+        broker.kill()
+        for each in (first, second):
+            each.send_signal(signal.SIGINT)
+        for each in (first, second):
+            done = desk.finish(each)
+            assert (done.code, done.out) == (130, "")
+            assert done.err == (
+                f"talk: not known to be silent: wh-1, wh-2: the broker at {broker.url} went away\n"
+                "talk: 0 of 2 as asked\n"
+            )
+        broker.start()
+        robots.each(lambda each: each.bridge.await_online(within=20))
+        assert states(robots, goals[PICKS[0]]) == ["ACTIVE", "ACTIVE"]
+        assert states(robots, goals[PICKS[1]]) == ["PENDING", "PENDING"]
+        assert desk.run("--robot", "@warehouse", "cancel").code == 0
+
+
+@pytest.mark.parametrize("to", ["*", "@all"])
+def test_where_all_are_offline_it_ends_though_the_broker_goes_before_it_has_told_of_all(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch, to: str
+) -> None:
+    with Listener(broker) as publisher:
+        robots_told.presence(publisher, "off-1", online=False)
+    outcomes = iter(fleet_of(broker, monkeypatch, grace=60).say(to, "hello"))
+    assert next(outcomes).state == "OFFLINE"
+    with limits():
+        killed = time.monotonic()
+        broker.kill()
+        assert list(outcomes) == []
+        assert_within(time.monotonic() - killed, 1, "the end of a command to nobody who is there")
+
+
+@pytest.mark.slow
+def test_where_the_broker_goes_before_it_has_told_of_all_who_was_asked_is_lost_after_half_a_minute(
+    broker: Broker,
+) -> None:
+    with RealRobots(broker, PAIR, ["warehouse"]) as robots, Desk(broker) as desk:
+        with Listener(broker) as publisher:
+            robots_told.presence(publisher, "wh-3", online=False, groups=["warehouse"])
+        waiting = [
+            desk.start("--robot", to, "say", "--wait", "--ttl", "0", "--id", f"asked-{number}", "--", LONG)
+            for number, to in enumerate(PICKS)
+        ]
+        assert [line_of(each) for each in waiting] == ["wh-3 - OFFLINE 3\n"] * 2
+        with limits():
+            killed = time.monotonic()
+            broker.kill()
+            for number, each in enumerate(waiting):
+                done = desk.finish(each, timeout=ABSENCE + 10)
+                assert_within(time.monotonic() - killed, ABSENCE + 1, "that all are lost")
+                assert done.code == 13, done
+                assert {name: (state, code) for name, (_, state, code) in told(done).items()} == dict.fromkeys(
+                    PAIR, ("LOST", 12)
+                ), number
+        request(robots, "cancel")
+        for robot in PAIR:
+            robots[robot].bridge.kill()
+
+
+@pytest.mark.slow
+def test_who_was_stopped_for_longer_than_a_robot_may_be_silent_has_lost_nothing(pair: RealRobots, desk: Desk) -> None:
+    """What has come meanwhile counts before anybody is taken for gone."""
+    waiting = [
+        desk.start("--robot", to, "say", "--wait", "--ttl", "0", "--id", f"stopped-{number}", "--", "length=4 on we go")
+        for number, to in enumerate(PICKS)
+    ]
+    pair.each(lambda each: [each.talk.watcher.wait_for(f"stopped-{number}", "PENDING") for number in range(2)])
+    for each in waiting:
+        each.send_signal(signal.SIGSTOP)
+    time.sleep(SILENCE + 1)
+    for each in waiting:
+        each.send_signal(signal.SIGCONT)
+    for number, each in enumerate(waiting):
+        assert_told(desk.finish(each), 0, alike(PAIR, f"stopped-{number}", "SUCCEEDED", 0), "2 of 2 as asked")
+
+
+# what a robot answers
+
+EVIL = "\x1b[31mred"
+NO_STATE, NO_SUCH_STATE, NO_ID = {"id": "odd"}, {"id": "odd", "state": "DANCING"}, {"id": EVIL, "state": "PENDING"}
+#: Requests, by their text, their first id, or their kind, and what one robot answers to them.
+ODD: dict[str, list[dict[str, Any]]] = {
+    "no state": [{"ok": True, "goal": NO_STATE}],
+    "no such state": [{"ok": True, "goal": NO_SUCH_STATE}],
+    "no id": [{"ok": True, "goal": NO_ID}],
+    "no goal": [{"ok": True, "goal": [7]}],
+    "canceled-odd": [{"canceled": NO_STATE}, {"ok": True}],
+    "canceled-evil": [{"canceled": NO_ID}, {"ok": True}],
+    "canceled-unknown": [{"canceled": {"id": 4}}, {"ok": False, "error": {"code": "unknown_goal", "message": EVIL}}],
+    "waited-odd": [{"goal": NO_SUCH_STATE}, {"ok": True}],
+    "waited-evil": [{"goal": NO_ID}, {"ok": True}],
+    "status": [{"pending": NO_STATE}, {"ok": True, "server": {}, "active": NO_ID}],
+    "pause": [{"ok": True, "goal": NO_SUCH_STATE}],
+}
+#: Commands, what they are about, and what the other robots make of it.
+COMMANDS = [
+    ("say", "no state", ("PENDING", 0)),
+    ("say", "no such state", ("PENDING", 0)),
+    ("say", "no id", ("PENDING", 0)),
+    ("say", "no goal", ("PENDING", 0)),
+    ("say --wait", "no state", ("SUCCEEDED", 0)),
+    ("say --wait", "no such state", ("SUCCEEDED", 0)),
+    ("say --wait", "no id", ("SUCCEEDED", 0)),
+    ("cancel", "canceled-odd", ("UNKNOWN", 8)),
+    ("cancel", "canceled-evil", ("UNKNOWN", 8)),
+    ("cancel", "canceled-unknown", ("UNKNOWN", 8)),
+    ("wait", "waited-odd", ("UNKNOWN", 8)),
+    ("wait", "waited-evil", ("UNKNOWN", 8)),
+    ("status", "", ("IDLE", 0)),
+]
+
+
+def odd(asked: dict[str, Any]) -> Sequence[dict[str, Any]]:
+    """Answer a request as no server would."""
+    return ODD.get(str(asked.get("text") or (asked.get("ids") or [asked["request"]])[0]), [])
+
+
+@pytest.fixture
+def stranger(pair: RealRobots) -> Iterator[Pretended]:
+    """A robot that answers with goals that are none."""
+    with Pretended(pair.broker, "odd-1", odd, ["odd"]) as result:
+        yield result
+
+
+def assert_plain(done: Finished) -> None:
+    """Assert that it was no surprise to the command, and that no terminal would obey what it says."""
+    assert "a bug" not in done.err, done
+    assert "\x1b" not in done.out + done.err, done
+
+
+@pytest.mark.usefixtures("stranger")
+@pytest.mark.parametrize("to", ["*", "@all"])
+def test_what_one_robot_sends_that_is_no_goal_is_its_own_failure_alone(desk: Desk, to: str) -> None:
+    lines = [["--robot", to, *command.split(), *([what] if what else [])] for command, what, _ in COMMANDS]
+    for line, done, (_, _, others) in zip(lines, at_once(desk, *lines), COMMANDS, strict=True):
+        assert_plain(done)
+        assert done.code == 13 if others[1] else done.code in (9, 12), (line, done)
+        found = {name: (state, code) for name, (_, state, code) in told(done).items()}
+        assert found.pop("odd-1")[1] in (9, 12), (line, done)
+        if line[2] == "status":  # which tells what else is going on
+            assert {code for _, code in found.values()} == {0}
+        else:
+            assert found == dict.fromkeys(PAIR, others), (line, done)
+        assert "odd-1: " in done.err
+
+
+@pytest.mark.usefixtures("stranger")
+def test_what_the_only_robot_sends_that_is_no_goal_is_an_error_that_says_so(desk: Desk) -> None:
+    commands = [*COMMANDS, ("pause", "", None)]
+    lines = [["--robot", "odd-1", *command.split(), *([what] if what else [])] for command, what, _ in commands]
+    for line, done in zip(lines, at_once(desk, *lines), strict=True):
+        assert_plain(done)
+        assert done.code in (9, 12), (line, done)
+        assert done.err.startswith("talk: "), (line, done)
+
+
+@pytest.mark.parametrize("name", ["presence", "request", "robot", "reply"])
+def test_a_robot_that_is_called_as_a_part_of_a_topic_is_heard_as_any_other(
+    scripted: Any, broker: Broker, make_bridge: MakeBridge, name: str
+) -> None:
+    make_bridge(scripted, broker, name, groups=["odd"])
+    with Desk(broker) as desk:
+        picks = [f"{name[:-1]}*", "@odd", "@all"]
+        lines = [["--robot", to, "say", "--wait", "--id", f"of-{n}", "hello"] for n, to in enumerate(picks)]
+        for number, done in enumerate(at_once(desk, *lines)):
+            assert_told(done, 0, {name: (f"of-{number}", "SUCCEEDED", 0)}, "1 of 1 as asked")
+
+
+@pytest.mark.parametrize("moment", [1e300, -1e300, 1e15, -1e15])
+def test_a_moment_that_no_calendar_has_keeps_nobody_from_seeing_the_rest(broker: Broker, moment: float) -> None:
+    goal = {"id": "odd", "state": "SUCCEEDED", "text": "hello", "created_at": moment, "ended_at": moment}
+    status = {"active": None, "text": None, "pending": 0, "paused": False, "last": {**goal, "at": moment}}
+    event = {"event": "state", "id": "odd", "state": "SUCCEEDED", "at": moment, "n": 1, "goal": goal}
+    presence = {"talk": 1, "online": True, "session": "s", "since": moment, "groups": ["all"], "version": "0.1.0"}
+    presence |= {"allow": [], "server": robots_told.SERVER}
+    with Listener(broker) as publisher, Desk(broker) as desk:
+        publisher.publish("talk/robot/odd-1/presence", presence, retain=True)
+        publisher.publish("talk/robot/odd-1/status", status, retain=True)
+        plain, for_programs = at_once(desk, ["fleet", "status"], ["--json", "fleet", "status"])
+        assert (plain.code, plain.err, plain.out.splitlines()[1].split()[:3]) == (0, "", ["odd-1", "yes", "0.1.0"])
+        assert (for_programs.code, json.loads(for_programs.out)["status"]["last"]["state"]) == (0, "SUCCEEDED")
+        watching = Watching(desk)
+        publisher.publish("talk/robot/odd-1/event/state", event)
+        assert "SUCCEEDED" in watching.until("odd ")
+        publisher.publish("talk/robot/odd-1/presence", {**presence, "session": "t"}, retain=True)
+        watching.until("online")
+        done = watching.end()
+    assert_plain(done)
+
+
+# who asks
+
+
+@pytest.mark.parametrize("to", PICKS)
+def test_one_that_leaves_the_group_while_it_speaks_is_cancelled_as_the_others(
+    broker: Broker, make_bridge: MakeBridge, make_talk: MakeTalk, to: str
+) -> None:
+    talks = [make_talk(scripted=True) for _ in PAIR]
+    _, leaving = (make_bridge(talk, broker, name, groups=["warehouse"]) for talk, name in zip(talks, PAIR, strict=True))
+    with Desk(broker) as desk, Listener(broker, "talk/robot/wh-2/request/+") as asked:
+        waiting = desk.start("--robot", to, "say", "--wait", "--id", "left", "--", LONG)
+        for each in talks:
+            each.watcher.wait_for("left", "ACTIVE")
+        assert leaving.terminate() == 0
+        make_bridge(talks[1], broker, "wh-2")
+        # The desk has heard of it, and asks how the goal stands.
+        asked.await_message(lambda each: bool(each.payload) and each.json["request"] == "wait")
+        waiting.send_signal(signal.SIGINT)
+        assert_told(desk.finish(waiting), 130, alike(PAIR, "left", "PREEMPTED", 7), "0 of 2 as asked")
+
+
+@pytest.mark.parametrize("to", PICKS)
+def test_once_all_outcomes_were_taken_there_is_nothing_left_to_cancel(fleet: Fleet, to: str) -> None:
+    for wait in (True, False):
+        outcomes = fleet.say(to, "length=0", wait=wait)
+        assert len(list(outcomes)) == 2
+        with pytest.raises(UsageError, match="all outcomes have been taken: cancel the goal by its id"):
+            outcomes.cancel()
+
+
+@pytest.mark.parametrize("to", PICKS)
+def test_as_long_as_outcomes_are_to_come_all_may_be_cancelled(fleet: Fleet, pair: RealRobots, to: str) -> None:
+    goal = f"within-{PICKS.index(to)}"
+    assert pair["wh-2"].talk.request("say", text=LONG)["ok"]
+    outcomes = fleet.say(to, "length=0", id=goal)
+    for each in outcomes:
+        if each.robot == "wh-1":
+            outcomes.cancel()
+        else:
+            assert (each.robot, each.state) == ("wh-2", "RECALLED")
+    assert states(pair, goal) == ["SUCCEEDED", "RECALLED"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("to", PICKS)
+def test_who_is_patient_waits_for_room_for_longer_than_for_an_answer(fleet: Fleet, pair: RealRobots, to: str) -> None:
+    goal = f"patient-{PICKS.index(to)}"
+    request(pair, "say", id=f"before-{goal}", text=LONG)
+    with Asker(pair.broker) as bob:
+        for number in range(PENDING):
+            bob.send({"seq": number, "request": "say", "text": "length=0"}, to="talk/group/warehouse")
+        assert bob.listener.find(lambda _: sum("ok" in each for each in bob.lines) == 2 * PENDING, PATIENCE)
+    room = threading.Timer(8, lambda: request(pair, "cancel", ids=[f"before-{goal}"]))
+    room.start()
+    began = time.monotonic()
+    outcomes = list(fleet.say(to, "length=0", patient=True, ttl=0, id=goal, wait=False))
+    assert time.monotonic() - began > 7
+    room.join()
+    assert {each.robot: (each.state, each.exit_code) for each in outcomes} == dict.fromkeys(PAIR, ("PENDING", 0))
+    assert pair.each(lambda each: each.talk.watcher.wait_for_terminal(goal)) == ["SUCCEEDED"] * 2
+
+
+def descriptors() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("to", ["*", "@all"])
+def test_who_takes_the_first_and_goes_leaves_nothing_open(fleet: Fleet, to: str) -> None:
+    list(fleet.status(to))  # what is imported once, opens what stays open
+    gc.collect()
+    before = descriptors()
+    for _ in range(20):
+        for _ in fleet.status(to):
+            break
+    gc.collect()
+    assert descriptors() == before
+
+
+@pytest.mark.parametrize("to", ["*", "@all"])
+def test_what_is_left_before_its_end_is_closed_at_once(fleet: Fleet, to: str) -> None:
+    list(fleet.status(to))
+    before = descriptors()
+    with fleet.status(to) as asked:
+        assert next(iter(asked)).exit_code == 0
+        assert descriptors() > before
+    assert descriptors() == before
+
+
+def test_what_the_broker_refuses_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    rules = "topic readwrite #\nuser olga\ntopic read talk/robot/+/presence\ntopic readwrite talk/reply/olga/+/+\n"
+    with Broker(acl=rules) as broker:
+        with Listener(broker) as publisher:
+            robots_told.presence(publisher, "wh-1", groups=["warehouse"])
+        fleet = fleet_of(broker, monkeypatch, user="olga")
+
+        def refused() -> None:
+            assert [(each.state, each.exit_code) for each in fleet.say("wh-*", "hello")] == [("REFUSED", 10)]
+            with pytest.raises(AccessDenied):
+                list(fleet.say("@warehouse", "hello"))
+
+        refused()
+        before = descriptors()
+        for _ in range(5):
+            refused()
+        assert descriptors() == before
+
+
+def test_of_goals_of_which_one_has_ended_none_counts_as_asked_when_the_time_is_over(
+    pair: RealRobots, desk: Desk
+) -> None:
+    request(pair, "say", id="over", text="length=0")
+    pair.each(lambda each: each.talk.watcher.wait_for_terminal("over"))
+    request(pair, "say", id="not-over", text=LONG)
+    lines = [["--robot", to, "wait", "--timeout", "0.6", "over", "not-over"] for to in PICKS]
+    for done in at_once(desk, *lines):
+        assert done.code == 124, done
+        assert sorted(done.out.splitlines()) == [f"{name} over SUCCEEDED 0" for name in PAIR]
+        assert done.err == "talk: not done: wh-1, wh-2\ntalk: 0 of 2 as asked\n"
