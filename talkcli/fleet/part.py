@@ -87,8 +87,10 @@ class Part:
     def _accepted(self, reply: JsonObject, items: list[JsonObject]) -> None:
         """Follow the goals that are to be waited for."""
         request = self._request
-        if isinstance(request, Say) and request.wait:
-            found = [Goal.from_json(reply.get("goal"))]
+        if isinstance(request, Say):
+            found = [Goal.from_json(reply.get("goal"))]  # without one it is no answer: it may be spoken all the same
+            if not request.wait:
+                return
         elif isinstance(request, Wait):
             found = list(goals(items, "goal"))
         else:
@@ -123,7 +125,8 @@ class Part:
     def _answered(self, reply: JsonObject, items: list[JsonObject]) -> list[Outcome]:
         """Return what a reply says of a robot that has nothing more to tell."""
         name, request = self._name, self._request
-        goal = goal_in(reply)
+        asked_for = isinstance(request, Status) and request.id is not None
+        goal = Goal.from_json(reply.get("goal")) if asked_for else goal_in(reply)
         if isinstance(request, Cancel):
             return self._canceled(Canceled.from_items(items)) or [Outcome(name, IDLE)]
         if isinstance(request, Pause | Resume):
