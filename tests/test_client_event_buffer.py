@@ -117,7 +117,7 @@ def test_event_that_comes_twice_is_one() -> None:
 
 
 def test_thousands_of_ids_go_in_lines_that_are_not_too_long() -> None:
-    ids = [f"4k7f-{each}" for each in range(9_000)] + ["é" * 64, "🤖" * 64, "\ud800" * 64]
+    ids = [f"4k7f-{each}" for each in range(9_000)] + ["é" * 64, "🤖" * 64]
     asked: list[str] = []
 
     def play(peer: Peer) -> None:
