@@ -42,6 +42,14 @@ def test_what_is_late_beside_a_late_control_is_not_measured(control: MakeControl
     assert told.startswith("it took 0.250 s, the limit is 0.1 s; the control took 0.030 s, usually 0.010 s")
 
 
+def test_what_has_a_limit_of_milliseconds_waits_as_long_as_three_controls(control: MakeControl) -> None:
+    with limits(control(0.03)):
+        assert_within(0.089, 0.02, "it")
+    assert len(take_unmeasured()) == 1
+    with pytest.raises(AssertionError, match="it took"), limits(control(0.03)):
+        assert_within(0.091, 0.02, "it")
+
+
 @pytest.mark.parametrize(("beside", "seconds"), [(0.01, 0.11), (0.019, 0.11), (0.03, 0.35)])
 def test_what_a_control_does_not_explain_fails(control: MakeControl, beside: float, seconds: float) -> None:
     with pytest.raises(AssertionError, match="it took"), limits(control(beside)):

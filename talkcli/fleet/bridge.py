@@ -337,7 +337,7 @@ class Bridge:
             said = decode(payload) if payload else {}  # somebody has cleared it
         except BadRequest as error:
             log.seldom("presence", f"what is said of this robot's presence can't be read: {log.shown(str(error))}")
-            return
+            said = {}  # as if it had been cleared
         online = said.get("online") is True
         if said.get("session") == self._session and online:
             return

@@ -30,6 +30,8 @@ _EVERY = 0.25
 _LATE = 2.0
 #: Process starts, at most, of which what has a limit consists: a sentence after a crash waits for about so much work.
 _WORK = 10
+#: … and at least: what has a limit of milliseconds goes through as many processes, each of which waits for its turn.
+_LEAST_WORK = 3
 #: Controls that tell how long one takes when the machine is quiet: the shortest of them.
 _FIRST = 5
 #: The variable that tells the workers of a run how long a process start took before they began.
@@ -121,6 +123,7 @@ def _judge(watched: Watched) -> None:
     told = f"the control took {max(watched.controls):.3f} s, usually {usual:.3f} s"
     for what, seconds, limit in watched.late:
         line = f"{what} took {seconds:.3f} s, the limit is {limit} s; {told}"
-        explained = min(limit * worst / usual, limit + _WORK * (worst - usual)) if worst >= _LATE * usual else limit
+        times_late = max(limit, _LEAST_WORK * usual) * worst / usual
+        explained = min(times_late, limit + _WORK * (worst - usual)) if worst >= _LATE * usual else limit
         assert seconds <= explained, line
         _unmeasured.append(line)
