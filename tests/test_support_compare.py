@@ -85,6 +85,17 @@ def test_more_than_a_busy_machine_does_to_a_sentence_is_noticed(low: Samples) ->
             assert_heard(recorded(heard), [low])
 
 
+def test_what_the_monitor_loses_without_a_sign_is_forgiven_once_and_no_more_than_it_does(low: Samples) -> None:
+    def without(lost: int, *places: int) -> Samples:
+        starts = [0, *(each + lost for each in places)]
+        return np.concatenate([low[a:b] for a, b in zip(starts, [*places, len(low)], strict=True)])
+
+    assert_heard(recorded(without(72, 9000)), [low])
+    for heard in (without(160, 9000), without(72, 9000, 15000)):
+        with pytest.raises(AssertionError, match="not heard as it should"):
+            assert_heard(recorded(heard), [low])
+
+
 def test_half_the_volume_is_the_same_sentence(low: Samples) -> None:
     assert_heard(recorded((low // 2).astype(np.int16)), [low])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 import wave
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_same, heard, quick_talk, render_quick, send
-from tests.conformance.voices import with_both
+from tests.conformance.voices import Joe, with_both
 from tests.support.compare import EXTENT, assert_heard, assert_silent
 from tests.support.reference import RATE, played, render
 
@@ -32,7 +33,10 @@ def test_row_01_a_goal_is_spoken_and_its_end_is_told(make_talk: MakeTalk, sink: 
     done = talk.run("say", "--wait", "--", LOW)
     assert (done.code, done.err) == (0, "")
     goal = talk.goal(done.id)
-    assert (goal["state"], goal["message"]) == ("SUCCEEDED", "Talk completed successfully")
+    assert goal["state"] == "SUCCEEDED"
+    # Beside other tests a machine may be too slow for a neural voice: then that is told.
+    gaps = r"(, but with \d gaps? of \d\.\d s in all: .*)?" if isinstance(voice, Joe) else ""
+    assert re.fullmatch(f"Talk completed successfully{gaps}", goal["message"])
     assert (goal["reason"], goal["spoken"]) == (None, LOW)
     assert talk.watcher.states(done.id) == SPOKEN
     (reference,) = voice.render([LOW], 200)
