@@ -245,6 +245,19 @@ def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float,
     return held
 
 
+def follow(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[int, int] | None:
+    """Return from where to where in a sentence's sound a part of it goes, sample by sample; None where it is none.
+
+    But for what a busy machine does to it. `reached`: samples that were heard before, of which it may say the last
+    `back` again.
+    """
+    begins = max(0, reached - back)
+    runs = _walk(part, wanted[begins:], 0, ahead=reached - begins)
+    if not runs or runs[-1][0] + runs[-1][2] < len(part):
+        return None
+    return begins + runs[0][1], begins + runs[-1][1] + runs[-1][2]
+
+
 def _ran_dry(first: Samples, second: Samples, wanted: Samples, twice: int) -> bool:
     """Return whether these are the two parts of a sentence, in which a player ran dry: see `_exact`."""
     runs = _walk(first, wanted, 0)
