@@ -91,7 +91,7 @@ def test_what_the_monitor_loses_without_a_sign_is_forgiven_once_and_no_more_than
         return np.concatenate([low[a:b] for a, b in zip(starts, [*places, len(low)], strict=True)])
 
     assert_heard(recorded(without(72, 9000)), [low])
-    for heard in (without(160, 9000), without(72, 9000, 15000)):
+    for heard in (without(240, 9000), without(72, 9000, 15000)):
         with pytest.raises(AssertionError, match="not heard as it should"):
             assert_heard(recorded(heard), [low])
 

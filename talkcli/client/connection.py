@@ -245,7 +245,7 @@ class BaseConnection:
         if exchange.reply is None and not exchange.sent:
             raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended or self._absent}")
         if exchange.reply is None:
-            why = self.ended or f"it did not reply within {self._patience:g} s"
+            why = self.ended or self._no_reply
             words = f"{request.kind} was sent to the server at {self.path}, but {why}"
             if isinstance(request, Say):
                 raise Lost(f"{words}; it may still be spoken")
@@ -316,6 +316,11 @@ class BaseConnection:
     def answer_by(self, exchange: Exchange) -> float:
         """Return until when an answer is waited for, by the monotonic clock, as far as it is known now."""
         return exchange.touched + self._patience
+
+    @property
+    def _no_reply(self) -> str:
+        """Why no answer is waited for any more."""
+        return f"it did not reply within {self._patience:g} s"
 
     def silent_by(self, began: float) -> tuple[float, str]:
         """Return when the server counts as gone that says nothing, to one who waits since then, and why."""

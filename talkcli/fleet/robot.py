@@ -169,6 +169,10 @@ class RobotConnection(BaseConnection):
             by = self._absent_since + (ABSENCE_LIMIT if self._patience >= ANSWER_LIMIT else self._patience)
         return by if self._end is None else min(by, max(self._end, exchange.touched))
 
+    @property
+    def _no_reply(self) -> str:
+        return super()._no_reply if self._absent_since is None else self._absent
+
     def silent_by(self, began: float) -> tuple[float, str]:
         if self._absent_since is None:
             return super().silent_by(began)

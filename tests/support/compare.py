@@ -42,9 +42,9 @@ _NEARBY = RATE // 20
 #: Samples of silence that players that ran dry may put into one sentence.
 _DRY = RATE // 2
 #: Samples that the monitor may lose where a stream starts, and where a player ran dry: up to 217 were seen to be. And
-#: those that it may lose once in a sentence without a sign of that: up to 72 were, on a busy machine, where the second
+#: those that it may lose once in a sentence without a sign of that: up to 110 were, on a busy machine, where the second
 #: piece of a neural voice's sound had come just in time, and the player knew of no gap.
-_LOST, _LOST_ONCE = 256, 96
+_LOST, _LOST_ONCE = 256, 192
 
 
 @dataclass(frozen=True, slots=True)
