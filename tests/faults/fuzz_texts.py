@@ -155,6 +155,7 @@ class Speaker:
     def _end(self) -> None:
         if self._process is not None:
             self._process.kill()
+            select.select([self._process.liveness], [], [], _LONGEST)  # it is gone: a busy machine takes its time
             self._process.close()
         self._process = None
         self._events.clear()
