@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from tests.conformance import stopped
+from tests.conformance.hearing import LONG, QUICK
+from tests.conformance.hearing import LOW as BATTERY
 from tests.faults.soak_clients import ALIKE
 from tests.support.compare import (
     alike,
@@ -174,6 +177,18 @@ def test_a_stopped_sentence_is_recognised_by_its_beginning(low: Samples) -> None
         assert_begun(recorded(low[:20000], low[-20000:]), low)
     with pytest.raises(AssertionError, match="nothing was heard"):
         assert_begun(SILENCE, low)
+
+
+@pytest.mark.parametrize("silence", [0, 4, 63, 240])
+def test_a_sentence_is_found_behind_one_that_was_stopped_however_little_silence_is_between(silence: int) -> None:
+    (beginning,) = render([LONG], rate=QUICK)
+    first, _ = extent(beginning) or (0, 0)
+    for (following,) in stopped._render_after_stop((LONG, BATTERY), QUICK)[10:13]:
+        behind, last = extent(following) or (0, 0)
+        heard = recorded(beginning[first : first + 4000], np.zeros(silence, np.int16), following[behind:last])
+        stopped.assert_heard_after_stop(heard, LONG, [BATTERY])
+        with pytest.raises(AssertionError):
+            stopped.assert_heard_after_stop(np.delete(heard, slice(len(heard) // 2, -RATE // 4)), LONG, [BATTERY])
 
 
 @pytest.mark.parametrize("dry", [5000, 12000])

@@ -168,12 +168,12 @@ class Outages:
     bridge: list[float] = field(default_factory=list)
 
     def excuse_twice(self, sent: float, first: float, second: float) -> bool:
-        """Whether a goal may be begun twice: the server that knew its id died, and the bridge with it, or so shortly
-        before that the next bridge had no time to ask that server.
+        """Whether a goal may be begun twice: the server that knew its id died, and then the bridge that remembered it,
+        or that so shortly before that the next bridge had no time to ask the server.
         """
         servers = [each for each in self.server if first < each < second]
         bridges = [each for each in self.bridge if sent < each < second]
-        return any(abs(one - other) < _TOGETHER for one in servers for other in bridges)
+        return any(bridge > server - _TOGETHER for server in servers for bridge in bridges)
 
     def excuse_lost(self, reached: float, ended: float) -> bool:
         """Whether a result may be unknown to its desk: the broker died with it, and the server that could repeat it."""

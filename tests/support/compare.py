@@ -223,6 +223,13 @@ def assert_begun(heard: Recording | Samples, reference: Samples, shortest: float
     return seconds
 
 
+def same_until(samples: Samples, reference: Samples) -> int:
+    """Return the place behind the last sample, from the first sound on, that is the same as the reference; else 0."""
+    found = extent(samples)
+    last = _walk(samples, _sound(reference), found[0])[-1:] if found else []
+    return last[0][0] + last[0][2] if last else 0
+
+
 def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float, twice: float = 0.0) -> float:
     """Assert that the reference was heard whole, held once in its middle for at least `pause` seconds.
 
