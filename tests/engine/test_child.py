@@ -72,7 +72,10 @@ def test_its_status_is_that_of_its_end() -> None:
     assert _status(_run("kill -TERM $$")) == -signal.SIGTERM
 
 
-def test_what_cannot_be_started_is_an_error_and_leaves_nothing_open(tmp_path: Path) -> None:
+def test_what_cannot_be_started_is_an_error_and_leaves_nothing_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))  # of folders that this user may enter: of others the error is theirs
     plain = tmp_path / "plain"
     plain.write_text("no program")
     before = os.listdir("/proc/self/fd")
