@@ -133,6 +133,16 @@ def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(
     assert scripted.run("say", "--wait", "length=0").code == 0
 
 
+@pytest.fixture
+def many_files() -> Iterator[None]:
+    """Let the tests open more files than a backlog has places: a user's limit is often as low as that."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.usefixtures("many_files")
 @pytest.mark.parametrize(
     ("processes", "max_queue"),
     [
@@ -218,15 +228,6 @@ def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_t
     assert talk.run("cancel", goal).code == 0
     assert time.monotonic() - began < 5
     assert talk.watcher.wait_for_terminal(goal) == "PREEMPTED"
-
-
-@pytest.fixture
-def many_files() -> Iterator[None]:
-    """Let the tests open more files than a backlog has places: a user's limit is often as low as that."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    yield
-    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 @pytest.mark.usefixtures("many_files")

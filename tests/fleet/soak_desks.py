@@ -76,8 +76,8 @@ class Sent:
     ttl: float | None
     #: whether one desk alone has sent it, once: a result that reached the broker is for that
     once: bool = True
-    #: wall clock, just before it was sent last
-    at: float = field(default_factory=time.time)
+    #: wall clock, just before each time that it was sent
+    at: list[float] = field(default_factory=lambda: [time.time()])
     #: how it ended at a desk, and when (wall clock), for each time that it was sent
     ends: list[tuple[str, float]] = field(default_factory=list)
 
@@ -226,7 +226,8 @@ class Desks:
         return self._said(goal, lambda: client.say(goal.text, id=goal.id, rate=RATE, **options))
 
     def _say_again(self, client: Client, goal: Sent) -> tuple[Sent, GoalHandle] | None:
-        goal.once, goal.at = False, time.time()
+        goal.once = False
+        goal.at.append(time.time())
         return self._said(goal, lambda: client.say(goal.text, id=goal.id, rate=RATE, ttl=goal.ttl))
 
     def _said(self, goal: Sent, say: Callable[[], GoalHandle]) -> tuple[Sent, GoalHandle] | None:

@@ -169,7 +169,7 @@ class Outages:
 
     def excuse_twice(self, sent: float, first: float, second: float) -> bool:
         """Whether a goal may be begun twice: the server that knew its id died, and then the bridge that remembered it,
-        or that so shortly before that the next bridge had no time to ask the server.
+        or that so shortly before that the next bridge had no time to ask the server. `sent`: the first time.
         """
         servers = [each for each in self.server if first < each < second]
         bridges = [each for each in self.bridge if sent < each < second]
@@ -188,11 +188,14 @@ def judge(ledger: Ledger, witness: Witness, overheard: Overheard, outages: Outag
     found = []
     for goal in ledger.all():
         begun = witness.begun(goal.text)
+        sent = list(goal.at)
         twice = [(one.at, other.at) for one, other in pairwise(begun)]
-        if not all(outages.excuse_twice(goal.at, *each) for each in twice):
-            found.append(f"{goal.id} was spoken {len(begun)} times: {begun}")
-        if begun and goal.ttl is not None and begun[0].at > goal.at + goal.ttl + STALE:
-            found.append(f"{goal.id} began {begun[0].at - goal.at:.1f} s after it was sent, its ttl is {goal.ttl:g} s")
+        if not all(outages.excuse_twice(sent[0], *each) for each in twice):
+            found.append(f"{goal.id} was spoken {len(begun)} times: {begun}, sent at {sent}, {outages}")
+        for each in begun:
+            late = each.at - max((at for at in sent if at < each.at), default=sent[0])
+            if goal.ttl is not None and late > goal.ttl + STALE:
+                found.append(f"{goal.id} began {late:.1f} s after it was sent, its ttl is {goal.ttl:g} s")
         settled = [how for how, at in goal.ends if at < now - _BEHIND]
         if settled:
             found += _contradictions(goal, settled, begun, results.get(goal.id), outages)
