@@ -15,7 +15,7 @@ import pytest
 from talkcli import Client
 from talkcli.client.connect import Interrupted
 from talkcli.client.connection import SocketConnection
-from talkcli.errors import Lost, ServerUnavailable
+from talkcli.errors import Lost, RequestRefused, ServerUnavailable
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, PausedChanged, Result, Snapshot, StateChanged, WordHeard
 from tests.support.connection import PATIENCE
@@ -200,6 +200,19 @@ def test_reply_without_a_goal_is_no_goal() -> None:
             client.say("a")
         with pytest.raises(ServerUnavailable):
             client.say("a")
+
+
+@pytest.mark.parametrize("error", [None, "no", {}, {"code": "bad_text", "message": None}, {"message": ""}])
+def test_refusal_without_a_reason_says_so(error: object) -> None:
+    def play(peer: Peer) -> None:
+        peer.send({"seq": peer.receive("pause")["seq"], "ok": False, "error": error})
+
+    with (
+        serving(play) as path,
+        Client(path) as client,
+        pytest.raises(RequestRefused, match=r"^refused: the server gives no reason$"),
+    ):
+        client.pause()
 
 
 def test_events_of_kinds_not_known_here_are_ignored() -> None:

@@ -332,7 +332,7 @@ class BaseConnection:
 
         error = reply.get("error")
         code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
-        return refusal(str(code), printable(str(message)), items)
+        return refusal(str(code), printable(str(message or "refused: the server gives no reason")), items)
 
     # -- what has come
 
