@@ -39,8 +39,9 @@ if TYPE_CHECKING:
 
 #: Seconds for which an event is of use.
 EVENT_EXPIRY = 60
-#: Seconds between two statuses at least.
-STATUS_EVERY = 1.0
+#: Seconds between two statuses at least; and from what happens to the one that tells of it. A goal that is cancelled
+#: is PREEMPTING for some milliseconds: told at once, that it has ended would come a second later.
+STATUS_EVERY, STATUS_AFTER = 1.0, 0.1
 #: Characters of a text in the status: thousands of goals may wait, whose texts are kept for it.
 LONGEST_TEXT = 1_000
 #: Seconds without a line after which the server is taken to hang: it says that it is alive every 5.
@@ -98,7 +99,7 @@ class News:
     def tell(self) -> None:
         """Tell how the robot is, soon."""
         if self._due is None:
-            due = max(self._loop.time(), self._told + STATUS_EVERY)
+            due = max(self._loop.time() + STATUS_AFTER, self._told + STATUS_EVERY)
             self._due = self._loop.call_at(due, self._tell)
 
     def beat(self) -> None:

@@ -201,6 +201,13 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
             assert found, f"simulated robots are not there within {within} s: {self.log[-2000:]}"
             assert "there" in each.stdout.readline(), self.log[-2000:]
 
+    def await_spoken(self, goal_id: str, within: float = THERE_LIMIT) -> None:
+        """Wait until all have begun to speak a goal."""
+        end = time.monotonic() + within
+        while (begun := sum(each.id == goal_id for each in self.spoken)) < len(self.names):
+            assert time.monotonic() < end, f"{begun} of {len(self.names)} speak {goal_id} within {within} s"
+            time.sleep(0.05)  # that a file grows is no event here
+
     def assert_spoken_once(self, goal_id: str, names: Collection[str] | None = None) -> list[Spoken]:
         """Assert that this goal was begun once on each of these robots, all if none are named, and on no other."""
         found = [each for each in self.spoken if each.id == goal_id]

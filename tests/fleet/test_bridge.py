@@ -416,6 +416,18 @@ def test_a_server_that_hangs_is_none_until_it_goes_on(robot: Robot) -> None:
 # What everybody is told
 
 
+def test_everybody_is_told_soon_that_what_was_cancelled_is_spoken_no_more(robot: Robot) -> None:
+    """Not first that it is being cancelled, and a second later that it was."""
+    with Asker(robot.broker) as asker, Listener(robot.broker, f"{ANNA}/status") as everybody:
+        goal = asker.say("never-ends")
+        everybody.await_message(lambda each: each.json["active"] == goal["id"])
+        time.sleep(1.1)  # that nothing is told before the next may be, is no event
+        asked = time.monotonic()
+        asker.ask("cancel")
+        told = everybody.await_message(lambda each: each.arrived > asked).json
+        assert (told["active"], told["last"]["state"]) == (None, "PREEMPTED")
+
+
 def of(messages: list[Published], kind: str) -> list[Message]:
     return [each.json for each in messages if each.topic == f"{ANNA}/{kind}"]
 

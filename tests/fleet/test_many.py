@@ -153,6 +153,7 @@ def test_a_hundred_simulated_robots_beside_three_real_ones() -> None:
         with Desk(broker, env={"TALK_ROBOT": "@all"}) as desk, limits():
             waiting = desk.start("say", "--wait", "--id", "long", "--", "length=60 a long one")
             await_active(real, "long")
+            simulated.await_spoken("long")
             cancelled = desk.run("cancel")
             assert_told(cancelled, 0, alike(everybody, "long", "PREEMPTED", 0), "103 of 103 as asked")
             assert_within(cancelled.seconds, CANCEL, "a cancel of 103 robots")

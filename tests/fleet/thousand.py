@@ -133,12 +133,8 @@ class Stage(contextlib.AbstractContextManager["Stage"]):
 
     def await_spoken(self, goal: str) -> None:
         """Wait until all speak a goal."""
-        end = time.monotonic() + _PATIENCE
         self.real.each(lambda each: each.talk.watcher.wait_for(goal, "ACTIVE"))
-        while sum(each.id == goal for each in self.simulated.spoken) < len(self.simulated.names):
-            if time.monotonic() > end:
-                raise FailedError(f"not all speak {goal}")
-            time.sleep(0.1)
+        self.simulated.await_spoken(goal, _PATIENCE)
 
     def check(self, goal: str, asked: Asked) -> None:
         """See that each has begun a goal once, and in its time."""
