@@ -54,9 +54,10 @@ class Lookout:
         #: what comes on a new connection, until all that the broker keeps has come; None after that
         self._arriving: _Arriving | None = None
         self._begun = False
-        #: by the monotonic clock: since when there is no broker, None while there is; until when each robot that was
-        #: there before that may still come back
+        #: by the monotonic clock: since when there is no broker, None while there is, and why; until when each robot
+        #: that was there before that may still come back
         self._away_since: float | None = time.monotonic()
+        self._why = ""
         self._missing: dict[str, float] = {}
 
     def follow(self, interrupt: Mapping[int, int] | None = None) -> Iterator[Sighting]:
@@ -86,7 +87,7 @@ class Lookout:
 
     def went_down(self, why: str) -> None:
         """Take note of it; that another try has failed is no news."""
-        self._arriving = None
+        self._arriving, self._why = None, why
         if self._away_since is None:
             self._away_since = time.monotonic()
             self._seen.append(Away(why, ABSENCE_LIMIT))
@@ -122,7 +123,7 @@ class Lookout:
             if not self._begun and away >= ANSWER_LIMIT:
                 raise self._desk.unanswered(ANSWER_LIMIT)
             if away >= ABSENCE_LIMIT:
-                raise Lost(f"the broker at {self._broker.url} was away for {ABSENCE_LIMIT:g} s: {self._desk.failure}")
+                raise Lost(f"the broker at {self._broker.url} was away for {ABSENCE_LIMIT:g} s: {self._why}")
         for name in [name for name, until in self._missing.items() if now >= until]:
             del self._missing[name]
             self._change(name, None)

@@ -264,7 +264,8 @@ def test_a_broker_that_stays_away_is_lost(broker: Broker, monkeypatch: pytest.Mo
     monkeypatch.setattr(lookout, "ABSENCE_LIMIT", 0.5)
     with Looking(broker) as looking:
         broker.kill()
-        with pytest.raises(Lost, match=r"was away for 0\.5 s: no broker at"):
+        # The second is so where a busy machine has not tried once by then.
+        with pytest.raises(Lost, match=r"was away for 0\.5 s: (no broker at .*refused|the broker at .* went away)$"):
             looking.find(Back)
         assert looking.find(Away).limit == 0.5
 
