@@ -11,7 +11,6 @@ the same then is judged by its correlation.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -269,24 +268,18 @@ def follow(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[int
 
 
 def _ran_dry(first: Samples, second: Samples, wanted: Samples, twice: int) -> bool:
-    """Return whether these are the two parts of a sentence, in which a player ran dry: see `_exact`.
-
-    Of a player that has to be started again, so that a few samples may be heard `twice`, nobody knows how far it has
-    come but by the clock: where it was dry before, as much may be missing, or be heard twice, as it was.
-    """
+    """Return whether these are the two parts of a sentence, in which a player ran dry: see `_exact`."""
     runs = _walk(first, wanted, 0)
     if not runs or runs[-1][0] + runs[-1][2] < len(first):
         return False
     reached = runs[-1][1] + runs[-1][2]
-    dry = sum(after[0] + after[1] - before[0] - before[1] - 2 * before[2] for before, after in pairwise(runs))
-    unknown = min(dry, _DRY) if twice else 0
-    back = min(reached, twice + unknown + _SLACK)
-    rest = _walk(second, wanted[reached - back :], 0, ahead=back + unknown)
+    back = min(reached, twice + _SLACK)
+    rest = _walk(second, wanted[reached - back :], 0, ahead=back)
     if not rest or len(wanted) - (reached - back + rest[-1][1] + rest[-1][2]) > _LOST:
         return False
     # A stream that goes on loses nothing where it was held; one that was started again, or ran dry, may.
     between = int(np.count_nonzero(wanted[reached : reached - back + rest[0][1]]))
-    return between <= (_LOST + unknown if twice or len(runs) + len(rest) > 2 else 2 * _SLACK)
+    return between <= (_LOST if twice or len(runs) + len(rest) > 2 else 2 * _SLACK)
 
 
 def _assert_parts(first: Samples, second: Samples, wanted: Samples, twice: float) -> None:
