@@ -110,8 +110,8 @@ def test_an_asker_to_whom_nothing_is_owed_is_let_go_without_a_word(
         await house.ask({"seq": 1, "request": "status"})
         told = house.lines()
         pass_time(GONE + 0.1)
-        house.askers.beat()
         before = talk.request("status")["server"]["clients"]
+        house.askers.beat()
         end = time.monotonic() + 5
         while talk.request("status")["server"]["clients"] >= before:
             assert time.monotonic() < end, "the connection to the server is kept"

@@ -1,0 +1,168 @@
+"""The bridge's connection to its server: how it begins, and that nothing is lost or left over on it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli import __version__
+from talkcli.errors import Busy, ServerUnavailable
+from talkcli.fleet.local import dial
+from talkcli.protocol.events import busy_greeting, greeting
+from talkcli.protocol.lines import encode
+from tests.support.surroundings import short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+GREETING = encode(greeting(__version__, 7, "a1b2"))
+PATIENCE = 10.0
+
+
+@pytest.fixture
+def listening() -> Iterator[socket.socket]:
+    """A server's socket, where nobody greets by himself."""
+    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(f"{directory}/s")
+        listening.listen()
+        listening.settimeout(PATIENCE)
+        yield listening
+
+
+def run(work: Callable[[], Awaitable[None]]) -> None:
+    async def within() -> None:
+        await asyncio.wait_for(work(), 2 * PATIENCE)
+
+    asyncio.run(within())
+
+
+async def accepted(listening: socket.socket) -> socket.socket:
+    connected, _ = await asyncio.to_thread(listening.accept)
+    connected.settimeout(PATIENCE)
+    return connected
+
+
+def lines(connected: socket.socket, count: int) -> list[bytes]:
+    with connected.makefile("rb") as said:
+        return [said.readline() for _ in range(count)]
+
+
+@pytest.mark.parametrize("parts", [(GREETING,), (GREETING[:9], GREETING[9:]), (GREETING + b'{"event": 1}\n',)])
+@pytest.mark.parametrize("wait", [0.0, 0.5])
+def test_a_server_that_greets_at_once_or_later_or_in_pieces_is_one(
+    listening: socket.socket, parts: tuple[bytes, ...], wait: float
+) -> None:
+    async def work() -> None:
+        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+        with await accepted(listening) as server:
+            for each in parts:
+                await asyncio.sleep(wait)  # 0.2 s are waited for in the loop, and the rest in a thread
+                server.sendall(each)
+            local = await dialing
+            assert (local.boot, local.pid) == ("a1b2", 7)
+            local.write(b"asked\n")
+            server.sendall(b"answered\n")
+            assert await asyncio.to_thread(lines, server, 2) == [
+                encode({"request": "hello", "name": "bob"}),
+                b"asked\n",
+            ]
+            heard = [each for _ in range(len(parts[-1].splitlines())) for each in await local.read()]
+            assert heard == [*parts[-1].splitlines()[1:], b"answered"]
+            local.close()
+            assert server.recv(1) == b""
+
+    run(work)
+
+
+def test_what_the_server_does_not_take_at_once_comes_later_and_in_order(listening: socket.socket) -> None:
+    sent = [b"%d " % each + b"x" * 60_000 + b"\n" for each in range(50)]
+
+    async def work() -> None:
+        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+        with await accepted(listening) as server:
+            server.sendall(GREETING)
+            local = await dialing
+            for each in sent:
+                local.write(each)
+            assert (await asyncio.to_thread(lines, server, 51))[1:] == sent
+            local.write(b"and more\n")
+            assert await asyncio.to_thread(lines, server, 1) == [b"and more\n"]
+            local.close()
+
+    run(work)
+
+
+@pytest.mark.parametrize("who", ["the server", "the bridge"])
+def test_one_who_reads_hears_of_the_end_whoever_ends_it(listening: socket.socket, who: str) -> None:
+    async def work() -> None:
+        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+        with await accepted(listening) as server:
+            server.sendall(GREETING)
+            local = await dialing
+            reading = asyncio.create_task(local.read())
+            await asyncio.sleep(0.05)
+            (server if who == "the server" else local).close()
+            assert await reading == []
+            for _ in range(2):
+                local.write(b"to nobody\n")
+                local.close()
+            assert await local.read() == []
+
+    run(work)
+
+
+@pytest.mark.parametrize("said", [encode(busy_greeting()), b"220 mail\n", b""])
+def test_one_that_does_not_let_it_in_is_none(
+    listening: socket.socket, said: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("talkcli.client.connect.BUSY_LIMIT", 0.3)
+
+    async def work() -> None:
+        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+        with contextlib.suppress(TimeoutError):
+            while not dialing.done():  # a busy one is tried again
+                listening.settimeout(0.5)
+                with await accepted(listening) as server:
+                    server.sendall(said)
+        with pytest.raises(Busy if said.startswith(b"{") else ServerUnavailable):
+            await dialing
+
+    run(work)
+
+
+@pytest.mark.parametrize("wait", [0.0, 0.4])
+def test_one_who_gives_up_keeps_the_place_until_the_server_has_greeted(listening: socket.socket, wait: float) -> None:
+    async def work() -> None:
+        slots = asyncio.Semaphore(1)
+        dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
+        await asyncio.sleep(wait)
+        with await accepted(listening) as server:
+            dialing.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await dialing
+            assert slots.locked()
+            server.sendall(GREETING)
+            await slots.acquire()
+            assert lines(server, 2) == [encode({"request": "hello", "name": "bob"}), b""]
+
+    run(work)
+    gc.collect()  # what is left open would be told here
+
+
+def test_no_socket_that_is_left_costs_no_place(listening: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(_: str | None) -> None:
+        raise OSError("Too many open files")
+
+    async def work() -> None:
+        slots = asyncio.Semaphore(1)
+        with pytest.raises(OSError, match="Too many"):
+            await dial(listening.getsockname(), "bob", slots=slots)
+        assert not slots.locked()
+
+    monkeypatch.setattr("talkcli.fleet.local.reach", none_left)
+    run(work)
