@@ -20,6 +20,7 @@ from tests.support.compare import (
     compare,
     extent,
 )
+from tests.support.recording import LOUD
 from tests.support.reference import RATE, Sentence, render
 
 if TYPE_CHECKING:
@@ -205,6 +206,24 @@ def test_a_player_that_ran_dry_changes_nothing_about_a_sentence_that_was_stopped
     for wrong in (low[16000:], low[14000:]):
         with pytest.raises(AssertionError):
             assert_resumed(recorded(begun[:16000], pause, wrong), low, 1.9)
+
+
+def test_what_is_quiet_beside_a_pause_is_the_sentences_own() -> None:
+    """A sentence with zeros of its own, between sounds that are hardly any, is held there; and it ran dry before."""
+    (sentence,) = render([Sentence("two three four five six seven eight nine ten", rate=450)])
+    sounds = np.flatnonzero(sentence)
+    places = [int(sounds[each]) for each in np.flatnonzero(np.diff(sounds) > 200)]
+    gap, pause = np.zeros(900, np.int16), np.zeros(2 * RATE, np.int16)
+    quiet = [place for place in places if np.abs(sentence[place - 8 : place + 1]).max() < LOUD and place > 9000]
+    assert quiet
+    for place in quiet:
+        for at in (place + 1, place + 100):
+            begun = np.concatenate([sentence[:5000], gap, sentence[5000:at]])
+            assert_resumed(recorded(begun, pause, sentence[at:]), sentence, 1.9)
+            assert_resumed(recorded(begun, pause, sentence[at - 800 :]), sentence, 1.9, twice=0.05)
+            for wrong in (sentence[at + 1500 :], sentence[at - 1500 :]):
+                with pytest.raises(AssertionError):
+                    assert_resumed(recorded(begun, pause, wrong), sentence, 1.9, twice=0.05)
 
 
 def test_a_sentence_that_was_held_is_recognised_by_its_parts(low: Samples) -> None:

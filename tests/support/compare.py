@@ -239,15 +239,19 @@ def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float,
     samples = heard.samples if isinstance(heard, Recording) else heard
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
     assert len(loud) > 1, f"no sentence was heard: {_told(samples, [])}"
-    gap = int(np.argmax(np.diff(loud)))
-    first, second = samples[loud[0] : loud[gap] + 1], samples[loud[gap + 1] : loud[-1] + 1]
-    held = float(loud[gap + 1] - loud[gap]) / RATE
+    # What is quiet beside the pause is the sentence's own: where it is held there are but zeros.
+    sound = loud[0] + np.flatnonzero(samples[loud[0] : loud[-1] + 1])
+    gap = int(np.argmax(np.diff(sound)))
+    end, again = int(sound[gap]) + 1, int(sound[gap + 1])
+    first, second = samples[loud[0] : end], samples[again : loud[-1] + 1]
+    held = (again - end + 1) / RATE
     assert held >= pause, f"held for {held:.3f} s: {_told(samples, [])}"
     wanted = _sound(reference)
     try:
         _assert_parts(first, second, wanted, twice)
     except AssertionError as error:
-        if not _ran_dry(first, second, wanted, round(twice * RATE)):
+        # Zeros of the sentence's own, where it was held at them, can't be told from those of the pause.
+        if not _ran_dry(first, samples[end : loud[-1] + 1], wanted, round(twice * RATE)):
             runs = [_walk(each, wanted, 0, ahead=len(wanted)) for each in (first, second)]
             told = f"parts of {len(first)} and {len(second)} samples, sample by sample (heard at, its own, so many)"
             raise AssertionError(f"{error}; {told}: {runs[0]} and {runs[1]} of {len(wanted)}") from error
