@@ -42,9 +42,10 @@ _NEARBY = RATE // 20
 #: Samples of silence that players that ran dry may put into one sentence.
 _DRY = RATE // 2
 #: Samples that the monitor may lose where a stream starts, and where a player ran dry: up to 217 were seen to be. And
-#: those that it may lose once in a sentence without a sign of that: up to 110 were, on a busy machine, where the second
-#: piece of a neural voice's sound had come just in time, and the player knew of no gap.
-_LOST, _LOST_ONCE = 256, 192
+#: those that it may lose once in a sentence without a sign of that: up to 110 were, on a machine that kept the engine
+#: waiting for 48 ms. The sound server says then that it ran dry, there, and 0.3 ms later that it goes on: what it has
+#: rendered it takes back, and in the monitor are neither the zeros nor the first of what replaces them.
+_LOST, _LOST_ONCE = 256, 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,14 @@ class Comparison:
     def end(self) -> int:
         """The sample of the recording after the last that was compared."""
         return int(self.places[0][-1]) + 1 if self.places else self.offset + round(self.expected * RATE)
+
+    @property
+    def gaps(self) -> list[float]:
+        """The seconds of each silence that is not the reference's own."""
+        if self.places is None:
+            return []
+        longer = np.diff(self.places[0]) - np.diff(self.places[1])
+        return [float(each) / RATE for each in longer[longer > 0]]
 
 
 def extent(samples: Samples, loud: int = LOUD) -> tuple[int, int] | None:
