@@ -1,10 +1,11 @@
 """One connection to the robot's own server, from nothing to its end: it has greeted, and lines go both ways.
 
-What waits has a thread of its own meanwhile. Nothing here knows what the lines say.
+What waits for longer than a moment has a thread of its own. But for the greeting nothing here knows what lines say.
 """
 
 from __future__ import annotations
 
+import _socket  # see `peers`
 import asyncio
 import contextlib
 import threading
@@ -48,6 +49,8 @@ class Local:
         #: done once there may be something to read
         self._readable: asyncio.Future[None] | None = None
         self._closed = False
+        #: whether what came last was there already, so that others may have waited
+        self._busy = False
 
     async def read(self) -> list[bytes]:
         """Return the lines that have come since, at least one, without their newlines; none once it has ended."""
@@ -77,14 +80,18 @@ class Local:
 
     async def _receive(self) -> bytes:
         """Return what comes next; nothing once it has ended."""
+        if self._busy:
+            await asyncio.sleep(0)
+        self._busy = True
         while not self._closed:
             try:
                 return self._socket.recv(_READ)
             except BlockingIOError:
-                self._readable = self._loop.create_future()
-                self._loop.add_reader(self._socket, self._wake)
+                self._busy = False
             except OSError:
                 break
+            self._readable = self._loop.create_future()
+            self._loop.add_reader(self._socket, self._wake)
             try:
                 await self._readable
             finally:
@@ -97,7 +104,7 @@ class Local:
             self._readable.set_result(None)
 
     def _send(self) -> None:
-        """Send what the server takes of what waits; that the connection has broken is found by who reads."""
+        """Send what the server takes of what waits; that the connection has broken is told by who reads."""
         if self._closed:
             return
         try:
@@ -106,6 +113,8 @@ class Local:
             pass
         except OSError:
             self._unsent.clear()
+            with contextlib.suppress(OSError):
+                self._socket.shutdown(_socket.SHUT_RDWR)  # half a line may have gone: nothing may follow it
         if self._unsent:
             self._loop.add_writer(self._socket, self._send)
         else:
@@ -131,11 +140,14 @@ async def dial(socket: str | None, name: str, *, urgent: bool = False, slots: as
         raise
 
     def rest() -> asyncio.Future[Begun]:
-        return apart(lambda: connect(place, words, begun=begun), _hang_up, finished)
+        going = apart(lambda: connect(place, words, begun=begun), _hang_up, finished)
+        if going.done():  # it could not begin
+            _hang_up(begun)
+        return going
 
     try:
         begun = await _hear(begun)
-    except asyncio.CancelledError:
+    except BaseException:
         rest().cancel()  # what has connected is in the server's way until it has greeted, whoever waits for that
         raise
     greeting, ended, _ = begun.received.partition(b"\n")
@@ -143,13 +155,14 @@ async def dial(socket: str | None, name: str, *, urgent: bool = False, slots: as
         return Local(await rest())
     if finished:
         finished()
-    return Local(connect(place, words, begun=begun))  # it has all that it would wait for
+    return Local(connect(place, words, 0, begun=begun))  # it has all that it would wait for
 
 
 def _say_hello(begun: Begun, words: JsonObject) -> Begun:
-    if begun.socket:
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # it has hung up; it may have said why
-            begun.socket.send(encode(words))
+    if not begun.socket:
+        return begun
+    with contextlib.suppress(OSError):  # it has hung up; it may have said why
+        begun.socket.send(encode(words))
     return replace(begun, greeted=True)
 
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gc
 import socket
+import threading
 from typing import TYPE_CHECKING
 
 import pytest
@@ -112,6 +113,77 @@ def test_one_who_reads_hears_of_the_end_whoever_ends_it(listening: socket.socket
                 local.write(b"to nobody\n")
                 local.close()
             assert await local.read() == []
+
+    run(work)
+
+
+def test_others_have_their_turn_while_a_server_has_much_to_say(listening: socket.socket) -> None:
+    async def work() -> None:
+        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+        with await accepted(listening) as server:
+            server.sendall(GREETING)
+            local = await dialing
+            server.setblocking(False)
+            said = 0
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    said += server.send(b'{"event": "alive"}\n' * 500)
+            turns = reads = heard = 0
+
+            def look() -> None:
+                nonlocal turns
+                turns += 1
+                asyncio.get_running_loop().call_soon(look)
+
+            look()
+            while heard < said // 19:
+                heard += len(await local.read())
+                reads += 1
+            assert turns >= reads > 1
+            local.close()
+
+    run(work)
+
+
+def test_one_that_can_be_told_nothing_more_has_ended(listening: socket.socket) -> None:
+    """Part of a line may have gone: what came behind that would be another request."""
+
+    async def work() -> None:
+        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+        with await accepted(listening) as server:
+            server.sendall(GREETING)
+            local = await dialing
+            lines(server, 1)
+            reading = asyncio.create_task(local.read())
+            await asyncio.sleep(0)
+            server.shutdown(socket.SHUT_RD)
+            local.write(b"asked\n")
+            assert await reading == []
+            local.write(b"asked again\n")
+            local.close()
+
+    run(work)
+
+
+@pytest.mark.parametrize("given_up", [False, True])
+def test_where_no_thread_can_be_started_nothing_is_left_over(
+    listening: socket.socket, monkeypatch: pytest.MonkeyPatch, given_up: bool
+) -> None:
+    def no_more(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    async def work() -> None:
+        slots = asyncio.Semaphore(1)
+        dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
+        with await accepted(listening) as server:
+            with monkeypatch.context() as patched:
+                patched.setattr(threading.Thread, "start", no_more)
+                if given_up:
+                    dialing.cancel()
+                with pytest.raises(asyncio.CancelledError if given_up else RuntimeError):
+                    await dialing
+            assert lines(server, 2)[1] == b""
+        assert not slots.locked()
 
     run(work)
 
