@@ -216,8 +216,10 @@ class Bridge:
 
     def _forget_descriptor(self) -> None:
         if self._descriptor >= 0:
-            self._loop.remove_reader(self._descriptor)
-            self._loop.remove_writer(self._descriptor)
+            for forget in (self._loop.remove_reader, self._loop.remove_writer):
+                # Where paho has closed it already, one that is watched for both is forgotten with an error.
+                with contextlib.suppress(OSError):
+                    forget(self._descriptor)
             self._descriptor, self._writing = -1, False
 
     def _read(self) -> None:

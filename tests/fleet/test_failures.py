@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
+from paho.mqtt import client as paho
 
+from talkcli.fleet.bridge import Bridge, Settings
+from talkcli.fleet.broker import from_environment
 from tests.fleet.asker import Asker
 from tests.fleet.robot import LONG, Robot
 from tests.support.bridge import desk
+from tests.support.connection import PATIENCE
 from tests.support.mqtt import Listener, mosquitto
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from tests.conftest import MakeTalk
     from tests.fleet.conftest import MakeBridge
     from tests.support.broker import Broker
-    from tests.support.processes import Finished
+    from tests.support.processes import Finished, Talk
 
 #: Seconds in which a desk knows that a robot is not there: that is "at once", for who waits at a prompt.
 AT_ONCE = 1.0
@@ -67,6 +74,42 @@ def test_a_broker_that_is_not_there_is_told_and_nothing_is_spoken_when_it_is_bac
     robot.broker.start()
     robot.bridge.await_online(within=15)
     assert_spoken(robot)
+
+
+def test_a_connection_that_breaks_under_an_answer_is_made_again(
+    scripted: Talk, broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What had come is read, and then the answer can't be sent, while the bridge still waits for room for it."""
+    bugs: list[object] = []
+    original = paho.Client._sock_send
+
+    def send(client: paho.Client, data: bytes) -> int:
+        if b"not_allowed" in data:
+            raise ConnectionResetError
+        return original(client, data)
+
+    async def until(wanted: Callable[[], bool]) -> None:
+        while not wanted():  # noqa: ASYNC110 - a bridge tells nobody
+            await asyncio.sleep(0.01)
+
+    async def run() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _loop, told: bugs.append(told))
+        settings = Settings("anna", from_environment(broker.env()), ("say",), socket=scripted.socket)
+        bridge = Bridge(settings, lambda: settings.broker)
+        work = asyncio.create_task(bridge.run())
+        await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)
+        with Asker(broker, "olga") as olga:
+            monkeypatch.setattr(paho.Client, "_sock_send", send)
+            olga.send({"seq": 1, "request": "set", "rate": 200})
+            await asyncio.wait_for(until(lambda: not bridge.ready), PATIENCE)
+            await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)
+            olga.send({"seq": 2, "request": "say", "text": "hello"})
+            assert (await asyncio.to_thread(olga.reply, 2))["ok"]
+        bridge.end()
+        await work
+
+    asyncio.run(run())
+    assert not bugs
 
 
 def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:
