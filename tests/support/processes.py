@@ -50,11 +50,16 @@ class Finished:
 
 def children(pid: int) -> list[int]:
     """Return the children of a process, whichever of its threads started them."""
-    found: list[int] = []
-    for thread in os.listdir(f"/proc/{pid}/task"):
-        with open(f"/proc/{pid}/task/{thread}/children", encoding="ascii") as file:
-            found += map(int, file.read().split())
-    return found
+    while True:
+        found: list[int] = []
+        threads = os.listdir(f"/proc/{pid}/task")
+        try:
+            for thread in threads:
+                with open(f"/proc/{pid}/task/{thread}/children", encoding="ascii") as file:
+                    found += map(int, file.read().split())
+        except (FileNotFoundError, ProcessLookupError):
+            continue  # a thread has ended meanwhile: its children are another's now, which may have been looked at
+        return found
 
 
 def start_talk(words: Sequence[str], env: Mapping[str, str], stdin: int = subprocess.DEVNULL) -> Process:
