@@ -27,7 +27,7 @@ def test_what_comes_of_it_is_undone_where_nobody_waits_any_more() -> None:
     go, undone = threading.Event(), asyncio.Event()
 
     async def give_up() -> None:
-        work = asyncio.ensure_future(apart(lambda: go.wait(5), lambda result: undone.set() if result else None))
+        work = apart(lambda: go.wait(5), lambda result: undone.set() if result else None)
         await asyncio.sleep(0)
         work.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -43,7 +43,7 @@ def test_it_is_over_when_its_thread_is_and_not_when_nobody_waits_any_more(monkey
 
     async def give_up() -> None:
         over = asyncio.Event()
-        work = asyncio.ensure_future(apart(lambda: go.wait(5), finished=over.set))
+        work = apart(lambda: go.wait(5), finished=over.set)
         await asyncio.sleep(0)
         work.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -70,7 +70,7 @@ def test_the_end_does_not_wait_for_it() -> None:
     go = threading.Event()
 
     async def leave() -> None:
-        work = asyncio.ensure_future(apart(lambda: go.wait(30)))
+        work = apart(lambda: go.wait(30))
         await asyncio.sleep(0)
         work.cancel()
 

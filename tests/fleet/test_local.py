@@ -19,7 +19,9 @@ from talkcli.protocol.lines import encode
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+
+    from talkcli.fleet.local import Local
 
 GREETING = encode(greeting(__version__, 7, "a1b2"))
 PATIENCE = 10.0
@@ -46,6 +48,15 @@ async def accepted(listening: socket.socket) -> socket.socket:
     connected, _ = await asyncio.to_thread(listening.accept)
     connected.settimeout(PATIENCE)
     return connected
+
+
+@contextlib.asynccontextmanager
+async def greeted(listening: socket.socket) -> AsyncIterator[tuple[Local, socket.socket]]:
+    """A connection, and the server's end of it."""
+    dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+    with await accepted(listening) as server:
+        server.sendall(GREETING)
+        yield await dialing, server
 
 
 def lines(connected: socket.socket, count: int) -> list[bytes]:
@@ -84,10 +95,7 @@ def test_what_the_server_does_not_take_at_once_comes_later_and_in_order(listenin
     sent = [b"%d " % each + b"x" * 60_000 + b"\n" for each in range(50)]
 
     async def work() -> None:
-        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
-        with await accepted(listening) as server:
-            server.sendall(GREETING)
-            local = await dialing
+        async with greeted(listening) as (local, server):
             for each in sent:
                 local.write(each)
             assert (await asyncio.to_thread(lines, server, 51))[1:] == sent
@@ -101,10 +109,7 @@ def test_what_the_server_does_not_take_at_once_comes_later_and_in_order(listenin
 @pytest.mark.parametrize("who", ["the server", "the bridge"])
 def test_one_who_reads_hears_of_the_end_whoever_ends_it(listening: socket.socket, who: str) -> None:
     async def work() -> None:
-        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
-        with await accepted(listening) as server:
-            server.sendall(GREETING)
-            local = await dialing
+        async with greeted(listening) as (local, server):
             reading = asyncio.create_task(local.read())
             await asyncio.sleep(0.05)
             (server if who == "the server" else local).close()
@@ -119,10 +124,7 @@ def test_one_who_reads_hears_of_the_end_whoever_ends_it(listening: socket.socket
 
 def test_others_have_their_turn_while_a_server_has_much_to_say(listening: socket.socket) -> None:
     async def work() -> None:
-        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
-        with await accepted(listening) as server:
-            server.sendall(GREETING)
-            local = await dialing
+        async with greeted(listening) as (local, server):
             server.setblocking(False)
             said = 0
             with contextlib.suppress(BlockingIOError):
@@ -149,10 +151,7 @@ def test_one_that_can_be_told_nothing_more_has_ended(listening: socket.socket) -
     """Part of a line may have gone: what came behind that would be another request."""
 
     async def work() -> None:
-        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
-        with await accepted(listening) as server:
-            server.sendall(GREETING)
-            local = await dialing
+        async with greeted(listening) as (local, server):
             lines(server, 1)
             reading = asyncio.create_task(local.read())
             await asyncio.sleep(0)
