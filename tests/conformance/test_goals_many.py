@@ -19,7 +19,7 @@ from tests.conformance.stopped import DROPPED
 from tests.conformance.told import assert_told_in_order
 from tests.conformance.witness import ends
 from tests.support import census
-from tests.support.compare import alike, compare, extent
+from tests.support.compare import alike, compare
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, render
 from tests.support.timing import assert_within, limits
@@ -195,14 +195,13 @@ def _assert_alike(heard: Samples, reference: Samples) -> None:
     player that ran dry puts them in, and what the monitor drops there shifts what follows a little.
     """
     sound, wanted = _sounding(heard), _sounding(reference)
-    # What was heard begins before the sentence does: there are scraps of those that it has preempted.
-    (first, last), (begin, end) = (extent(each) or (0, 0) for each in (sound, wanted))
-    sound = sound[first + max(0, min(last - first - (end - begin), round(PRECISION * RATE))) :]
     compared = compare(sound, wanted)
     assert abs(compared.heard - compared.expected) <= 0.02, compared
     # Of another sentence they are about 0.1 and 0.2; the first is low as well where the monitor dropped something.
     assert max(compared.correlation, alike(sound, wanted)) > 0.5, compared
     heard_from, begin = (int(np.flatnonzero(np.abs(each.astype(np.int32)) > LOUD)[0]) for each in (sound, wanted))
+    # What it is longer by stands before it: scraps of the sentences that it has preempted.
+    heard_from += max(0, round((compared.heard - compared.expected) * RATE))
     frame = RATE // 20
     starts = np.arange(0, round(compared.expected * RATE) - frame + 1, frame)
     own = np.array([_loudness(wanted[begin + start :][:frame]) for start in starts])
