@@ -169,7 +169,7 @@ def test_a_goal_that_is_longer_than_the_broker_takes_is_told_of_without_its_word
     talk = make_talk(scripted=True)
     with Broker(max_packet=4096) as broker, Asker(broker) as asker:
         make_bridge(talk, broker, "anna")
-        goal = asker.say("long " * 700, wait=True, key="door")
+        goal = asker.say("never-ends " + "long " * 700, wait=True, key="door")
         assert (goal["text"], goal["key"]) == (None, "door")
         asker.line(lambda each: each.get("state") == "ACTIVE")
         active = asker.ask("status")["active"]
