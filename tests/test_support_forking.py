@@ -77,6 +77,15 @@ def test_it_reads_its_standard_input(env: dict[str, str], tmp_path: pathlib.Path
     assert said.stat().st_size > 1000
 
 
+def test_a_signal_is_not_lost_however_early_it_comes(env: dict[str, str]) -> None:
+    for _ in range(30):
+        reading = piped(["say", "-"], env)  # which would wait for ever
+        reading.send_signal(signal.SIGINT)
+        assert reading.wait(LIMIT) in (130, -signal.SIGINT)
+        assert reading.stdin
+        reading.communicate(timeout=LIMIT)
+
+
 def test_its_streams_may_be_files_and_one_another(env: dict[str, str], tmp_path: pathlib.Path) -> None:
     with open(tmp_path / "both", "wb") as both, Forked(["status"], env, stdout=both.fileno(), stderr=subprocess.STDOUT):
         pass

@@ -20,6 +20,7 @@ from tests.support.timing import assert_within, limits
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from tests.support.connection import Wire
     from tests.support.processes import Process, Talk
 
 #: Seconds that a client's start and end may take besides what is measured.
@@ -50,12 +51,14 @@ def test_row_07_server_that_is_killed_loses_the_goal(scripted: Talk) -> None:
     assert goal["message"].startswith("Talk lost: ")
 
 
-def _until_watched(talk: Talk, clients: int) -> None:
-    """Wait until so many clients are connected: this one's question, the watcher and those that wait."""
+def _until_connected(wire: Wire, clients: int) -> None:
+    """Wait until so many clients are: this one, the watcher and those that wait.
+
+    `wire`: one for all questions of a test: each would count until the server has seen it go.
+    """
     end = time.monotonic() + 5
-    with talk.connect() as wire:  # one for all questions: each would count until the server has seen it go
-        while wire.request("status")["server"]["clients"] != clients:
-            assert time.monotonic() < end, "the clients have not connected"
+    while wire.request("status")["server"]["clients"] != clients:
+        assert time.monotonic() < end, "the clients have not connected"
 
 
 def test_row_08_timeout_holds_while_the_server_is_frozen(scripted: Talk) -> None:
@@ -165,8 +168,10 @@ def test_row_31_goal_that_ended_is_known_to_any_process(scripted: Talk) -> None:
 def test_wait_returns_the_code_of_the_first_in_order_that_did_not_succeed(scripted: Talk) -> None:
     active, *pending = (scripted.run("say", "never-ends", str(each)).id for each in range(3))
     scripted.watcher.wait_for_word(active)
-    waiters = [scripted.start("wait", *ids) for ids in ((*pending, active), (active, *pending), ())]
-    _until_watched(scripted, 5)
+    with scripted.connect() as wire:
+        _until_connected(wire, 2)
+        waiters = [scripted.start("wait", *ids) for ids in ((*pending, active), (active, *pending), ())]
+        _until_connected(wire, 5)
     scripted.run("cancel")
     assert [scripted.finish(each).code for each in waiters] == [6, 7, 0]  # without an id, it only waits
 
@@ -180,11 +185,12 @@ def test_row_33_signal_ends_what_the_client_owns(
     scripted: Talk, command: str, number: signal.Signals, code: int
 ) -> None:
     client, goal_id = speaking(scripted, "--wait") if command == "say" else speaking(scripted)
-    if command == "wait":
-        assert scripted.finish(client).id == goal_id
-        _until_watched(scripted, 2)
-        client = scripted.start("wait", goal_id)
-    _until_watched(scripted, 3)
+    with scripted.connect() as wire:
+        if command == "wait":
+            assert scripted.finish(client).id == goal_id
+            _until_connected(wire, 2)
+            client = scripted.start("wait", goal_id)
+        _until_connected(wire, 3)
     client.send_signal(number)
     done = scripted.finish(client)
     assert done.code == code

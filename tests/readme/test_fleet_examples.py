@@ -231,9 +231,10 @@ def test_broker_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> No
 
 
 @runs("Topics")
-def test_plain_text_is_spoken_and_cancelled(site: Site) -> None:
+def test_plain_text_is_said_and_cancelled(site: Site) -> None:
+    site.talk.request("pause")  # else it may have been spoken before
     assert site.run("Topics") == ""
-    goal = site.goal("the washing is done", "PREEMPTED", "RECALLED")
+    goal = site.goal("the washing is done", "RECALLED")
     assert (goal["client"]["name"], goal["by"]["client"]["name"]) == ("mqtt:ha", "mqtt:ha")
 
 

@@ -107,6 +107,7 @@ def _become(asked: dict[str, Any], given: list[int], parent: int) -> None:
         os.dup2(each, number)
     os.closerange(3, max(map(int, os.listdir("/proc/self/fd"))) + 1)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     os.environ.clear()
     os.environ.update(asked["env"])
     os.chdir(asked["directory"])
@@ -130,6 +131,8 @@ if __name__ == "__main__":
     _import_talk()
     gc.collect()
     gc.freeze()  # so that no child copies what none of them frees
+    # Python forgets, in the child, the signals that came during a fork: this one waits until the child is itself.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     request = _serve(socket.socket(fileno=int(sys.argv[1])))
 
     from talkcli.cli import main
