@@ -53,13 +53,13 @@ def children(pid: int) -> list[int]:
     while True:
         found: list[int] = []
         threads = os.listdir(f"/proc/{pid}/task")
-        try:
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             for thread in threads:
                 with open(f"/proc/{pid}/task/{thread}/children", encoding="ascii") as file:
                     found += map(int, file.read().split())
-        except (FileNotFoundError, ProcessLookupError):
-            continue  # a thread has ended meanwhile: its children are another's now, which may have been looked at
-        return found
+        # Where a thread has ended meanwhile, its children are another's now, which may have been looked at before.
+        if set(threads) <= set(os.listdir(f"/proc/{pid}/task")):
+            return found
 
 
 def start_talk(words: Sequence[str], env: Mapping[str, str], stdin: int = subprocess.DEVNULL) -> Process:
