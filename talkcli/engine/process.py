@@ -68,6 +68,8 @@ class EngineProcess:
         `env`: if not this process's; `command`: its command line, if not `engine_command`'s.
         """
         self.ready = False
+        #: whether it has said anything of a goal
+        self.used = False
         #: what the process said itself of why it cannot start
         self.failed: protocol.StartFailed | None = None
         #: the monotonic time by which it must be gone, once it was killed; for who watches over it

@@ -28,7 +28,7 @@ BACK_OFF = (0.0, 0.1, 0.5, 2.0, 10.0)
 #: Lines of the process's standard error that are passed on in a while, and the seconds of that: a whole traceback, and
 #: no flood, as a driver of somebody else's may write a line for each word, for months.
 LINES, WHILE = 20, 60.0
-#: A ready process that dies sooner than this, with no goal in hand, was of no use.
+#: A ready process that dies sooner than this, and has had no goal, was of no use.
 SHORT_LIFE = 1.0
 #: Seconds without a ready process after which each start that fails costs a goal: nobody waits for ever.
 PATIENCE = 10.0
@@ -83,7 +83,7 @@ class Restarts:
         self._missing_since = now
 
     def died(self, now: float, *, age: float, had_goal: bool) -> None:
-        """Plan the start after a process that had been ready; one that died over a goal costs no wait."""
+        """Plan the start after a process that had been ready; one that has had a goal costs no wait."""
         self._missing_since = now
         if had_goal or age > SHORT_LIFE:
             self._failures = 0
@@ -398,6 +398,7 @@ class Supervisor:
     def _note(self, process: EngineProcess, event: protocol.Event) -> None:
         self._load_heard_at = time.monotonic()
         if isinstance(event, protocol.OF_A_GOAL):
+            process.used = True
             if self._goal and self._goal.spoken and event.id == self._goal.say.id:  # else it has ended already
                 self._note_of(self._goal, event)
             return
@@ -436,14 +437,13 @@ class Supervisor:
         self._selector.unregister(process.socket.fileno())
         process.gone_by = now + SILENCE_LIMIT
         self._dying.append(process)
-        goal = self._goal
-        had_goal = goal is not None and goal.spoken
-        if goal and had_goal:
+        goal = self._goal if self._goal and self._goal.spoken else None
+        if goal:
             self._take_back(goal, process, words, reason)
         if not (self._closing or process.failed):
             self._post(EngineDied(words))
         if process.ready:
-            self._restarts.died(now, age=now - self._started_at, had_goal=had_goal)
+            self._restarts.died(now, age=now - self._started_at, had_goal=goal is not None or process.used)
         elif process.failed:
             self._start_failed(process.failed.message, lasting=process.failed.lasting)
         else:

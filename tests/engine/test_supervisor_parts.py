@@ -127,7 +127,7 @@ class Undying:
     """Stands for a process that had a goal, and that no kill ends for long."""
 
     def __init__(self) -> None:
-        self.ready, self.failed, self.gone_by = True, None, 0.0
+        self.ready, self.used, self.failed, self.gone_by = True, True, None, 0.0
         self.socket, self._other = socket.socketpair()
         self.stderr = self._other.fileno()
         self.liveness = os.dup(self.stderr)

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.engine.supervisor import BACK_OFF
 from tests.conformance.hearing import LONG, begin, engine_process, send
 from tests.faults.broken import python_path, write
 from tests.support import census
+from tests.support.connection import PATIENCE
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -46,6 +48,17 @@ def too_few_descriptors(talk: Talk) -> Iterator[None]:
 def _scripted_engine(talk: Talk) -> int:
     (engine,) = census.descendants(talk.pid)
     return engine
+
+
+def _replaced(talk: Talk, engine: int) -> int:
+    """Kill the engine process, and return the next one, once it is there."""
+    os.kill(engine, signal.SIGKILL)
+    end = time.monotonic() + PATIENCE
+    while not (found := set(census.descendants(talk.pid)) - {engine}):
+        assert time.monotonic() < end, talk.log
+        time.sleep(0.002)  # a process that is started is no event
+    (next_one,) = found
+    return next_one
 
 
 def _ends(talk: Talk, goals: list[str]) -> list[tuple[str, str | None]]:
@@ -86,11 +99,7 @@ def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted
     talk.script_start("hang")  # so that each start can be met in its middle
     engine = _scripted_engine(talk)
     for _ in range(3):
-        os.kill(engine, signal.SIGKILL)
-        known = engine
-        while not (found := set(census.descendants(talk.pid)) - {known}):
-            time.sleep(0.002)  # a process that is started is no event
-        (engine,) = found
+        engine = _replaced(talk, engine)
     talk.script_start("")
     os.kill(engine, signal.SIGKILL)
     assert _ends(talk, [first]) == [("ABORTED", "engine_crashed")]
@@ -104,6 +113,13 @@ def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(m
         os.kill(engine_process(talk), signal.SIGKILL)
         goal = send(talk, "yes", rate=450)
         assert _ends(talk, [goal]) == [("SUCCEEDED", None)], talk.goal(goal)
+
+
+def test_engines_that_have_spoken_and_are_killed_while_idle_are_replaced_at_once(scripted: Talk) -> None:
+    engine = _scripted_engine(scripted)
+    for _ in range(2 * len(BACK_OFF)):
+        engine = _replaced(scripted, engine)
+        assert _ends(scripted, [send(scripted, "length=0")]) == [("SUCCEEDED", None)]
 
 
 def test_an_engine_that_does_not_come_for_long_costs_a_goal_each_time_it_is_tried(
