@@ -68,7 +68,7 @@ class EngineProcess:
         `env`: if not this process's; `command`: its command line, if not `engine_command`'s.
         """
         self.ready = False
-        #: whether it has said anything of a goal
+        #: whether it has said anything of a goal; for who watches over it
         self.used = False
         #: what the process said itself of why it cannot start
         self.failed: protocol.StartFailed | None = None

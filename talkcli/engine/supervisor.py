@@ -398,8 +398,8 @@ class Supervisor:
     def _note(self, process: EngineProcess, event: protocol.Event) -> None:
         self._load_heard_at = time.monotonic()
         if isinstance(event, protocol.OF_A_GOAL):
-            process.used = True
             if self._goal and self._goal.spoken and event.id == self._goal.say.id:  # else it has ended already
+                process.used = True
                 self._note_of(self._goal, event)
             return
         if isinstance(event, protocol.Ready):

@@ -52,7 +52,7 @@ def test_row_07_server_that_is_killed_loses_the_goal(scripted: Talk) -> None:
 
 
 def _until_connected(wire: Wire, clients: int) -> None:
-    """Wait until so many clients are: this one, the watcher and those that wait.
+    """Wait until so many clients are connected: this one, the watcher and those that wait.
 
     `wire`: one for all questions of a test: each would count until the server has seen it go.
     """

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 
 LACKING = "no library"
+YES = protocol.Say("g1", "yes", 200, 1.0, None, 50)
 
 
 def test_the_wait_grows_with_each_process_that_never_got_ready() -> None:
@@ -124,10 +125,10 @@ def test_what_is_too_much_is_counted_and_told_with_the_next_lines(monkeypatch: p
 
 
 class Undying:
-    """Stands for a process that had a goal, and that no kill ends for long."""
+    """Stands for a process that is ready, and that no kill ends for long."""
 
     def __init__(self) -> None:
-        self.ready, self.used, self.failed, self.gone_by = True, True, None, 0.0
+        self.ready, self.used, self.failed, self.gone_by = True, False, None, 0.0
         self.socket, self._other = socket.socketpair()
         self.stderr = self._other.fileno()
         self.liveness = os.dup(self.stderr)
@@ -142,17 +143,40 @@ class Undying:
         os.close(self.liveness)
 
 
+def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
+    """Return an engine thread that doesn't run, with this process."""
+    engine = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), posted.append)
+    for descriptor in (process.socket.fileno(), process.liveness):
+        engine._selector.register(descriptor, selectors.EVENT_READ, process)
+    engine._process = process
+    engine._started_at = time.monotonic()
+    return engine
+
+
+@pytest.mark.parametrize("spoken", [True, False])
+def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool) -> None:
+    process = cast("EngineProcess", Undying())
+    engine = _watching(process, [])
+    engine._restarts.failed(0.0, 0.0, None)
+    if spoken:
+        engine._goal = Handed(YES, heard_at=0.0)
+        engine._note(process, protocol.Ended(YES.id, protocol.COMPLETED, duration=0.1))
+    engine._note(process, protocol.Alive(""))  # as one does that loads a voice
+    before = time.monotonic()
+    engine._lose_process("it is killed", "engine_crashed")
+    assert (engine._restarts.due_at - before < BACK_OFF[1]) == spoken
+    engine._bury(process)
+    engine._inbox.close()
+
+
 @pytest.mark.parametrize("in_time", [True, False])
 def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pytest.MonkeyPatch, in_time: bool) -> None:
     posted: list[Report] = []
-    engine = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), posted.append)
-    monkeypatch.setattr(engine, "_start", lambda: None)
     undying = Undying()
     process = cast("EngineProcess", undying)
-    for descriptor in (undying.socket.fileno(), undying.liveness):
-        engine._selector.register(descriptor, selectors.EVENT_READ, process)
-    engine._process = process
-    engine._goal = Handed(protocol.Say("g1", "yes", 200, 1.0, None, 50), heard_at=0.0, started=True)
+    engine = _watching(process, posted)
+    monkeypatch.setattr(engine, "_start", lambda: None)
+    engine._goal = Handed(YES, heard_at=0.0, started=True)
     engine._lose_process("it hangs", "engine_hung")
     due = process.gone_by
     engine._keep_limits(due - SILENCE_LIMIT / 2)

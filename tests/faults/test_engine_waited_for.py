@@ -116,6 +116,7 @@ def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(m
 
 
 def test_engines_that_have_spoken_and_are_killed_while_idle_are_replaced_at_once(scripted: Talk) -> None:
+    assert BACK_OFF[-1] > PATIENCE, "a goal that has to wait so long is not awaited"
     engine = _scripted_engine(scripted)
     for _ in range(2 * len(BACK_OFF)):
         engine = _replaced(scripted, engine)

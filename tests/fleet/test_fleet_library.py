@@ -104,7 +104,7 @@ def test_an_outcome_comes_as_soon_as_its_robot_is_done(fleet: Fleet, pair: RealR
     outcomes = fleet.say(to, "hello", id=f"soon-{BOTH.index(to)}")
     first = next(iter(outcomes))
     assert (first.robot, first.state, len(outcomes)) == ("wh-2", "SUCCEEDED", 2)
-    pair["wh-1"].talk.watcher.wait_for(f"soon-{BOTH.index(to)}", "PENDING")  # the other may have been done before
+    pair["wh-1"].talk.watcher.wait_for(f"soon-{BOTH.index(to)}", "PENDING")  # wh-2 may be done before wh-1 has taken it
     request(pair, "cancel")
     assert found(outcomes) == {"wh-1": ("RECALLED", 6)}
 
