@@ -13,7 +13,7 @@ import time
 from typing import TYPE_CHECKING
 
 from tests.support.sink import pactl
-from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory
+from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory, stop_child
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -71,8 +71,8 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
         self.pactl("unload-module", module)
 
     def freeze(self, part: str = "pipewire-pulse") -> None:
-        """Stop its pulse server as it is, or another part."""
-        self._running[part].send_signal(signal.SIGSTOP)
+        """Stop its pulse server as it is, or another part; it has stopped when this returns, with all its threads."""
+        stop_child(self._running[part].pid)
 
     def thaw(self, part: str = "pipewire-pulse") -> None:
         """Let it go on."""

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from tests.support.espeak import RATE
 from tests.support.monitor import Monitor
 from tests.support.recording import Recording
-from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory
+from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory, stop_child
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -134,8 +134,8 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
             self._warm_up()
 
     def freeze(self) -> None:
-        """Stop the sound server as it is (SIGSTOP)."""
-        self._running().send_signal(signal.SIGSTOP)
+        """Stop the sound server as it is (SIGSTOP); it has stopped when this returns, with all its threads."""
+        stop_child(self.pid)
 
     def thaw(self) -> None:
         """Let a frozen sound server go on (SIGCONT)."""
