@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 #: The logins of the examples, and how each is proved.
 PASSWORDS = {each: f"password-of-{each}" for each in ("anna", "olga", "ha")}
+#: Where the examples of requests are answered.
+_REPLIES = "talk/reply/ha/one/anna"
 #: Seconds in which a robot must be there, or have done what it was asked.
 LIMIT = 20.0
 #: What the examples' broker is here; what is no matter of theirs.
@@ -80,12 +82,21 @@ class Site:
         goal: dict[str, Any] = self._listener.await_message(lambda each: _tells(each, text, states), LIMIT).json["goal"]
         return goal
 
+    def await_last_line(self, text: str) -> None:
+        """Wait until the one who has asked for a goal with this text has been told how it ended: nothing more comes."""
+        self._listener.await_message(lambda each: each.topic == _REPLIES and _has_result(each, text), LIMIT)
+
 
 def _tells(message: Message, text: str, states: tuple[str, ...]) -> bool:
     if not message.topic.endswith("/event/state"):
         return False
     goal = message.json.get("goal") or {}
     return goal.get("text") == text and goal["state"] in states
+
+
+def _has_result(message: Message, text: str) -> bool:
+    lines = [json.loads(each) for each in message.text.splitlines()]
+    return any(each.get("event") == "result" and each["goal"]["text"] == text for each in lines)
 
 
 def _online(message: Message) -> bool:
@@ -114,7 +125,7 @@ def site(make_talk: MakeTalk, tmp_path: Path, place: str) -> Iterator[Site]:
         broker = stack.enter_context(Broker())
         bridge = stack.enter_context(Bridge(talk, broker, "anna", groups=["warehouse"]))
         bridge.await_online()
-        listener = stack.enter_context(Listener(broker, "talk/robot/anna/event/+"))
+        listener = stack.enter_context(Listener(broker, "talk/robot/anna/event/+", _REPLIES))
         shell = stack.enter_context(contextlib.closing(Shell(tmp_path, clean_environment(place), talk=False)))
         _set_up_clients(shell, broker)
         yield Site(talk, broker, bridge, shell, listener)
@@ -249,6 +260,7 @@ def test_request_is_answered_once_and_hung_up(site: Site) -> None:
     answer = json.loads(site.run("Requests and replies: A request").splitlines()[0])
     assert _part(answer, example) == example
     site.goal("the door is open", "SUCCEEDED")
+    site.await_last_line("the door is open")  # else it may be what the next one takes for its answer
     again = json.loads(site.run("Requests and replies: A request").splitlines()[0])
     assert again["attached"] is True
     assert site.run("Requests and replies: A request #3") == ""
