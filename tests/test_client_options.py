@@ -85,10 +85,12 @@ def test_throttled_goal_is_rejected(client: Client) -> None:
 
 
 def test_same_id_again_attaches(client: Client, scripted: Talk) -> None:
+    scripted.request("pause")  # so that no word is told before the second is attached
     first = client.say("length=0.2 one", id="door.1", feedback=True)
     with Client(scripted.socket) as other:
         second = other.say("length=0.2 one", id="door.1", feedback=True)
         assert (first.attached, second.attached) == (False, True)
+        other.resume()
         assert [each.word for each in second.feedback(5)][-1] == "one"
         assert second.wait(5) == first.wait(5)
         third = other.say("length=0.2 one", id="door.1")

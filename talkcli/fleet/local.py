@@ -209,13 +209,7 @@ def apart(
     def tell(result: _T | None, error: BaseException | None) -> None:
         if finished:
             finished()
-        if done.cancelled():
-            if undo and error is None:
-                undo(result)  # type: ignore[arg-type]
-        elif error is None:
-            done.set_result(result)  # type: ignore[arg-type]
-        else:
-            done.set_exception(error)
+        _hand_over(done, result, error, undo)
 
     def run() -> None:
         result: _T | None = None
@@ -224,11 +218,26 @@ def apart(
             result = work()
         except BaseException as raised:  # noqa: BLE001 - it is raised where it is waited for
             error = raised
-        with contextlib.suppress(RuntimeError):  # the loop has ended
+        try:
             loop.call_soon_threadsafe(tell, result, error)
+        except RuntimeError:  # the loop has ended
+            _hand_over(done, result, error, undo)
 
     try:
         threading.Thread(target=run, daemon=True).start()
     except RuntimeError as error:  # the system gives this process no more of them
         tell(None, error)
     return done
+
+
+def _hand_over(
+    done: asyncio.Future[_T], result: _T | None, error: BaseException | None, undo: Callable[[_T], object] | None
+) -> None:
+    """Give what has come of it to who waits for that; undo it, where nobody does."""
+    if done.cancelled() or done.get_loop().is_closed():
+        if undo and error is None:
+            undo(result)  # type: ignore[arg-type]
+    elif error is None:
+        done.set_result(result)  # type: ignore[arg-type]
+    else:
+        done.set_exception(error)

@@ -66,13 +66,14 @@ def test_it_is_over_when_its_thread_is_and_not_when_nobody_waits_any_more(monkey
     asyncio.run(fail())
 
 
-def test_the_end_does_not_wait_for_it() -> None:
-    go = threading.Event()
+def test_the_end_does_not_wait_for_it_and_what_comes_of_it_then_is_undone() -> None:
+    go, undone = threading.Event(), threading.Event()
 
     async def leave() -> None:
-        work = apart(lambda: go.wait(30))
+        work = apart(lambda: go.wait(30), lambda result: undone.set() if result else None)
         await asyncio.sleep(0)
         work.cancel()
 
     asyncio.run(leave())
     go.set()
+    assert undone.wait(5)
