@@ -10,6 +10,7 @@ import pytest
 
 from tests.support.processes import Talk
 from tests.support.sink import Sink
+from tests.support.surroundings import needs_no_server
 from tests.support.timing import calibrate, take_unmeasured
 
 if TYPE_CHECKING:
@@ -43,6 +44,12 @@ def _interruptible() -> None:
     """Start clients with signals as a terminal would: what runs the tests in its background may have these ignored."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@pytest.fixture
+def nobody_serves() -> None:
+    """Let a test go on where a client that names no socket finds nobody: where no server of the user's own runs."""
+    needs_no_server()
 
 
 def pytest_configure() -> None:

@@ -356,6 +356,7 @@ def test_a_sound_server_that_hangs_is_named_and_it_ends_all_the_same(
     assert found["sentence"]["next"] == found["sound server"]["next"]
 
 
+@pytest.mark.usefixtures("nobody_serves")
 @pytest.mark.parametrize("limit", [0.5, pytest.param(connect.ANSWER_LIMIT, marks=pytest.mark.slow)])
 def test_a_server_that_hangs_is_named(
     make_talk: MakeTalk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: float
@@ -370,6 +371,7 @@ def test_a_server_that_hangs_is_named(
     assert "server" not in found
 
 
+@pytest.mark.usefixtures("nobody_serves")
 @pytest.mark.parametrize("limit", [0.5, pytest.param(connect.BUSY_LIMIT, marks=pytest.mark.slow)])
 def test_a_full_server_is_named(
     make_talk: MakeTalk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: float

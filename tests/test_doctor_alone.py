@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
     from tests.support.sink import Sink
 
+pytestmark = pytest.mark.usefixtures("nobody_serves")
+
 #: Seconds in which it ends, whatever it finds.
 LIMIT = 60.0
 USERS = pytest.mark.skipif(

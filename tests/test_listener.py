@@ -287,6 +287,7 @@ def test_client_of_another_user_ends_with_10(home: str) -> None:
         assert run([*client, "--socket", path, "say", "--wait", "hello"], theirs).code == 0
 
 
+@pytest.mark.usefixtures("nobody_serves")
 @as_root
 def test_server_that_another_user_put_where_ours_would_be_is_not_trusted(home: str) -> None:
     os.mkdir(f"{home}/talk", 0o777)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from typing import TYPE_CHECKING
 
@@ -30,8 +29,7 @@ def env(tmp_path: Path) -> Iterator[dict[str, str]]:
     tiny_voice.put(tmp_path / "voices", "tiny")
     tiny_voice.put(tmp_path / "voices", "broken", b"no model")
     with short_directory() as home:
-        os.mkdir(f"{home}/run", 0o700)
-        yield environment(home, XDG_RUNTIME_DIR=f"{home}/run", TALK_VOICES=str(tmp_path / "voices"))
+        yield environment(home, TALK_SOCKET=f"{home}/s", TALK_VOICES=str(tmp_path / "voices"))
 
 
 def test_goals_are_spoken_with_one_and_end_in_words_where_it_is_broken(env: dict[str, str], tmp_path: Path) -> None:

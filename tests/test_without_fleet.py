@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
 import pytest
@@ -31,8 +30,7 @@ COMMANDS = (
 
 def test_neither_server_nor_clients_import_anything_of_it(tmp_path: Path) -> None:
     with short_directory() as home:
-        os.mkdir(f"{home}/run", 0o700)
-        env = spied(tmp_path, environment(home, XDG_RUNTIME_DIR=f"{home}/run"))
+        env = spied(tmp_path, environment(home, TALK_SOCKET=f"{home}/s"))
         with serving(env):
             for command in COMMANDS:
                 done = run([*TALK, *command], env)

@@ -45,8 +45,7 @@ def measure(directory: Path, *options: str, without: Sequence[str] = ()) -> Cost
     """Run a server with these options, and clients one after the other, where these packages are not there."""
     tiny_voice.put(directory / "voices", "tiny")
     with short_directory() as home:
-        os.mkdir(f"{home}/run", 0o700)
-        env = environment(home, XDG_RUNTIME_DIR=f"{home}/run", TALK_VOICES=str(directory / "voices"))
+        env = environment(home, TALK_SOCKET=f"{home}/s", TALK_VOICES=str(directory / "voices"))
         env = spied(directory, env, without)
         with serving(env, *options) as server:
             for command in COMMANDS:

@@ -58,6 +58,7 @@ def test_client_looks_where_platformdirs_puts_the_socket(home: str, name: str) -
         assert looked[0].startswith(home)
 
 
+@pytest.mark.usefixtures("nobody_serves")
 @pytest.mark.parametrize("name", ["a runtime directory", "none", "none, another temporary directory"])
 def test_server_and_client_meet_without_naming_a_socket(home: str, name: str) -> None:
     env = filled(home, name)
@@ -75,6 +76,7 @@ def test_server_and_client_meet_without_naming_a_socket(home: str, name: str) ->
     assert run([*TALK, "status"], env).code == 3
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_error_names_every_place_in_its_order(home: str) -> None:
     os.makedirs(f"{home}/run/talk", 0o700)
     done = run([*TALK, "status"], environment(home, XDG_RUNTIME_DIR=f"{home}/run"))
@@ -86,6 +88,7 @@ def test_error_names_every_place_in_its_order(home: str) -> None:
     assert done.code == 3
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_system_service_serves_in_the_directory_that_systemd_made(home: str) -> None:
     with serving(environment(home, RUNTIME_DIRECTORY=f"{home}/run")) as server:
         assert f"ready on {home}/run/talk.sock" in server.log

@@ -237,6 +237,7 @@ def test_system_s_service_is_exposed_to_little(home: str) -> None:
     assert float(found[1]) <= 2.0
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_command_serves_in_the_environment_that_systemd_gives_it(home: str) -> None:
     os.mkdir(f"{home}/talk", 0o755)
     with Supervisor(f"{home}/n") as supervisor:

@@ -97,6 +97,7 @@ def test_place_that_another_user_made_is_refused(home: str, whole: bool) -> None
     assert place(home) in done.err
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_place_that_is_made_by_the_server_is_nobody_else_s(home: str) -> None:
     env = environment(home)
     with serving(env, command=["sh", "-c", 'umask 0; exec "$@"', "sh", *SERVE]):

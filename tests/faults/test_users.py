@@ -195,6 +195,7 @@ def test_another_user_is_refused_before_a_request_is_read_whatever_the_file_says
     assert "somebody else" not in server.log
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_client_tells_nothing_to_a_server_of_another_user_except_where_it_was_named(home: str) -> None:
     os.makedirs(f"{home}/run/talk")
     os.chmod(f"{home}/run/talk", 0o777)
@@ -209,6 +210,7 @@ def test_client_tells_nothing_to_a_server_of_another_user_except_where_it_was_na
         assert b'"hello"' in heard()  # it is named: that is the user's own trust
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
     """As the system's service: its user is neither root nor the client's."""
     script = f"""

@@ -7,15 +7,17 @@ import os
 import shutil
 import signal
 import site
+import socket
 import sys
 import tempfile
 import time
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import pytest
 
 import talkcli
+from talkcli import paths
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -48,10 +50,24 @@ def needs_packages(*names: str) -> None:
     _skip_without([each for each in names if find_spec(each) is None])
 
 
+def needs_no_server() -> None:
+    """Skip the test if a server of the user's own runs where clients look; where CI is set, fail it.
+
+    It would be found where a test expects nobody, and say aloud what the test says.
+    """
+    for place in paths.client_sockets(None):
+        with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
+            probe.settimeout(1)  # one that hangs may have no room for it
+            probe.connect(place)
+            _skip(f"needs a machine on which no talk server runs, and one is on {place}")
+
+
 def _skip_without(missing: list[str]) -> None:
-    if not missing:
-        return
-    reason = f"needs {', '.join(missing)}, which is not installed"
+    if missing:
+        _skip(f"needs {', '.join(missing)}, which is not installed")
+
+
+def _skip(reason: str) -> NoReturn:
     if os.environ.get("CI"):
         pytest.fail(reason, pytrace=False)
     pytest.skip(reason)
