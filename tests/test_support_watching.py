@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import paths
 from tests.support.connection import Message, Wire
 from tests.support.surroundings import (
     MARK,
@@ -22,6 +23,7 @@ from tests.support.surroundings import (
     dying_with_parent,
     marked,
     needs,
+    needs_no_server,
     short_directory,
 )
 from tests.support.watcher import Watcher
@@ -197,6 +199,21 @@ def test_a_missing_program_skips_but_fails_in_ci(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("CI", "true")
     with pytest.raises(pytest.fail.Exception, match="no-such-program"):
         needs("no-such-program")
+
+
+def test_a_server_of_the_user_s_own_skips_but_fails_in_ci(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CI", raising=False)
+    with short_directory() as home, socket.socket(socket.AF_UNIX) as server:
+        path = f"{home}/s"
+        monkeypatch.setattr(paths, "client_sockets", lambda _: [f"{home}/not there", path])
+        server.bind(path)
+        needs_no_server()  # what is left over serves nobody
+        server.listen()
+        with pytest.raises(pytest.skip.Exception, match=path):
+            needs_no_server()
+        monkeypatch.setenv("CI", "true")
+        with pytest.raises(pytest.fail.Exception, match=path):
+            needs_no_server()
 
 
 def test_directories_are_short_private_and_removed(monkeypatch: pytest.MonkeyPatch) -> None:
