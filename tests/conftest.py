@@ -48,7 +48,7 @@ def _interruptible() -> None:
 
 @pytest.fixture
 def nobody_serves() -> None:
-    """Let a test go on where a client that names no socket finds nobody: where no server of the user's own runs."""
+    """Skip the test on a machine where a server runs, or was left behind, at a place where clients look."""
     needs_no_server()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import os
 import socket
@@ -201,16 +202,21 @@ def test_a_missing_program_skips_but_fails_in_ci(monkeypatch: pytest.MonkeyPatch
         needs("no-such-program")
 
 
-def test_a_server_of_the_user_s_own_skips_but_fails_in_ci(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_where_clients_look_skips_but_fails_in_ci(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CI", raising=False)
+    monkeypatch.setattr(glob, "glob", lambda _: [])
     with short_directory() as home, socket.socket(socket.AF_UNIX) as server:
         path = f"{home}/s"
-        monkeypatch.setattr(paths, "client_sockets", lambda _: [f"{home}/not there", path])
+        monkeypatch.setattr(paths, "client_sockets", lambda _: [f"{home}/there is none", path])
+        needs_no_server()
         server.bind(path)
-        needs_no_server()  # what is left over serves nobody
-        server.listen()
-        with pytest.raises(pytest.skip.Exception, match=path):
+        with pytest.raises(pytest.skip.Exception, match=f"{path}: nobody answers: left over"):
             needs_no_server()
+        server.listen(0)
+        with pytest.raises(pytest.skip.Exception, match=f"{path}: there is one"):
+            needs_no_server()
+        with pytest.raises(pytest.skip.Exception, match=f"{path}: Resource temporarily unavailable"):
+            needs_no_server()  # it hangs, and has no room for another
         monkeypatch.setenv("CI", "true")
         with pytest.raises(pytest.fail.Exception, match=path):
             needs_no_server()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 import pytest
@@ -28,9 +29,11 @@ COMMANDS = (
 )
 
 
+@pytest.mark.usefixtures("nobody_serves")
 def test_neither_server_nor_clients_import_anything_of_it(tmp_path: Path) -> None:
     with short_directory() as home:
-        env = spied(tmp_path, environment(home, TALK_SOCKET=f"{home}/s"))
+        os.mkdir(f"{home}/run", 0o700)
+        env = spied(tmp_path, environment(home, XDG_RUNTIME_DIR=f"{home}/run"))  # as a user who names no socket
         with serving(env):
             for command in COMMANDS:
                 done = run([*TALK, *command], env)

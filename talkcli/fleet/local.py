@@ -201,7 +201,8 @@ def apart(
     """Return what `work` does, in a thread of its own, for which nobody waits at the end of the process.
 
     `undo`: done with what comes of it, where nobody waits for that any more; `finished`: called once the work is over,
-    whether anybody waits or not.
+    whether anybody waits or not. Both are called in the loop; once that has ended, `undo` is in the work's own thread,
+    and `finished` is not called.
     """
     loop = asyncio.get_running_loop()
     done: asyncio.Future[_T] = loop.create_future()
@@ -209,7 +210,12 @@ def apart(
     def tell(result: _T | None, error: BaseException | None) -> None:
         if finished:
             finished()
-        _hand_over(done, result, error, undo)
+        if done.cancelled():
+            _undo(undo, result, error)
+        elif error is None:
+            done.set_result(result)  # type: ignore[arg-type]
+        else:
+            done.set_exception(error)
 
     def run() -> None:
         result: _T | None = None
@@ -220,8 +226,8 @@ def apart(
             error = raised
         try:
             loop.call_soon_threadsafe(tell, result, error)
-        except RuntimeError:  # the loop has ended
-            _hand_over(done, result, error, undo)
+        except RuntimeError:  # the loop has ended, and whoever waited with it
+            _undo(undo, result, error)
 
     try:
         threading.Thread(target=run, daemon=True).start()
@@ -230,14 +236,7 @@ def apart(
     return done
 
 
-def _hand_over(
-    done: asyncio.Future[_T], result: _T | None, error: BaseException | None, undo: Callable[[_T], object] | None
-) -> None:
-    """Give what has come of it to who waits for that; undo it, where nobody does."""
-    if done.cancelled() or done.get_loop().is_closed():
-        if undo and error is None:
-            undo(result)  # type: ignore[arg-type]
-    elif error is None:
-        done.set_result(result)  # type: ignore[arg-type]
-    else:
-        done.set_exception(error)
+def _undo(undo: Callable[[_T], object] | None, result: _T | None, error: BaseException | None) -> None:
+    """Undo what has come of work, if anything has: nobody waits for it."""
+    if undo and error is None:
+        undo(result)  # type: ignore[arg-type]

@@ -122,6 +122,7 @@ def until_silence(sink: Sink, begin: Action, stop: Action, after: float = 0.0) -
         end = begin()
         _await_sound(recording)
         time.sleep(_BEFORE_STOP + after)
+        _await_more(recording)  # a neural voice that is too slow is silent now and then
         stopped = time.monotonic()
         stop_ends = stop()
         _await_quiet(recording)
@@ -157,9 +158,13 @@ def from_old_to_new(sink: Sink, begin: Action, preempt: Action, after: float) ->
 
 
 def _await_sound(recording: Recording) -> None:
+    if recording.first_sound() is None:
+        _await_more(recording)
+
+
+def _await_more(recording: Recording) -> None:
     try:
-        if recording.first_sound() is None:
-            recording.wait_for_sound(_PATIENCE)
+        recording.wait_for_sound(_PATIENCE)
     except TimeoutError as error:
         raise FailedError(f"it was not heard: {error}") from None
 

@@ -134,6 +134,7 @@ def test_plain_text_is_said_and_anything_cancels(lasting_robot: Robot) -> None:
         new = events.await_message(lambda each: each.json["state"] == "PENDING" and each.json["goal"]["text"] == text)
         goal = new.json["id"]
         events.await_message(lambda each: (each.json["id"], each.json["state"]) == (goal, "ACTIVE"))
+        assert lasting_robot.talk.goal(goal)["text"] == text
         events.publish(f"{ANNA}/cancel/hass", b"")
         ended = events.await_message(lambda each: (each.json["id"], each.json["state"]) == (goal, "PREEMPTED"))
     assert ended.json["goal"]["by"]["client"]["name"] == "mqtt:hass"

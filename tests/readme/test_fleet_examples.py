@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 #: The logins of the examples, and how each is proved.
 PASSWORDS = {each: f"password-of-{each}" for each in ("anna", "olga", "ha")}
 #: Where the examples of requests are answered.
-_REPLIES = "talk/reply/ha/one/anna"
+_REPLIES = block("Requests and replies: A request").partition(" -e ")[2].split()[0]
 #: Seconds in which a robot must be there, or have done what it was asked.
 LIMIT = 20.0
 #: What the examples' broker is here; what is no matter of theirs.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import shutil
 import signal
@@ -51,15 +52,25 @@ def needs_packages(*names: str) -> None:
 
 
 def needs_no_server() -> None:
-    """Skip the test if a server of the user's own runs where clients look; where CI is set, fail it.
+    """Skip the test if there is a server at any place where clients look, or was; where CI is set, fail it.
 
-    It would be found where a test expects nobody, and say aloud what the test says.
+    A client that names no socket would find it, and have it say aloud what the test says; a server that names none
+    would not start beside it.
     """
-    for place in paths.client_sockets(None):
-        with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
-            probe.settimeout(1)  # one that hangs may have no room for it
+    for place in [*paths.client_sockets(None), *glob.glob(f"/run/user/*/talk/{paths.SOCKET}")]:
+        found = _at(place)
+        if found != paths.ABSENT:
+            _skip(f"needs a machine on which no talk server runs; {place}: {found}")
+
+
+def _at(place: str) -> str:
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1)
+        try:
             probe.connect(place)
-            _skip(f"needs a machine on which no talk server runs, and one is on {place}")
+        except OSError as error:
+            return paths.found_at(place, error)
+    return "there is one"
 
 
 def _skip_without(missing: list[str]) -> None:
