@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import signal
@@ -18,6 +17,7 @@ from talkcli.engine.players.child import Child
 from talkcli.engine.players.program import ProgramPlayer
 from tests.engine.spawned import FAST, Spawned
 from tests.engine.test_player_faults import Player
+from tests.support import census
 from tests.support.processes import children
 from tests.support.reference import played, render
 
@@ -53,16 +53,6 @@ def _run(script: str, *inherited: int) -> Child:
     return Child(("/bin/sh", "-c", script), inherited)
 
 
-def _descriptors(pid: int) -> dict[int, str]:
-    """Return what a process has open."""
-    folder = f"/proc/{pid}/fd"
-    links = {}
-    for name in os.listdir(folder):
-        with contextlib.suppress(FileNotFoundError):  # the one that lists them
-            links[int(name)] = os.readlink(f"{folder}/{name}")
-    return links
-
-
 # -- a child
 
 
@@ -88,11 +78,11 @@ def test_what_cannot_be_started_is_an_error_and_leaves_nothing_open(
 
 def test_it_has_three_streams_what_it_inherits_and_its_leash() -> None:
     reading, writing = os.pipe()
-    before = _descriptors(os.getpid())
+    before = census.descriptors(os.getpid())
     child = _run("kill -STOP $$", writing)
     # What a program opens while it is loaded is closed when it has stopped itself.
     os.waitid(os.P_PID, child.pid, os.WSTOPPED | os.WNOWAIT)
-    its = _descriptors(child.pid)
+    its = census.descriptors(child.pid)
     assert its.pop(1) == os.devnull
     assert its.pop(writing) == os.readlink(f"/proc/self/fd/{writing}")
     ours = {os.readlink(f"/proc/self/fd/{each}") for each in (child.stdin, child.stderr, child._leash)}
@@ -101,7 +91,7 @@ def test_it_has_three_streams_what_it_inherits_and_its_leash() -> None:
     assert not os.get_inheritable(writing)
     child.kill()
     _status(child)
-    assert _descriptors(os.getpid()) == before
+    assert census.descriptors(os.getpid()) == before
     os.close(reading)
     os.close(writing)
 

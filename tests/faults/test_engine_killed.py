@@ -252,7 +252,7 @@ def _feeding(talk: Talk, player: int) -> bool:
     """Whether the engine still has samples for the player: it holds the other end of its standard input."""
     pipe = os.readlink(f"/proc/{player}/fd/0")
     engine = engine_process(talk)
-    return pipe in [os.readlink(f"/proc/{engine}/fd/{each}") for each in os.listdir(f"/proc/{engine}/fd")]
+    return pipe in census.descriptors(engine).values()
 
 
 def _assert_lost(talk: Talk, goal: str, number: signal.Signals) -> None:

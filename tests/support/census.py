@@ -57,6 +57,16 @@ def assert_as_before(pid: int, before: Census, memory: int) -> Census:
     return found
 
 
+def descriptors(pid: int) -> dict[int, str]:
+    """Return what a process has open, but for what it closes meanwhile."""
+    folder = f"/proc/{pid}/fd"
+    found = {}
+    for name in os.listdir(folder):
+        with contextlib.suppress(FileNotFoundError):
+            found[int(name)] = os.readlink(f"{folder}/{name}")
+    return found
+
+
 def descendants(pid: int) -> list[int]:
     """Return the ids of all processes below one."""
     parents: dict[int, list[int]] = {}
@@ -85,8 +95,5 @@ def _own(pid: int) -> int:
 
 def told(pid: int) -> str:
     """Return what a process has, for messages."""
-    targets = []
-    for each in os.listdir(f"/proc/{pid}/fd"):
-        with contextlib.suppress(OSError):
-            targets.append(f"{each} → {os.readlink(f'/proc/{pid}/fd/{each}')}")
+    targets = [f"{number} → {target}" for number, target in descriptors(pid).items()]
     return "; ".join([*(command_line(each) for each in descendants(pid)), *sorted(targets)])
