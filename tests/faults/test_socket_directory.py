@@ -86,12 +86,11 @@ def test_place_of_one_s_own_that_is_open_to_all_is_refused_or_closed(home: str) 
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can make what is another user's")
-@pytest.mark.parametrize("whole", [True, False])
-def test_place_that_another_user_made_is_refused(home: str, whole: bool) -> None:
-    os.makedirs(f"{place(home)}/talk", 0o700)
-    os.chown(f"{place(home)}/talk", NOBODY, NOBODY)
-    if whole:
-        os.chown(place(home), NOBODY, NOBODY)
+@pytest.mark.parametrize("theirs", [["talk"], ["", "talk"], [""]], ids=["inside", "whole", "empty"])
+def test_place_that_another_user_made_is_refused(home: str, theirs: list[str]) -> None:
+    for name in theirs:
+        os.makedirs(f"{place(home)}/{name}", 0o700)
+        os.chown(f"{place(home)}/{name}", NOBODY, NOBODY)
     done = run(SERVE, environment(home))
     assert (done.code, done.out) == (11, ""), done
     assert place(home) in done.err
