@@ -13,6 +13,7 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.players import Command
+from talkcli.engine.players import child as child_module
 from talkcli.engine.players.child import Child
 from talkcli.engine.players.program import ProgramPlayer
 from tests.engine.spawned import FAST, Spawned
@@ -51,6 +52,23 @@ def _status(child: Child, seconds: float = 10.0) -> int:
 
 def _run(script: str, *inherited: int) -> Child:
     return Child(("/bin/sh", "-c", script), inherited)
+
+
+def test_who_holds_a_pipe_is_looked_for_no_longer_than_it_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    looked: list[str] = []
+
+    def links(folder: str) -> list[str]:
+        looked.append(folder)
+        if len(looked) == 2:
+            os.close(writing)
+        return []
+
+    monkeypatch.setattr(child_module, "_links", links)
+    monkeypatch.setattr(child_module, "processes", lambda: [-1, -2, -3, -4])
+    assert not child_module.kill_holders(reading)
+    assert looked == ["/proc/-1/fd", "/proc/-2/fd"]
+    os.close(reading)
 
 
 # -- a child

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import itertools
 import os
 import select
 import signal
@@ -179,12 +180,14 @@ def is_held(pipe: int, seconds: float = 0.0) -> bool:
 def kill_holders(pipe: int) -> bool:
     """Kill the processes that hold a pipe, but this one, where they don't let go of it in a moment.
 
+    Who else holds it is looked for no longer than it is held: on a machine that is full, that takes tenths of a second.
     Return whether any of them was killed: others can't be, or can't be found.
     """
     if not is_held(pipe, _MOMENT):
         return False
     link, own = f"pipe:[{os.fstat(pipe).st_ino}]", os.getpid()
-    return kill(pid for pid in processes() if pid != own and link in _links(f"/proc/{pid}/fd"))
+    while_held = itertools.takewhile(lambda _: is_held(pipe, 0), processes())
+    return kill(pid for pid in while_held if pid != own and link in _links(f"/proc/{pid}/fd"))
 
 
 def kill(pids: Iterable[int]) -> bool:
