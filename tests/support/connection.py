@@ -92,17 +92,6 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
             if message.get("event") == event and all(message.get(name) == value for name, value in fields.items()):
                 return message
 
-    def closed_by_server(self, timeout: float = PATIENCE) -> bool:
-        """Return whether the server closes the connection in time; what it still says is dropped."""
-        end = time.monotonic() + timeout
-        try:
-            while True:
-                self.receive(max(0.001, end - time.monotonic()))
-        except EOFError:
-            return True
-        except TimeoutError:
-            return False
-
     def shut_down(self) -> None:
         """End the connection for both sides; a `receive` in another thread returns at once, with EOFError."""
         with contextlib.suppress(OSError):
