@@ -15,15 +15,16 @@ from typing import TYPE_CHECKING
 from talkcli import __version__
 from talkcli.daemon import log
 from talkcli.daemon.systemd import Systemd
-from talkcli.errors import AddressInUse, BadRequest, TalkError
+from talkcli.errors import AddressInUse, TalkError
 from talkcli.fleet import homeassistant, topics
 from talkcli.fleet.askers import Askers
 from talkcli.fleet.link import NOT_AUTHORIZED, Link, Will, boottime
 from talkcli.fleet.local import apart
 from talkcli.fleet.news import News
 from talkcli.fleet.policy import ECHO_EVERY, STALE, Dropped, Echoes, HungUp, Policy, Refused
+from talkcli.fleet.presence import Presence, rank
 from talkcli.frozen import frozen
-from talkcli.protocol.lines import MAX_LINE, decode, encode
+from talkcli.protocol.lines import MAX_LINE, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -98,8 +99,8 @@ class Bridge:
         self._down = asyncio.Event()
         #: whether requests are taken: no other bridge of this name is there
         self._settled = False
-        #: what the broker has kept of another one
-        self._other: JsonObject | None = None
+        #: whether the broker has kept the presence of another one
+        self._other = False
         #: what settles that, once this bridge's question has come back
         self._question: asyncio.TimerHandle | None = None
         self._echoes = Echoes(boottime())
@@ -175,7 +176,7 @@ class Bridge:
         """Begin with a connection: first of all find out whether another bridge of this name is there."""
         self._down.clear()
         self._link, self._descriptor = link, link.fileno()
-        self._settled, self._other, self._question = False, None, None
+        self._settled, self._other, self._question = False, False, None
         self._loop.add_reader(self._descriptor, self._read)
         self._echoes = Echoes(boottime())
         self._unanswered = None
@@ -328,29 +329,28 @@ class Bridge:
                 self._question = self._loop.call_later(wait, self._settle)
             return
         session, _, number = payload.partition(b" ")
-        if session == self._session.encode() and number.isdigit() and self._echoes.came(int(number)):
+        if session == self._session.encode() and self._echoes.came(number):
             self._unanswered = None
 
     # -- who is there
 
     def _hear_presence(self, payload: bytes) -> None:
         """Hear what some bridge of this name says of itself: this one, one that has ended, another that is there."""
-        try:
-            said = decode(payload) if payload else {}  # somebody has cleared it
-        except BadRequest as error:
-            log.seldom("presence", f"what is said of this robot's presence can't be read: {log.shown(str(error))}")
-            said = {}  # as if it had been cleared
-        online = said.get("online") is True
-        if said.get("session") == self._session and online:
+        said = Presence.read(self._settings.name, payload)
+        found = rank(said)
+        if payload and (said is None or (said.online and found is None)):
+            words = 'it is not a JSON object with "online", "session" and a numeric "since"'
+            log.seldom("presence", f"a message on this robot's presence topic is ignored: {words}")
+        if found and found[1] == self._session:
             return
         if not self._question and not self._settled:
-            # The broker has kept it: whoever said it may be gone.
-            self._other = said if online else None
-        elif not online:
+            # The broker has kept it, so its bridge may be gone.
+            self._other = found is not None
+        elif found is None:
             if self._settled:
-                self._be_present()  # somebody's will, which came late
-        elif _age(said) < (self._since, self._session):
-            words = f"another bridge is '{self._settings.name}' already: session {log.shown(str(said.get('session')))}"
+                self._be_present()  # in place of a late will, or of a message that was ignored
+        elif found < (self._since, self._session):
+            words = f"another bridge is '{self._settings.name}' already: session {log.shown(found[1])}"
             self.end(AddressInUse(f"{words}; each robot has a name of its own, give another --name"))
         else:
             self._settle()
@@ -469,9 +469,3 @@ class Bridge:
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(taken.wait(), _GOODBYE)
         self._go_down(link)
-
-
-def _age(said: JsonObject) -> tuple[float, str]:
-    """Return by what a bridge is older than another of its name: the one that began first stays."""
-    since = said.get("since")
-    return float(since) if isinstance(since, int | float) else 0.0, str(said.get("session"))

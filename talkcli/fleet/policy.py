@@ -15,7 +15,7 @@ from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import SHOWN, Say
 from talkcli.protocol.events import Result, StateChanged, failure, ok, take_seq
-from talkcli.protocol.lines import MAX_LINE, decode
+from talkcli.protocol.lines import MAX_DIGITS, MAX_LINE, decode
 from talkcli.protocol.requests import KINDS, read_request
 
 if TYPE_CHECKING:
@@ -197,8 +197,9 @@ class Echoes:
             del self._sent[next(iter(self._sent))]
         return self._number
 
-    def came(self, number: int) -> bool:
-        """Note that an echo has come back, and return whether that was known of it."""
+    def came(self, text: bytes) -> bool:
+        """Note that the echo of this number has come back; return False if it is not one that is awaited."""
+        number = int(text) if text.isdigit() and len(text) <= MAX_DIGITS else 0
         sent = self._sent.get(number)
         if sent is None:
             return False

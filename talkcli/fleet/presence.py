@@ -65,6 +65,13 @@ class Presence:
         return {**said, "groups": list(self.groups), "allow": list(self.allow)}
 
 
+def rank(said: Presence | None) -> tuple[float, str] | None:
+    """Return the rank among bridges of one name: the lowest stays. None if no bridge that is online wrote this."""
+    if said is None or said.since is None or not (said.online and said.session):
+        return None
+    return said.since, said.session
+
+
 def _text(value: object) -> str:
     return value if isinstance(value, str) else ""
 

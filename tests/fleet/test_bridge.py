@@ -394,7 +394,10 @@ def test_what_an_earlier_server_has_rejected_may_be_sent_to_the_next(robot: Robo
         assert asker.say("in time", id="bob-1")["state"] == "PENDING"
 
 
-@pytest.mark.parametrize("wrong", [b"", b'{"talk": 1, "online": false, "session": "old"}'])
+@pytest.mark.parametrize(
+    "wrong",
+    [b"", b"7", b'{"talk": 1, "online": false, "session": "old"}', b'{"talk": 1, "online": true, "session": "old"}'],
+)
 def test_what_others_say_of_its_presence_is_put_right(lasting_robot: Robot, wrong: bytes) -> None:
     said = kept(lasting_robot.broker, f"{ANNA}/presence")
     with Listener(lasting_robot.broker, f"{ANNA}/presence") as listener:

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from talkcli.fleet.presence import Presence
+from talkcli.fleet.presence import Presence, rank
 
 SERVER = {"boot": "7r2z", "pid": 4711, "version": "0.1.0"}
 HERE = {
@@ -20,6 +20,8 @@ HERE = {
     "server": SERVER,
     "later": "a field that is not known yet",
 }
+#: Values that are neither a string nor a number.
+OTHER_VALUES: tuple[object, ...] = (None, True, [], {})
 
 
 def test_what_a_bridge_says_is_taken_up() -> None:
@@ -38,7 +40,13 @@ def test_what_the_will_says_is_that_it_is_gone_and_of_which_groups_it_was() -> N
     assert found == Presence("anna", online=False, session="9b51", groups=("all", "night"))
 
 
-@pytest.mark.parametrize("payload", [b"", b"\n", b"[]", b"anna", b'"online"', b"{", b"\xff", b'{"a": 1, "a": 2}'])
+@pytest.mark.parametrize(
+    "payload",
+    [
+        *(b"", b"\n", b"[]", b"anna", b'"online"', b"{", b"\xff", b'{"a": 1, "a": 2}'),
+        *(b'{"online": true, "since": ' + each + b"}" for each in (b"NaN", b"-Infinity", b"1e999", b"7" * 5000)),
+    ],
+)
 def test_what_is_cleared_or_is_no_object_is_no_presence(payload: bytes) -> None:
     assert Presence.read("anna", payload) is None
 
@@ -54,6 +62,8 @@ def test_a_name_that_no_robot_can_have_is_none(name: str) -> None:
         {"online": 1, "since": "today", "groups": "all", "allow": None, "server": [], "session": 3, "version": {}},
         {"online": "true", "since": True, "groups": {}, "server": "none"},
         {"groups": [1, None, ["all"]]},
+        {"since": 10**19, "session": True, "server": 1e300, "version": 10**19, "allow": {"say": True}},
+        {"since": -1e300, "session": ["9b51"], "server": False, "version": None, "allow": [[], {}, 1.5]},
         {},
     ],
 )
@@ -65,3 +75,19 @@ def test_of_groups_those_are_taken_that_can_be_read() -> None:
     found = Presence.read("anna", b'{"online": true, "groups": ["all", 7, "night"]}')
     assert found is not None
     assert found.groups == ("all", "night")
+
+
+@pytest.mark.parametrize(
+    ("changed", "found"),
+    [
+        ({}, (1767225600.25, "9b51")),
+        ({"since": 0}, (0.0, "9b51")),
+        ({"online": False}, None),
+        *(({"since": wrong}, None) for wrong in (*OTHER_VALUES, "today", 10**19)),
+        *(({"session": wrong}, None) for wrong in (*OTHER_VALUES, "", 7)),
+    ],
+)
+def test_only_a_presence_with_a_time_and_a_session_is_compared_with_other_bridges(
+    changed: dict[str, object], found: tuple[float, str] | None
+) -> None:
+    assert rank(Presence.read("anna", json.dumps(HERE | changed).encode())) == found
