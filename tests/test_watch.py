@@ -169,7 +169,7 @@ def test_lines_follow_a_window_that_is_resized(scripted: Talk) -> None:
 def test_reason_that_is_too_long_for_its_column_has_a_line_of_its_own(scripted: Talk) -> None:
     message = "audio_open_error:_No_such_file_or_directory"
     text = f"fail=audio_device message={message}"
-    with at_terminal(scripted, 90, "watch") as watch:
+    with at_terminal(scripted, 100, "watch") as watch:
         watch.wait_for("silent")
         scripted.run("say", "--", text)
         watch.wait_for("ABORTED.*\n.*\n")
@@ -181,7 +181,7 @@ def test_reason_that_is_too_long_for_its_column_has_a_line_of_its_own(scripted: 
     assert lines[at + 1] == " " * 10 + "audio_device: audio open error: No such file or directory"
     # It had no line before that could have told who sent it.
     assert re.search(r'"" +invalid_text: the text is empty, from \S', lines[-1])
-    assert all(width(each) <= 90 for each in lines)
+    assert all(width(each) <= 100 for each in lines)
 
 
 def test_colour_by_outcome_on_a_terminal_alone(scripted: Talk) -> None:

@@ -43,8 +43,34 @@ _ABOUT = {
 _IF_ANY = frozenset({"synthesizer", "device", "lead_in", "ttl", "preempt"})
 
 _NOBODY = "nobody known"
-#: Programs whose first argument is the script that one looks for.
-_INTERPRETER = re.compile(r"(ba|da|z|fi|k)?sh|python[\d.]*|perl|ruby|node|lua|env|sudo|timeout|nice")
+#: Programs that start another one, without their version: their options that take a value, their options after which no
+#: script follows, and the number of arguments before the program.
+_SHELL = ("o O rcfile init-file", "c s", 0)
+_STARTERS = {
+    **dict.fromkeys(("sh", "bash", "dash", "ash", "zsh", "ksh", "fish"), _SHELL),
+    "python": ("W X", "c", 0),
+    "perl": ("I", "e E", 0),
+    "ruby": ("I r", "e", 0),
+    "node": ("r require import", "e p eval print", 0),
+    "lua": ("l", "e", 0),
+    "chrt": ("T P D", "", 1),
+    "env": ("u C unset chdir", "", 0),
+    "flock": ("w E timeout", "c", 1),
+    "ionice": ("c n class classdata", "", 0),
+    "nice": ("n adjustment", "", 0),
+    "nohup": ("", "", 0),
+    "setsid": ("", "", 0),
+    "stdbuf": ("i o e input output error", "", 0),
+    "sudo": ("u g h p C D R T user group host prompt chdir", "", 0),
+    "taskset": ("", "", 1),
+    "time": ("f o format output", "", 0),
+    "timeout": ("s k signal kill-after", "", 1),
+    "xargs": ("n P I L s d a E max-args max-procs arg-file", "", 0),
+}
+#: Arguments that are neither the program nor one of those before it: variables that are set.
+_ASSIGNMENT = re.compile(r"\w+=.*")
+#: Paths of open files, which say nothing about the script.
+_DESCRIPTOR = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
 
 
 def ending(goal: Goal) -> str:
@@ -273,12 +299,38 @@ def _program(sender: Sender) -> str:
 
 
 def _script(sender: Sender) -> str:
-    """Return the name of the script, without its directory, its interpreter and its arguments."""
-    words = (sender.parent or sender.command or "a program").split(" ")
-    name = _base(words[0])
-    if len(words) > 1 and _INTERPRETER.fullmatch(name) and not words[1].startswith("-"):
-        name = _base(words[1])
-    return printable(name, MAX_COMMAND)
+    """Return the name of the script, without its directory, its arguments and the programs that started it."""
+    words = (sender.parent or "").split()
+    if not words:
+        return _program(sender)
+    while started := _started(words):
+        words = started
+    return printable(_base(words[0]), MAX_COMMAND)
+
+
+def _started(words: list[str]) -> list[str]:
+    """Return the command that this command starts, empty if it starts none or a script without a name."""
+    name = _base(words[0]).rstrip("0123456789.")
+    if name not in _STARTERS:
+        return []
+    valued, nameless, arguments = _STARTERS[name]
+    rest = iter(range(1, len(words)))
+    for place in rest:
+        word = words[place]
+        if word.startswith("-"):
+            options = [word[2:]] if word.startswith("--") else list(word[1:])
+            for number, each in enumerate(options, start=1):
+                if each in nameless.split():
+                    return []
+                if each in valued.split():
+                    if number == len(options):  # else its value is the rest of this word
+                        next(rest, None)
+                    break
+        elif not _ASSIGNMENT.fullmatch(word):
+            if arguments == 0:
+                return [] if _DESCRIPTOR.fullmatch(word) else words[place:]
+            arguments -= 1
+    return []
 
 
 def _base(path: str) -> str:

@@ -180,16 +180,57 @@ def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
     ]
     assert who_forms(replace(PATROL, name=None))[1:] == ["patrol.sh, pid 812", "patrol.sh"]
     assert who_forms(None) == ["nobody known"]
-    scripts = {
-        "python3 -m robot": "python3",
-        "/usr/bin/python3.11 /opt/a.py x": "a.py",
-        "-bash": "-bash",
-        "bash -c talk say x": "bash",
-        "./patrol": "patrol",
-        "/": "/",
-    }
-    for parent, script in scripts.items():
-        assert who_forms(Sender(parent=parent))[-1] == script
+
+
+@pytest.mark.parametrize(
+    ("parent", "script"),
+    [
+        ("-bash", "-bash"),
+        ("./patrol", "patrol"),
+        ("/", "/"),
+        # interpreters
+        ("/usr/bin/python3.11 /opt/a.py x", "a.py"),
+        ("python3 -u -W ignore -Wonce /opt/a.py", "a.py"),
+        ("python3 -m robot.patrol x", "robot.patrol"),
+        ("python3 -c import talkcli", "python3"),
+        ("bash -e a.sh", "a.sh"),
+        ("bash -euo pipefail a.sh -c", "a.sh"),
+        ("bash -c talk say x", "bash"),
+        ("bash -lc talk say x", "bash"),
+        ("bash -s x", "bash"),
+        ("bash /dev/fd/3", "bash"),
+        ("/bin/sh /proc/self/fd/3 x", "sh"),
+        ("perl -ne print a", "perl"),
+        ("node --require x.js a.js", "a.js"),
+        # programs that start another one
+        ("timeout 60 python3 a.py", "a.py"),
+        ("timeout -s KILL -k 5 1m ./a", "a"),
+        ("timeout --signal KILL --kill-after=5 0.5 ./a", "a"),
+        ("nice -n 5 ./a", "a"),
+        ("nice -n5 ./a", "a"),
+        ("ionice -c 3 ./a", "a"),
+        ("env -i A=1 B=2 ./a C=3", "a"),
+        ("env -u X ./a", "a"),
+        ("sudo -u robot -E A=1 ./a", "a"),
+        ("sudo -Eu robot -- ./a -x", "a"),
+        ("/usr/bin/time -f %e ./a", "a"),
+        ("stdbuf -oL ./a", "a"),
+        ("chrt -f 5 ./a", "a"),
+        ("taskset -c 0,1 ./a", "a"),
+        ("flock -w 5 /run/lock/x ./a", "a"),
+        ("xargs -n 1 ./a", "a"),
+        ("sudo nohup setsid nice timeout 60 bash a.sh", "a.sh"),
+        # without a program
+        ("timeout 60", "timeout"),
+        ("sudo -u", "sudo"),
+        ("nice -", "nice"),
+        ("env bash", "bash"),
+        ("env  ", "env"),
+        (None, "a program"),
+    ],
+)
+def test_a_sender_is_shown_by_the_script_that_it_runs(parent: str | None, script: str) -> None:
+    assert who_forms(Sender(parent=parent))[-1] == script
 
 
 def test_why_a_goal_ended() -> None:
