@@ -45,7 +45,7 @@ SERVER = "the server"
 #: What to do where a server answers and takes no client, by the code of the client's error.
 _ANSWERS = {
     "protocol_mismatch": "install the same talk on both sides, and start the server again",
-    "busy": "end some of its clients, or give it more places: talk serve --max-clients 512",
+    "busy": "end some of its clients, or raise the limit that is named: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "have its owner let you in: talk serve --socket-mode 0660, and join the socket's group",
 }
 #: What to do about what is found, that which is most surely in the way first.

@@ -203,9 +203,12 @@ def greeting(version: str, pid: int, boot: str) -> JsonObject:
     return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": []}
 
 
-def busy_greeting() -> JsonObject:
-    """Return what a server says first, and last, that takes no more clients."""
-    return {"talk": PROTOCOL, "error": "busy"}
+def busy_greeting(message: str | None = None) -> JsonObject:
+    """Return the greeting of a server that takes no more clients.
+
+    `message`: why, and what to do; None if the limit is `--max-clients`.
+    """
+    return {"talk": PROTOCOL, "error": "busy", **({} if message is None else {"message": message})}
 
 
 def check_greeting(message: JsonObject, version: str) -> None:
@@ -220,7 +223,10 @@ def check_greeting(message: JsonObject, version: str) -> None:
             f"{theirs!a}: {side}"
         )
     if message.get("error") == "busy":
-        raise Busy("the server has as many clients as it takes (`talk serve --max-clients`)", "busy")
+        words = message.get("message")
+        if not (isinstance(words, str) and words and words.isprintable()):  # it may be a stranger's, for a terminal
+            words = "the server has as many clients as it takes (`talk serve --max-clients`)"
+        raise Busy(words, "busy")
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:

@@ -42,6 +42,11 @@ AT_ONCE = 8
 RESERVE = 16
 #: Descriptors that a server has without clients: fourteen, and two for what a library may open.
 OWN = 16
+#: What a client is told if the server has no descriptor left for it.
+_TOO_FEW_DESCRIPTORS = (
+    "the server has too few file descriptors for more clients: raise LimitNOFILE= of its unit, or ulimit -n before "
+    "talk serve"
+)
 #: Seconds until it looks again where no connection could be taken up.
 RETRY_AFTER = 1.0
 #: What the system says that has nothing left to take up a connection with; the connection waits.
@@ -323,7 +328,7 @@ class Acceptor:
             f"clients are turned away: only {self._descriptors} files may be open (raise LimitNOFILE= or ulimit -n)",
         )
         with connected, contextlib.suppress(OSError):  # it is gone again
-            connected.send(encode(busy_greeting()))
+            connected.send(encode(busy_greeting(_TOO_FEW_DESCRIPTORS)))
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
         """Leave the connections waiting for a while: the loop would ask for them without end."""

@@ -84,7 +84,7 @@ def receive(client: socket.socket) -> dict[str, Any]:
 
 
 def greeted(clients: list[socket.socket]) -> list[socket.socket]:
-    """Return the clients that were let in; each has been told, the others that the server is busy."""
+    """Return the clients that were let in; assert that the others were told that descriptors are missing."""
     inside = []
     for each in clients:
         greeting = receive(each)
@@ -93,6 +93,7 @@ def greeted(clients: list[socket.socket]) -> list[socket.socket]:
             inside.append(each)
         else:
             assert greeting["error"] == "busy"
+            assert "LimitNOFILE" in greeting["message"]
     return inside
 
 

@@ -62,10 +62,19 @@ def test_any_object_for_a_greeting_is_accepted_or_a_mismatch(message: JsonObject
         assert message.get("talk") == 1
 
 
-def test_a_server_that_is_full_is_busy() -> None:
-    assert busy_greeting() == {"talk": 1, "error": "busy"}
-    with pytest.raises(Busy) as busy:
-        check_greeting(busy_greeting(), "0.1")
+@pytest.mark.parametrize(
+    ("greeting", "words"),
+    [
+        (busy_greeting(), "as many clients as it takes .*--max-clients"),
+        (busy_greeting("too few descriptors"), "^too few descriptors$"),
+        ({"talk": 1, "error": "busy", "message": ["none"]}, "--max-clients"),
+        ({"talk": 1, "error": "busy", "message": ""}, "--max-clients"),
+        ({"talk": 1, "error": "busy", "message": "\x1b[31m"}, "--max-clients"),
+    ],
+)
+def test_a_server_that_is_full_is_busy_and_may_say_why(greeting: JsonObject, words: str) -> None:
+    with pytest.raises(Busy, match=words) as busy:
+        check_greeting(greeting, "0.1")
     assert (busy.value.code, busy.value.exit_code) == ("busy", 5)
 
 
