@@ -181,7 +181,7 @@ class ClickCommand(_Documented):
         context = click.get_current_context()
         options: Common = context.obj
         options.typed = {each for each in given if context.get_parameter_source(each) is ParameterSource.COMMANDLINE}
-        fault = self.row.fault(given, options.typed, options.robot, options.socket)
+        fault = self.row.fault(given, options.typed, options.robot, options.socket, options.connect_timeout)
         if fault:
             raise click.UsageError(fault, context)
         return self.row.carry_out(options, given)

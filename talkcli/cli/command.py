@@ -88,19 +88,28 @@ class Command:
     plain: bool = True
     #: whether it means a server, which may be a robot's of a fleet, and not this machine alone
     asks: bool = True
+    #: whether it connects to one server, which it can wait for
+    connects: bool = True
     #: the function that asks several robots at once, as `runs` one, without the options that don't go with that; ""
     #: where the command does not
     several: str = ""
     rule: Rule | None = None
 
     def fault(
-        self, given: Mapping[str, Any], typed: AbstractSet[str], robot: str | None = None, socket: str | None = None
+        self,
+        given: Mapping[str, Any],
+        typed: AbstractSet[str],
+        robot: str | None = None,
+        socket: str | None = None,
+        connect_timeout: float | None = None,
     ) -> str | None:
         """Return what is wrong with values that each can be read, for people, or None.
 
-        `robot`, `socket`: the options of every command that say whom it means, as they were typed.
+        `robot`, `socket`, `connect_timeout`: options of every command, as they were typed.
         """
         if robot is not None and (fault := self._stray(given, robot, socket)):
+            return fault
+        if connect_timeout is not None and (fault := self._impatient(given, robot)):
             return fault
         refused = (words for each in self.options if (words := each.refusal(given[each.name])))
         return next(refused, None) or (self.rule(given, typed) if self.rule else None)
@@ -123,13 +132,28 @@ class Command:
                 )
         return Selection(robot).fault
 
+    def _impatient(self, given: Mapping[str, Any], robot: str | None) -> str | None:
+        """Return what is wrong with waiting until the server can be reached, or None."""
+        output = given.get("output") is not None
+        if not (self.asks and self.connects) or output:
+            return f"'talk {self.name}{' --output' * output}' waits for no server: leave out --connect-timeout"
+        if robot is not None:
+            from talkcli.fleet.selection import several
+
+            if several(robot):
+                return "--connect-timeout waits for one robot: name it, or leave out --connect-timeout"
+        return None
+
     def carry_out(self, options: Common, given: Mapping[str, Any]) -> int | None:
         """Carry it out with what was given, and return the exit code; None for 0."""
         options.urgent = self.urgent
         runs = self.runs
         robot = named_robot(options.robot, options.socket) if self.asks and given.get("output") is None else None
         if robot:
-            if fault := self._stray(given, robot, None):
+            fault = self._stray(given, robot, None)
+            if fault is None and options.connect_timeout is not None:
+                fault = self._impatient(given, robot)
+            if fault:
                 raise UsageError(fault)
             from talkcli.fleet.selection import several
 
@@ -161,6 +185,14 @@ COMMON = (
         "A robot of a fleet, by its broker (TALK_BROKER); or several: a glob, @GROUP, @all.  [env var: TALK_ROBOT]",
         metavar="NAME",
         offers="robots",
+    ),
+    option(
+        "--connect-timeout",
+        NUMBER,
+        "Keep trying to reach the server for SEC seconds; with --robot, until the robot is online.",
+        limits=(0, None),
+        above=True,
+        metavar="SEC",
     ),
     option("--insecure", FLAG, "Send the password to the broker without TLS."),
     option("--json", FLAG, "For programs: one JSON object a line; errors, too."),

@@ -314,6 +314,7 @@ _ROWS = (
         """,
         runs="doctor:doctor",
         plain=False,
+        connects=False,
         examples="""
         talk doctor
         talk doctor --silent                    at night: all of it, without a sound
@@ -344,6 +345,7 @@ _ROWS = (
         """,
         runs="fleet:fleet",
         several="fleet:fleet",
+        connects=False,
         examples="""
         talk fleet status
         talk fleet status --robot @warehouse

@@ -244,6 +244,7 @@ def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
 def _ask(context: click.Context, question: Callable[[Client], _Answer]) -> _Answer | None:
     """Return the server's answer, or None if there is none for whatever reason."""
     options: Common = context.find_root().obj  # with --socket, where it stood before
+    options.connect_timeout = None
     try:
         with options.connect(PATIENCE) as client:
             return question(client)

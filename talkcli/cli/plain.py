@@ -121,7 +121,7 @@ def _complete(
         given[argument.name] = tuple(words) if many else next(iter(words), None)
     elif words:
         return None
-    if command.fault(given, typed, common.get("robot"), common.get("socket")):
+    if command.fault(given, typed, common.get("robot"), common.get("socket"), common.get("connect_timeout")):
         return None
     return Plain(command, given, common, typed)
 

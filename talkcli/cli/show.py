@@ -12,7 +12,16 @@ import sys
 import time
 
 from talkcli import __version__, paths
-from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, EXIT_TIMEOUT, TalkError, UsageError, limits
+from talkcli.errors import (
+    EXIT_ERROR,
+    EXIT_SIGINT,
+    EXIT_SIGPIPE,
+    EXIT_TIMEOUT,
+    ServerUnavailable,
+    TalkError,
+    UsageError,
+    limits,
+)
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -49,6 +58,7 @@ class Common:
     insecure = False
     json = False
     quiet = False
+    connect_timeout: float | None = None
     #: how far its connection has come already, maybe with its request sent: see `plain`
     begun: Begun | None = None
     #: signals that wait for somebody to take them
@@ -66,19 +76,28 @@ class Common:
     def connect(self, timeout: float | None = None, **options: Any) -> Client:
         """Return a client connected to the server; see `SocketConnection` for the options.
 
-        `timeout`: seconds that all may take, and so the longest that an answer is waited for.
+        `timeout`: seconds that all may take, and so the longest that an answer is waited for. The command's first
+        connection is tried again for `connect_timeout` seconds; TimeoutError if `timeout` is over before that.
         """
         from talkcli.client.client import Client
         from talkcli.client.connect import ANSWER_LIMIT
 
-        options = {"patience": min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), **options}
-        robot = paths.named_robot(self.robot, self.socket)
-        if robot:
-            end = None if timeout is None else self.began + timeout
-            return Client.over(self._reach(robot, end=end, **options))
-        from talkcli.client.connection import SocketConnection
-
-        return Client.over(SocketConnection(self.socket, begun=self.begun, **{"urgent": self.urgent, **options}))
+        began, end = time.monotonic(), None if timeout is None else self.began + timeout
+        options = {"patience": min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), "end": end, **options}
+        connect_timeout, self.connect_timeout = self.connect_timeout, None
+        if connect_timeout is None:
+            return Client.over(self._connection(**options))
+        waits = connect_timeout if end is None else min(connect_timeout, max(0.0, end - began))
+        try:
+            return Client.over(self._connection(keep_trying=waits, **options))
+        except ServerUnavailable as error:
+            now = time.monotonic()
+            if now < began + waits:  # it can't be expected to come
+                raise
+            words = f"waited for {round(now - began, 1):g} s: {error.message}"
+            if end is not None and now >= end:
+                raise TimeoutError(words) from None
+            raise ServerUnavailable(words) from None
 
     def crowd(self, timeout: float | None = None, **options: Any) -> Crowd:
         """Return the robots of a fleet that were named, connected to their broker; the options are `Crowd`'s.
@@ -101,8 +120,13 @@ class Common:
 
         return from_environment(os.environ, insecure=self.insecure)
 
-    def _reach(self, robot: str, **options: Any) -> Connection:
-        """Return a connection to a robot of a fleet."""
+    def _connection(self, **options: Any) -> Connection:
+        """Return a connection to the server of this machine, or to a robot of a fleet."""
+        robot = paths.named_robot(self.robot, self.socket)
+        if not robot:
+            from talkcli.client.connection import SocketConnection
+
+            return SocketConnection(self.socket, begun=self.begun, **{"urgent": self.urgent, **options})
         broker = self.broker()
         from talkcli.fleet.robot import reach
 

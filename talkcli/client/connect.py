@@ -38,6 +38,8 @@ ANSWER_LIMIT = 5.0
 #: that were turned away together don't come back together.
 BUSY_LIMIT = 5.0
 _BUSY_PAUSE = (0.02, 0.2)
+#: Seconds between two tries to reach a server that is not there yet: the first pause, which doubles up to the second.
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 0.25
 #: What to do next where nobody answers.
 _START = "start one with: talk serve"
 _LET_IN = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
@@ -181,36 +183,66 @@ def connect(
     patience: float = ANSWER_LIMIT,
     interrupt: Mapping[int, int] | None = None,
     begun: Begun | None = None,
+    keep_trying: float = 0.0,
+    end: float | None = None,
 ) -> Begun:
     """Return a connection to the first server that answers, with its greeting read.
 
-    `named`: the only socket to try, or None for the list; `hello`: what is said to it; `patience`: seconds in which the
-    server must greet; `interrupt`: what ends it with Interrupted, as in `ready`; `begun`: how far it has come already.
+    Args:
+        named: the only socket to try, or None for the list.
+        hello: the first request.
+        patience: seconds in which the server must greet.
+        interrupt: what ends it with Interrupted, as in `ready`.
+        begun: how far the connection has come already.
+        keep_trying: seconds for which a server that is not there yet is tried again, and for which it may greet.
+        end: the monotonic time by which the server must have greeted in any case, or None.
 
-    ServerUnavailable, AccessDenied, ProtocolMismatch or Busy where there is none.
+    Raises:
+        ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: there is no server that can be used.
     """
     from talkcli.errors import AccessDenied, Busy, ServerUnavailable
 
-    end = time.monotonic() + min(BUSY_LIMIT, patience)
-    begun = begun or reach(named)
+    give_up = time.monotonic() + (keep_trying or min(BUSY_LIMIT, patience))
+    begun, next_pause = begun or reach(named), _FIRST_PAUSE_S
     while True:
-        try:
-            if begun.socket is None:
-                raise _nobody(begun, named)
-            return _greet(begun, begun.socket, hello, patience, interrupt)
-        except AccessDenied as error:
-            if begun.socket is None or begun.sent:
-                raise
-            failures = (*begun.failures, (begun.path, error))
-        except (Busy, ServerUnavailable) as error:
-            again = begun.full or isinstance(error, Busy)
-            if not again or begun.sent or time.monotonic() >= end:
-                raise
+        error: TalkError | None = None
+        busy = begun.full
+        again = busy or (keep_trying > 0 and _may_come(begun))
+        if begun.socket:
+            greet_by = time.monotonic() + patience
+            if keep_trying:
+                greet_by = max(greet_by, give_up)
+                greet_by = greet_by if end is None else min(greet_by, end)
+            try:
+                return _greet(begun, begun.socket, hello, greet_by, interrupt)
+            except AccessDenied as denied:
+                if begun.sent:
+                    raise
+                begun = reach(named, (*begun.failures, (begun.path, denied)))
+                continue
+            except Busy as refused:
+                error, again, busy = refused, True, True
+            except ConnectionError:
+                error = ServerUnavailable(f"the server at {begun.path} closed the connection before it answered")
+                again = keep_trying > 0
+        left = give_up - time.monotonic()
+        if not again or begun.sent or left <= 0:
+            raise error or _nobody(begun, named)
+        pause = next_pause
+        if busy:
             import random
 
-            ready({}, random.uniform(*_BUSY_PAUSE), interrupt)
-            failures = ()
-        begun = reach(named, failures)
+            pause = random.uniform(*_BUSY_PAUSE)
+        else:
+            next_pause = min(2 * pause, _LONGEST_PAUSE_S)
+        ready({}, min(pause, left), interrupt)
+        begun = reach(named)
+
+
+def _may_come(begun: Begun) -> bool:
+    """Whether a server may still start at one of the places that were tried in vain."""
+    found = (paths.found_at(path, error) for path, error in begun.failures if isinstance(error, OSError))
+    return any(each in {paths.ABSENT, paths.STALE} for each in found)
 
 
 def ready(watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None) -> set[int]:
@@ -235,12 +267,14 @@ def ready(watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[
 
 
 def _greet(
-    begun: Begun, connected: _socket.socket, hello: JsonObject, patience: float, interrupt: Mapping[int, int] | None
+    begun: Begun, connected: _socket.socket, hello: JsonObject, end: float, interrupt: Mapping[int, int] | None
 ) -> Begun:
-    """Greet, unless that has been done, and be greeted; where that fails the connection is closed."""
+    """Greet, unless that has been done, and be greeted by `end`; the connection is closed if that fails.
+
+    ConnectionError if the server hangs up first.
+    """
     from talkcli.protocol.lines import request_line
 
-    end = time.monotonic() + patience
     received = begun.received
     try:
         if not begun.greeted:
@@ -275,12 +309,9 @@ def _heard(connected: _socket.socket, path: str, end: float, interrupt: Mapping[
         pid, _ = peers.credentials(connected)
         hint = f"look at process {pid}, and restart it if it hangs"
         raise ServerUnavailable(f"the server at {path} does not answer; {hint}")
-    try:
-        data = connected.recv(65536)
-    except ConnectionResetError:
-        data = b""
+    data = connected.recv(65536)
     if not data:
-        raise ServerUnavailable(f"the server at {path} closed the connection before it answered")
+        raise ConnectionResetError
     return data
 
 

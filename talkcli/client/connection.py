@@ -389,16 +389,21 @@ class SocketConnection(BaseConnection):
         interrupt: Mapping[int, int] | None = None,
         patience: float = ANSWER_LIMIT,
         begun: Begun | None = None,
+        keep_trying: float = 0.0,
+        end: float | None = None,
     ) -> None:
-        """Connect.
+        """Connect; the errors are those of `Client`.
 
-        `socket`: path of the server's socket, default TALK_SOCKET, then the usual places; `name`: what the sender calls
-        itself, default TALK_NAME; `urgent`: for status and cancel alone, for which a full server keeps some places;
-        `interrupt`: what ends any waiting with Interrupted, as in `connect.ready`; `patience`: seconds in which the
-        server must greet, and answer; `begun`: how far it has come already, maybe with what is to be the first request
-        sent.
-
-        What is raised, `Client` says.
+        Args:
+            socket: path of the server's socket; default TALK_SOCKET, then the usual places.
+            name: what the sender calls itself; default TALK_NAME.
+            urgent: for status and cancel alone, for which a full server keeps some places.
+            interrupt: what ends any waiting with Interrupted, as in `connect.ready`.
+            patience: seconds in which the server must greet, and answer each request.
+            begun: how far the connection has come already; its first request may have been sent.
+            keep_trying: seconds for which a server that is not there yet is tried again. What is left of them counts
+                as patience if it is more.
+            end: the monotonic time by which the server must have greeted, if it is tried again; or None.
         """
         super().__init__(patience)
         self._interrupt = interrupt
@@ -406,8 +411,10 @@ class SocketConnection(BaseConnection):
         if name and len(name) > MAX_NAME:
             raise UsageError(f"the name of the sender has {len(name)} characters, the longest allowed is {MAX_NAME}")
         said = hello(name, urgent=urgent)
-        begun = connect(paths.named_socket(socket), said, patience, self._interrupt, begun)
+        give_up = time.monotonic() + keep_trying
+        begun = connect(paths.named_socket(socket), said, patience, self._interrupt, begun, keep_trying, end)
         assert begun.socket
+        self._patience = max(patience, round(give_up - time.monotonic(), 1))
         self._socket, self.path, self.boot, self.pid = begun.socket, begun.path, begun.boot, begun.pid
         self._splitter = LineSplitter()
         self._lines.extend(self._splitter.feed(begun.received))

@@ -13,7 +13,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from talkcli import __version__
-from talkcli.client.connect import ANSWER_LIMIT, sender
+from talkcli.client.connect import ANSWER_LIMIT, ready, sender
 from talkcli.client.connection import BaseConnection, Exchange
 from talkcli.errors import (
     AccessDenied,
@@ -52,6 +52,8 @@ EXPIRY = 5
 _SIGN_OF_LIFE = 30.0
 #: Times that a request goes out again after an absence: a broker may end the connection because of it.
 _MAX_TRIES = 5
+#: Seconds between two tries to reach a broker that is not there yet.
+_PAUSE_S = 0.25
 #: Characters of a user's name in the ids that are given here, which have 64 at most.
 _OF_USER = 48
 #: Goals that are asked for at once after an absence: a bridge takes 64 requests of one asker.
@@ -244,9 +246,15 @@ class RobotConnection(BaseConnection):
 
     # -- the beginning
 
-    def greet(self) -> None:
-        """Wait until the broker has told of the robot; errors as of `reach`."""
+    def greet(self, give_up: float) -> None:
+        """Wait until the broker has told of the robot, and until `give_up` (monotonic) for it to be online.
+
+        Errors as of `reach`.
+        """
         self._desk.await_kept(self._patience, lambda: bool(self._presence), self._interrupt)
+        while self._absent_since is not None and self._desk.link and (left := give_up - time.monotonic()) > 0:
+            self._desk.serve(left, self._interrupt)
+        self._patience = max(self._patience, round(give_up - time.monotonic(), 1))
         if not self._presence:
             words = f"no robot '{self._robot}' is known at {self._desk.broker.url}: nothing was sent"
             raise ServerUnavailable(f"{words}; on the robot: talk bridge --name {self._robot}")
@@ -402,20 +410,27 @@ class RobotConnection(BaseConnection):
             self._desk.close()
 
 
-def reach(robot: str, broker: Broker, **options: Any) -> RobotConnection:
+def reach(robot: str, broker: Broker, *, keep_trying: float = 0.0, **options: Any) -> RobotConnection:
     """Connect to a robot's server by a desk of its own, and find the robot there; the options are RobotConnection's.
+
+    `keep_trying`: seconds for which a broker that can't be reached is tried again, and the robot is waited for.
 
     ServerUnavailable where there is no broker, or no such robot, or that has no server: nothing was sent then.
     AccessDenied where the broker doesn't let this user in, or may not be trusted; UsageError for what can't be.
     """
-    desk = Desk(broker)
-    try:
-        desk.visitor = connection = RobotConnection(robot, desk, **options)
-        connection.greet()
-    except BaseException:
-        desk.close()
-        raise
-    return connection
+    give_up = time.monotonic() + keep_trying
+    while True:
+        desk = Desk(broker)
+        try:
+            desk.visitor = connection = RobotConnection(robot, desk, **options)
+            connection.greet(give_up)
+            return connection
+        except BaseException as error:
+            desk.close()
+            left = give_up - time.monotonic()
+            if not isinstance(error, ServerUnavailable) or left <= 0:
+                raise
+        ready({}, min(_PAUSE_S, left), options.get("interrupt"))
 
 
 def new_id(desk: Desk) -> str:
