@@ -122,6 +122,7 @@ def assert_read_alike(arguments: list[str], environment: Mapping[str, str]) -> N
     assert (found.command.name, found.given) == (command, params)
     assert {*found.typed} == {each.name for each in found.command.options if each.name in options.typed}
     assert found.common.get("socket") == options.socket
+    assert found.common.get("connect_timeout") == options.connect_timeout
     assert (found.common.get("json", False), found.common.get("quiet", False)) == (options.json, options.quiet)
 
 

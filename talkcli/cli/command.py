@@ -136,7 +136,7 @@ class Command:
         """Return what is wrong with waiting until the server can be reached, or None."""
         output = given.get("output") is not None
         if not (self.asks and self.connects) or output:
-            return f"'talk {self.name}{' --output' * output}' waits for no server: leave out --connect-timeout"
+            return f"'talk {self.name}{' --output' * output}' does not wait for a server: leave out --connect-timeout"
         if robot is not None:
             from talkcli.fleet.selection import several
 

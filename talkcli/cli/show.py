@@ -94,7 +94,7 @@ class Common:
             now = time.monotonic()
             if now < began + waits:  # it can't be expected to come
                 raise
-            words = f"waited for {round(now - began, 1):g} s: {error.message}"
+            words = f"waited for {round(waits, 1):g} s: {error.message}"
             if end is not None and now >= end:
                 raise TimeoutError(words) from None
             raise ServerUnavailable(words) from None

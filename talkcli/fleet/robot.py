@@ -251,7 +251,8 @@ class RobotConnection(BaseConnection):
 
         Errors as of `reach`.
         """
-        self._desk.await_kept(self._patience, lambda: bool(self._presence), self._interrupt)
+        left = self._patience if self._end is None else max(0.0, self._end - time.monotonic())
+        self._desk.await_kept(min(self._patience, left), lambda: bool(self._presence), self._interrupt)
         while self._absent_since is not None and self._desk.link and (left := give_up - time.monotonic()) > 0:
             self._desk.serve(left, self._interrupt)
         self._patience = max(self._patience, round(give_up - time.monotonic(), 1))

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.client.client import Client
+from talkcli.fleet import topics
 from tests.fleet.robot import LONG, Robot
 from tests.support.bridge import Desk
+from tests.support.connection import PATIENCE
 from tests.support.mqtt import Listener
 from tests.support.proxy import Proxy
 from tests.support.surroundings import needs_packages
@@ -215,3 +217,39 @@ def test_a_goal_of_a_desk_whose_reader_went_away_is_cancelled_at_the_robot(lasti
         asked.stdout.close()
         assert asked.wait(10) == 141
         assert lasting_robot.talk.goal("unread")["state"] == "PREEMPTED"
+
+
+def test_a_command_waits_for_a_robot_to_be_online(robot: Robot) -> None:
+    assert robot.bridge.terminate() == 0
+    with Desk(robot.broker) as somebody, Listener(robot.broker, topics.reply("+", "+", "+")) as listener:
+        client = somebody.start("--robot", "anna", "--connect-timeout", "60", "say", "--wait", "length=0.1")
+        listener.await_message(lambda _: True)  # the desk's marker: it has asked who is there
+        robot.bridge.start()
+        assert somebody.finish(client).code == 0
+    assert robot.spoken == ["length=0.1"]
+
+
+def test_a_command_waits_for_the_broker(robot: Robot) -> None:
+    with Proxy(robot.broker.port) as proxy, Desk(robot.broker, port=proxy.port) as somebody:
+        came = proxy.hold_from("to_broker", b"MQTT")
+        client = somebody.start("--robot", "anna", "--connect-timeout", "60", "say", "--wait", "length=0.1")
+        assert came.wait(PATIENCE)
+        proxy.release()
+        proxy.cut()
+        assert somebody.finish(client).code == 0
+    assert robot.spoken == ["length=0.1"]
+
+
+@pytest.mark.parametrize(
+    ("robot", "line", "code", "words"),
+    [
+        ("anna", "--connect-timeout 0.1 say hello", 3, "waited for 0.1 s: no robot 'anna' is known"),
+        ("anna", "--connect-timeout 60 say --wait --timeout 0.1 hello", 124, "waited for"),
+        ("@all", "--connect-timeout 60 status", 2, "--connect-timeout waits for one robot"),
+    ],
+)
+def test_a_robot_is_waited_for_no_longer(broker: Broker, robot: str, line: str, code: int, words: str) -> None:
+    with Desk(broker, env={"TALK_ROBOT": robot}) as somebody:
+        done = somebody.run(*line.split())
+    assert (done.code, done.out) == (code, "")
+    assert words in done.err

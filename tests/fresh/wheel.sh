@@ -15,12 +15,7 @@ talk=$PLACE/bin/talk
 serve() {
     "$talk" serve "$@" &
     server=$!
-    for _ in $(seq 100); do
-        "$talk" status > /dev/null 2>&1 && return
-        sleep 0.1
-    done
-    echo "no answer from talk serve $*" >&2
-    return 1
+    "$talk" --connect-timeout 10 status > /dev/null
 }
 
 serve

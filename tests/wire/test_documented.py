@@ -285,7 +285,7 @@ def test_every_command_in_the_examples_can_be_read(document: Document) -> None:
     """Its options are the command's own; what stands around it is the shell's business. The README has all commands."""
     seen = set()
     lines = "".join(document.examples("sh"))
-    for name, rest in re.findall(r"\btalk (?:--json |--robot \S+ )?([a-z]+)\b([^|#;&\n]*)", lines):
+    for name, rest in re.findall(r"\btalk (?:--json |--(?:robot|connect-timeout) \S+ )?([a-z]+)\b([^|#;&\n]*)", lines):
         if name not in commands.COMMANDS:
             continue
         seen.add(name)
@@ -301,9 +301,9 @@ def test_readme_has_the_setup_commands_as_they_were() -> None:
         == [each for each in README.examples("sh") if ".venv" in each]
         == [
             "python3 -m venv .venv && . .venv/bin/activate && pip install . && "
-            '{ talk serve & sleep 3; talk say "talk is ready" --wait; }\n',
+            '{ talk serve & talk --connect-timeout 10 say "talk is ready" --wait; }\n',
             "python3 -m venv .venv && . .venv/bin/activate && pip install . && "
-            '{ talk serve --player file:ready.wav & sleep 3; talk say "talk is ready" --wait; }\n',
+            '{ talk serve --player file:ready.wav & talk --connect-timeout 10 say "talk is ready" --wait; }\n',
             "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest -n 4\n",
         ]
     )

@@ -1,0 +1,226 @@
+"""`--connect-timeout`: what a client tries again until a server is there, and what it doesn't."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.client import connect
+from talkcli.client.connection import SocketConnection
+from talkcli.errors import AccessDenied, ProtocolMismatch, ServerUnavailable, TalkError
+from tests.support.connection import PATIENCE
+from tests.support.processes import start_talk
+from tests.support.scripted_peer import GREETING
+from tests.support.surroundings import clean_environment, short_directory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Process
+
+HELLO = connect.hello(None, urgent=False)
+BUSY = b'{"talk": 1, "error": "busy", "message": "256 clients"}\n'
+HANG_UP = b""
+
+
+@pytest.fixture
+def path() -> Iterator[str]:
+    with short_directory() as directory:
+        yield f"{directory}/talk/s"
+
+
+@contextlib.contextmanager
+def serving(path: str, *greetings: bytes) -> Iterator[None]:
+    """Serve one client after the other at this path, each with its greeting."""
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(path)
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(path)
+        listening.listen()
+
+        def serve() -> None:
+            for each in greetings:
+                connected, _ = listening.accept()
+                with connected:
+                    connected.sendall(each)
+                    while each and connected.recv(65536):
+                        pass
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield
+        thread.join(PATIENCE)
+
+
+def on_pause(monkeypatch: pytest.MonkeyPatch, act: Callable[[int], object]) -> list[float]:
+    """Call this with its number instead of each pause between two tries; return the seconds of the pauses."""
+    pauses: list[float] = []
+    ready = connect.ready
+
+    def instead(
+        watched: Mapping[int, int], timeout: float, interrupt: Mapping[int, int] | None = None
+    ) -> set[int] | None:
+        if watched:
+            return ready(watched, timeout, interrupt)
+        pauses.append(timeout)
+        act(len(pauses))
+        return None
+
+    monkeypatch.setattr(connect, "ready", instead)
+    return pauses
+
+
+def leave_stale(path: str) -> None:
+    os.makedirs(os.path.dirname(path))
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(path)
+
+
+@pytest.mark.parametrize(
+    "prepare",
+    [lambda _: None, lambda path: os.makedirs(os.path.dirname(path)), leave_stale],
+    ids=["no directory", "no socket", "nobody at the socket"],
+)
+@pytest.mark.parametrize("greetings", [[GREETING], [HANG_UP, GREETING], [BUSY, GREETING]])
+def test_a_server_that_starts_meanwhile_is_reached(
+    path: str, monkeypatch: pytest.MonkeyPatch, prepare: Callable[[str], None], greetings: list[bytes]
+) -> None:
+    prepare(path)
+    with contextlib.ExitStack() as stack:
+        pauses = on_pause(monkeypatch, lambda n: stack.enter_context(serving(path, *greetings)) if n == 3 else None)
+        begun = connect.connect(path, HELLO, keep_trying=60)
+        assert begun.socket
+        begun.socket.close()
+    assert len(pauses) == 3 + len(greetings) - 1
+    assert pauses[:3] == [0.02, 0.04, 0.08]
+
+
+@pytest.mark.parametrize(
+    ("greeting", "error"),
+    [
+        (b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n', AccessDenied),
+        (b'{"talk": 99, "version": "9"}\n', ProtocolMismatch),
+        (b"220 mail ready\n", ServerUnavailable),
+    ],
+)
+def test_a_server_that_says_no_is_asked_once(
+    path: str, monkeypatch: pytest.MonkeyPatch, greeting: bytes, error: type[TalkError]
+) -> None:
+    pauses = on_pause(monkeypatch, lambda _: None)
+    with serving(path, greeting), pytest.raises(error):
+        connect.connect(path, HELLO, keep_trying=60)
+    assert pauses == []
+
+
+def test_a_place_where_no_server_can_come_is_tried_once(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses = on_pause(monkeypatch, lambda _: None)
+    os.makedirs(path)
+    with pytest.raises(ServerUnavailable, match="a directory, and no socket"):
+        connect.connect(path, HELLO, keep_trying=60)
+    monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: [f"{path}/s"])
+    monkeypatch.setattr("talkcli.peers.credentials", lambda _: (1, os.getuid() + 1))
+    with serving(f"{path}/s"), pytest.raises(AccessDenied, match="belongs to uid"):
+        connect.connect(None, HELLO, keep_trying=60)
+    assert pauses == []
+
+
+def test_a_place_that_is_denied_does_not_end_the_waiting_for_another(
+    path: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A user who may not use the machine's server starts one."""
+    denied = f"{path}-denied"
+    monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: [path, denied])
+    refusal = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(serving(denied, refusal))
+        on_pause(monkeypatch, lambda _: stack.enter_context(serving(path, GREETING)))
+        begun = connect.connect(None, HELLO, keep_trying=60)
+        assert begun.socket
+        begun.socket.close()
+    assert begun.path == path
+
+
+@pytest.mark.parametrize(
+    ("keep_trying", "left", "least", "most"), [(0, None, 4, 5), (1, None, 4, 5), (60, None, 50, 60), (2, 2, 1, 2)]
+)
+def test_what_is_left_of_the_time_is_for_the_greeting_and_the_replies(
+    path: str, monkeypatch: pytest.MonkeyPatch, keep_trying: float, left: float | None, least: float, most: float
+) -> None:
+    waited: list[float] = []
+    ready = connect.ready
+
+    def noted(
+        watched: Mapping[int, int], timeout: float, interrupt: Mapping[int, int] | None = None
+    ) -> set[int] | None:
+        waited.append(timeout)
+        return ready(watched, timeout, interrupt)
+
+    monkeypatch.setattr(connect, "ready", noted)
+    with serving(path, GREETING):
+        end = None if left is None else time.monotonic() + left
+        connection = SocketConnection(path, keep_trying=keep_trying, end=end)
+        connection.close()
+    assert all(least <= each <= most for each in waited)
+    assert max(least, 4) <= connection._patience <= max(most, 5)
+
+
+@contextlib.contextmanager
+def trying(path: str, *words: str) -> Iterator[Process]:
+    """Start `talk` with --connect-timeout; it has come back to a server that hung up, and nobody serves now."""
+    os.makedirs(os.path.dirname(path))
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(path)
+        listening.listen()
+        listening.settimeout(PATIENCE)
+        env = clean_environment(os.path.dirname(path), {"TALK_SOCKET": path})
+        client = start_talk(["--connect-timeout", "60", *words], env)
+        for _ in range(3):
+            listening.accept()[0].close()
+        os.unlink(path)
+    try:
+        yield client
+    finally:
+        client.kill()
+        client.wait()
+
+
+def test_a_sentence_is_spoken_once_the_server_is_there(path: str, make_talk: MakeTalk) -> None:
+    with trying(path, "say", "--wait", "--id", "first", "length=0.1") as client:
+        talk = make_talk(scripted=True, env={"TALK_SOCKET": path})
+        out, err = client.communicate(timeout=PATIENCE)
+        assert (client.wait(), out) == (0, "first\n"), err
+    assert talk.watcher.texts("SUCCEEDED") == ["length=0.1"]
+
+
+@pytest.mark.parametrize("line", ["say --wait hello", "status"])
+def test_ctrl_c_ends_the_waiting(path: str, line: str) -> None:
+    with trying(path, *line.split()) as client:
+        client.send_signal(signal.SIGINT)
+        out, err = client.communicate(timeout=PATIENCE)
+        assert (client.wait(), out, err) == (130, "", "")
+
+
+@pytest.mark.parametrize(
+    ("line", "code"),
+    [
+        ("--connect-timeout 0.1 say --wait hello", 3),
+        ("--connect-timeout 0.1 say --wait --timeout 60 hello", 3),
+        ("--connect-timeout 60 say --wait --timeout 0.1 hello", 124),
+        ("--connect-timeout 60 say --lines --wait --timeout 0.1", 124),
+        ("--connect-timeout 60 wait --timeout 0.1", 124),
+    ],
+)
+def test_the_shorter_time_ends_the_waiting(path: str, line: str, code: int) -> None:
+    client = start_talk(line.split(), clean_environment(os.path.dirname(path), {"TALK_SOCKET": path}))
+    out, err = client.communicate(timeout=PATIENCE)
+    assert (client.wait(), out) == (code, ""), err
+    assert "--lines" in line or f"  {path}: not there" in err
