@@ -109,7 +109,7 @@ class Command:
         """
         if robot is not None and (fault := self._stray(given, robot, socket)):
             return fault
-        if connect_timeout is not None and (fault := self._impatient(given, robot)):
+        if connect_timeout is not None and (fault := self._waiting_fault(given, robot)):
             return fault
         refused = (words for each in self.options if (words := each.refusal(given[each.name])))
         return next(refused, None) or (self.rule(given, typed) if self.rule else None)
@@ -132,7 +132,7 @@ class Command:
                 )
         return Selection(robot).fault
 
-    def _impatient(self, given: Mapping[str, Any], robot: str | None) -> str | None:
+    def _waiting_fault(self, given: Mapping[str, Any], robot: str | None) -> str | None:
         """Return what is wrong with waiting until the server can be reached, or None."""
         output = given.get("output") is not None
         if not (self.asks and self.connects) or output:
@@ -152,7 +152,7 @@ class Command:
         if robot:
             fault = self._stray(given, robot, None)
             if fault is None and options.connect_timeout is not None:
-                fault = self._impatient(given, robot)
+                fault = self._waiting_fault(given, robot)
             if fault:
                 raise UsageError(fault)
             from talkcli.fleet.selection import several
