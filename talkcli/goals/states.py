@@ -12,7 +12,7 @@ from talkcli.errors import TalkError
 
 
 class State(IntEnum):
-    """State of a goal; the value is actionlib's number, the name is what is written everywhere."""
+    """State of a goal. Its value is actionlib's number; `str` and f-strings give its name."""
 
     PENDING = 0  # in the queue
     ACTIVE = 1  # handed to the engine
@@ -29,6 +29,13 @@ class State(IntEnum):
     def terminal(self) -> bool:
         """Whether a goal in this state has ended."""
         return not TRANSITIONS[self]
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __format__(self, spec: str) -> str:
+        # From Python 3.11 on, IntEnum formats the number unless this method is overridden, too.
+        return format(int(self) if spec.endswith("d") else self.name, spec)
 
 
 #: The terminal states, each with the exit code of a command whose goal ended in it.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 
 import pytest
 
@@ -51,6 +52,13 @@ def record_in(state: State) -> Record:
 
 def test_names_and_numbers_are_actionlibs() -> None:
     assert {each.name: each.value for each in State} == NUMBERS
+
+
+@pytest.mark.parametrize(("name", "number"), NUMBERS.items())
+def test_a_state_prints_as_its_name_and_is_a_number_in_json(name: str, number: int) -> None:
+    state = State[name]
+    assert (str(state), f"{state}", f"{state:>11}") == (name, name, f"{name:>11}")
+    assert (f"{state:d}", json.dumps(state)) == (f"{number}", f"{number}")
 
 
 @pytest.mark.parametrize(("state", "target"), [each for each in PAIRS if each in ALLOWED])
