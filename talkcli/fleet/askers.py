@@ -152,18 +152,19 @@ class Askers:
             counted = self.share.left(event.id)
             if counted and self.waiting and goal and event.state is State.RECALLED and goal.reason == "canceled":
                 self._canceled_by = goal.by
-        elif self.ids.boot_of(event.id) == boot:
+        elif self.ids.in_share(event.id, boot):
             self.share.came(event.id, goal.key if goal else None)
         self.look()
 
     def known(self, goal: Goal, boot: str) -> None:
         """Note a goal that the server knows, if it came by the broker: an earlier bridge may have sent it."""
-        if goal.client and (goal.client.name or "").startswith(AFAR):
-            self.ids.note(goal.id, boot)
+        ours = goal.client and (goal.client.name or "").startswith(AFAR)
+        if ours and self.ids.boot_of(goal.id) != boot:
+            self.ids.note(goal.id, boot, in_share=True)
 
     def server_came(self, pending: list[Goal], boot: str) -> None:
         """Count what is pending at the server as it begins to be watched."""
-        self.share.begin((each.id, each.key) for each in pending if self.ids.boot_of(each.id) == boot)
+        self.share.begin((each.id, each.key) for each in pending if self.ids.in_share(each.id, boot))
         self.look()
 
     def server_went(self) -> None:

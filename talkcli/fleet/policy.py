@@ -213,31 +213,36 @@ class Echoes:
 
 
 class Ids:
-    """The ids of the goals that were last sent to a server, and which start of it that was."""
+    """The ids of the goals that were last sent to a server, each with that server's boot id."""
 
     def __init__(self) -> None:
-        self._boots: dict[str, str] = {}
+        #: by id: the boot id, and whether the goal takes a place of the share
+        self._sent: dict[str, tuple[str, bool]] = {}
 
     def boot_of(self, goal_id: str) -> str | None:
         """Return the boot id of the server that a goal was sent to; None for one that is not known."""
-        return self._boots.get(goal_id)
+        return self._sent.get(goal_id, (None, False))[0]
 
-    def note(self, goal_id: str, boot: str) -> None:
+    def in_share(self, goal_id: str, boot: str) -> bool:
+        """Whether a goal that is pending at the server of this boot takes a place of the share."""
+        return self._sent.get(goal_id) == (boot, True)
+
+    def note(self, goal_id: str, boot: str, *, in_share: bool) -> None:
         """Note that a goal is sent to this server."""
-        self._boots.pop(goal_id, None)
-        self._boots[goal_id] = boot
-        if len(self._boots) > REMEMBERED:
-            del self._boots[next(iter(self._boots))]
+        self._sent.pop(goal_id, None)
+        self._sent[goal_id] = boot, in_share
+        if len(self._sent) > REMEMBERED:
+            del self._sent[next(iter(self._sent))]
 
     def forget(self, goal_id: str) -> None:
         """Forget a goal that the server did not take: it can't have been spoken."""
-        self._boots.pop(goal_id, None)
+        self._sent.pop(goal_id, None)
 
 
 class Share:
     """The goals from the broker that are pending at the server, or on their way there: by their ids, with their keys.
 
-    A goal's reply and the events of it come on different connections, so either may be first.
+    Goals that bring `preempt` or `flush` are not counted. A goal's reply and the events of it come on different connections, so either may be first.
     """
 
     def __init__(self) -> None:
@@ -252,10 +257,15 @@ class Share:
         """How many the server says are pending."""
         return len(self._pending)
 
+    @staticmethod
+    def counts(say: Say) -> bool:
+        """Whether a goal needs a place of the share, or else goes past it."""
+        return not (say.preempt or say.flush)
+
     def has_room(self, say: Say) -> bool:
         """Whether one more may be sent: also where it is sure to take another's place."""
         keys = (*self._sent.values(), *self._pending.values())
-        return len(self) < SHARE or say.flush or (say.key is not None and say.key in keys)
+        return len(self) < SHARE or not self.counts(say) or (say.key is not None and say.key in keys)
 
     def sent(self, goal_id: str, key: str | None) -> None:
         """Count a goal that is sent to the server."""

@@ -211,14 +211,15 @@ class Session:
         assert isinstance(say, Say)
         assert local
         goal_id = say.id or self._new_id()
-        boot = house.ids.boot_of(goal_id)
+        boot, counts = house.ids.boot_of(goal_id), house.share.counts(say)
         if boot not in (None, local.boot):
             words = f"{goal_id} was sent to a server that has ended since: it may have been spoken"
             self._refuse(ask, "lost", words)
-        elif forced or (house.share.has_room(say) and (say.flush or not house.waiting)):
+        elif forced or (house.share.has_room(say) and not (counts and house.waiting)):
             if self._send(_Open(ask, goal_id, fresh=boot is None), ask.line(house.boottime(), goal_id)):
-                house.ids.note(goal_id, local.boot)
-                house.share.sent(goal_id, say.key)
+                house.ids.note(goal_id, local.boot, in_share=counts)
+                if counts:
+                    house.share.sent(goal_id, say.key)
         elif say.patient:
             house.waiting.append((ask, self))
         else:

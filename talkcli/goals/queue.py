@@ -1,6 +1,6 @@
 """The goals that wait, in the order in which they will be spoken: one sorted list.
 
-Pure: it keeps what it is given, and knows who would give way; whether anybody must is the scheduler's. Higher
+Pure: it keeps what it is given, and knows which goal would be displaced; whether one is, the scheduler decides. Higher
 priority goes first, first in first out among equals, but for what is put at the front of its priority or in the place
 of another.
 
@@ -35,8 +35,8 @@ class Queue:
         self._goals: list[_Entry] = []
         #: those that were sent to preempt, in the same order
         self._preempting: list[_Entry] = []
-        #: in the order in which they give way, the last first: priority, negated, and number
-        self._giving_way: list[_Entry] = []
+        #: in the order in which a full queue displaces them, the last first: priority, negated, and number
+        self._displaceable: list[_Entry] = []
         #: those with a time to live: its end, and their number
         self._expiries: list[_Entry] = []
         self._by_key: dict[str, Record] = {}
@@ -67,10 +67,9 @@ class Queue:
         """Return the goals of this priority and lower ones that were sent to preempt."""
         return list(map(_goal, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
-    def giving_way_to(self, priority: int) -> Record | None:
-        """Return the goal that gives way to one of this priority: of a lower and the lowest, the one accepted last."""
-        last = self._giving_way[-1][2] if self._giving_way else None
-        return last if last and last.priority < priority else None
+    def newest_of_lowest(self) -> Record | None:
+        """Return the goal that a full queue displaces: of the lowest priority, the goal accepted last."""
+        return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, instead: Record | None = None) -> None:
         """Put a goal at the end of its priority, or at the front where it preempts.
@@ -103,7 +102,7 @@ class Queue:
         """Return the lists that a goal is in, and what it is in each; the same where it stands by its number."""
         entry = -record.priority, record.turn, record
         yield self._goals, entry
-        yield self._giving_way, entry if record.turn == record.number else (-record.priority, record.number, record)
+        yield self._displaceable, entry if record.turn == record.number else (-record.priority, record.number, record)
         if record.preempt:
             yield self._preempting, entry
         if record.expires_at is not None:

@@ -393,8 +393,10 @@ class Scheduler:
         # There never are more goals in the queue than may be: one that will be recalled makes room enough.
         if way or len(self._queue) < self.max_queue:
             return way
-        displaced = self._queue.giving_way_to(say.priority)
-        return [(displaced, "displaced")] if displaced else None
+        last = self._queue.newest_of_lowest()
+        # A goal that brings `preempt` displaces its own priority, too. Any preempting goal there is in `way` already.
+        limit = say.priority if say.preempt else say.priority - 1
+        return [(last, "displaced")] if last and last.priority <= limit else None
 
     def _preempts(self, say: Say) -> bool:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)

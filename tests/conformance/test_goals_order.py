@@ -70,6 +70,23 @@ def test_row_47_in_a_full_queue_the_newest_of_the_lowest_priority_gives_way(make
     assert_told_in_order(talk)
 
 
+def test_row_47_a_goal_that_brings_preempt_displaces_the_newest_that_does_not(make_talk: MakeTalk) -> None:
+    """Not even a logger that keeps every place taken silences it."""
+    talk = make_talk("--max-queue", "3", scripted=True)
+    active = begin(talk)
+    with talk.connect() as logger:
+        for number in range(5):
+            logger.send({"request": "say", "text": f"length=0 line {number}", "patient": True})
+        assert logger.request("hello")["ok"]
+        lines = pending(talk)
+        assert len(lines) == 3
+        fire = submit(talk, "length=0 fire", preempt=True)["id"]
+        assert_recalled(talk, lines[-1], "displaced", by=fire)
+        assert states(talk, fire)[-1] == "SUCCEEDED"
+        assert states(talk, active)[-1] == "PREEMPTED"
+    assert_told_in_order(talk)
+
+
 def test_row_47_a_goal_of_the_same_or_a_lower_priority_displaces_nothing(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "2", scripted=True)
     begin(talk)
@@ -100,7 +117,7 @@ def test_row_47_a_goal_that_is_rejected_has_done_nothing(make_talk: MakeTalk) ->
     """Not even where it preempts: the one that is ACTIVE has room for itself alone."""
     talk = make_talk("--max-queue", "1", scripted=True)
     active = begin(talk)
-    waiting = queue(talk, 0)
+    waiting = queue(talk, 1)
     assert_rejected(submit(talk, "length=0 not now", preempt=True), "queue_full")
     assert_rejected(submit(talk, "", flush=True), "invalid_text")
     assert_rejected(submit(talk, "length=0", flush=True, rate=1), "bad_option", "rate")

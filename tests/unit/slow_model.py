@@ -116,11 +116,15 @@ class SlowModel:
         return len(self.staying(wish)) >= self.max_queue
 
     def displaced_by(self, wish: Wish) -> SlowGoal | None:
-        """Return the newest pending goal of the lowest priority, where that is lower than this one's."""
-        lowest = min(each.priority for each in self.staying(wish))
-        if lowest >= wish.priority:
-            return None
-        return [each for each in self.all if each in self.staying(wish) and each.priority == lowest][-1]
+        """Return the newest pending goal of the lowest priority, if this goal may displace it.
+
+        Its priority must be lower. If this goal brings `preempt`, the same priority will do for a goal without it.
+        """
+        lower = [each for each in self.staying(wish) if each.priority < wish.priority]
+        same = [each for each in self.staying(wish) if each.priority == wish.priority and not each.preempt]
+        weaker = lower + same if wish.preempt else lower
+        lowest = min((each.priority for each in weaker), default=0)
+        return next((each for each in reversed(self.all) if each in weaker and each.priority == lowest), None)
 
     def cancelled_early(self, wish: Wish) -> str | None:
         """Return who cancelled this id before it was there, a short while ago."""

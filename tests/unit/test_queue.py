@@ -90,12 +90,11 @@ def test_whatever_comes_and_goes_the_queue_is_as_the_list(
         assert (len(queue), queue.first()) == (len(told), told[0] if told else None)
         assert queue.next_expiry() == min((each.expires_at for each in told if each.expires_at), default=None)
         lowest = [each for each in told if each.priority == min(other.priority for other in told)]
-        newest = max(lowest, key=lambda each: each.number, default=None)
+        assert queue.newest_of_lowest() is max(lowest, key=lambda each: each.number, default=None)
         for priority in (-3, -2, 0, 1, 2):
             lower = [each for each in told if each.priority <= priority]
             assert queue.up_to(priority) == lower
             assert set(queue.preempting_up_to(priority)) == {each for each in lower if each.preempt}
-            assert queue.giving_way_to(priority) == (newest if newest and newest.priority < priority else None)
         for key in ("battery", "door", "face", None):
             assert queue.with_key(key) == next((each for each in told if each.key == key is not None), None)
         for text in ("text 0", "text 1", "text 2", "text 3"):

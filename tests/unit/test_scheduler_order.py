@@ -157,6 +157,40 @@ def test_in_a_full_queue_nothing_gives_way_to_an_equal_or_a_lower_one(priority: 
     assert robot.waiting() == [3, 2]
 
 
+@pytest.mark.parametrize(
+    ("priorities", "say", "displaced"),
+    [
+        ([0, 0], Say("fire", preempt=True), 2),
+        ([0, 0], Say("fire", preempt=True, key="fire"), 2),
+        ([2, 1, 1, 2], Say("fire", preempt=True, priority=2), 3),
+        ([1, 1], Say("fire", preempt=True), None),
+        ([0, 0], Say("fire"), None),
+        ([0, 0], Say("fire", preempt=False), None),
+        ([1, 1], Say("fire", flush=True), None),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("paused", [False, True])
+@pytest.mark.parametrize("preempt", [False, True])
+def test_only_a_goal_that_brings_preempt_displaces_its_own_priority(
+    priorities: list[int], say: Say, displaced: int | None, paused: bool, preempt: bool
+) -> None:
+    robot = Robot(preempt=preempt, max_queue=len(priorities))
+    active = robot.says("a long story", priority=2, preempt=False)
+    waiting = [robot.says("log", priority=each, preempt=False) for each in priorities]
+    if paused:
+        robot.pauses()
+    goal = robot.asks(say)
+    ended = [each for each in waiting if each.state is State.RECALLED]
+    if displaced is None:
+        assert (ending(goal), ended) == ((State.REJECTED, "queue_full", None), [])
+    else:
+        assert ended == [waiting[displaced - 1]]
+        assert ending(ended[0]) == (State.RECALLED, "displaced", By(goal=goal.id))
+        stopped = active.priority <= say.priority
+        assert (active.state is State.PREEMPTING) is stopped
+
+
 def test_a_goal_may_give_way_that_is_first_in_the_queue_for_it_is_the_newest() -> None:
     robot = Robot(max_queue=2)
     robot.says()
@@ -209,8 +243,8 @@ def test_a_goal_that_could_wait_for_room_is_known() -> None:
     assert not robot.lacks_room(Say("x"))
     waiting = robot.asks(Say("y", key="face", id="mine"))
     assert robot.lacks_room(Say("x"))
-    assert robot.lacks_room(Say("x", preempt=True))
-    for fits in (Say("x", priority=1), Say("x", flush=True), Say("x", key="face")):
+    assert robot.lacks_room(Say("x", preempt=True, priority=-1))
+    for fits in (Say("x", priority=1), Say("x", flush=True), Say("x", preempt=True), Say("x", key="face")):
         assert not robot.lacks_room(fits)
     for would_not_help in (Say(""), Say("x", rate=1), Say("y", id="mine"), Say("z", id="mine")):
         assert not robot.lacks_room(would_not_help)
