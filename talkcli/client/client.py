@@ -224,7 +224,7 @@ class Client:
         return Goal.from_json(reply.get("goal"))
 
     def log(self, count: int = 20) -> list[Goal]:
-        """Return the last `count` goals that ended, REJECTED ones too, oldest first; at most 1,200 are kept."""
+        """Return the last `count` goals that ended, REJECTED ones too, oldest first; at most 2,200 are kept."""
         if not 0 < count <= MAX_LOG:
             raise UsageError(f"a log has 1 to {MAX_LOG} goals, not {count}")
         _, items = self._connection.request(Log(count))

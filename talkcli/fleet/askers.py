@@ -160,7 +160,7 @@ class Askers:
         """Note a goal that the server knows, if it came by the broker: an earlier bridge may have sent it."""
         ours = goal.client and (goal.client.name or "").startswith(AFAR)
         if ours and self.ids.boot_of(goal.id) != boot:
-            self.ids.note(goal.id, boot, in_share=True)
+            self.ids.note(goal.id, boot)
 
     def server_came(self, pending: list[Goal], boot: str) -> None:
         """Count what is pending at the server as it begins to be watched."""

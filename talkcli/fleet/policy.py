@@ -227,7 +227,7 @@ class Ids:
         """Whether a goal that is pending at the server of this boot takes a place of the share."""
         return self._sent.get(goal_id) == (boot, True)
 
-    def note(self, goal_id: str, boot: str, *, in_share: bool) -> None:
+    def note(self, goal_id: str, boot: str, *, in_share: bool = True) -> None:
         """Note that a goal is sent to this server."""
         self._sent.pop(goal_id, None)
         self._sent[goal_id] = boot, in_share
@@ -242,7 +242,8 @@ class Ids:
 class Share:
     """The goals from the broker that are pending at the server, or on their way there: by their ids, with their keys.
 
-    Goals that bring `preempt` or `flush` are not counted. A goal's reply and the events of it come on different connections, so either may be first.
+    Goals that bring `preempt` or `flush` are not counted. A goal's reply and its events come on different connections,
+    so either may be first.
     """
 
     def __init__(self) -> None:

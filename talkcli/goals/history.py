@@ -23,10 +23,13 @@ if TYPE_CHECKING:
 _Name = TypeVar("_Name")
 _Fact = TypeVar("_Fact")
 
-#: Results kept: a robot that speaks ten times a minute has more than an hour and a half to ask.
-MAX_ENDED = 1_000
-#: REJECTED goals have a ring of their own, so that a client that is refused all the time drives out nobody's result.
+#: Results kept of goals that were spoken: a robot that speaks ten times a minute has 100 minutes to ask.
+MAX_SPOKEN = 1_000
+#: REJECTED goals have a ring of their own: a client that is refused all the time drives out no result.
 MAX_REJECTED = 200
+#: RECALLED goals have one, too, so that a flood that is recalled drives out no result of a goal that was spoken. One
+#: cancel may recall the 1,000 goals that a connection may have waiting for room: each can still be asked for.
+MAX_RECALLED = 1_000
 #: Bytes of all the texts kept together: the limits above times the longest text would be 40 MB.
 MAX_TEXT_BYTES = 8 * 1024 * 1024
 #: Keys whose last beginning is remembered, and as many texts.
@@ -43,13 +46,19 @@ class History:
 
     def __init__(self) -> None:
         self._all: OrderedDict[str, Record] = OrderedDict()
-        self._ended: OrderedDict[str, Record] = OrderedDict()
+        #: the goals of `_all` by how they ended: REJECTED, RECALLED, or after they had begun
         self._rejected: OrderedDict[str, Record] = OrderedDict()
+        self._recalled: OrderedDict[str, Record] = OrderedDict()
+        self._spoken: OrderedDict[str, Record] = OrderedDict()
         self._text_bytes = 0
 
     def add(self, record: Record) -> None:
         """Keep a goal that has ended; the oldest give way."""
-        kept, limit = (self._rejected, MAX_REJECTED) if record.state is State.REJECTED else (self._ended, MAX_ENDED)
+        kept, limit = self._spoken, MAX_SPOKEN
+        if record.state is State.REJECTED:
+            kept, limit = self._rejected, MAX_REJECTED
+        elif record.state is State.RECALLED:
+            kept, limit = self._recalled, MAX_RECALLED
         self._all[record.id] = kept[record.id] = record
         self._text_bytes += record.text_bytes
         if len(kept) > limit:
@@ -66,7 +75,7 @@ class History:
 
     def latest(self, count: int) -> Iterator[Record]:
         """Return the last goals that ended, REJECTED ones aside, the newest first."""
-        return islice(reversed(self._ended.values()), count)
+        return islice((each for each in reversed(self._all.values()) if each.state is not State.REJECTED), count)
 
     def log(self, count: int) -> Iterator[Record]:
         """Return the last goals that ended, REJECTED ones too, the newest first."""

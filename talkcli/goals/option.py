@@ -26,7 +26,7 @@ MAX_NAME = 64
 #: `data` that travels with a goal, in bytes of JSON: a label for programs, not something that the server has to store.
 MAX_DATA = 1024
 #: Goals that one request for the log asks for: as many as are kept.
-MAX_LOG = 1_200
+MAX_LOG = 2_200
 _DIGITS = frozenset("0123456789")
 _LETTERS = frozenset("abcdefghijklmnopqrstuvwxyz")
 _OF_AN_ID = _DIGITS | _LETTERS | frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ._:/-")

@@ -27,7 +27,7 @@ from tests.support.surroundings import short_directory
 
 #: Clients that send goals all the time.
 CLIENTS = 8
-#: Goals before the first count: the history is full then, and everything was used once.
+#: Goals before the first count: most of the history is full then, and everything was used once.
 WARM_UP = 1_200
 #: kB that the server and its engine process may have grown by.
 GROWN = 8 * 1024

@@ -29,7 +29,7 @@ _SILENCE = 15.0
 #: Seconds in which all that has happened has come here, too; and in which a desk has what the broker has.
 _BEHIND = 1.0
 #: Goals that have ended, as many as a server keeps.
-_LOG = 1_200
+_LOG = 2_200
 
 
 @dataclass(frozen=True, slots=True)

@@ -228,6 +228,13 @@ def test_twenty_goals_from_afar_may_wait_and_those_of_the_robot_have_their_place
     own = lasting_robot.talk.request("say", text="the robot's own")["goal"]
     assert own["state"] == "PENDING"
     assert asker.ask("cancel")["count"] == 21
+    fire = asker.say("fire", preempt=True)
+    assert fire["state"] == "PENDING"
+    goals = [asker.say(f"flood {each}") for each in range(21)]
+    assert [each["state"] for each in goals] == ["PENDING"] * 20 + ["REJECTED"], "fire was counted"
+    fire = asker.say("fire", preempt=True)
+    assert fire["state"] == "PENDING"
+    assert asker.ask("cancel")["count"] == 21
     assert asker.say("again there is room")["state"] == "PENDING"
     asker.ask("cancel")
 

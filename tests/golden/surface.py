@@ -92,7 +92,7 @@ ERRORS = (
     "watch now",
     "log",
     "log -n 0",
-    "log -n 1201",
+    "log -n 2201",
     "set",
     "set --rate 5",
     "set --ttl -1",

@@ -341,7 +341,7 @@ def test_what_is_refused_or_rejected_gives_its_place_back() -> None:
     assert len(share) == 0
 
 
-def test_a_goal_that_takes_anothers_place_needs_no_room() -> None:
+def test_a_goal_that_takes_anothers_place_or_preempts_needs_no_room() -> None:
     share = Share()
     for each in range(20):
         share.sent(f"g{each}", "battery" if each == 7 else None)

@@ -21,42 +21,28 @@ def ended(number: int, state: State = State.SUCCEEDED, text: str = "door open") 
     return record
 
 
-def test_the_last_thousand_results_are_kept() -> None:
+@pytest.mark.parametrize(
+    ("state", "limit"), [(State.REJECTED, 200), (State.RECALLED, 1_000), (State.SUCCEEDED, 1_000)], ids=str
+)
+def test_many_goals_that_end_alike_drive_out_no_other(state: State, limit: int) -> None:
     history = History()
-    records = [ended(number) for number in range(1_001)]
-    for record in records:
+    others = [
+        ended(number, each) for number, each in enumerate({State.REJECTED, State.RECALLED, State.SUCCEEDED} - {state})
+    ]
+    alike = [ended(number, state) for number in range(10, 2_000)]
+    for record in (*others, *alike):
         history.add(record)
-    assert history.find("4k7f-0") is None
-    assert all(history.find(each.id) is each for each in records[1:])
-
-
-def test_rejected_goals_drive_out_nobodys_result() -> None:
-    history = History()
-    result = ended(0)
-    history.add(result)
-    rejected = [ended(number, State.REJECTED) for number in range(1, 2_000)]
-    for record in rejected:
-        history.add(record)
-    assert history.find(result.id) is result
-    assert all(history.find(each.id) is each for each in rejected[-200:])
-    assert history.find(rejected[-201].id) is None
-
-
-def test_results_drive_out_no_rejected_goal() -> None:
-    history = History()
-    rejected = ended(0, State.REJECTED)
-    history.add(rejected)
-    for number in range(1, 1_500):
-        history.add(ended(number))
-    assert history.find(rejected.id) is rejected
+    kept = [each for each in (*others, *alike) if history.find(each.id)]
+    assert kept == [*others, *alike[-limit:]]
 
 
 def test_latest_are_the_newest_first_without_rejected_ones() -> None:
     history = History()
-    for number in range(6):
-        history.add(ended(number, State.REJECTED if number % 2 else State.ABORTED))
-    assert [each.number for each in history.latest(2)] == [4, 2]
-    assert [each.number for each in history.latest(10)] == [4, 2, 0]
+    states = [State.ABORTED, State.REJECTED, State.RECALLED, State.SUCCEEDED, State.REJECTED, State.RECALLED]
+    for number, state in enumerate(states):
+        history.add(ended(number, state))
+    assert [each.number for each in history.latest(2)] == [5, 3]
+    assert [each.number for each in history.latest(10)] == [5, 3, 2, 0]
     assert list(history.latest(0)) == []
 
 
@@ -80,7 +66,7 @@ def test_the_log_forgets_what_the_history_forgets() -> None:
 
 def test_an_id_that_was_forgotten_may_come_again() -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "MAX_ENDED", 2)
+        patch.setattr(module, "MAX_SPOKEN", 2)
         history = History()
         for number in (1, 2, 3, 1):
             history.add(ended(number))
@@ -133,20 +119,20 @@ def test_a_text_without_words_spoken_is_forgotten_with_them() -> None:
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 12)), max_size=60))
 def test_limits_hold_after_any_goals_and_only_the_oldest_texts_are_gone(goals: list[tuple[bool, int]]) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "MAX_ENDED", 7)
+        patch.setattr(module, "MAX_SPOKEN", 7)
         patch.setattr(module, "MAX_REJECTED", 3)
         patch.setattr(module, "MAX_TEXT_BYTES", 40)
         history = History()
         records = []
         for number, (rejected, size) in enumerate(goals):
-            records.append(ended(number, State.REJECTED if rejected else State.RECALLED, "é" * size))
+            records.append(ended(number, State.REJECTED if rejected else State.SUCCEEDED, "é" * size))
             history.add(records[-1])
     kept = [each for each in records if history.find(each.id) is not None]
     assert [each for each in kept if each.state is State.REJECTED] == [
         each for each in records if each.state is State.REJECTED
     ][-3:]
-    assert [each for each in kept if each.state is State.RECALLED] == [
-        each for each in records if each.state is State.RECALLED
+    assert [each for each in kept if each.state is State.SUCCEEDED] == [
+        each for each in records if each.state is State.SUCCEEDED
     ][-7:]
     assert list(history.log(100)) == kept[::-1]
     assert sum(len(each.text.encode()) for each in kept if each.text is not None) <= 40

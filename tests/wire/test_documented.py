@@ -16,7 +16,7 @@ from talkcli.cli import click_app, commands
 from talkcli.fleet import policy, topics
 from talkcli.goals import states
 from talkcli.goals.goal import Goal
-from talkcli.goals.history import MAX_ENDED, MAX_REJECTED
+from talkcli.goals.history import MAX_RECALLED, MAX_REJECTED, MAX_SPOKEN
 from talkcli.goals.options import Cancel
 from talkcli.goals.states import State
 from talkcli.protocol import events
@@ -147,9 +147,8 @@ def test_a_value_of_the_documented_type_is_read_and_null_where_it_may_be(kind: s
 def test_what_is_kept_is_what_the_text_says() -> None:
     assert Cancel().everything
     assert RECENT == 10
-    assert f"last {MAX_ENDED:,} goals that ended are kept, and the last {MAX_REJECTED} that were" in WIRE.section(
-        "The goal"
-    )
+    kept = f"{MAX_SPOKEN:,} spoken goals, {MAX_RECALLED:,} RECALLED ones and {MAX_REJECTED} REJECTED ones"
+    assert f"The server keeps the last {kept}." in WIRE.section("The goal")
 
 
 def test_limits_are_those_of_the_code() -> None:
