@@ -52,14 +52,6 @@ def displace(robot: Robot) -> None:
     assert robot.says("urgent", priority=8).state.name == "PENDING"
 
 
-def displace_by_preempting(robot: Robot) -> None:
-    before = next(robot.scheduler.pending())
-    if before.preempt:
-        robot.cancels(before.id)  # else the next preempting goal would recall it, and displace nothing
-        robot.says("one more")
-    assert robot.says("fire", priority=8, preempt=True).state.name == "PENDING"
-
-
 def be_refused(robot: Robot) -> None:
     assert robot.says("one too many", priority=-1).reason == "queue_full"
 
@@ -103,7 +95,7 @@ def ask_for_room(robot: Robot) -> None:
 
 STEPS = [
     *(speak_the_next, be_refused, replace, look_at_the_clock, attach, throttle, displace, preempt),
-    *(cancel_and_say, cancel_a_key, ask_for_room, displace_by_preempting),
+    *(cancel_and_say, cancel_a_key, ask_for_room),
 ]
 
 
