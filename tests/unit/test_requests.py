@@ -215,7 +215,7 @@ WRONG: list[tuple[str, str, list[object]]] = [
     ("cancel", "current", [None, 0, 1, "yes"]),
     ("cancel", "before", ["", 7, True, ["4k7f-1"], "a" * 65]),
     ("cancel", "key", [7, True, ["battery"]]),
-    ("log", "count", [None, 0, -1, 1_201, 1.0, "20", True]),
+    ("log", "count", [None, 0, -1, 2_201, 1.0, "20", True]),
     ("set", "rate", [200.0, "200", True]),
     ("set", "volume", ["1", True]),
     ("set", "voice", [1, True]),

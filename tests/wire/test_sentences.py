@@ -48,7 +48,7 @@ def test_what_is_bad_field_in_the_table(scripted: Talk) -> None:
             )
         ],
         "more than 4,096 `ids`": [{"seq": 7, "request": "wait", "ids": ["i"] * 4_097}],
-        "a `count` out of its range": [{"seq": 7, "request": "log", "count": count} for count in (0, 1_201)],
+        "a `count` out of its range": [{"seq": 7, "request": "log", "count": count} for count in (0, 2_201)],
     }
     for words, requests in cases.items():
         assert words in row[1]
