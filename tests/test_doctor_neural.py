@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli import Client
+from talkcli import Client, install
 from talkcli.client.connect import Interrupted
 from talkcli.doctor import neural, voice
 from talkcli.doctor.neural import Neural, Tried
 from talkcli.doctor.report import DONE, FAILED, WARNING
 from talkcli.doctor.voice import Engine
-from talkcli.engine.synthesizers.models import INSTALL, NEEDED
+from talkcli.engine.synthesizers.models import NEEDED
 from tests.conformance.bareserve import environment, serving
 from tests.engine.test_neural import WITHOUT
 from tests.support import tiny_voice
@@ -138,7 +138,7 @@ def test_without_the_extra_it_says_what_to_install(home: str, tmp_path: Path, us
     tiny_voice.put(Path(home) / "v", "tiny")
     env = _environment(home, tmp_path, WITHOUT.format(names=["onnxruntime"]))
     found = doctor({**env, **({"TALK_VOICE": "piper/tiny"} if used else {})})
-    step = f"{INSTALL}, into the Python that serves"
+    step = install.neural()
     assert found["neural"] == {
         "check": "neural",
         "state": "failed" if used else "warning",
@@ -267,6 +267,6 @@ def test_a_voice_that_fails_is_a_warning_where_espeak_speaks_in_its_place() -> N
 
 
 def test_a_voice_that_takes_what_is_not_installed_is_cured_by_that() -> None:
-    words = f"the voice piper/a is listed, but it cannot be loaded: numpy is missing: {INSTALL}, into the Python"
+    words = f"the voice piper/a is listed, but it cannot be loaded: numpy is missing: {install.neural()}"
     found = voice.judge("2.99", Engine(reason="unknown_voice", words=words), server=False)[-1]
-    assert (found.check, found.next) == ("voices", f"{INSTALL}, into the Python that serves")
+    assert (found.check, found.next) == ("voices", install.neural())

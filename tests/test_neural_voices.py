@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import install
 from talkcli.engine.protocol import Voice
-from talkcli.engine.synthesizers.models import INSTALL, NEEDED
+from talkcli.engine.synthesizers.models import NEEDED
 from talkcli.engine.synthesizers.voices import find_voice
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.engine.test_neural import SLOW_TO_SPEAK, WITHOUT
@@ -173,7 +174,7 @@ def test_without_the_extra_they_are_listed_and_refused_with_what_to_install(
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(WITHOUT.format(names=[package]))
     bare = {**env, "PYTHONPATH": f"{tmp_path / 'site'}:{env.get('PYTHONPATH', '')}"}
-    words = f"{package} is missing: {INSTALL}, into the Python that serves"
+    words = f"{package} is missing: {install.neural()}"
     done = run([*TALK, "serve", "--player", "null", "--voice", "piper/tiny"], bare)
     assert (done.code, words in done.err) == (2, True), done
     with serving(bare):

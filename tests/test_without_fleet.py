@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import install
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.support.spied import imported, spied
 from tests.support.surroundings import short_directory
@@ -53,4 +54,4 @@ def test_what_to_install_is_said_where_a_robot_is_named(words: list[str], tmp_pa
     env = spied(tmp_path, environment(str(tmp_path), TALK_ROBOT="anna", TALK_BROKER="mqtt://127.0.0.1"), ["paho"])
     done = run([*TALK, *words], env)
     assert (done.code, done.out) == (2, "")
-    assert done.err == "talk: a fleet needs paho-mqtt: pip install 'talkcli[fleet]'\n"
+    assert done.err == f"talk: a fleet needs paho-mqtt: {install.command('paho-mqtt')}\n"

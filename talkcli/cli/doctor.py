@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.show import need_fleet, note, screen, show_found
+from talkcli.cli.show import note, screen, show_found
 from talkcli.doctor.report import heard, lines, verdict
 from talkcli.goals.states import EXIT_CODES, State
 from talkcli.paths import named_robot
@@ -48,7 +48,9 @@ def _examination(
         from talkcli.doctor.examine import Examination
 
         return Examination(options.socket, silent=silent, interrupt=interrupt)
-    need_fleet()
+    from talkcli.fleet.broker import need_client
+
+    need_client()
     from talkcli.doctor import broker
 
     return broker.Examination(robot, os.environ, insecure=options.insecure, interrupt=interrupt)

@@ -12,16 +12,7 @@ import sys
 import time
 
 from talkcli import __version__, paths
-from talkcli.errors import (
-    EXIT_ERROR,
-    EXIT_SIGINT,
-    EXIT_SIGPIPE,
-    EXIT_TIMEOUT,
-    ServerUnavailable,
-    TalkError,
-    UsageError,
-    limits,
-)
+from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, EXIT_TIMEOUT, ServerUnavailable, TalkError, limits
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -115,9 +106,9 @@ class Common:
 
     def broker(self) -> Broker:
         """Return the broker of the fleet; UsageError where that, or what it needs, is not there."""
-        need_fleet()
-        from talkcli.fleet.broker import from_environment
+        from talkcli.fleet.broker import from_environment, need_client
 
+        need_client()
         return from_environment(os.environ, insecure=self.insecure)
 
     def _connection(self, **options: Any) -> Connection:
@@ -132,14 +123,6 @@ class Common:
 
         options.pop("urgent", None)  # a broker keeps no places for that
         return reach(robot, broker, **options)
-
-
-def need_fleet() -> None:
-    """UsageError where what a fleet needs is not installed."""
-    from talkcli.fleet.broker import has_client
-
-    if not has_client():
-        raise UsageError("a fleet needs paho-mqtt: pip install 'talkcli[fleet]'")
 
 
 def ended(command: Callable[[], object], options: Common) -> int:

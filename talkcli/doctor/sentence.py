@@ -167,7 +167,7 @@ def remedy(reason: str | None, words: str | None = None, player: object = None, 
         return _BUSY
     if reason == "audio_device" and ("denied" in said or "not permitted" in said):
         return "sudo usermod -aG audio USER for the user who serves, log in again, and start the server again"
-    if reason == "engine_failed" and "libespeak-ng" in (words or ""):
+    if reason == "engine_failed" and "libespeak-ng is missing" in (words or ""):
         return INSTALL_LIBRARY
     if reason in _OF_PLAYER and isinstance(player, str) and is_custom(player):
         command = player.replace("{rate}", "22050").replace("{device}", str(device or "default"))

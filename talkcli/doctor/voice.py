@@ -15,18 +15,20 @@ import time
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
+from talkcli import install
 from talkcli.doctor.report import Finding, done, failed, warning
 from talkcli.engine import protocol
 from talkcli.engine.process import Conversation, EngineFailed
-from talkcli.engine.synthesizers.models import INSTALL
 from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-#: What to do where there is no library.
-INSTALL_LIBRARY = "sudo apt-get install -y libespeak-ng1, or: pip install espeakng-loader"
+#: The next step if something is missing.
+INSTALL_LIBRARY = install.espeak_library()
+_INSTALL_PYTTSX3 = install.command("pyttsx3")
+_INSTALL_NEURAL = install.neural()
 
 
 @frozen
@@ -110,16 +112,15 @@ def judge(pyttsx3: str | None, engine: Engine, *, server: bool) -> list[Finding]
     if engine.reason is None:
         return [done("pyttsx3", f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"), *_library(engine)]
     if "pyttsx3 is missing" in words or pyttsx3 is None:
-        step = "pip install pyttsx3, into the same Python"
-        return [broken("pyttsx3", words or "pyttsx3 is missing", step)]
+        return [broken("pyttsx3", words or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
     found = done("pyttsx3", pyttsx3)
     if engine.reason == "unknown_voice":
         step = "choose one that 'talk voices' lists, in TALK_VOICE or --voice"
-        if INSTALL in words:
-            step = f"{INSTALL}, into the Python that serves"
+        if _INSTALL_NEURAL in words:
+            step = _INSTALL_NEURAL
         return [found, done("libespeak-ng", "loaded"), broken("voices", words, step)]
     step = "talk serve logs the engine's own words"
-    if "data" in words and "espeak" in words:
+    if "espeak-ng data" in words:
         step = "sudo apt-get install -y espeak-ng-data"
     elif "libespeak-ng" in words:
         step = INSTALL_LIBRARY

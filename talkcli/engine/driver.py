@@ -10,6 +10,7 @@ import os
 import sys
 import types
 
+from talkcli import install
 from talkcli.engine.playback import Playback
 from talkcli.engine.players.base import CannotSpeak, Stopped
 from talkcli.engine.protocol import Ready, StartFailed
@@ -47,7 +48,7 @@ def start(configure: Configure, session: Session) -> Ready:
     try:
         import pyttsx3
     except ModuleNotFoundError as error:
-        raise CannotStart(f"pyttsx3 is missing: pip install pyttsx3 ({error})") from error
+        raise CannotStart(f"pyttsx3 is missing ({error}): {install.command('pyttsx3')}") from error
     own = is_own(configure.driver)
     shown = configure.driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
     name = f"talk_{shown}" if own else shown

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from talkcli import install
 from talkcli.errors import UsageError
 from talkcli.fleet import topics
 from talkcli.frozen import frozen
@@ -97,9 +98,10 @@ def from_environment(environment: Mapping[str, str], *, insecure: bool = False) 
     return Broker(host, port, tls, user, password, ca, cert, key)
 
 
-def has_client() -> bool:
-    """Whether what speaks MQTT is installed, the extra `fleet`."""
-    return find_spec("paho") is not None
+def need_client() -> None:
+    """Raise UsageError if the MQTT client, paho-mqtt, is not installed."""
+    if find_spec("paho") is None:
+        raise UsageError(f"a fleet needs paho-mqtt: {install.command('paho-mqtt')}")
 
 
 def user(broker: Broker) -> str:

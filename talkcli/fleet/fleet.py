@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.client.client import Client
 from talkcli.client.connect import ANSWER_LIMIT
-from talkcli.errors import UsageError
-from talkcli.fleet.broker import URL, from_environment, has_client
+from talkcli.fleet.broker import URL, from_environment, need_client
 from talkcli.fleet.selection import Selection
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.protocol.requests import Pause, Resume, Status, Wait
@@ -47,10 +46,9 @@ class Fleet:
         certificates, the variables beside that one say. `name`: what the sender calls itself, default TALK_NAME;
         `insecure`: whether a password may go to another machine without TLS. Nothing is connected yet.
 
-        UsageError for settings that are wrong or missing, or where paho-mqtt is: `pip install 'talkcli[fleet]'`.
+        UsageError if a setting is wrong or missing, or if paho-mqtt is not installed.
         """
-        if not has_client():
-            raise UsageError("a fleet needs paho-mqtt: pip install 'talkcli[fleet]'")
+        need_client()
         environment = dict(os.environ) if broker is None else {**os.environ, URL: broker}
         self._broker = from_environment(environment, insecure=insecure)
         self._name = name

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import install
 from talkcli.engine import protocol
-from talkcli.engine.synthesizers.models import INSTALL, NEEDED
+from talkcli.engine.synthesizers.models import NEEDED
 from tests.engine.spawned import SOON, Spawned
 from tests.engine.test_pausing_players import without_silence
 from tests.engine.test_player_faults import Player, player
@@ -193,12 +194,12 @@ def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package:
     with _engine(tmp_path / "voices", before=WITHOUT.format(names=[package])) as engine:
         message = _failed(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
         assert f"{VOICE} is listed, but it cannot be loaded" in message
-        assert INSTALL in message
+        assert install.neural() in message
         assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
     with _spawned(tmp_path / "voices", before=WITHOUT.format(names=[package]), voice=VOICE) as engine:
         failed = engine.until(protocol.StartFailed)
         assert failed.usage
-        assert INSTALL in failed.message
+        assert install.neural() in failed.message
 
 
 # -- faults
@@ -307,7 +308,7 @@ def test_whatever_memory_there_is_a_sentence_has_one_end_and_the_next_is_espeaks
             assert megabytes > 300, "so much it takes"
         else:
             message = _failed(ended)
-            assert "there is no memory for it; end another program" in message or INSTALL in message
+            assert "there is no memory for it; end another program" in message or install.neural() in message
         assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
 
 
@@ -662,6 +663,7 @@ def test_one_is_dropped_that_is_to_make_room(place: Path) -> None:
 def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path) -> None:
     hangs = """
 import threading
+from talkcli import install
 from talkcli.engine import protocol
 protocol.LOAD_LIMIT = 0.3
 from talkcli.engine.synthesizers import inference

@@ -8,6 +8,7 @@ import time
 
 import pytest
 
+from talkcli import install
 from talkcli.engine import protocol
 from tests.engine.spawned import Spawned
 from tests.support.timing import assert_within, limits
@@ -291,9 +292,8 @@ def test_the_wheels_library_serves_where_the_system_has_none() -> None:
 def test_no_library_at_all_says_what_to_install() -> None:
     failed = _start_failure(before=NO_LIBRARY + "sys.modules['espeakng_loader'] = None")
     assert failed.reason == "engine_failed"
-    assert failed.message.startswith(
-        "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader (libespeak-ng.so.1: "
-    )
+    assert failed.message.startswith("libespeak-ng is missing (libespeak-ng.so.1: ")
+    assert failed.message.endswith(f"): {install.espeak_library()}")
 
 
 def test_a_library_without_a_voice_of_its_own_says_which() -> None:
@@ -313,7 +313,8 @@ espeak.load = without_english
 
 def test_no_pyttsx3_says_what_to_install() -> None:
     failed = _start_failure(before="sys.modules['pyttsx3'] = None")
-    assert failed.message.startswith("pyttsx3 is missing: pip install pyttsx3")
+    assert failed.message.startswith("pyttsx3 is missing (")
+    assert failed.message.endswith(f"): {install.command('pyttsx3')}")
 
 
 def test_an_unknown_driver_is_named_with_those_there_are() -> None:

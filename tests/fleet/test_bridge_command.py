@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import install
 from talkcli.fleet import topics
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.faults.supervisor import Supervisor
@@ -88,7 +89,7 @@ def test_what_to_install_is_said_and_what_needs_none_of_it_is_printed(home: str,
     env = spied(tmp_path, environment(home, TALK_BROKER=BROKER), ["paho"])
     done = run([*TALK, "bridge", "--name", "anna"], env)
     assert (done.code, done.out) == (2, "")
-    assert done.err == "talk: a fleet needs paho-mqtt: pip install 'talkcli[fleet]'\n"
+    assert done.err == f"talk: a fleet needs paho-mqtt: {install.command('paho-mqtt')}\n"
     for words in (["--print-acl"], ["--name", "anna", "--print-unit", "user"]):
         done = run([*TALK, "bridge", *words], env)
         assert (done.code, done.err) == (0, ""), done

@@ -93,7 +93,7 @@ def test_text_of_others_is_escaped_in_every_finding() -> None:
 @pytest.mark.parametrize(
     ("engine", "pyttsx3", "check", "step"),
     [
-        (Engine(reason="engine_failed", words="pyttsx3 is missing: pip install pyttsx3"), "2.99", "pyttsx3", "pip"),
+        (Engine(reason="engine_failed", words="pyttsx3 is missing (no module): install it"), "2.99", "pyttsx3", "pip"),
         (Engine(reason="engine_failed", words="libespeak-ng is missing: install it"), "2.99", "libespeak-ng", "libesp"),
         (
             Engine(reason="engine_failed", words="there is no espeak-ng data: install espeak-ng-data"),
@@ -226,7 +226,7 @@ def test_every_reason_of_an_aborted_goal_has_a_remedy_of_its_own() -> None:
         "nothing_to_say", "not_silent", "unknown_voice",
     }  # fmt: skip
     assert reasons <= sentence.REMEDIES.keys()
-    missing = "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader"
+    missing = "libespeak-ng is missing (libespeak-ng.so.1: cannot open): install it"
     assert "apt-get install -y libespeak-ng1" in sentence.remedy("engine_failed", missing)
     assert sentence.remedy("engine_failed", "no module named pyttsx3") == sentence.REMEDIES["engine_failed"]
 

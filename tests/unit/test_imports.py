@@ -25,7 +25,7 @@ PACKAGE = Path(talkcli.__file__).parent
 #: Each layer may import those before it, and itself; nothing imports one behind it.
 LAYERS = ["ground", "goals", "protocol", "terminal", "daemon", "client", "engine", "server", "fleet", "doctor", "cli"]
 #: The files of the ground, which lie flat and import nothing of the others but each other.
-GROUND = {"errors", "frozen", "paths", "peers"}
+GROUND = {"errors", "frozen", "install", "paths", "peers"}
 #: What lies flat besides: the package's face and its command, which hand on what others have.
 FACE = {"", "__main__"}
 #: What is pure besides all of `goals`, `protocol` and `terminal`.

@@ -13,6 +13,7 @@ import errno
 import itertools
 import os
 
+from talkcli import install
 from talkcli.engine.players import on_path
 from talkcli.engine.players.base import SAMPLE, CannotSpeak, Stopped
 from talkcli.engine.protocol import Voice
@@ -70,7 +71,7 @@ def load() -> tuple[Any, str, int]:
     with _no_sound_server():
         rate = _espeak.Initialize(_espeak.AUDIO_OUTPUT_SYNCHRONOUS, _BUFFER_MS, data, _DONT_EXIT)
     if rate <= 0:
-        raise NotInstalled("there is no espeak-ng data: install espeak-ng-data, or pip install espeakng-loader")
+        raise NotInstalled("there is no espeak-ng data: sudo apt-get install -y libespeak-ng1 espeak-ng-data")
     version = (_espeak.Info(None) or b"").decode("utf-8", "replace").split(" ")[0]
     return _espeak, f"eSpeak NG {version} ({origin})", rate
 
@@ -109,8 +110,7 @@ def _preload() -> tuple[str, bytes | None]:
     except (ImportError, OSError) as error:
         if _passes(error):
             raise
-        text = "libespeak-ng is missing: install libespeak-ng1, or pip install espeakng-loader"
-        raise NotInstalled(f"{text} ({missing})") from error
+        raise NotInstalled(f"libespeak-ng is missing ({missing}): {install.espeak_library()}") from error
     return "espeakng-loader", str(espeakng_loader.get_data_path()).encode()
 
 

@@ -12,11 +12,12 @@ import time
 import traceback
 from collections import deque
 
+from talkcli import install
 from talkcli.engine.protocol import LOAD_LIMIT, Loaded, Unloaded
 from talkcli.engine.synthesizers import models
 from talkcli.engine.synthesizers.cache import Cache
 from talkcli.engine.synthesizers.inference import Model, load_libraries
-from talkcli.engine.synthesizers.models import INSTALL, BadFile
+from talkcli.engine.synthesizers.models import BadFile
 from talkcli.engine.synthesizers.voices import NEURAL
 from talkcli.engine.synthesizers.work import Work
 from talkcli.frozen import TYPE_CHECKING, frozen
@@ -173,7 +174,7 @@ def _load(path: str) -> Iterator[Kept]:
     except OSError as error:
         raise BadFile(f"{path} cannot be read: {error.strerror}") from error
     except ImportError as error:
-        raise BadFile(f"{path} cannot be loaded ({error}): {INSTALL}") from error
+        raise BadFile(f"{path} cannot be loaded ({error}): {install.neural()}") from error
     except MemoryError as error:
         raise BadFile(f"{path} cannot be loaded: there is no memory for it; end another program") from error
 

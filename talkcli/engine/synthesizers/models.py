@@ -13,6 +13,7 @@ import os
 import stat
 import sys
 
+from talkcli import install
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.voices import NEURAL
 from talkcli.frozen import TYPE_CHECKING, frozen
@@ -23,9 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-#: What has to be installed besides, and how.
-NEEDED = ("onnxruntime", "numpy")
-INSTALL = "pip install 'talkcli[neural]'"
+#: The packages that a model needs.
+NEEDED = install.NEURAL
 
 _MODEL, JSON = ".onnx", ".json"
 #: How packages with voices are called, and where in one they may be.
@@ -70,11 +70,11 @@ class Description:
 
 
 def missing() -> str | None:
-    """Return what is to be said where a package that is needed is not installed; nothing is imported."""
+    """Return which package that is needed is missing, and the next step; None if all are installed."""
     from importlib.util import find_spec
 
     lacking = next((each for each in NEEDED if find_spec(each) is None), None)
-    return None if lacking is None else f"{lacking} is missing: {INSTALL}, into the Python that serves"
+    return None if lacking is None else f"{lacking} is missing: {install.neural()}"
 
 
 def found(environment: Mapping[str, str] | None = None) -> dict[str, str]:

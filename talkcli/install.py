@@ -1,0 +1,97 @@
+"""The command that installs a package into the environment that runs this process.
+
+Messages name this command if a package is missing. Nothing else needs this module.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from talkcli.frozen import TYPE_CHECKING, frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+#: Neither onnxruntime nor espeakng-loader has a 32-bit build. The process decides, because a 64-bit kernel can run a
+#: 32-bit system. On such a system `platform.machine()` names the kernel's architecture.
+IS_64_BIT = sys.maxsize > 2**32
+
+#: The packages that neural voices need.
+NEURAL = ("onnxruntime", "numpy")
+
+
+@frozen
+class Environment:
+    """A Python environment, as far as it decides how packages get into it."""
+
+    python: str  # path of the interpreter
+    pipx: str | None = None  # directory of the environment if pipx made it
+    user_home: str = ""
+    has_pip: bool = True
+    made_by_uv: bool = False
+    externally_managed: bool = False  # pip installs nothing into the system's Python without an option
+    needs_sudo: bool = False
+
+
+def command(*packages: str) -> str:
+    """Return the command that installs packages into the environment of this process."""
+    return command_for(_environment(), packages)
+
+
+def neural(*more: str) -> str:
+    """Return the step that makes neural voices work, with more packages if any are named."""
+    if not IS_64_BIT:
+        return "neural voices need a 64-bit system: choose one of espeak's voices, such as en"
+    return command(*NEURAL, *more)
+
+
+def espeak_library() -> str:
+    """Return the step that installs libespeak-ng."""
+    package = "sudo apt-get install -y libespeak-ng1"
+    return f"{package}, or {command('espeakng-loader')}" if IS_64_BIT else package
+
+
+def command_for(environment: Environment, packages: Sequence[str]) -> str:
+    """Return the shell command that installs packages into this environment."""
+    from shlex import join, quote
+
+    sudo = "sudo " if environment.needs_sudo else ""
+    names = join(packages)
+    if environment.pipx is not None:
+        home = os.path.dirname(os.path.dirname(environment.pipx))
+        own = home.startswith(f"{environment.user_home}/")
+        named = "" if own else f"PIPX_HOME={quote(home)} "
+        return f"{sudo}{named}pipx inject {quote(os.path.basename(environment.pipx))} {names}"
+    python = quote(environment.python)
+    if environment.made_by_uv and not environment.has_pip:
+        return f"{sudo}uv pip install --python {python} {names}"
+    pip = f"{sudo}{python} -m pip install {names}"
+    before = f"{sudo}{python} -m ensurepip"
+    if environment.externally_managed:
+        pip = f"{sudo}{python} -m pip install --break-system-packages {names}"
+        before = "sudo apt-get install -y python3-pip"
+    return pip if environment.has_pip else f"{before} && {pip}"
+
+
+def _environment() -> Environment:
+    from importlib.util import find_spec
+
+    is_virtual = sys.prefix != sys.base_prefix
+    # A package in a user's own site-packages is beside the system's Python, and so is the checkout that one works on.
+    owner = os.stat(sys.prefix if is_virtual else os.path.dirname(__file__)).st_uid
+    return Environment(
+        python=sys.executable or "python3",
+        pipx=sys.prefix if os.path.exists(os.path.join(sys.prefix, "pipx_metadata.json")) else None,
+        user_home=os.path.expanduser("~"),
+        has_pip=find_spec("pip") is not None,
+        made_by_uv=is_virtual and _is_made_by_uv(),
+        externally_managed=not is_virtual
+        and os.path.exists(os.path.join(os.path.dirname(os.__file__), "EXTERNALLY-MANAGED")),
+        needs_sudo=os.geteuid() not in {0, owner},
+    )
+
+
+def _is_made_by_uv() -> bool:
+    with open(os.path.join(sys.prefix, "pyvenv.cfg"), encoding="utf-8") as file:
+        return any(line.startswith("uv =") for line in file)

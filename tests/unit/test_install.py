@@ -1,0 +1,71 @@
+"""The command that installs a package, for each kind of environment."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+
+import pytest
+
+from talkcli import install
+from talkcli.engine.synthesizers.models import missing
+from talkcli.engine.synthesizers.voices import unknown_voice
+from talkcli.frozen import replace
+from talkcli.install import Environment, command_for
+
+VENV = Environment("/home/pi/talk/.venv/bin/python")
+SYSTEM = Environment("/usr/bin/python3", externally_managed=True)
+PIPX = Environment(
+    "/home/pi/.local/pipx/venvs/talkcli/bin/python", pipx="/home/pi/.local/pipx/venvs/talkcli", user_home="/home/pi"
+)
+OPT = Environment("/opt/talk/bin/python3", needs_sudo=True)
+
+
+@pytest.mark.parametrize(
+    ("environment", "command"),
+    [
+        (VENV, "/home/pi/talk/.venv/bin/python -m pip install numpy"),
+        (replace(VENV, python="/home/pi/my robot/bin/python"), "'/home/pi/my robot/bin/python' -m pip install numpy"),
+        (
+            replace(VENV, has_pip=False),
+            "/home/pi/talk/.venv/bin/python -m ensurepip && /home/pi/talk/.venv/bin/python -m pip install numpy",
+        ),
+        (
+            replace(VENV, has_pip=False, made_by_uv=True),
+            "uv pip install --python /home/pi/talk/.venv/bin/python numpy",
+        ),
+        (replace(VENV, made_by_uv=True), "/home/pi/talk/.venv/bin/python -m pip install numpy"),
+        (OPT, "sudo /opt/talk/bin/python3 -m pip install numpy"),
+        (
+            replace(OPT, has_pip=False),
+            "sudo /opt/talk/bin/python3 -m ensurepip && sudo /opt/talk/bin/python3 -m pip install numpy",
+        ),
+        (PIPX, "pipx inject talkcli numpy"),
+        (replace(PIPX, pipx="/home/pi/.local/pipx/venvs/talkcli-2"), "pipx inject talkcli-2 numpy"),
+        (
+            replace(PIPX, pipx="/opt/pipx/venvs/talkcli", needs_sudo=True),
+            "sudo PIPX_HOME=/opt/pipx pipx inject talkcli numpy",
+        ),
+        (SYSTEM, "/usr/bin/python3 -m pip install --break-system-packages numpy"),
+        (replace(SYSTEM, externally_managed=False), "/usr/bin/python3 -m pip install numpy"),
+        (
+            replace(SYSTEM, has_pip=False, needs_sudo=True),
+            "sudo apt-get install -y python3-pip && sudo /usr/bin/python3 -m pip install --break-system-packages numpy",
+        ),
+    ],
+)
+def test_the_command_fits_the_environment(environment: Environment, command: str) -> None:
+    assert command_for(environment, ["numpy"]) == command
+
+
+def test_the_command_names_the_python_that_runs() -> None:
+    assert sys.executable in shlex.split(install.command("numpy"))
+
+
+def test_on_a_32_bit_system_no_package_is_named_that_has_no_build_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(install, "IS_64_BIT", False)
+    assert install.espeak_library() == "sudo apt-get install -y libespeak-ng1"
+    step = "neural voices need a 64-bit system: choose one of espeak's voices, such as en"
+    monkeypatch.setattr("talkcli.engine.synthesizers.models.NEEDED", ["no_such_package"])
+    assert missing() == f"no_such_package is missing: {step}"
+    assert unknown_voice("piper/joe", ()) == f'unknown voice "piper/joe": {step}'
