@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -12,10 +15,11 @@ from talkcli import install
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers.models import NEEDED
 from talkcli.engine.synthesizers.voices import find_voice
-from tests.conformance.bareserve import TALK, environment, run, serving
+from tests.conformance.bareserve import LIMIT, SERVE, TALK, environment, run, serving
 from tests.engine.test_neural import SLOW_TO_SPEAK, WITHOUT
 from tests.support import tiny_voice
-from tests.support.surroundings import needs_packages, short_directory
+from tests.support.processes import children
+from tests.support.surroundings import needs, needs_packages, short_directory
 from tests.test_completion import offered
 
 if TYPE_CHECKING:
@@ -227,3 +231,32 @@ def test_a_speaker_that_a_voice_lacks_is_refused(env: dict[str, str], tmp_path: 
             assert json.loads(run([*TALK, "--json", "status", goal], env).out)["voice"] == voice
     done = run([*TALK, "serve", "--player", "null", "--voice", "piper/tiny#4"], env)
     assert (done.code, "it has one speaker" in done.err) == (2, True), done
+
+
+#: System calls that change a file or use the internet, even if they failed.
+_REPORTS = re.compile(
+    r"AF_INET|O_WRONLY|O_RDWR|O_CREAT|\b(mkdir|mknod|rename|unlink|link|symlink|chmod|chown|truncate)\w*\("
+)
+
+
+@pytest.mark.parametrize("seconds", [0, pytest.param(30, marks=pytest.mark.slow)])
+def test_a_neural_sentence_reports_to_nobody(env: dict[str, str], tmp_path: Path, seconds: int) -> None:
+    """Even if the user has turned on onnxruntime's telemetry, which asks for its host 9 seconds after the import."""
+    needs("strace")
+    trace = tmp_path / "trace"
+    traced = ["strace", "-f", "-y", "-s", "4096", "-e", "trace=%network,%file", "-o", str(trace), *SERVE]
+    env |= {"ORT_DISABLE_TELEMETRY": "0", "PYTHONDONTWRITEBYTECODE": "1"}
+    with serving(env, command=traced) as server:
+        (talk,) = children(server.process.pid)
+        try:
+            done = run([*TALK, "say", "--wait", "--voice", "piper/tiny", "--voice-only", "hello"], env)
+            assert done.code == 0, done
+            time.sleep(seconds)
+        finally:
+            os.kill(talk, signal.SIGTERM)  # strace itself passes no signal on
+            server.process.wait(LIMIT)
+    lines = trace.read_text(errors="replace").splitlines()
+    assert any("onnxruntime" in each for each in lines)
+    home = env["HOME"]
+    own = (f'"{home}"', f'"{home}/s', f'"{home}/.cache"', f'"{home}/.cache/talk', '"/dev/null"')
+    assert [each for each in lines if _REPORTS.search(each) and not any(place in each for place in own)] == []

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from talkcli.engine.synthesizers.models import Description
     from talkcli.engine.synthesizers.vits import Buffer
 
+# From version 1.30 on, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
+# telemetry host some seconds later. A robot's voice reports to nobody, so a user's own value is overwritten.
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+
 #: Frames on either side of some that their samples depend on. Reckoned for the largest of Piper's decoders ("high"),
 #: 13.4; of a "medium" one the samples with 10 are those of the whole to a part in 400,000.
 AROUND = 14
