@@ -169,6 +169,20 @@ def test_install_for_one_user(newcomer: Shell) -> None:
     found = newcomer.run("PATH=/usr/bin:/bin bash -ic 'type -ap talk' 2> bash.log")
     assert talk in found.stdout.splitlines(), found  # an older `talk` may come before it, as the README says
     assert newcomer.run(f"{talk} --version").stdout.startswith("talk ")
+    for command in (f"say -o said.wav --voice {REAL_VOICE} hello", "--robot anna status"):
+        assert f"`{_follow_the_advice(newcomer, f'{talk} {command}')}`" in README.text
+    assert newcomer.run("test -s said.wav").returncode == 0
+
+
+def _follow_the_advice(shell: Shell, command: str) -> str:
+    """Run a command that lacks a package, and then what its message advises; return that advice."""
+    failed = shell.run(command)
+    advice = re.search(r"\S+ (-m pip install|inject talkcli) .*", failed.stderr)
+    assert advice, failed
+    done = shell.run(advice[0], limit=LIMIT)
+    assert done.returncode == 0, done
+    assert advice[0] not in (again := shell.run(command)).stderr, again
+    return advice[0]
 
 
 @pytest.mark.slow
@@ -181,6 +195,7 @@ def test_install_for_all_users(newcomer: Shell) -> None:
     talk = newcomer.directory / "system/usr/local/bin/talk"
     assert newcomer.run(f"{talk} --version").stdout.startswith("talk ")
     assert newcomer.run(f"{talk} say -o hello.wav -- hello && test -s hello.wav").returncode == 0
+    assert "/system/opt/talk/bin/python" in _follow_the_advice(newcomer, f"{talk} --robot anna status")
 
 
 def _packages(text: str) -> set[str]:
