@@ -83,7 +83,8 @@ def test_one_is_changed_and_the_others_stay(
 
 
 def test_what_is_printed_can_be_given_back(shared: Talk) -> None:
-    shared.run("set", "--rate", "150", "--volume", "0.1", "--ttl", "1.5", "--pitch", "60", "--voice", "en")
+    shared.run("set", "--rate", "150", "--volume", str(0.1 + 0.2), "--ttl", "1.5", "--pitch", "60", "--voice", "en")
+    assert "volume 0.3, " in shared.log
     before = settings(shared)
     words = [word for name, value in before.items() if name != "preempt" for word in (f"--{name}", value)]
     assert shared.run("set", *words).code == 0

@@ -80,6 +80,11 @@ def _bad_data(value: JsonObject) -> str | None:
         return DATA.wrong
 
 
+def figure(value: object) -> str:
+    """Return a value for people: a number has at most four decimals."""
+    return f"{round(value, 4):.12g}" if isinstance(value, float) else str(value)
+
+
 FLAG = Kind("boolean", (bool,), "must be true or false")
 TEXT = Kind("string", (str,), "must be a string", "TEXT")
 #: a text that names something: on a command line it is never empty, and it is UTF-8

@@ -27,6 +27,7 @@ from talkcli.goals.option import (
     WORD,
     Option,
     Setting,
+    figure,
     is_clients_id,
 )
 
@@ -469,5 +470,5 @@ def told(settings: JsonObject) -> list[str]:
     for each in SETTINGS:
         setting, value = each.setting, settings.get(each.name)
         if setting:
-            found.append(setting.told_none if setting.told_none and not value else setting.told.format(value))
+            found.append(setting.told_none if setting.told_none and not value else setting.told.format(figure(value)))
     return found

@@ -20,7 +20,7 @@ from talkcli.goals import text as texts
 from talkcli.goals.goal import By
 from talkcli.goals.history import EarlyCancels, History, Said
 from talkcli.goals.loading import Loading
-from talkcli.goals.option import is_clients_id
+from talkcli.goals.option import figure, is_clients_id
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option
 from talkcli.goals.queue import Queue
 from talkcli.goals.record import Record
@@ -376,7 +376,7 @@ class Scheduler:
             last = self._said.within(say.throttle, say.key, say.text, now.monotonic)
             if last is None:
                 return None
-            first, words = last, f"was said less than {say.throttle:g} s ago"
+            first, words = last, f"was said less than {figure(say.throttle)} s ago"
         record.by = By(goal=first)
         return "throttled", f"the same {words}"
 
@@ -418,7 +418,7 @@ class Scheduler:
     def _expire(self, now: Now) -> list[Effect]:
         effects: list[Effect] = []
         for record in self._queue.expired(now.monotonic):
-            words = f"its time to live of {record.say.ttl:g} s was over before it was spoken"
+            words = f"its time to live of {figure(record.say.ttl)} s was over before it was spoken"
             effects += self._recall(record, "expired", words, None, now)
         return effects
 

@@ -17,6 +17,7 @@ from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals.goal import By
+from talkcli.goals.option import figure
 from talkcli.goals.options import INITIAL, Cancel, Say, Set, as_shown, bad_option, given
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
@@ -354,7 +355,7 @@ class Requests:
         self._speech.want(changed.get("voice"), anew=True)
         self._speech.apply(self._scheduler.tick(self._speech.now()))  # who waited for a voice may wait no more
         if changed:
-            values = ", ".join(f"{name} {value}" for name, value in changed.items())
+            values = ", ".join(f"{name} {figure(value)}" for name, value in changed.items())
             log.line(f"set to {log.shown(values)} by {who(call.connection.sender)}")
         call.answer(settings=as_shown(self._scheduler.settings))
 

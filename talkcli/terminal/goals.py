@@ -10,6 +10,7 @@ import re
 import time
 
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.option import figure
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
 from talkcli.terminal.text import GAP, LONGEST_ID, Screen, cut, fitted, folded, id_room, pad, printable, width
@@ -98,7 +99,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("from", who(goal.client)),
         ("priority", str(goal.priority)),
         ("key", goal.key and f'"{printable(goal.key)}"'),
-        ("ttl", goal.ttl and ", ".join(filter(None, (f"{goal.ttl:g} s", _left(goal, now))))),
+        ("ttl", goal.ttl and ", ".join(filter(None, (f"{figure(goal.ttl)} s", _left(goal, now))))),
         ("data", None if goal.data is None else printable(encode(goal.data).decode().rstrip("\n"))),
         ("queued", _moment(goal.queued_at)),
         ("started", _moment(goal.started_at)),
@@ -346,7 +347,7 @@ def _about(server: JsonObject, *names: str) -> list[str]:
 def _value(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return figure(value)
 
 
 def clock(seconds: float | None) -> str:

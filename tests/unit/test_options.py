@@ -201,7 +201,8 @@ def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_ther
     shown = as_shown(INITIAL)
     assert shown == {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
     assert as_shown(replace(INITIAL, voice=DEFAULT_VOICE, ttl=0.0)) == shown
-    assert told(shown) == ["rate 200", "volume 1.0", "voice the driver's own", "pitch 50", "goals queue", "no ttl"]
+    assert told({**shown, "volume": 0.1 + 0.2, "ttl": 1e6})[1::4] == ["volume 0.3", "ttl 1000000 s"]
+    assert told(shown) == ["rate 200", "volume 1", "voice the driver's own", "pitch 50", "goals queue", "no ttl"]
     changed = as_shown(replace(INITIAL, voice="de", ttl=2.5, preempt=True))
     assert told(changed)[2:] == ["voice de", "pitch 50", "goals preempt", "ttl 2.5 s"]
 
