@@ -77,6 +77,8 @@ class Configure:
     output: int | None = None
     #: whether a sentence fails whose output is muted, where it doesn't say so itself.
     audible: bool = False
+    #: the program that is tried first where no player is named; None for the usual order.
+    worked: str | None = None
 
 
 @frozen
@@ -254,6 +256,7 @@ class Ended:
     duration: float | None = None  # seconds of audio, where all of it was synthesised
     gaps: int = 0  # times that it was silent in its midst, as its sound was not made in time
     gap_seconds: float = 0.0  # for so long in all
+    player: str | None = None  # what took the sound, where no player is named
 
 
 Command = Configure | Say | Stop | Pause | Resume | Followed | Load

@@ -366,7 +366,7 @@ class Session:
         self._tell_output()
         goal, self._goal = self._goal, None
         gaps = len(self.gaps), round(sum(self.gaps), 3)
-        self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration, *gaps))
+        self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration, *gaps, self.players.chosen))
 
     def _alive_due(self) -> float | None:
         loading = self._synthesizer is not None and self._synthesizer.descriptor is not None

@@ -19,6 +19,7 @@ from talkcli.engine import protocol
 from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.errors import TalkError, UsageError
+from talkcli.frozen import replace
 from talkcli.goals.goal import Output
 from talkcli.goals.options import INITIAL, for_engine, model_of
 from talkcli.goals.scheduler import Changed, Effect, Now, Order
@@ -414,6 +415,8 @@ class Speech:
         active = self.scheduler.active
         if active is None or active.id != ended.id:
             return  # it was given up before the engine came to its end, perhaps just now
+        if self.ready and ended.player:  # status shows what plays, not what was tried first
+            self.ready = replace(self.ready, player=ended.player)
         if ended.outcome == protocol.COMPLETED:
             effects = self.scheduler.completed(ended.id, ended.duration, now, ended.gaps, ended.gap_seconds)
         elif ended.outcome == protocol.STOPPED and active.stop_since is not None:

@@ -285,6 +285,7 @@ def test_the_next_player_is_tried_with_the_whole_sentence(player: Player, tmp_pa
         assert ended.duration is not None
         assert player.heard.stat().st_size == round(ended.duration * 22050) * 2
         assert len(engine.words()) == 5
+        assert ended.player == "pacat"
         # It worked, so it is the first next time: the failing one would have left a mark.
         player.program(f"open({str(tmp_path / 'mark')!r}, 'w')", "aplay")
         assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED

@@ -104,7 +104,9 @@ class Players:
         #: whether the sentence in hand is to fail where it is muted
         self._audible = configure.audible
         #: the name of the player by which a sentence was played whole, the last time
-        self.worked: str | None = None
+        self.worked = configure.worked
+        #: the name of the player that took the sentence in hand, where none is named
+        self.chosen: str | None = None
         self._used_at: float | None = None
 
     def candidates(self, rate: int) -> Iterator[Callable[[], Player]]:
@@ -125,11 +127,13 @@ class Players:
         """Take note of a new sentence."""
         self._own_lead_in = say.lead_in
         self._audible = self._configure.audible if say.audible is None else say.audible
-        self.output = None
+        self.output = self.chosen = None
         self.gap.followed, self.gap.by_neural = say.followed, say.by_neural
 
     def tell(self, player: Player) -> None:
         """Take note of where the sentence in hand goes now; that it was muted before is not forgotten."""
+        if player.proven and self._configure.player is None:
+            self.chosen = player.name
         output, before = player.output, self.output
         if before is None:
             self.output = output
@@ -165,7 +169,7 @@ class Players:
                 server.kill()
                 return server.name
         try:
-            return commands(None, None, 1)[0].name
+            return commands(None, None, 1, self.worked)[0].name
         except CannotSpeak:
             return None
 
