@@ -113,7 +113,7 @@ def test_silent_makes_no_sound_without_a_server_either(home: str, sink: Sink) ->
         found = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"), "--silent")
         recording.wait_until_quiet(0.2)
     assert_silent(recording)
-    assert found["sentence"]["state"] == "done"
+    assert found["sentence"]["state"] == "ok"
 
 
 def test_without_any_sound_the_player_s_own_words_are_told(home: str) -> None:

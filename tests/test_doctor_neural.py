@@ -16,7 +16,7 @@ from talkcli import Client, install
 from talkcli.client.connect import Interrupted
 from talkcli.doctor import neural, voice
 from talkcli.doctor.neural import Neural, Tried
-from talkcli.doctor.report import DONE, FAILED, WARNING
+from talkcli.doctor.report import FAILED, OK, WARNING
 from talkcli.doctor.voice import Engine
 from talkcli.engine.synthesizers.models import NEEDED
 from tests.conformance.bareserve import environment, serving
@@ -58,12 +58,12 @@ def _environment(home: str, tmp_path: Path, code: str, **more: str) -> dict[str,
 def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
     needs_packages(*NEEDED)
     found = doctor({**alone, "TALK_VOICE": "piper/ti"})
-    assert found["neural"]["state"] == "done"
+    assert found["neural"]["state"] == "ok"
     assert re.search(r"onnxruntime \d+\.\d+.*, numpy \d+\.\d+", found["neural"]["message"])
     assert found["voice files"] == {
-        "check": "voice files", "state": "done", "message": "as they should be: piper/tiny", "next": None
+        "check": "voice files", "state": "ok", "message": "as they should be: piper/tiny", "next": None
     }  # fmt: skip
-    assert found["neural voice"]["state"] == "done"
+    assert found["neural voice"]["state"] == "ok"
     assert re.match(f"piper/ti {TRIED}", found["neural voice"]["message"]), found
     assert list(found)[3:8] == ["voices", "neural", "voice files", "neural voice", "session"]
 
@@ -149,6 +149,29 @@ def test_without_the_extra_it_says_what_to_install(home: str, tmp_path: Path, us
     assert used is (found["voices"]["next"] == step)
 
 
+@pytest.mark.parametrize(
+    ("code", "words", "step", "used"),
+    [
+        ("os.kill(os.getpid(), 4)", "it was killed by SIGILL", "this processor is too old", True),
+        ("raise ImportError('no libgomp.so.1')", "ImportError: no libgomp.so.1", "install it again", False),
+    ],
+)
+def test_a_package_that_cannot_be_imported_is_a_finding(
+    home: str, tmp_path: Path, code: str, words: str, step: str, used: bool
+) -> None:
+    needs_packages(*NEEDED)
+    tiny_voice.put(Path(home) / "v", "tiny")
+    env = _environment(home, tmp_path, "")
+    (tmp_path / "site" / "onnxruntime.py").write_text(
+        f"import os\nassert os.environ['ORT_DISABLE_TELEMETRY'] == '1'\n{code}\n"
+    )
+    found = doctor({**env, **({"TALK_VOICE": "piper/tiny"} if used else {})})
+    assert found["neural"]["state"] == ("failed" if used else "warning")
+    assert re.match(f"onnxruntime .* cannot be imported: {re.escape(words)}$", found["neural"]["message"])
+    assert found["neural"]["next"].startswith(step)
+    assert "neural voice" not in found
+
+
 def test_where_nothing_neural_is_there_nothing_is_done() -> None:
     code = """
 import sys
@@ -199,14 +222,14 @@ def test_what_the_server_says_of_its_voices_is_told_where_they_cannot_be_looked_
     assert (found.state, found.message) == (WARNING, "the server cannot speak by piper/b: x is no model")
     assert found.next == "see whether it still is so: talk set --voice piper/b"
     (found,) = neural.judge_told({"piper/a": FAILED_THEN["piper/a"]})
-    assert (found.state, found.message) == (DONE, "of the server: piper/a")
+    assert (found.state, found.message) == (OK, "of the server: piper/a")
     assert neural.judge_told({}) == neural.judge_told(None) == []
 
 
 def test_a_voice_that_speaks_here_and_that_the_server_has_given_up_is_told_so() -> None:
     facts = Neural(None, used="piper/b", tried=Tried(loaded=0.5, speed=9.0))
     assert neural.judge(facts, server=True, told=FAILED_THEN)[-1].state == WARNING
-    assert neural.judge(facts, server=True, told={})[-1].state == DONE
+    assert neural.judge(facts, server=True, told={})[-1].state == OK
 
 
 # -- the one that is tried, and what is made of it
@@ -255,7 +278,7 @@ def test_a_machine_that_is_too_slow_is_told_what_to_choose() -> None:
         "piper/a is in use: loaded in 3.0 s, makes a sentence 1.3 times as fast as it is heard, takes 250 MB"
     )
     assert "quality is low" in (slow.next or "")
-    assert _judged(loaded=3.04, speed=1.31).state == DONE
+    assert _judged(loaded=3.04, speed=1.31).state == OK
     assert "MB" not in _judged(speed=2.0).message
 
 
@@ -268,5 +291,5 @@ def test_a_voice_that_fails_is_a_warning_where_espeak_speaks_in_its_place() -> N
 
 def test_a_voice_that_takes_what_is_not_installed_is_cured_by_that() -> None:
     words = f"the voice piper/a is listed, but it cannot be loaded: numpy is missing: {install.neural()}"
-    found = voice.judge("2.99", Engine(reason="unknown_voice", words=words), server=False)[-1]
+    found = voice.judge("2.99", Engine(reason="unknown_voice", words=words), server=None)[-1]
     assert (found.check, found.next) == ("voices", install.neural())

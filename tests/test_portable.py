@@ -117,4 +117,4 @@ def test_doctor_looks_without_a_trace(served: Talk) -> None:
     found = {each["check"]: each for each in map(json.loads, done.out.splitlines())}
     assert done.err == ""
     assert {"python", "pyttsx3", "socket", "server", "settings", "sentence"} <= found.keys()
-    assert found["server"]["state"] == found["sentence"]["state"] == "done"
+    assert found["server"]["state"] == found["sentence"]["state"] == "ok"

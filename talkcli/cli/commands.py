@@ -305,7 +305,7 @@ _ROWS = (
         about="""
         Check everything between a sentence and a loudspeaker, in order, and say the one thing to do next.
 
-        Each check is a line: done, warning or failed. At last a sentence is played: by the server, where it waits
+        Each check is a line: ok, warning or failed. At last a sentence is played: by the server, where it waits
         its turn (20 seconds at most), or without a server by an engine of this command's own, with TALK_PLAYER and
         TALK_VOICE. With --silent it is always that engine, which plays zeros by the server's player: no goal waits,
         and none is in the log.
@@ -320,7 +320,7 @@ _ROWS = (
         talk doctor --silent                    at night: all of it, without a sound
         ssh robot talk doctor                   the exit code comes back
         talk doctor --robot anna                what is between here and anna
-        talk --json doctor | jq 'select(.state != "done")'
+        talk --json doctor | jq 'select(.state != "ok")'
         """,
         exit_codes={
             0: "a sentence would be heard; with --robot: the robot answers",

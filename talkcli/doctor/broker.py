@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.client.client import Client
 from talkcli.client.connect import ready
-from talkcli.doctor.report import ADMITTED, ANSWERED, FAILED, Finding, done, failed, some, warning
+from talkcli.doctor.report import ADMITTED, ANSWERED, FAILED, Finding, failed, ok, some, warning
 from talkcli.doctor.server import span, summary
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
@@ -307,7 +307,7 @@ def judge_settings(words: str, *, named: bool) -> Finding:
 def judge_way(broker: Broker, way: Way) -> Finding:
     """Judge whether there is anybody."""
     if way.trouble is None:
-        return done("broker", f"{broker.url} takes connections, in {way.took * 1000:.0f} ms")
+        return ok("broker", f"{broker.url} takes connections, in {way.took * 1000:.0f} ms")
     step = _STEPS.get(way.trouble, _STEPS[SILENT])
     return failed("broker", f"{broker.url}: {way.trouble}", step.format(host=broker.host, port=broker.port))
 
@@ -330,7 +330,7 @@ def judge_certificate(broker: Broker, way: Way, now: float, *, near: bool) -> li
     if way.until - now < _SOON:
         words = f"good until {date}, {span(way.until - now)} from now; trusted by {by}"
         return [warning(check, words, f"renew the certificate of {broker.host}, and have mosquitto read it: SIGHUP")]
-    return [done(check, f"trusted by {by}; good until {date}")]
+    return [ok(check, f"trusted by {by}; good until {date}")]
 
 
 def _trust(broker: Broker, way: Way, now: float) -> str:
@@ -363,13 +363,13 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
         return failed("login", wrong, step)
     how = [words for words, given in (("a password", broker.password), ("a certificate", broker.cert)) if given]
     who = "nobody" if broker.user is None else f"'{broker.user}'"
-    return done("login", f"as {who}, with {' and '.join(how) or 'neither password nor certificate'}")
+    return ok("login", f"as {who}, with {' and '.join(how) or 'neither password nor certificate'}")
 
 
 def judge_anonymous(refusal: str | None) -> Finding:
     """Judge whether anybody gets in; `refusal`: why nobody does."""
     if refusal is not None:
-        return done("anonymous", "who has no credentials is not let in")
+        return ok("anonymous", "who has no credentials is not let in")
     words = "the broker lets in who has no credentials: anybody on the network can make the robots speak"
     return warning("anonymous", words, "allow_anonymous false in mosquitto.conf, and: talk bridge --print-acl")
 
@@ -389,12 +389,12 @@ def judge_name(presence: Presence, now: float) -> Finding:
     server = presence.server
     if server is None:
         return failed("name", f"{words}; it has no talk server", f"on {robot}: systemctl status talk; talk doctor")
-    return done("name", f"{words}; its server is talk {server.get('version')}, process {server.get('pid')}")
+    return ok("name", f"{words}; its server is talk {server.get('version')}, process {server.get('pid')}")
 
 
 def judge_free(robot: str) -> Finding:
     """Judge a robot's own name of which the broker keeps nothing."""
-    return done("name", f"'{robot}' is free: no bridge has it, and none had it")
+    return ok("name", f"'{robot}' is free: no bridge has it, and none had it")
 
 
 def judge_unknown(robot: str, known: tuple[str, ...], name: str, *, may: bool) -> Finding:
@@ -424,7 +424,7 @@ def judge_rights(name: str, allowed: Allowed) -> Finding:
     if allowed.trouble is not None:
         words = f"what '{name}' may do can't be found out: {allowed.trouble}"
         return failed("rights", words, "see what the broker's log says: journalctl -u mosquitto")
-    return done("rights", f"the broker lets '{name}' do what is needed")
+    return ok("rights", f"the broker lets '{name}' do what is needed")
 
 
 def judge_bridge(robot: str, server: JsonObject, took: float) -> Finding:
@@ -434,7 +434,7 @@ def judge_bridge(robot: str, server: JsonObject, took: float) -> Finding:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")
     if server.get("engine") not in {"ready", "starting"}:
         return warning("bridge", words, f"on {robot}: talk doctor")
-    return done("bridge", words)
+    return ok("bridge", words)
 
 
 def judge_no_answer(robot: str, words: str) -> Finding:

@@ -48,14 +48,17 @@ class Examination:
         self._process: int | None = None
         #: whether the sound server hangs: whoever asks it again waits again
         self._hangs = False
+        #: the environment of what plays
+        self._env: Mapping[str, str] = os.environ
 
     def findings(self) -> Iterator[Finding]:
         """Give each finding as soon as it is known; Interrupted."""
         client, found = server.connect(self._option, self._interrupt)
         with client or contextlib.nullcontext():
             for each in self._all(client, found):
-                self._found.append(each)
-                yield each
+                told = sound.installing(each, self._env)
+                self._found.append(told)
+                yield told
 
     def _all(self, client: Client | None, found: server.Places) -> Iterator[Finding]:
         itself: list[Finding] = []
@@ -68,9 +71,10 @@ class Examination:
         named = None if client else os.environ.get("TALK_VOICE") or None
         engine = voice.look(voice.Setting(voice=named, interrupt=self._interrupt))
         yield voice.python()
-        yield from voice.judge(voice.pyttsx3(), engine, server=client is not None)
+        yield from voice.judge(voice.pyttsx3(), engine, server=self._told("engine"))
         process = self._process = server.process_here(client) if client else None
         here, env = machine.surroundings(process)
+        self._env = env
         used = self._told("voice") if self._server else named
         yield from self._neural(used, engine, here, env, running=client is not None)
         if client is not None and process is None:
@@ -78,7 +82,7 @@ class Examination:
             yield from sound.judge_silent(self._player(), running=True)
         elif sys.platform.startswith("linux"):
             yield machine.judge_session(here)
-            yield from self._sound(here, env, running=client is not None)
+            yield from self._sound(engine, here, env, running=client is not None)
         yield server.judge_places(found)
         yield from itself
         yield self._sentence(client, engine, here, env)
@@ -106,13 +110,15 @@ class Examination:
         value = self._server.get(setting)
         return str(value) if value else None
 
-    def _sound(self, here: machine.Session, env: Mapping[str, str], *, running: bool) -> Iterator[Finding]:
+    def _sound(
+        self, engine: voice.Engine, here: machine.Session, env: Mapping[str, str], *, running: bool
+    ) -> Iterator[Finding]:
         if not is_own(self._told("driver")):
             return  # it plays by itself
         wanted, device = self._player(), self._told("device")
-        players = sound.players(env, wanted)
+        players = sound.players(env, wanted, None if running else engine.player)
         cards, found = machine.cards(here), sound.sound_server(env, here)
-        used = wanted or ("pulse" if found.name else next(iter(players.found), None))
+        used = wanted or players.first or ("pulse" if found.name and found.pulse else next(iter(players.found), None))
         devices = None if used == "pulse" and found.hangs else sound.devices(env, used, device)
         self._hangs = found.hangs
         yield from sound.judge(players, devices, cards, found, here, running=running)
@@ -129,7 +135,7 @@ class Examination:
                 return sentence.ELSEWHERE
             played = sentence.beside(client, self._setting_of_server(self._process, env), LIMIT)
         elif client is not None:
-            played = replace(sentence.by_server(client, sentence.TEXT, LIMIT), player=wanted, served=True)
+            played = replace(sentence.by_server(client, sentence.TEXT, LIMIT), served=True)
         elif engine.reason is not None:
             played = sentence.Played(State.ABORTED, engine.reason, engine.words)
         else:
@@ -148,11 +154,11 @@ class Examination:
 
     def _setting_of_server(self, process: int, env: Mapping[str, str]) -> voice.Setting:
         """Return what the server speaks with, for a process that does as it does, without a sound."""
-        player = self._told("player")
+        player, worked = self._told("player"), None
         if is_silent(player):
             player = "null"  # a file would get a sentence more, perhaps in the middle of one of the server's
         elif player in PLAYERS and not machine.names_a_player(process, env):
-            player = None  # that one is the first that the server tries, and not the only one
+            player, worked = None, player  # the server tries that one first, and then the others
         return voice.Setting(
-            player, self._told("device"), self._told("voice"), self._interrupt, self._told("driver"), env
+            player, self._told("device"), self._told("voice"), self._interrupt, self._told("driver"), worked, env
         )

@@ -15,7 +15,7 @@ import struct
 from typing import TYPE_CHECKING
 
 from talkcli import peers
-from talkcli.doctor.report import Finding, done, some, warning
+from talkcli.doctor.report import Finding, ok, some, warning
 from talkcli.engine.players import devices
 from talkcli.frozen import frozen
 
@@ -32,7 +32,7 @@ _GENERATIONS = 8
 _CRON = frozenset({"cron", "crond", "cronie", "anacron"})
 _SSH = frozenset({"ssh", "sshd"})
 #: What is to be said where the server's surroundings can't be seen.
-ELSEWHERE = done(
+ELSEWHERE = ok(
     "session", "the server runs on another machine or in a container: run talk doctor there to look at its sound"
 )
 #: An entry of an access control list for one user, or for one group; and the bits for reading and writing.
@@ -237,7 +237,7 @@ def judge_session(session: Session) -> Finding:
     if session.runtime is None:
         if session.usual_runtime is None:
             # As on a robot without logind: nothing is missing that there could be.
-            return done("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")
+            return ok("session", f"{who}; no XDG_RUNTIME_DIR, as there is no session of this user")
         again = "" if session.server is None else " where the server is started, and start it again"
         return warning(
             "session",
@@ -255,15 +255,15 @@ def judge_session(session: Session) -> Finding:
             f"{words}, which is uid {session.runtime_owner}'s: its sound server takes nobody else",
             f"run this as the user who owns it: sudo -u '#{session.runtime_owner}' talk doctor",
         )
-    return done("session", words)
+    return ok("session", words)
 
 
 def judge_cards(cards: Cards, session: Session, *, served: bool) -> Finding:
     """Judge which cards there are; `served`: whether a sound server answers, which opens them itself."""
     if cards.names:
-        return done("cards", some(cards.names))
+        return ok("cards", some(cards.names))
     if served:
-        return done("cards", "none of this machine's own; the sound server has what is needed")
+        return ok("cards", "none of this machine's own; the sound server has what is needed")
     if "a container" in session.kinds:
         step = "start the container with --device /dev/snd, or with the sound server's socket: see the README"
         return warning("cards", "none in this container", step)
@@ -275,13 +275,13 @@ def judge_access(cards: Cards, session: Session, *, served: bool) -> Finding:
     """Judge who may open the cards; `served`: as of `judge_cards`."""
     group = cards.group
     if not cards.nodes:
-        return done("group", f"nothing in /dev/snd to open, so the group {group} is not needed")
+        return ok("group", f"nothing in /dev/snd to open, so the group {group} is not needed")
     if not cards.forbidden:
         member = "in the group {}" if group in session.groups else "not in the group {}, and needs not to be"
-        return done("group", f"user {session.user} may open the cards ({member.format(group)})")
+        return ok("group", f"user {session.user} may open the cards ({member.format(group)})")
     words = f"user {session.user} may not open {some(cards.forbidden)}: not in the group {group}"
     if served:
-        return done("group", f"{words}; the sound server opens them")
+        return ok("group", f"{words}; the sound server opens them")
     if cards.from_next_login:
         step = "log out and in again" if session.server is None else "start the server again, from a new login"
         return warning("group", f"{words} yet, though it is to be from the next login on", step)

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import time
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
-from talkcli.doctor.report import Finding, done, failed, some, warning
+from talkcli import install
+from talkcli.doctor.report import Finding, failed, ok, some, warning
+from talkcli.doctor.sound import asked
 from talkcli.doctor.voice import fault
 from talkcli.engine import protocol
 from talkcli.engine.process import Conversation, EngineFailed
@@ -32,6 +35,20 @@ _FAST_ENOUGH = 1.3
 _RUNTIME, _FILES, _VOICE = "neural", "voice files", "neural voice"
 #: What has a server load a voice that it has given up.
 _AGAIN = "see whether it still is so: talk set --voice "
+#: Imports packages one by one, for a process of its own: on an old processor that may be the end of it.
+_IMPORT = """
+import sys
+sys.path[:] = filter(None, sys.path)  # nothing of the current directory
+for each in sys.argv[1:]:
+    print(each, flush=True)
+    try:
+        __import__(each)
+    except Exception as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+"""
+#: Seconds that this may take, from an SD card.
+_IMPORT_LIMIT_S = 10.0
+_REINSTALL = f"install it again: {install.neural()} --force-reinstall"
 _CHOOSE = "choose one of espeak's: talk set --voice en, or talk serve --voice en"
 
 
@@ -65,6 +82,8 @@ class Neural:
     #: the voice that is spoken with, as its user wrote it; how it went with it, if it was tried
     used: str | None = None
     tried: Tried | None = None
+    #: which package is installed and cannot be imported, and why, for people
+    broken: str | None = None
 
 
 def look(
@@ -83,8 +102,19 @@ def look(
             good.append(NEURAL + name)
         except models.BadFile as error:
             bad.append((NEURAL + name, *_parted(str(error))))
-    tried = None if used is None or missing else _try(used, env, limit, interrupt)
-    return Neural(missing, tuple(map(_installed, models.NEEDED)), tuple(good), tuple(bad), used, tried)
+    broken = None if missing else _broken(os.environ if env is None else env)
+    tried = None if used is None or missing or broken else _try(used, env, limit, interrupt)
+    return Neural(missing, tuple(map(_installed, models.NEEDED)), tuple(good), tuple(bad), used, tried, broken)
+
+
+def _broken(env: Mapping[str, str]) -> str | None:
+    """Return which of the packages cannot be imported, and why; None if all can."""
+    env = {**env, **models.NO_TELEMETRY}
+    said = asked(sys.executable, "-c", _IMPORT, *reversed(models.NEEDED), env=env, limit=_IMPORT_LIMIT_S)
+    if said.trouble is None:
+        return None
+    package = said.out.split()[-1] if said.out else models.NEEDED[0]
+    return f"{_installed(package)} cannot be imported: {said.trouble}"
 
 
 def _installed(package: str) -> str:
@@ -153,7 +183,7 @@ def judge_told(voices: object) -> list[Finding]:
     if failed:
         voice, why = next(iter(failed.items()))
         return [warning(_VOICE, f"the server cannot speak by {voice}: {why}", f"{_AGAIN}{voice}")]
-    return [done(_VOICE, f"of the server: {some(loaded)}")] if loaded else []
+    return [ok(_VOICE, f"of the server: {some(loaded)}")] if loaded else []
 
 
 def _given_up(voices: object) -> dict[str, str]:
@@ -169,18 +199,27 @@ def judge(neural: Neural, *, server: bool, told: object = None) -> list[Finding]
     """
     tried = neural.tried
     broken = warning if server or neural.used is None else failed
-    found = [done(_RUNTIME, ", ".join(neural.installed))]
+    found = [ok(_RUNTIME, ", ".join(neural.installed))]
     if neural.missing is not None:
         found = [broken(_RUNTIME, *_parted(neural.missing))]
+    elif neural.broken is not None:
+        found = [broken(_RUNTIME, neural.broken, _reinstall(neural.broken))]
     if neural.bad:
         (voice, words, step), *others = neural.bad
         more = f"; and something is wrong with {some(tuple(each[0] for each in others))}" if others else ""
         found.append(warning(_FILES, f"{voice}: {words}{more}", step))
     elif neural.good:
-        found.append(done(_FILES, f"as they should be: {some(neural.good)}"))
+        found.append(ok(_FILES, f"as they should be: {some(neural.good)}"))
     if tried is not None and tried.speed is not None and _given_up(told):
         return [*found, *judge_told(told)]  # as it was then, and is no more
     return found if tried is None else [*found, _tried(neural.used or "", tried, broken)]
+
+
+def _reinstall(words: str) -> str:
+    """Return what to do about a package that cannot be imported."""
+    if "SIGILL" in words:
+        return "this processor is too old for that version: install an older one, or use an espeak voice"
+    return _REINSTALL
 
 
 def _tried(used: str, tried: Tried, broken: Callable[[str, str, str], Finding]) -> Finding:
@@ -194,4 +233,4 @@ def _tried(used: str, tried: Tried, broken: Callable[[str, str, str], Finding]) 
     if tried.speed < _FAST_ENOUGH:
         step = "choose a voice whose quality is low or x_low, or one of espeak's: talk set --voice en"
         return warning(_VOICE, f"{words}: this machine is too slow for it, or too busy", step)
-    return done(_VOICE, words)
+    return ok(_VOICE, words)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
 #: The states of a finding. A warning may be why a sentence is not heard; with a failure it is certain.
-DONE, WARNING, FAILED = "done", "warning", "failed"
+OK, WARNING, FAILED = "ok", "warning", "failed"
 #: The check that sends a sentence all the way.
 SENTENCE = "sentence"
 #: Names that are shown of a long list.
@@ -29,7 +29,7 @@ _ARROW = "-> "
 #: Before the next step, at the end.
 _STEP = "  "
 #: Which state of a goal has a finding's colour.
-_COLOURS = {DONE: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILED: State.ABORTED}
+_COLOURS = {OK: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILED: State.ABORTED}
 
 
 @frozen
@@ -66,9 +66,9 @@ ADMITTED = Question(
 )
 
 
-def done(check: str, message: str) -> Finding:
+def ok(check: str, message: str) -> Finding:
     """Return a finding that all is well."""
-    return Finding(check, DONE, printable(message))
+    return Finding(check, OK, printable(message))
 
 
 def warning(check: str, message: str, step: str) -> Finding:

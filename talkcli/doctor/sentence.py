@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from talkcli.client.connect import Interrupted
-from talkcli.doctor.report import SENTENCE, Finding, done, failed
+from talkcli.doctor.report import SENTENCE, Finding, failed, ok
 from talkcli.doctor.sound import is_custom
 from talkcli.doctor.voice import INSTALL_LIBRARY, conversation, fault
 from talkcli.engine import protocol
@@ -43,9 +43,9 @@ REMEDIES = {
     "engine_failed": "install what the message names, into the Python that serves",
     "engine_crashed": "run talk doctor again; if it comes back, try another voice: talk set --voice en",
     "engine_hung": "run talk doctor again on a machine that is less busy",
-    "not_silent": "start the server again: a player of its cannot be killed",
+    "not_silent": "start the server again: one of its players could not be killed",
     "unknown_voice": "choose one that 'talk voices' lists: talk set --voice NAME",
-    "nothing_to_say": "choose a voice for the text's language: talk set --voice NAME",
+    "nothing_to_say": "send words of the voice's language, or choose a voice for the text's: talk set --voice NAME",
     "queue_full": "empty the queue: talk cancel",
     "shutdown": "start the server again: talk serve",
     "lost": "start the server again: talk serve",
@@ -92,7 +92,8 @@ def by_server(client: Client, text: str, limit: float) -> Played:
         try:
             if goal.speech_paused:
                 return Played(goal.cancel().state, "paused", "speech is paused")
-            return _played(goal.wait(limit))
+            ended = goal.wait(limit)
+            return replace(_played(ended), player=client.status().server.get("player"))
         except TimeoutError:
             return _taken_back(client, goal, limit)
         except Interrupted:
@@ -143,7 +144,7 @@ def by_engine(text: str, setting: Setting, volume: float, limit: float) -> Playe
             engine.say(protocol.Say("doctor", text, rate, volume, setting.voice, 50))
             ended = engine.until(protocol.Ended)
             if ended.outcome == protocol.COMPLETED:
-                return Played(State.SUCCEEDED, duration=ended.duration, player=player)
+                return Played(State.SUCCEEDED, duration=ended.duration, player=ended.player or player)
             return Played(State.ABORTED, ended.reason, ended.message or ended.outcome, player=player)
     except EngineFailed as error:
         return Played(State.ABORTED, *fault(error))
@@ -160,9 +161,17 @@ def behind(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
     return next((steps[check] for check in _BEHIND[: 1 if custom else None] if steps.get(check) is not None), None)
 
 
-def remedy(reason: str | None, words: str | None = None, player: object = None, device: object = None) -> str:
+def remedy(
+    reason: str | None,
+    words: str | None = None,
+    player: object = None,
+    device: object = None,
+    text: str | None = None,
+) -> str:
     """Return what to do about a goal that ended for this reason; `player`, `device`: what has played it, if known."""
     said = (words or "").lower()
+    if reason == "nothing_to_say" and text is not None and not any(map(str.isalnum, text)):
+        return "send a text with words: this one has no letters and no digits"
     if reason == "audio_device" and "busy" in said:
         return _BUSY
     if reason == "audio_device" and ("denied" in said or "not permitted" in said):
@@ -188,13 +197,13 @@ def judge(
         seconds = "" if played.duration is None else f", {played.duration:.1f} s"
         player = f", {played.player}" if played.player else ""
         said = "played to its end without sound" if silent else f'"{TEXT}" was played to its end'
-        return done(SENTENCE, f"{said} {how}{player}{seconds}")
+        return ok(SENTENCE, f"{said} {how}{player}{seconds}")
     if played.reason in {"late", "paused"}:
         return failed(SENTENCE, f"not spoken: {played.words}", remedy(played.reason))
     words = (played.words or "it ended without a reason").removeprefix(f"Talk {played.state.name.lower()}: ")
     step = remedy(played.reason, words, played.player, device)
     if played.beside_speech and step == _BUSY:
-        return done(SENTENCE, f"the device is busy with what the server speaks at this moment ({words})")
+        return ok(SENTENCE, f"the device is busy with what the server speaks at this moment ({words})")
     label = f"{played.state.name}, {played.reason}" if played.reason else played.state.name
     if played.reason == "audio_stalled" and played.suspended:
         words = f"{words}; suspended: {', '.join(played.suspended)}"

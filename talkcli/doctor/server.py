@@ -14,8 +14,9 @@ from talkcli import __version__, paths, peers
 from talkcli.client.client import Client
 from talkcli.client.connection import SocketConnection
 from talkcli.doctor.machine import owner
-from talkcli.doctor.report import Finding, done, failed, warning
+from talkcli.doctor.report import Finding, failed, ok, warning
 from talkcli.doctor.sentence import remedy
+from talkcli.doctor.voice import WORKING
 from talkcli.errors import TalkError
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.options import told
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 _NAME = "talk doctor"
 #: How an error begins that names every place: `Places` says that better.
 _NO_SERVER = "no server"
-#: Goals of the log that are looked at for failures.
-_LOG = 100
+#: Goals of the log that are looked at for failures, and the check of it.
+_LOG, _RECENT = 100, "recent goals"
 #: Seconds in which an engine should be ready, and between two looks whether it is.
 _STARTING, _PAUSE = 1.0, 0.05
 #: What is found at a place, beside what `found_at` finds where nobody can be reached.
@@ -174,7 +175,7 @@ def judge_places(found: Places) -> Finding:
         if before:
             passed = "; ".join(map(_shown, before))
             return warning("socket", f"{words}; before it: {passed}", f"remove what is in the way: {before[0].path}")
-        return done("socket", words)
+        return ok("socket", words)
     places = "; ".join(map(_shown, found.places))
     words = f"no server; {'named by ' + found.named if found.named else 'tried'}: {places}"
     if found.trouble is not None and not any(each.what == STOPPED for each in found.places):
@@ -219,19 +220,19 @@ def gone(words: str) -> Finding:
 
 def judge(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
     """Judge a server by its own description and by the goals that ended last, oldest first."""
-    return [_itself(server), _settings(server), _failures(log, now, server)]
+    return [_itself(server), _settings(server), _recent(log, now, server)]
 
 
 def _itself(server: JsonObject) -> Finding:
     version, engine, words = server.get("version"), server.get("engine"), summary(server)
     if server.get("paused") is True:
         return failed("server", f"speech is paused; {words}", "talk resume")
-    if engine not in {"ready", "starting"}:
+    if engine not in WORKING:
         return warning("server", words, remedy("engine_failed", words))
     if version != __version__:
         step = "start the server again, with the talk that is installed now"
         return warning("server", f"{words}; this is talk {__version__}", step)
-    return done("server", words)
+    return ok("server", words)
 
 
 def summary(server: JsonObject) -> str:
@@ -249,16 +250,16 @@ def _settings(server: JsonObject) -> Finding:
     if isinstance(volume, int | float) and volume < _FAINT_SETTING:
         broken = failed if volume <= 0 else warning
         return broken("settings", words, "talk set --volume 1")
-    return done("settings", words)
+    return ok("settings", words)
 
 
-def _failures(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
+def _recent(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
     if not log:
-        return done("failures", "none: this server has spoken nothing yet")
+        return ok(_RECENT, "none yet")
     aborted = [each for each in log if each.state is State.ABORTED]
     many = "the last goal" if len(log) == 1 else f"the last {len(log)} goals"
     if not aborted:
-        return done("failures", f"none in {many}")
+        return ok(_RECENT, f"none of {many} failed" if len(log) > 1 else f"{many} did not fail")
     last = aborted[-1]
     words = (last.message or "").removeprefix("Talk aborted: ")
     when = "" if last.ended_at is None else f", {span(now - last.ended_at)} ago ({clock(last.ended_at)})"
@@ -266,8 +267,9 @@ def _failures(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
     told = f"{who}{when}: {last.reason}: {words}"
     after = [each for each in log[log.index(last) + 1 :] if each.state is State.SUCCEEDED]
     if after:
-        return done("failures", f"{told}; {len(after)} succeeded since")
-    return warning("failures", told, remedy(last.reason, words, server.get("player"), server.get("device")))
+        return ok(_RECENT, f"{told}; {len(after)} succeeded since")
+    step = remedy(last.reason, words, server.get("player"), server.get("device"), last.text)
+    return warning(_RECENT, told, step)
 
 
 def span(seconds: object) -> str:

@@ -11,16 +11,18 @@ import contextlib
 import os
 import re
 import shlex
+import signal
+import socket
 import subprocess
 import tempfile
 from typing import TYPE_CHECKING
 
 from talkcli.doctor.machine import judge_access, judge_cards
-from talkcli.doctor.report import Finding, done, failed, some, warning
+from talkcli.doctor.report import Finding, failed, ok, some, warning
 from talkcli.engine.players import PACKAGES, PLAYERS, is_silent, on_path
 from talkcli.engine.players.child import kill
 from talkcli.engine.players.devices import DUMMY, sound_servers
-from talkcli.frozen import frozen
+from talkcli.frozen import frozen, replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -68,6 +70,8 @@ class Players:
     wanted: str | None
     #: whether a wanted program can be run
     runs: bool = True
+    #: what an engine process tries first where nothing is wanted; None if that is not known
+    first: str | None = None
 
 
 @frozen
@@ -81,6 +85,8 @@ class Devices:
     trouble: str | None = None
     #: the one that is set; None for the player's default
     wanted: str | None = None
+    #: the package of the program that lists them, if that program is not installed
+    package: str | None = None
 
 
 @frozen
@@ -91,6 +97,8 @@ class SoundServer:
     name: str | None = None
     #: the sink that is played to by default
     sink: str | None = None
+    #: whether it takes PulseAudio's clients, as the player pulse is one
+    pulse: bool = True
     #: where none answers: sockets of sound servers that are there all the same, of another user's for one
     sockets: tuple[str, ...] = ()
     #: what the client said; None where there is no program that could ask
@@ -115,8 +123,9 @@ class Level:
     louder: str
 
 
-def asked(program: str, *words: str, env: Mapping[str, str]) -> Said:
-    """Run a program to its end, in its own language, and return what it said."""
+def asked(program: str, *words: str, env: Mapping[str, str], limit: float | None = None) -> Said:
+    """Run a program to its end, in its own language, and return what it said; `limit`: seconds, if not LIMIT."""
+    limit = LIMIT if limit is None else limit
     if not on_path(program, env):
         return Said(f"{program} is not there")
     # Files, not pipes: what a program leaves running behind it would hold a pipe open.
@@ -133,14 +142,16 @@ def asked(program: str, *words: str, env: Mapping[str, str]) -> Said:
         except OSError as error:
             return Said(str(error))
         try:
-            code = process.wait(LIMIT)
+            code = process.wait(limit)
         except subprocess.TimeoutExpired:
             code = None
         finally:
             _end(process)
         said, complaint = _read(out.fileno()), _read(err.fileno())
     if code is None:
-        return Said(f"no answer within {LIMIT:g} s", said, late=True)
+        return Said(f"no answer within {limit:g} s", said, late=True)
+    if code < 0:
+        return Said(f"it was killed by {signal.Signals(-code).name}", said)
     lines = filter(None, map(str.strip, (complaint or said).splitlines()))
     return Said(next(lines, "it said nothing") if code else None, said)
 
@@ -170,19 +181,21 @@ def program_of(command: str) -> str | None:
         return None
 
 
-def players(env: Mapping[str, str], wanted: str | None) -> Players:
-    """Return which players there are; `wanted`: the setting."""
+def players(env: Mapping[str, str], wanted: str | None, first: str | None) -> Players:
+    """Return which players there are; `wanted`: the setting; `first`: as in `Players`."""
     found = tuple(each for each in PACKAGES if on_path(each, env))
     program = program_of(wanted or "")
-    return Players(found, wanted, runs=program == "pulse" or bool(program and on_path(program, env)))
+    return Players(found, wanted, program == "pulse" or bool(program and on_path(program, env)), first)
 
 
 def devices(env: Mapping[str, str], player: str | None, wanted: str | None) -> Devices | None:
     """Return where a player can play to; None for one that nobody can ask."""
     if player not in _LISTING:
         return None
-    command, names = _LISTING[player]
+    command, names, package = _LISTING[player]
     program, *words = command.split()
+    if not on_path(program, env):
+        return Devices(command, wanted=wanted, package=package)
     found = asked(program, *words, env=env)
     return Devices(command, tuple(names(found)), found.trouble, wanted)
 
@@ -209,12 +222,19 @@ def _node_names(said: Said) -> list[str]:
 
 _SINKS = "pactl list short sinks"
 #: How the devices of a player are listed, and read from what that says.
-_LISTING: dict[str | None, tuple[str, Callable[[Said], list[str]]]] = {
-    "aplay": ("aplay -L", _alsa_names),
-    "pulse": (_SINKS, _sink_names),
-    "pacat": (_SINKS, _sink_names),
-    "pw-cat": ("pw-cli ls Node", _node_names),
+_LISTING: dict[str | None, tuple[str, Callable[[Said], list[str]], str]] = {
+    "aplay": ("aplay -L", _alsa_names, PACKAGES["aplay"]),
+    "pulse": (_SINKS, _sink_names, PACKAGES["pacat"]),
+    "pacat": (_SINKS, _sink_names, PACKAGES["pacat"]),
+    "pw-cat": ("pw-cli ls Node", _node_names, PACKAGES["pw-cat"]),
 }
+
+
+def installing(finding: Finding, env: Mapping[str, str]) -> Finding:
+    """Return a finding whose next step also says where to get pactl, if the step needs it and it is missing."""
+    if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
+        return finding
+    return replace(finding, next=f"{finding.next} (for pactl: sudo apt-get install -y {PACKAGES['pacat']})")
 
 
 def suspended(env: Mapping[str, str]) -> tuple[str, ...]:
@@ -229,13 +249,34 @@ def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
     if pulse.trouble is None:
         return SoundServer(_field(pulse.out, "Server Name") or "PulseAudio", _field(pulse.out, "Default Sink"))
     wire = pulse if pulse.late else asked("pw-cli", "info", "0", env=env)
+    # Without pactl only the socket tells whether PulseAudio's clients are served.
+    native = None if on_path("pactl", env) else _listening(env)
     if wire.trouble is None:
-        return SoundServer("PipeWire, without its PulseAudio part")
+        name = "PipeWire" if native else "PipeWire, without its PulseAudio part"
+        return SoundServer(name, pulse=native is not None)
+    if native and native.startswith("/"):
+        return SoundServer(f"one listens on {native}")
     answers = {"pactl": pulse, "pw-cli": wire}
     trouble = next((said.trouble for each, said in answers.items() if on_path(each, env)), None)
     sockets = sound_servers(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else []))
     named = env.get("PULSE_SERVER") or None
     return SoundServer(sockets=tuple(sockets), trouble=trouble, hangs=wire.late, named=named)
+
+
+def _listening(env: Mapping[str, str]) -> str | None:
+    """Return where a server takes PulseAudio's clients of this environment; None if there is none.
+
+    Another machine's is not asked: a sentence shows whether it is there.
+    """
+    named = env.get("PULSE_SERVER", "").removeprefix("unix:")
+    if named and not named.startswith("/"):
+        return named
+    for path in [named] if named else [each for each in sound_servers(env) if each.endswith("/native")]:
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
+            probe.settimeout(LIMIT)
+            probe.connect(path)
+            return path
+    return None
 
 
 def _field(text: str, name: str) -> str | None:
@@ -308,26 +349,31 @@ def _by(running: bool) -> str:
 def _player(players: Players, server: SoundServer, *, running: bool) -> Finding:
     wanted, found = players.wanted, players.found
     broken = warning if running else failed
-    if wanted is None and server.name is not None:
+    pulse = players.first == "pulse" if players.first else server.name is not None and server.pulse
+    if wanted is None and pulse:
         after = f"; then {', '.join(found)}" if found else ""
-        return done("player", f"pulse is used, by the sound server{after}")
+        return ok("player", f"pulse is used, by the sound server{after}")
     if wanted is None and not found:
         first = next(iter(PACKAGES.values()))
         return broken("player", f"none is on the PATH: {', '.join(PACKAGES)}", f"sudo apt-get install -y {first}")
     if wanted is None:
         after = f"; then {', '.join(found[1:])}" if len(found) > 1 else ""
-        return done("player", f"{found[0]} is used{after}")
+        return ok("player", f"{found[0]} is used{after}")
     if not players.runs:
         package = PACKAGES.get(wanted)
         step = f"sudo apt-get install -y {package}" if package else "name a program that is there, with --player"
         return broken("player", f"{wanted} ({_by(running)}) is not there", step)
     others = [each for each in found if each != wanted]
     also = f"; there {'is' if len(others) == 1 else 'are'} also {', '.join(others)}" if others else ""
-    return done("player", f"{wanted} ({_by(running)}){also}")
+    return ok("player", f"{wanted} ({_by(running)}){also}")
 
 
 def _device(devices: Devices) -> Finding:
     wanted, names = devices.wanted, devices.names
+    if devices.package is not None:
+        words = f"{wanted or 'the default'}; others cannot be listed: {devices.listed_by.split()[0]} is not installed"
+        step = f"sudo apt-get install -y {devices.package}"
+        return ok("device", words) if wanted is None else warning("device", words, step)
     if devices.trouble is not None:
         step = f"look at what this says: {devices.listed_by}"
         return warning("device", f"{devices.listed_by}: {devices.trouble}", step)
@@ -336,7 +382,7 @@ def _device(devices: Devices) -> Finding:
         return warning("device", f"{devices.listed_by} lists none", step)
     # ALSA makes plughw:1,0 of any card; whether it can, the sentence shows.
     if wanted is None or wanted in names or ":" in wanted:
-        return done("device", f"{wanted or 'the default'}; {devices.listed_by} lists {some(names)}")
+        return ok("device", f"{wanted or 'the default'}; {devices.listed_by} lists {some(names)}")
     return warning(
         "device",
         f"{wanted} is not among those that {devices.listed_by} lists: {some(names)}",
@@ -351,7 +397,7 @@ def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Findin
         return warning(_SERVER, f"{server.name} has only a dummy output, {DUMMY}: nobody hears it", step)
     if server.name is not None:
         sink = f", plays to {server.sink}" if server.sink else ""
-        return done(_SERVER, f"{server.name}{sink}")
+        return ok(_SERVER, f"{server.name}{sink}")
     if server.hangs:
         step = "restart it: systemctl --user restart pipewire pipewire-pulse (or: pulseaudio -k)"
         return warning(_SERVER, f"there is one, but it does not answer {where}", step)
@@ -359,7 +405,7 @@ def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Findin
         if session.kinds and not cards.names:
             return _out_of_reach(server, session, f"none can be reached {where}")
         alone = "; players use ALSA" if cards.names else ""
-        return done(_SERVER, f"no PulseAudio or PipeWire runs for user {session.user}{alone}")
+        return ok(_SERVER, f"no PulseAudio or PipeWire runs for user {session.user}{alone}")
     at = f"at {server.named} (PULSE_SERVER)" if server.named else f"at {some(server.sockets)}"
     if server.trouble is None:
         step = "sudo apt-get install -y pulseaudio-utils"
@@ -399,4 +445,4 @@ def judge_levels(levels: tuple[Level, ...], *, default: bool) -> list[Finding]:
         if level.percent is not None and level.percent < _FAINT:
             return [warning(_LOUDNESS, f"{level.name} is at {level.percent}%: few will hear it", level.louder)]
     shown = [f"{each.name} at {each.percent}%" if each.percent is not None else f"{each.name} on" for each in levels]
-    return [done(_LOUDNESS, ", ".join(shown))]
+    return [ok(_LOUDNESS, ", ".join(shown))]

@@ -16,11 +16,11 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 from talkcli import install
-from talkcli.doctor.report import Finding, done, failed, warning
+from talkcli.doctor.report import Finding, failed, ok, warning
 from talkcli.engine import protocol
 from talkcli.engine.process import Conversation, EngineFailed
 from talkcli.engine.synthesizers.voices import is_neural
-from talkcli.frozen import frozen
+from talkcli.frozen import frozen, replace
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 INSTALL_LIBRARY = install.espeak_library()
 _INSTALL_PYTTSX3 = install.command("pyttsx3")
 _INSTALL_NEURAL = install.neural()
+#: What a server says of an engine that speaks, or will in a moment.
+WORKING = ("ready", "starting")
 
 
 @frozen
@@ -42,6 +44,8 @@ class Engine:
     voices: int | None = None
     #: how many of these are neural
     neural: int = 0
+    #: the player that it would try first; None if there is none, or it is not known
+    player: str | None = None
     #: why it didn't start, for programs and in its own words; None where it did
     reason: str | None = None
     words: str = ""
@@ -57,13 +61,15 @@ class Setting:
     #: what ends any waiting with Interrupted, as in `connect.ready`
     interrupt: Mapping[int, int] | None = None
     driver: str | None = None
+    #: the program that worked last, where no player is named
+    worked: str | None = None
     #: the environment in which it is to run; None for this process's
     env: Mapping[str, str] | None = None
 
 
 def python() -> Finding:
     """Return which interpreter runs this."""
-    return done("python", f"Python {platform.python_version()} ({sys.executable})")
+    return ok("python", f"Python {platform.python_version()} ({sys.executable})")
 
 
 def pyttsx3() -> str | None:
@@ -79,9 +85,9 @@ def look(setting: Setting) -> Engine:
     try:
         with conversation(setting) as engine:
             ready = engine.until(protocol.Ready)
-            found = Engine(ready.driver, ready.version)
+            found = Engine(ready.driver, ready.version, player=ready.player)
             voices = engine.until(protocol.Voices).voices
-            return Engine(ready.driver, ready.version, len(voices), sum(is_neural(each.id) for each in voices))
+            return replace(found, voices=len(voices), neural=sum(is_neural(each.id) for each in voices))
     except EngineFailed as error:
         if found.driver is None or error.reason == "engine_crashed":
             reason, words = fault(error)
@@ -92,7 +98,7 @@ def look(setting: Setting) -> Engine:
 def conversation(setting: Setting, limit: float = math.inf) -> Conversation:
     """Return what talks to an engine process of these settings, for at most `limit` seconds."""
     configure = protocol.Configure(
-        os.getpid(), setting.driver, setting.player, setting.device, setting.voice, list_voices=True
+        os.getpid(), setting.driver, setting.player, setting.device, setting.voice, worked=setting.worked
     )
     deadline = time.monotonic() + limit
     return Conversation(configure, env=setting.env, deadline=deadline, interrupt=setting.interrupt)
@@ -105,21 +111,26 @@ def fault(error: EngineFailed) -> tuple[str, str]:
     return error.reason, str(error)
 
 
-def judge(pyttsx3: str | None, engine: Engine, *, server: bool) -> list[Finding]:
-    """Judge the voice; `pyttsx3`: its version; `server`: whether one runs, so that a sentence needs nothing of this."""
-    broken = warning if server else failed
+def judge(pyttsx3: str | None, engine: Engine, *, server: str | None) -> list[Finding]:
+    """Judge the voice; `pyttsx3`: its version.
+
+    `server`: what a server says of its own engine. If that works, a sentence needs nothing of this.
+    """
+    broken = warning if server in WORKING else failed
+    if server not in {None, *WORKING} and engine.reason is None:
+        engine = Engine(reason="engine_failed", words=f"the server's engine: {server}")
     words = engine.words
     if engine.reason is None:
-        return [done("pyttsx3", f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"), *_library(engine)]
+        return [ok("pyttsx3", f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"), *_library(engine)]
     if "pyttsx3 is missing" in words or pyttsx3 is None:
         return [broken("pyttsx3", words or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
-    found = done("pyttsx3", pyttsx3)
+    found = ok("pyttsx3", pyttsx3)
     if engine.reason == "unknown_voice":
         step = "choose one that 'talk voices' lists, in TALK_VOICE or --voice"
         if _INSTALL_NEURAL in words:
             step = _INSTALL_NEURAL
-        return [found, done("libespeak-ng", "loaded"), broken("voices", words, step)]
-    step = "talk serve logs the engine's own words"
+        return [found, ok("libespeak-ng", "loaded"), broken("voices", words, step)]
+    step = "read what the engine said in the log of talk serve"
     if "espeak-ng data" in words:
         step = "sudo apt-get install -y espeak-ng-data"
     elif "libespeak-ng" in words:
@@ -135,10 +146,10 @@ def judge(pyttsx3: str | None, engine: Engine, *, server: bool) -> list[Finding]
 
 def _library(engine: Engine) -> list[Finding]:
     name = engine.synthesizer
-    found = [] if name is None else [done("libespeak-ng", f"{name}, with its data")]
+    found = [] if name is None else [ok("libespeak-ng", f"{name}, with its data")]
     if engine.voices is None:
         return [*found, warning("voices", "the engine listed none in time", "run talk doctor again")]
     if not engine.voices:
         step = "sudo apt-get install --reinstall -y espeak-ng-data"
         return [*found, warning("voices", "the engine has none", step)]
-    return [*found, done("voices", f"{engine.voices}, listed by 'talk voices'")]
+    return [*found, ok("voices", f"{engine.voices}, listed by 'talk voices'")]

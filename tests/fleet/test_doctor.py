@@ -81,7 +81,7 @@ def test_a_robot_that_answers_is_asked_by_all_that_is_between_and_nothing_is_lef
     with Listener(robot.broker, "talk/#") as listener:
         found = findings(robot.desk("--json", "doctor", timeout=LIMIT), 0)
         assert list(found) == WELL
-        assert {each["check"] for each in found.values() if each["state"] != "done"} == {"anonymous"}
+        assert {each["check"] for each in found.values() if each["state"] != "ok"} == {"anonymous"}
         assert "allow_anonymous false" in found["anonymous"]["next"]
         assert found["name"]["message"].startswith("anna is online for ")
         assert f"its server is talk {__version__}, process {robot.talk.pid}" in found["name"]["message"]
@@ -106,7 +106,7 @@ def test_a_bridge_goes_on_while_its_own_user_asks_the_doctor(robot: Robot) -> No
     with Desk(robot.broker, env={"TALK_MQTT_USER": "anna"}) as desk:
         found = findings(desk.run("--json", "--robot", "anna", "doctor"), 0)
     assert list(found) == WELL[:-1]
-    assert found["rights"]["state"] == "done"
+    assert found["rights"]["state"] == "ok"
     assert robot.desk("status").code == 0
     assert "doctor" not in robot.bridge.log
 
@@ -125,7 +125,7 @@ def test_a_bridge_that_says_nothing_is_told_from_a_robot_that_is_there(broker: B
     found = doctor(broker)
     assert time.monotonic() - began < 20
     assert list(found) == WELL
-    assert found["name"]["state"] == "done"
+    assert found["name"]["state"] == "ok"
     assert (found["bridge"]["state"], found["bridge"]["next"]) == (
         "failed", "see what the bridge's log says, on anna: journalctl -u talk-bridge",
     )  # fmt: skip
@@ -161,7 +161,7 @@ def test_an_operator_may_ask_and_a_login_without_the_lines_of_one_is_told_what_i
 ) -> None:
     make_bridge(scripted, secure_broker, "anna", user="anna", observer=OPERATORS[0])
     found = doctor(secure_broker, user=OPERATORS[0], code=0)
-    assert [each["state"] for each in found.values()] == ["done", "warning", *["done"] * 5]
+    assert [each["state"] for each in found.values()] == ["ok", "warning", *["ok"] * 5]
     assert found["login"]["message"] == "as 'olga', with a password"
     assert "renew the certificate of localhost" in found["certificate"]["next"], "it is good for two days"
     found = doctor(secure_broker, user=ROBOTS[1])
@@ -257,7 +257,7 @@ def test_a_certificate_is_a_login_and_without_one_nobody_is_let_in() -> None:
         is_there(broker, "anna", cert="anna", online=False)
         found = doctor(broker, cert="olga", env={"TALK_MQTT_USER": "olga"})
         assert found["login"]["message"] == "as 'olga', with a certificate"
-        assert found["anonymous"]["state"] == "done"
+        assert found["anonymous"]["state"] == "ok"
         found = doctor(broker)
         assert last(found)["check"] == "login"
         assert "TALK_MQTT_CERT and TALK_MQTT_KEY name " in found["login"]["next"]
@@ -292,7 +292,7 @@ def test_a_name_that_no_robot_can_have_is_a_usage_error() -> None:
         judging.Examination("a/b", {})
 
 
-@pytest.mark.parametrize(("days", "state"), [(13, "warning"), (15, "done")])
+@pytest.mark.parametrize(("days", "state"), [(13, "warning"), (15, "ok")])
 def test_a_certificate_is_renewed_two_weeks_before_its_end(days: int, state: str) -> None:
     (found,) = judging.judge_certificate(TLS, Way(until=1e9 + days * 86400), 1e9, near=False)
     assert found.state == state

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from talkcli import __version__
-from talkcli.doctor import report, sentence, server, voice
-from talkcli.doctor.report import DONE, FAILED, WARNING, Finding, done, failed, heard, next_step, warning
+from talkcli.doctor import report, sentence, server, sound, voice
+from talkcli.doctor.report import FAILED, OK, WARNING, Finding, failed, heard, next_step, ok, warning
 from talkcli.doctor.sentence import Played, behind
 from talkcli.doctor.server import Place, Places
 from talkcli.doctor.voice import Engine
@@ -16,6 +18,7 @@ from talkcli.goals.states import State
 from talkcli.paths import ABSENT, FORBIDDEN, STALE
 from talkcli.terminal.text import Screen, width
 
+MISSING = "libespeak-ng is missing (libespeak-ng.so.1: cannot open): install it"
 ENGINE = Engine("espeak", "eSpeak NG 1.51 (system)", 141)
 SPOKEN = Goal("4k7f-1", State.SUCCEEDED, text="x")
 SERVER: dict[str, object] = {
@@ -30,22 +33,22 @@ def of(findings: list[Finding], check: str) -> Finding:
 
 
 def test_a_sentence_is_heard_if_one_was_played_and_nothing_failed() -> None:
-    played = done("sentence", "played")
-    assert heard([done("python", "3"), warning("cards", "none", "plug in"), played])
+    played = ok("sentence", "played")
+    assert heard([ok("python", "3"), warning("cards", "none", "plug in"), played])
     assert not heard([failed("socket", "no server", "talk serve"), played])
-    assert not heard([done("python", "3")]), "nothing was proved"
+    assert not heard([ok("python", "3")]), "nothing was proved"
 
 
 def test_the_one_thing_to_do_is_for_the_first_that_failed() -> None:
     group = warning("group", "not in audio", "usermod")
     stuck = failed("sentence", "ABORTED", "look at the loudspeaker")
-    assert next_step([done("python", "3"), group, stuck]) == "look at the loudspeaker"
+    assert next_step([ok("python", "3"), group, stuck]) == "look at the loudspeaker"
     assert next_step([group, failed("socket", "no server", "talk serve"), stuck]) == "talk serve"
-    assert next_step([group, done("sentence", "played")]) is None
+    assert next_step([group, ok("sentence", "played")]) is None
 
 
 def test_a_sentence_that_found_no_device_is_cured_where_the_device_was_looked_at() -> None:
-    looked = [warning("cards", "none", "plug in"), warning("group", "not in audio", "usermod"), done("python", "3")]
+    looked = [warning("cards", "none", "plug in"), warning("group", "not in audio", "usermod"), ok("python", "3")]
     assert behind(looked) == "usermod"
     assert behind(looked[2:]) is None
 
@@ -77,7 +80,7 @@ def test_a_player_of_one_s_own_is_cured_by_itself_unless_it_names_a_cause() -> N
 
 def test_a_device_that_is_busy_is_heard_where_the_server_speaks() -> None:
     busy = Played(State.ABORTED, "audio_device", "aplay: audio open error: Device or resource busy")
-    assert sentence.judge(replace(busy, beside_speech=True), silent=True).state == DONE
+    assert sentence.judge(replace(busy, beside_speech=True), silent=True).state == OK
     assert sentence.judge(busy, silent=True).state == FAILED
     gone = Played(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
     assert sentence.judge(replace(gone, beside_speech=True), silent=True).state == FAILED
@@ -112,21 +115,27 @@ def test_text_of_others_is_escaped_in_every_finding() -> None:
     ],
 )
 def test_a_voice_that_cannot_speak_is_named(engine: Engine, pyttsx3: str | None, check: str, step: str) -> None:
-    found = of(voice.judge(pyttsx3, engine, server=False), check)
+    found = of(voice.judge(pyttsx3, engine, server=None), check)
     assert found.state == FAILED
     assert engine.words in found.message
     assert step in (found.next or "")
-    assert of(voice.judge(pyttsx3, engine, server=True), check).state == WARNING, "the server has its own"
+    assert of(voice.judge(pyttsx3, engine, server="ready"), check).state == WARNING, "the server has its own"
 
 
 def test_a_voice_that_can_speak_is_told_with_its_version_and_voices() -> None:
-    found = voice.judge("2.99", ENGINE, server=False)
+    found = voice.judge("2.99", ENGINE, server=None)
     assert [each.check for each in found] == ["pyttsx3", "libespeak-ng", "voices"]
-    assert {each.state for each in found} == {DONE}
+    assert {each.state for each in found} == {OK}
     assert "1.51 (system)" in found[1].message
     assert "141" in found[2].message
     for voices in (None, 0):
-        assert voice.judge("2.99", Engine("espeak", "eSpeak", voices), server=False)[-1].state == WARNING
+        assert voice.judge("2.99", Engine("espeak", "eSpeak", voices), server="starting")[-1].state == WARNING
+
+
+def test_a_library_that_the_server_lacks_is_what_is_missing_before_its_silent_player() -> None:
+    for engine in (ENGINE, Engine(reason="engine_failed", words=MISSING)):
+        found = [*voice.judge("2.99", engine, server=MISSING), *sound.judge_silent("null", running=True)]
+        assert next_step(found) == voice.INSTALL_LIBRARY
 
 
 PATH = "/run/user/1000/talk/talk.sock"
@@ -158,7 +167,7 @@ def test_where_no_server_is_each_place_is_named_with_what_is_there(found: Places
 def test_where_a_server_is_what_lies_before_it_is_a_warning() -> None:
     served = Place(PATH, server.SERVER, pid=4711)
     found = server.judge_places(Places((Place("/a", ABSENT), served)))
-    assert (found.state, found.message) == (DONE, f"the server is on {PATH} (process 4711)")
+    assert (found.state, found.message) == (OK, f"the server is on {PATH} (process 4711)")
     found = server.judge_places(Places((Place("/a", server.FOREIGN, 7), served)))
     assert found.state == WARNING
     assert "/a: another user's server (uid 7)" in found.message
@@ -167,13 +176,14 @@ def test_where_a_server_is_what_lies_before_it_is_a_warning() -> None:
 @pytest.mark.parametrize(
     ("change", "check", "state", "step"),
     [
-        ({}, "server", DONE, None),
+        ({}, "server", OK, None),
         ({"paused": True}, "server", FAILED, "talk resume"),
         ({"version": "0.0.1"}, "server", WARNING, "start the server again"),
         ({"engine": "pyttsx3 is missing"}, "server", WARNING, "install what"),
         ({"volume": 0.0}, "settings", FAILED, "talk set --volume 1"),
         ({"volume": 0.1}, "settings", WARNING, "talk set --volume 1"),
-        ({"ttl": 5.0, "lead_in": 300, "preempt": True}, "settings", DONE, None),
+        ({"ttl": 5.0, "lead_in": 300, "preempt": True}, "settings", OK, None),
+        ({"volume": 0.1 + 0.2, "ttl": 1.23456789012}, "settings", OK, None),
     ],
 )
 def test_a_server_is_judged_by_what_it_says_of_itself(
@@ -182,26 +192,36 @@ def test_a_server_is_judged_by_what_it_says_of_itself(
     found = of(server.judge({**SERVER, **change}, [], 0.0), check)
     assert found.state == state
     assert (step in str(found.next)) if step else found.next is None
+    assert not re.search(r"\.\d{5}", found.message)
 
 
 def test_the_last_failures_are_counted_and_the_last_one_told() -> None:
     aborted = Goal(
         "4k7f-2", State.ABORTED, reason="audio_device", ended_at=0.0, message="Talk aborted: aplay: device is busy"
     )
-    found = of(server.judge(SERVER, [SPOKEN, aborted], 600.0), "failures")
+    found = of(server.judge(SERVER, [SPOKEN, aborted], 600.0), "recent goals")
     assert found.state == WARNING
     assert "1 of the last 2 goals ABORTED, last 4k7f-2, 10 min ago" in found.message
     assert "audio_device: aplay: device is busy" in found.message
     assert "another program holds the device" in str(found.next)
-    found = of(server.judge(SERVER, [aborted, SPOKEN], 600.0), "failures")
-    assert (found.state, "1 succeeded since" in found.message) == (DONE, True)
-    assert of(server.judge(SERVER, [SPOKEN], 0.0), "failures").message == "none in the last goal"
+    found = of(server.judge(SERVER, [aborted, SPOKEN], 600.0), "recent goals")
+    assert (found.state, "1 succeeded since" in found.message) == (OK, True)
+    assert of(server.judge(SERVER, [SPOKEN], 0.0), "recent goals").message == "the last goal did not fail"
+
+
+def test_a_text_without_words_is_cured_by_words() -> None:
+    goal = Goal("4k7f-2", State.ABORTED, text="...", reason="nothing_to_say", message="Talk aborted: nothing")
+    assert of(server.judge(SERVER, [goal], 0.0), "recent goals").next == (
+        "send a text with words: this one has no letters and no digits"
+    )
+    foreign = replace(goal, text="你好")
+    assert "choose a voice" in str(of(server.judge(SERVER, [foreign], 0.0), "recent goals").next)
 
 
 def test_the_sentence_says_how_it_ended_and_what_to_do() -> None:
     played = Played(State.SUCCEEDED, duration=1.7, player="aplay", served=True)
     found = sentence.judge(played, silent=False)
-    assert found.state == DONE
+    assert found.state == OK
     assert found.message.endswith("was played to its end through the server, aplay, 1.7 s")
     assert "without sound" in sentence.judge(played, silent=True).message
     denied = Played(State.ABORTED, "audio_device", "Talk aborted: aplay: audio open error: Permission denied")
@@ -226,13 +246,12 @@ def test_every_reason_of_an_aborted_goal_has_a_remedy_of_its_own() -> None:
         "nothing_to_say", "not_silent", "unknown_voice",
     }  # fmt: skip
     assert reasons <= sentence.REMEDIES.keys()
-    missing = "libespeak-ng is missing (libespeak-ng.so.1: cannot open): install it"
-    assert "apt-get install -y libespeak-ng1" in sentence.remedy("engine_failed", missing)
+    assert "apt-get install -y libespeak-ng1" in sentence.remedy("engine_failed", MISSING)
     assert sentence.remedy("engine_failed", "no module named pyttsx3") == sentence.REMEDIES["engine_failed"]
 
 
 FOUND = [
-    done("python", "Python 3.11.2"),
+    ok("python", "Python 3.11.2"),
     warning("sound server", "one " * 40, "do " * 40),
     failed("socket", "no server", "talk serve"),
 ]
@@ -252,10 +271,10 @@ def test_on_a_terminal_nothing_is_wider_than_it_is(columns: int) -> None:
 
 def test_in_a_pipe_a_finding_is_one_line_without_colour() -> None:
     assert [report.lines(each, Screen()) for each in FOUND[::2]] == [
-        ["done     python        Python 3.11.2"],
+        ["ok       python        Python 3.11.2"],
         ["failed   socket        no server -> talk serve"],
     ]
     assert report.verdict(FOUND, Screen()) == "a sentence would not be heard; do this next:\n  talk serve"
-    played = [done("python", "3"), done("sentence", "played")]
+    played = [ok("python", "3"), ok("sentence", "played")]
     assert report.verdict(played, Screen()) == "a sentence is heard, unless the loudspeaker itself is off"
     assert report.verdict([FOUND[1], *played], Screen()).endswith("; 1 warning")

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from talkcli.doctor import machine, sound
 from talkcli.doctor.machine import Cards, Session
-from talkcli.doctor.report import DONE, FAILED, WARNING, Finding
+from talkcli.doctor.report import FAILED, OK, WARNING, Finding, failed
 from talkcli.doctor.sound import Devices, Level, Players, SoundServer
 from talkcli.engine.players.devices import DUMMY
 from talkcli.frozen import replace
+from tests.faults.broken import write
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 PI = Session(1000, "pi", groups=("pi", "audio"), gids=(1000, 29), runtime="/run/user/1000", runtime_owner=1000)
 PLAYERS = Players(("aplay", "pacat"), None)
@@ -17,6 +23,7 @@ DEVICES = Devices("aplay -L", ("default", "plughw:CARD=Device,DEV=0"))
 CARDS = Cards(kernel=True, names=("USB Audio Device",), nodes=("/dev/snd/pcmC0D0p",), group="audio")
 NO_CARDS = Cards(kernel=True)
 NO_SERVER = SoundServer(trouble="Connection refused")
+WIRE = SoundServer("PipeWire, without its PulseAudio part", pulse=False)
 PULSE = SoundServer(name="PulseAudio (on PipeWire 1.2.7)", sink="alsa_output.usb")
 
 
@@ -37,15 +44,20 @@ def judged(
 def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
     found = sound.judge(PLAYERS, DEVICES, CARDS, SoundServer(), PI, running=False)
     assert [each.check for each in found] == ["player", "device", "cards", "group", "sound server"]
-    assert {each.state for each in found} == {DONE}, found
+    assert {each.state for each in found} == {OK}, found
     assert found[0].message == "aplay is used; then pacat"
 
 
 def test_a_sound_server_that_answers_is_played_to_without_a_program() -> None:
     assert judged("player", server=PULSE).message == "pulse is used, by the sound server; then aplay, pacat"
     alone = judged("player", Players((), None), server=PULSE)
-    assert (alone.state, alone.message) == (DONE, "pulse is used, by the sound server")
+    assert (alone.state, alone.message) == (OK, "pulse is used, by the sound server")
     assert judged("player", Players((), "pulse"), server=PULSE, running=True).message == "pulse (the server's)"
+    assert judged("player", server=WIRE).message == "aplay is used; then pacat"
+    # What an engine process has chosen counts more than what the sound server says.
+    chosen = replace(PLAYERS, first="aplay")
+    assert judged("player", chosen, server=PULSE).message == "aplay is used; then pacat"
+    assert judged("player", replace(PLAYERS, first="pulse"), server=WIRE).message.startswith("pulse is used")
 
 
 def test_a_sound_server_with_a_dummy_alone_is_heard_by_nobody() -> None:
@@ -79,8 +91,8 @@ def test_a_player_without_sound_is_not_heard(player: str) -> None:
 
 
 def test_a_device_is_looked_for_among_those_that_the_player_lists() -> None:
-    assert judged("device", devices=replace(DEVICES, wanted="default")).state == DONE
-    assert judged("device", devices=replace(DEVICES, wanted="plughw:1,0")).state == DONE
+    assert judged("device", devices=replace(DEVICES, wanted="default")).state == OK
+    assert judged("device", devices=replace(DEVICES, wanted="plughw:1,0")).state == OK
     found = judged("device", devices=replace(DEVICES, wanted="robot_speaker"))
     assert found.state == WARNING
     assert "robot_speaker is not among" in found.message
@@ -89,12 +101,30 @@ def test_a_device_is_looked_for_among_those_that_the_player_lists() -> None:
     assert "no answer" in judged("device", devices=Devices("aplay -L", trouble="no answer")).message
 
 
+def test_devices_that_no_program_can_list_are_a_fault_only_if_one_is_named() -> None:
+    unlisted = Devices("pactl list short sinks", package="pulseaudio-utils")
+    assert judged("device", devices=unlisted).state == OK
+    found = judged("device", devices=replace(unlisted, wanted="usb"))
+    assert (found.state, found.next) == (WARNING, "sudo apt-get install -y pulseaudio-utils")
+
+
+def test_a_step_that_takes_pactl_says_where_it_comes_from(tmp_path: Path) -> None:
+    muted = failed("loudness", "muted", "pactl set-sink-mute @DEFAULT_SINK@ 0")
+    without = {"PATH": str(tmp_path)}
+    step = f"{muted.next} (for pactl: sudo apt-get install -y pulseaudio-utils)"
+    assert sound.installing(muted, without).next == step
+    other = failed("socket", "no server", "talk serve")
+    assert sound.installing(other, without) == other
+    write(tmp_path / "pactl", "", 0o755)
+    assert sound.installing(muted, without) == muted
+
+
 def test_no_device_is_named_with_what_to_plug_in_or_to_hand_in() -> None:
     found = judged("cards", cards=NO_CARDS)
     assert (found.state, "plug in" in str(found.next)) == (WARNING, True)
     found = judged("cards", cards=NO_CARDS, session=replace(PI, kinds=("a container",)))
     assert "--device /dev/snd" in str(found.next)
-    assert judged("cards", cards=NO_CARDS, server=PULSE).state == DONE
+    assert judged("cards", cards=NO_CARDS, server=PULSE).state == OK
 
 
 def test_no_permission_for_the_device_names_the_group_and_the_user() -> None:
@@ -106,7 +136,7 @@ def test_no_permission_for_the_device_names_the_group_and_the_user() -> None:
     assert found.next == "sudo usermod -aG audio pi, and log in again"
     found = judged("group", cards=replace(forbidden, from_next_login=True), session=stranger)
     assert found.next == "log out and in again"
-    assert judged("group", cards=forbidden, session=stranger, server=PULSE).state == DONE, "it opens them"
+    assert judged("group", cards=forbidden, session=stranger, server=PULSE).state == OK, "it opens them"
 
 
 @pytest.mark.parametrize(
@@ -144,7 +174,7 @@ def test_without_a_runtime_directory_the_session_says_what_to_set() -> None:
     assert "cron, sudo" in found.message
     served = machine.judge_session(replace(PI, runtime=None, usual_runtime="/run/user/1000", server=7))
     assert "where the server is started" in str(served.next)
-    assert machine.judge_session(replace(PI, runtime=None)).state == DONE
+    assert machine.judge_session(replace(PI, runtime=None)).state == OK
     assert "not there" in machine.judge_session(replace(PI, runtime_owner=None)).message
     assert "uid 33's" in machine.judge_session(replace(PI, runtime_owner=33)).message
 
@@ -166,7 +196,7 @@ def test_what_is_muted_is_not_heard() -> None:
     assert sound.judge_levels((pulse,), default=False)[0].state == WARNING, "another device is played to"
     assert sound.judge_levels((wire,), default=True)[0].state == WARNING
     assert sound.judge_levels((replace(wire, percent=0),), default=True)[0].state == FAILED
-    assert sound.judge_levels((alsa,), default=True)[0].state == DONE
+    assert sound.judge_levels((alsa,), default=True)[0].state == OK
     assert sound.judge_levels((), default=True) == []
 
 

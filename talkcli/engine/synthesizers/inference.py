@@ -13,7 +13,7 @@ import hashlib
 import os
 
 from talkcli.engine.synthesizers.cache import AT_ONCE
-from talkcli.engine.synthesizers.models import BEGIN, END, PAD, BadFile, open_checked
+from talkcli.engine.synthesizers.models import BEGIN, END, NO_TELEMETRY, PAD, BadFile, open_checked
 from talkcli.engine.synthesizers.vits import NotCut, halves
 from talkcli.frozen import TYPE_CHECKING, frozen
 
@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from talkcli.engine.synthesizers.models import Description
     from talkcli.engine.synthesizers.vits import Buffer
 
-# From version 1.30 on, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
-# telemetry host some seconds later. A robot's voice reports to nobody, so a user's own value is overwritten.
-os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+os.environ.update(NO_TELEMETRY)  # before onnxruntime is imported
 
 #: Frames on either side of some that their samples depend on. Reckoned for the largest of Piper's decoders ("high"),
 #: 13.4; of a "medium" one the samples with 10 are those of the whole to a part in 400,000.

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 #: The packages that a model needs.
 NEEDED = install.NEURAL
+#: From version 1.30 on, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
+#: telemetry host some seconds later. A robot's voice reports to nobody, so a user's own value is overwritten.
+NO_TELEMETRY = {"ORT_DISABLE_TELEMETRY": "1"}
 
 _MODEL, JSON = ".onnx", ".json"
 #: How packages with voices are called, and where in one they may be.
