@@ -56,6 +56,13 @@ class Lost(TalkError):
     exit_code = 12
 
 
+class TimedOut(TalkError):
+    """What was asked for had not ended when the time for it was over."""
+
+    code = "timeout"
+    exit_code = EXIT_TIMEOUT
+
+
 class AddressInUse(TalkError):
     """`serve` cannot serve here: the socket is served already, or its directory is not safe."""
 

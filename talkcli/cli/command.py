@@ -29,7 +29,7 @@ FILE = Kind("string", (str,), "must be a string")
 MODE = Kind("string", (str,), "must be a string", "MODE")
 
 #: Options that go with one robot, or with none, and not with several.
-_OF_ONE = ("lines", "feedback", "output")
+_OF_ONE = ("lines", "ahead", "feedback", "output")
 
 #: Exit codes of every command that asks the server for something; a command says more of those that mean more to it.
 ASKING: Codes = {

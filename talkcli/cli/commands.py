@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Set as AbstractSet
     from typing import Any
 
+#: The most goals that `--ahead` allows: as many as a server's queue can be told to hold.
+MAX_AHEAD = 10_000
 #: The shells that there is a completion script for.
 SHELLS = ("bash", "zsh", "fish")
 
@@ -39,6 +41,8 @@ def _to_say() -> Iterator[Option]:
             what = "What the sender calls itself."
             yield Option("name", WORD, flags="--as", metavar="NAME", help=what, env="TALK_NAME")
     yield option("--lines", FLAG, "Speak each line of standard input, as it comes; no TEXT then.")
+    words = "With --lines: at most N of its goals are pending; other lines wait in the command.  [default: 10]"
+    yield option("--ahead", INTEGER, words, limits=(1, MAX_AHEAD))
     words = "Write it into a file instead; '-' is standard output. Needs no server."
     yield option("-o, --output", FILE, words, metavar="FILE.wav")
 
@@ -63,6 +67,8 @@ def _say_rule(given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
         return "--lines reads standard input: leave out TEXT"
     if given["lines"] and given["id"] is not None:
         return "--lines makes a goal of each line, and --id names one: leave out one of them"
+    if given["ahead"] is not None and not given["lines"]:
+        return "--ahead is about the lines of --lines: add that, or leave out --ahead"
     if not given["lines"] and not text:
         return "TEXT is missing: what is to be said, or '-' for standard input"
     if given["flush"] and given["preempt"] is False:
@@ -104,7 +110,7 @@ _ROWS = (
             0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
             4: "aborted: engine or audio failed; 'talk doctor' says more",
             5: "rejected: never queued (bad text, full queue or full server)",
-            6: "recalled: taken out of the queue before it was spoken",
+            6: "recalled: taken out of the queue before it was spoken; with --lines: not sent within its --ttl",
             7: "preempted: stopped while it was spoken",
             12: "lost: it was sent, then the server went away; it may still be spoken",
             124: "timed out, and cancelled",

@@ -1,6 +1,6 @@
-"""What ends a client's waiting: signals, a timeout, another thread, a reader of standard output that goes away.
+"""What ends a client's waiting: signals, a timeout, a reader of standard output that goes away.
 
-The first three become a descriptor that is readable then, so that they never cut a read or a write in two. The last is
+The first two become a descriptor that is readable then, so that they never cut a read or a write in two. The last is
 seen at standard output itself, which is waited for together with that. Until there is one of these, a signal for a goal
 that was sent early is held, by `plain`.
 """
@@ -126,8 +126,8 @@ class Interrupts:
         except BlockingIOError:
             pass
 
-    def wake(self) -> None:
-        """Make the descriptor readable, from any thread: there is something else to see to."""
+    def _wake(self) -> None:
+        """Make the descriptor readable."""
         try:
             os.write(self._write, b"\0")
         except BlockingIOError:
@@ -139,8 +139,8 @@ class Interrupts:
                 return
             os._exit(EXIT_SIGNAL + number)
         self.number = number
-        self.wake()
+        self._wake()
 
     def _expired(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         self.late = True
-        self.wake()
+        self._wake()

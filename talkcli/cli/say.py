@@ -30,10 +30,11 @@ from talkcli.cli.wait import (
     report,
     rest,
     show_if_possible,
+    timed_out,
     until_ended,
 )
 from talkcli.client.connect import Interrupted
-from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, Lost, UsageError
+from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import SOUND
 from talkcli.goals.states import State
@@ -54,6 +55,7 @@ def say(
     timeout: float | None,
     name: str | None,
     lines: bool,
+    ahead: int | None,
     output: str | None,
     **chosen: Any,
 ) -> int:
@@ -69,7 +71,7 @@ def say(
     if lines:
         from talkcli.cli.stdin import say_lines
 
-        return say_lines(options, name, chosen, wait, feedback, timeout)
+        return say_lines(options, name, chosen, wait, feedback, timeout, ahead)
     sentence = " ".join(text)
     if text == ("-",):
         from talkcli.cli.stdin import InputTooLong, read_text, rejected
@@ -109,10 +111,12 @@ def _say(
                 shown = feedback_for(options, asked=feedback)
                 if not wait or goal.state is State.REJECTED:
                     return regardless(_tell, goal, options, shown)
-                return _wait(goal, interrupts, end, options, shown)
+                return _wait(goal, interrupts, timeout, options, shown)
         except Lost as error:
-            if interrupts.number is None and (end is None or time.monotonic() < end):
-                raise
+            if interrupts.number is None:
+                if end is None or time.monotonic() < end:
+                    raise
+                raise timed_out(timeout, error.message) from error
             show_error(error, json=options.json)
     return interrupts.exit_code
 
@@ -137,30 +141,32 @@ def _tell(goal: GoalHandle, options: Common, shown: Feedback) -> int:
     return code if goal.state.terminal else EXIT_OK
 
 
-def _wait(goal: GoalHandle, interrupts: Interrupts, end: float | None, options: Common, shown: Feedback) -> int:
+def _wait(goal: GoalHandle, interrupts: Interrupts, timeout: float | None, options: Common, shown: Feedback) -> int:
     """Wait for a goal. It is this command's own: where it can't wait any longer, the goal ends too; unless another
     `say` had sent it before, with the same id.
     """
     try:
         introduce(goal, options, shown)
-        until_ended([goal], rest(end), shown)
+        until_ended([goal], rest(None if timeout is None else options.began + timeout), shown)
     except (Interrupted, OSError) as error:
         if isinstance(error, OSError) and not isinstance(error, TimeoutError):
             if not reader_is_gone(error):
                 raise
             interrupts.gone = True
         interrupts.look()
-        timed_out = interrupts.number is None and not interrupts.gone
+        late = interrupts.number is None and not interrupts.gone
         if interrupts.gone:
             give_up_output()
         if goal.attached:  # it is another's, and goes on
-            if timed_out:
-                shown.aside(f"{goal.id} has not ended within the time, and goes on: it was sent before")
+            if late:
+                raise timed_out(timeout, f"{goal.id} goes on: it was sent before") from None
             return interrupts.exit_code
         code = give_up(goal, interrupts, options, shown)
-        if not timed_out:
+        if not late:
             return interrupts.exit_code
-        return code if goal.state is State.SUCCEEDED else EXIT_TIMEOUT
+        if goal.state is not State.SUCCEEDED:
+            raise timed_out(timeout) from None
+        return code
     finally:
         regardless(shown.close)
     return report(goal.goal, options, shown)

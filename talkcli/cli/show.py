@@ -12,7 +12,7 @@ import sys
 import time
 
 from talkcli import __version__, paths
-from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, EXIT_TIMEOUT, ServerUnavailable, TalkError, limits
+from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, ServerUnavailable, TalkError, TimedOut, limits
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -131,14 +131,13 @@ def ended(command: Callable[[], object], options: Common) -> int:
         code = command()
         if sys.stdout:
             sys.stdout.flush()
-    except TalkError as error:
+    except (TalkError, TimeoutError) as error:
+        if isinstance(error, TimeoutError):  # what was asked for was not done in the time that it was given
+            error = TimedOut(str(error))
         show_error(error, json=options.json)
         return error.exit_code
     except KeyboardInterrupt:
         return EXIT_SIGINT
-    except TimeoutError as error:  # what was asked for was not done in the time that it was given
-        note(str(error))
-        return EXIT_TIMEOUT
     except MemoryError:
         note(f"there is not enough memory for talk: {limits()}")
         return EXIT_ERROR

@@ -1,15 +1,15 @@
-"""`say` from standard input: read as one text, or spoken line by line, each a goal as it arrives, over one connection.
+"""`say` from standard input: read as one text, or spoken line by line, each line a goal, over one connection.
 
-It never holds more than one text. Of lines, the main thread reads and sends them, waiting for room in the server's
-queue; with --wait a second thread waits for the goals, in their order. Of a goal that has ended nothing is kept but the
-exit code: the input may have no end.
+Of one text it never holds more than the longest one. Of lines, one thread does everything: it reads them into a
+`LineBuffer`, sends them while few enough of its goals are pending, and sees how its goals end. The input may have no
+end, so nothing is kept of a goal that was told of.
 """
 
 from __future__ import annotations
 
 import os
 import select
-import threading
+import time
 from collections import deque
 from functools import partial
 
@@ -24,13 +24,15 @@ from talkcli.cli.wait import (
     regardless,
     report,
     rest,
-    until_ended,
+    show_if_possible,
+    timed_out,
 )
 from talkcli.client.connect import Interrupted, ready
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, TalkError, UnknownGoal, UsageError, limits
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.client.connection import BaseConnection
+from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UnknownGoal, UsageError
+from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS
+from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS, Say
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, Result, unfinished
 from talkcli.protocol.lines import Cut, LineSplitter
@@ -41,20 +43,22 @@ if TYPE_CHECKING:
 
     from talkcli.cli.show import Common
     from talkcli.client.client import Client, GoalHandle
+    from talkcli.client.connection import Exchange
 
     _T = TypeVar("_T")
 
 #: Bytes that are read at once: what a pipe holds.
-_CHUNK = 65_536
+_CHUNK_BYTES = 65_536
 #: Bytes that are read of one text: the longest one, and the end of its line.
-_MOST = MAX_BYTES + len("\r\n")
-
-
-class InputLate(TalkError):
-    """What should be spoken was not there in time."""
-
-    code = "timeout"
-    exit_code = EXIT_TIMEOUT
+_TEXT_BYTES = MAX_BYTES + len("\r\n")
+#: Bytes of lines with a ttl that are read before they can be sent.
+_AHEAD_BYTES = 1_000_000
+#: Goals that may be pending if --ahead says nothing else.
+_AHEAD = 10
+#: Goals that have not been told of: of those that end before an older goal does, no more than this are kept.
+_MAX_UNTOLD = 1_000
+#: The least ttl that is sent: 0 would be no limit.
+_LEAST_TTL_S = 0.01
 
 
 class InputTooLong(Exception):
@@ -64,12 +68,12 @@ class InputTooLong(Exception):
 def read_text(end: float | None, interrupt: Mapping[int, int], *, whole: bool = False) -> str:
     """Return standard input as one text; InputTooLong for more than the longest one, which is not read to its end.
 
-    `end`: the monotonic time by which it must have been read, else InputLate; `interrupt`: what ends the reading with
+    `end`: the monotonic time by which it must have been read, else TimedOut; `interrupt`: what ends the reading with
     Interrupted, as in `connect.ready`; `whole`: read all of it, for no goal.
     """
     data = bytearray()
-    while whole or len(data) <= _MOST:
-        more = _read(_CHUNK if whole else _MOST + 1 - len(data), interrupt, end)
+    while whole or len(data) <= _TEXT_BYTES:
+        more = _read(_CHUNK_BYTES if whole else _TEXT_BYTES + 1 - len(data), interrupt, end)
         if not more:
             return _decoded(bytes(data))
         data += more
@@ -84,30 +88,85 @@ def rejected(words: str) -> Goal:
     return Goal("", State.REJECTED, reason="text_too_long", message=f"Talk rejected: {words}")
 
 
-def _lines(interrupt: Mapping[int, int]) -> Iterator[bytes]:
-    """Iterate over standard input's lines, each as soon as its newline has come; the last one may lack it.
+@frozen
+class Line:
+    """A line of standard input."""
 
-    One that is too long is read to its end, and `Cut`. `interrupt`: as in `read_text`.
-    """
-    # One byte above the longest text: the CR of a line that ends in CRLF.
-    splitter = LineSplitter(MAX_BYTES + 1)
-    while data := _read(_CHUNK, interrupt):
-        yield from splitter.feed(data)
-    if splitter.size:
-        yield splitter.end()
+    number: int
+    #: without the end of the line; the beginning, if the line is too long
+    text: str
+    #: bytes of a line that is too long to be spoken, else 0
+    excess: int = 0
+    #: until when it means anything (monotonic); None for ever
+    end: float | None = None
+
+
+class LineBuffer:
+    """Lines that were read and have not been sent. It has no clock: the time comes in as an argument."""
+
+    def __init__(self, ttl: float | None = None) -> None:
+        """`ttl`: seconds after which a line means nothing any more, counted from when it was read; None for ever."""
+        self._ttl = ttl
+        # One byte above the longest text: the CR of a line that ends in CRLF.
+        self._splitter = LineSplitter(MAX_BYTES + 1)
+        #: what was read and has not been cut into lines, and when: so a million short lines take no more than 1 MB
+        self._chunks: deque[tuple[float, bytes]] = deque()
+        self._lines: deque[Line] = deque()
+        self._number = 0
+        #: bytes that have not been cut into lines
+        self.size = 0
+        self.ended = False
+
+    def feed(self, data: bytes, now: float) -> None:
+        """Take up what was read; nothing is the input's end, where the last line may lack its newline."""
+        self.ended = not data
+        self.size += len(data)
+        self._chunks.append((now, data))
+
+    @property
+    def first(self) -> Line | None:
+        """The oldest line that has anything to say."""
+        while not self._lines and self._chunks:
+            now, data = self._chunks.popleft()
+            self.size -= len(data)
+            end = now + self._ttl if self._ttl else None
+            for line in self._splitter.feed(data) if data else [self._splitter.end()]:
+                self._number += 1
+                text = _decoded(line)
+                if isinstance(line, Cut):
+                    self._lines.append(Line(self._number, text, line.size, end))
+                elif text.strip():
+                    self._lines.append(Line(self._number, text, 0, end))
+        return self._lines[0] if self._lines else None
+
+    def take(self) -> Line:
+        """Take the first line away."""
+        return self._lines.popleft()
+
+    def take_late(self, now: float) -> Iterator[Line]:
+        """Take away the lines whose time is over."""
+        while (line := self.first) and line.end is not None and line.end <= now:
+            yield self.take()
 
 
 def _read(count: int, interrupt: Mapping[int, int], end: float | None = None) -> bytes:
     """Return what there is of standard input once there is something, at most so many bytes; b"" at its end."""
     while True:
         if not ready({0: select.POLLIN}, rest(end), interrupt):
-            raise InputLate("standard input has not ended within the time: nothing was sent")
-        try:
-            return os.read(0, count)
-        except BlockingIOError:  # whoever started this has made it so
-            continue
-        except OSError as error:
-            raise UsageError(f"standard input cannot be read: {error.strerror}") from error
+            raise TimedOut("standard input has not ended within the time: nothing was sent")
+        data = _read_now(count)
+        if data is not None:
+            return data
+
+
+def _read_now(count: int) -> bytes | None:
+    """Return what there is of standard input, at most so many bytes; b"" at its end, None if there is nothing."""
+    try:
+        return os.read(0, count)
+    except BlockingIOError:  # another program has made it so
+        return None
+    except OSError as error:
+        raise UsageError(f"standard input cannot be read: {error.strerror}") from error
 
 
 def _decoded(data: bytes) -> str:
@@ -116,11 +175,18 @@ def _decoded(data: bytes) -> str:
 
 
 def say_lines(
-    options: Common, name: str | None, chosen: dict[str, Any], wait: bool, feedback: bool, timeout: float | None
+    options: Common,
+    name: str | None,
+    chosen: dict[str, Any],
+    wait: bool,
+    feedback: bool,
+    timeout: float | None,
+    ahead: int | None,
 ) -> int:
     """Speak standard input line by line, and return the exit code.
 
-    `name`: what the sender calls itself; `chosen`: options of each goal; `timeout`: seconds for all of it.
+    `name`: what the sender calls itself; `chosen`: options of each goal; `timeout`: seconds for all of it; `ahead`:
+    goals that may be pending at once.
     """
     shown = feedback_for(options, asked=feedback)
     try:
@@ -128,9 +194,11 @@ def say_lines(
             Interrupts(timeout, output=wait) as interrupts,
             options.connect(timeout, name=name, interrupt=interrupts.watched) as client,
         ):
-            return _Lines(client, interrupts, options, chosen, wait, shown).run()
+            return _Lines(client, interrupts, options, chosen, wait, shown, ahead or _AHEAD).run()
     finally:
         regardless(shown.close)
+    if interrupts.late and interrupts.number is None and not interrupts.gone:
+        raise timed_out(timeout)
     return interrupts.exit_code
 
 
@@ -145,93 +213,232 @@ class _Lines:
         chosen: dict[str, Any],
         wait: bool,
         shown: Feedback,
+        ahead: int,
     ) -> None:
-        self._client = client
+        assert isinstance(client._connection, BaseConnection)
+        self._client, self._connection = client, client._connection
         self._interrupts = interrupts
         self._options = options
         self._chosen = chosen
         self._wait = wait
         self._shown = shown
-        self._tally = _Tally(options, interrupts, shown)
-        #: the number of the line that is being sent
+        self._ahead = ahead
+        self._ttl: float | None = chosen["ttl"] or None
+        self._buffer = LineBuffer(self._ttl)
+        #: the number of the line that is being sent, until it is accepted or refused
         self._sending: int | None = None
+        #: what was sent and has not been answered
+        self._sent: tuple[GoalHandle, Exchange] | None = None
+        #: goals that have not ended, in the order of their lines; with --wait, until they were told of
+        self._goals: deque[tuple[int, GoalHandle]] = deque()
+        #: since when there is something to hear from the server (monotonic)
+        self._since = 0.0
         self._told_of_pause = False
+        #: why nothing more is read or sent
+        self._error: TalkError | None = None
+        #: the first line that did not succeed, and its exit code
+        self._failure: tuple[int, int] | None = None
 
     def run(self) -> int:
         """Send all lines; with --wait, see them end."""
         try:
-            self._tally.start()
-        except RuntimeError as error:  # all that Python says of a thread that it can't have
-            raise TalkError(f"no thread can be started to wait for the goals: {limits()}") from error
-        try:
-            self._send_all()
-            self._tally.finish()
+            while not self._done:
+                try:
+                    self._step()
+                except TalkError as error:
+                    if self._error is not None:
+                        raise
+                    self._error = error
         except Interrupted:
-            return self._interrupted()
-        except TalkError as error:
-            return self._lost(error)
-        except BaseException as error:
-            if self._wait and isinstance(error, OSError) and reader_is_gone(error):
-                self._interrupts.gone = True
-                return self._interrupted()
-            self._tally.stop()
+            self._give_up()
             raise
-        return self._tally.code
+        except OSError as error:
+            if not (self._wait and reader_is_gone(error)):
+                raise
+            self._interrupts.gone = True
+            self._give_up()
+            raise Interrupted from None
+        code = self._failure[1] if self._failure else EXIT_OK
+        if self._error is not None:
+            self._shown.close()
+            show_error(self._error, json=self._options.json)
+            self._tell_of_the_rest()
+            return code or self._error.exit_code
+        return code
 
-    def _send_all(self) -> None:
-        for number, line in enumerate(_lines(self._interrupts.watched), start=1):
-            self._sending = number
-            text = _decoded(line)
-            if isinstance(line, Cut):
-                words = f"the line has {line.size:,} bytes, the longest text allowed has {MAX_BYTES:,}"
-                self._refuse(number, rejected(words))
-            elif text.strip():
-                text, unreadable = readable(text, number)
-                if unreadable and not self._options.quiet:
-                    self._shown.aside(unreadable)
-                self._send(number, text)
-            self._sending = None
+    @property
+    def _done(self) -> bool:
+        if self._wait and self._goals:
+            return False
+        return self._error is not None or not (self._sent or self._lines_to_come)
 
-    def _send(self, number: int, text: str) -> None:
-        handle = self._client.say(text, follow=self._wait, feedback=self._shown.shows, patient=True, **self._chosen)
+    @property
+    def _lines_to_come(self) -> bool:
+        return self._buffer.first is not None or not self._buffer.ended
+
+    @property
+    def _full(self) -> bool:
+        """Whether no line may be sent, because enough goals are pending."""
+        pending = sum(each.state is State.PENDING for _, each in self._goals)
+        # A line with a key replaces the one that is pending, so it adds none.
+        enough = pending >= self._ahead and self._chosen["key"] is None
+        return enough or len(self._goals) >= _MAX_UNTOLD
+
+    @property
+    def _reads(self) -> bool:
+        """Whether more is read: without a ttl only what can be sent, as a pipe holds the rest as well."""
+        if self._buffer.ended or self._error is not None:
+            return False
+        if self._ttl:
+            return self._buffer.size < _AHEAD_BYTES
+        return not (self._buffer.first or self._sent or self._full)
+
+    def _step(self) -> None:
+        """Do what can be done now, then wait for more to do."""
+        if self._error is None:
+            for line in self._buffer.take_late(time.monotonic()):
+                self._drop(line)
+            while self._buffer.first and not (self._sent or self._full):
+                self._send(self._buffer.take())
+            if self._done:
+                return
+        self._hear()
+        self._take_answer()
+        self._see_ends()
+        if self._connection.ended is not None and self._error is None and self._lines_to_come:
+            path = self._connection.path
+            raise ServerUnavailable(f"nothing more can be sent to the server at {path}: {self._connection.ended}")
+
+    # -- sending
+
+    def _send(self, line: Line) -> None:
+        if line.excess:
+            words = f"the line has {line.excess:,} bytes, the longest text allowed has {MAX_BYTES:,}"
+            self._refuse(line.number, rejected(words))
+            return
+        self._sending = line.number
+        text, unreadable = readable(line.text, line.number)
+        if unreadable and not self._options.quiet:
+            self._shown.aside(unreadable)
+        chosen = self._chosen
+        if line.end is not None:
+            chosen = {**chosen, "ttl": max(_LEAST_TTL_S, round(line.end - time.monotonic(), 2))}
+        # It is followed without --wait, too: how many goals are pending is known by their states.
+        request = Say(text, wait=True, feedback=self._shown.shows, patient=True, **chosen)
+        handle, accepted = self._client._handle(request)
+        if handle.state is State.REJECTED:
+            self._refuse(line.number, handle.goal)
+            return
+        if not self._goals:
+            self._since = time.monotonic()
+        self._sent = handle, self._connection.begin(request, accepted)
+
+    def _take_answer(self) -> None:
+        """Take up the server's answer to what was sent last, if it has come or can't come any more."""
+        if self._sent is None or not (self._sent[1].over or self._connection.ended):
+            return
+        (handle, exchange), number = self._sent, self._sending or 0
+        self._sent = None
+        self._connection.forget(exchange)
+        self._connection.answer(exchange)
         if handle.state is State.REJECTED:
             self._refuse(number, handle.goal)
             return
+        self._sending = None
         self._tell(introduce, handle, pause_is_known=self._told_of_pause)
         self._told_of_pause = handle.speech_paused
-        if self._wait:
-            self._tally.add(handle)
-        else:
+        if not self._wait:
             self._tell(report, handle.goal)
+        elif not self._goals:
+            self._shown.begin([handle.goal])
+        self._goals.append((number, handle))
 
     def _refuse(self, number: int, goal: Goal) -> None:
         """Tell of a line that is no goal, and go on."""
-        self._tally.add(self._tell(refuse, goal, where=f"line {number}: "))
+        self._sending = None
+        self._count(number, self._tell(refuse, goal, where=f"line {number}: "))
+
+    def _drop(self, line: Line) -> None:
+        """Tell of a line that can't be sent in time, and go on."""
+        words = f"line {line.number} was not sent: its ttl of {self._ttl:g} s is over"
+        goal = Goal("", State.RECALLED, text=line.text, reason="expired", message=words)
+        code = self._tell(refuse, goal)
+        if self._wait:
+            self._count(line.number, code)
+
+    def _count(self, number: int, code: int) -> None:
+        """Count a line's exit code: that of the first line that did not succeed is the command's."""
+        if code and (self._failure is None or number < self._failure[0]):
+            self._failure = number, code
 
     def _tell(self, act: Callable[..., _T], goal: Goal | GoalHandle, **how: object) -> _T:
         """Tell of a goal; where its reader is gone, who waits ends as by a signal, and who doesn't goes on without."""
         tell = partial(act, goal, self._options, self._shown, **how)
         return tell() if self._wait else regardless(tell)
 
-    def _interrupted(self) -> int:
-        """End before the input does: by a signal, by the timeout, because its output has no reader any more or the
-        tally can't go on.
-        """
+    # -- waiting
+
+    def _hear(self) -> None:
+        """Wait until there is something to do: more input, an answer, news of a goal, a line whose time is over."""
+        watched = self._interrupts.watched
+        first = self._buffer.first
+        end = first.end if first and self._error is None else None
+        was_full = self._full
+
+        def something() -> bool:
+            if self._sent and self._sent[1].over:
+                return True
+            return self._full != was_full or (self._wait and bool(self._goals) and self._goals[0][1]._has_next())
+
+        hear = partial(self._connection.wait_until, something, since=self._since)
+        if self._reads:
+            watched[0] = select.POLLIN
+        try:
+            if self._sent or self._goals:
+                hear(end)
+            else:
+                ready({}, rest(end), watched)
+        except Interrupted:
+            if watched.pop(0, None) is None:
+                raise
+            ready({}, 0, watched)  # raises Interrupted again, unless it was the input alone
+            data = _read_now(_CHUNK_BYTES)
+            if data is not None:
+                self._buffer.feed(data, time.monotonic())
+            if self._sent or self._goals:  # an input that always has more must not keep the server from being heard
+                hear(time.monotonic(), interruptible=False)
+        finally:
+            watched.pop(0, None)
+
+    def _see_ends(self) -> None:
+        """Tell what has happened to the goals, in their order, and forget those that have ended."""
+        if not self._wait:
+            self._goals = deque(each for each in self._goals if not each[1].state.terminal)
+            return
+        while self._goals:
+            number, handle = self._goals[0]
+            while event := handle.poll():
+                show_if_possible(self._shown.show, handle.goal, event)
+            if not handle.state.terminal:
+                return
+            self._count(number, report(handle.goal, self._options, self._shown))
+            self._goals.popleft()
+            if self._goals:
+                self._shown.begin([self._goals[0][1].goal])
+
+    # -- the end before the input's
+
+    def _give_up(self) -> None:
+        """End before the input does: by a signal, by the timeout, or because its output has no reader any more."""
         self._interrupts.look()
         if self._interrupts.gone:
             give_up_output()
-        elif self._interrupts.number is None and not self._interrupts.late:
-            self._tally.finish()
-            self._tell_of_the_rest()
-            return self._tally.code
-        self._tally.stop()
         if self._wait:
             # Who hangs up takes back the line that waits for room: else it would get that of the goals that end now.
             self._client.close()
             self._interrupts.clear()
-            self._cancel([each.id for each in self._tally.unfinished])
+            self._cancel([each.id for _, each in self._goals if not each.state.terminal])
         self._tell_of_the_rest()
-        return self._interrupts.exit_code
 
     def _cancel(self, ids: list[str]) -> None:
         """Cancel what was sent and has not ended, and tell how it ended."""
@@ -254,83 +461,14 @@ class _Lines:
         if recalled and not (self._shown.shows or self._options.json or self._options.quiet):
             note(f"{recalled} that waited: recalled")
 
-    def _lost(self, error: TalkError) -> int:
-        """End because the server takes no more lines, or because standard input can't be read."""
-        self._tally.finish()
-        self._shown.close()
-        show_error(error, json=self._options.json)
-        self._tell_of_the_rest()
-        return self._tally.code or error.exit_code
-
     def _tell_of_the_rest(self) -> None:
         """Say from which line on nothing was accepted, as far as that is known."""
-        if self._sending is not None and not self._options.quiet:
+        if self._options.quiet:
+            return
+        if self._sending is not None:
             self._shown.aside(f"line {self._sending} may not have been accepted; what follows it was not sent")
-
-
-class _Tally(threading.Thread):
-    """Waits for the goals in their order, tells how each ended, and keeps the first exit code that is no success."""
-
-    def __init__(self, options: Common, interrupts: Interrupts, shown: Feedback) -> None:
-        super().__init__(name="tally", daemon=True)
-        self._options = options
-        self._interrupts = interrupts
-        self._shown = shown
-        self._changed = threading.Condition()
-        #: goals that have not ended, as far as this thread knows, exit codes of lines that are no goals, at last None
-        self._waiting: deque[GoalHandle | int | None] = deque()
-        self._error: BaseException | None = None
-        #: the exit code of all lines so far
-        self.code = EXIT_OK
-
-    @property
-    def unfinished(self) -> list[GoalHandle]:
-        """The goals that were not seen to end."""
-        with self._changed:
-            return [each for each in self._waiting if not isinstance(each, int | None)]
-
-    def add(self, sent: GoalHandle | int | None) -> None:
-        """Wait for this one, too, or count this exit code when its turn comes; None: there are no more."""
-        with self._changed:
-            self._waiting.append(sent)
-            self._changed.notify()
-
-    def finish(self) -> None:
-        """Return when all have ended; what stopped this thread before that is raised."""
-        self.add(None)
-        self.join()
-        if self._error is not None:
-            raise self._error
-
-    def stop(self) -> None:
-        """End the thread as soon as that can be done, whatever has not ended."""
-        self.add(None)
-        self._interrupts.wake()
-        # It may hang on a standard output that nobody reads: then it ends with the process.
-        self.join(SILENCE)
-
-    def run(self) -> None:
-        """Wait for one after the other."""
-        try:
-            while (sent := self._next()) is not None:
-                code = sent if isinstance(sent, int) else self._see_end(sent)
-                with self._changed:
-                    self._waiting.popleft()
-                    self.code = self.code or code
-        except BaseException as error:  # noqa: BLE001 - whatever it is, the main thread raises it
-            self._error = error
-            self._interrupts.wake()
-
-    def _next(self) -> GoalHandle | int | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting)
-            return self._waiting[0]
-
-    def _see_end(self, handle: GoalHandle) -> int:
-        until_ended([handle], None, self._shown)
-        if handle.state is State.LOST:
-            self._interrupts.wake()  # nothing more can be sent
-        return report(handle.goal, self._options, self._shown)
+        elif self._buffer.first:
+            self._shown.aside(f"line {self._buffer.first.number} was not sent, and what follows it was not either")
 
 
 def _own(client: Client) -> list[str]:

@@ -11,7 +11,7 @@ import time
 from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.show import Feedback, give_up_failed, give_up_output, reader_is_gone, show, show_json
 from talkcli.client.connect import Interrupted
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable
+from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable, TimedOut
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
@@ -33,6 +33,11 @@ SILENCE = 1.0
 def rest(end: float | None) -> float | None:
     """Return the seconds that are left until a monotonic time."""
     return None if end is None else max(0.0, end - time.monotonic())
+
+
+def timed_out(timeout: float | None, words: str = "") -> TimedOut:
+    """Return the error of a command that --timeout has ended; `words`: what is told besides."""
+    return TimedOut(f"timed out after {timeout or 0:g} s{words and f': {words}'}")
 
 
 def show_if_possible(put: Callable[..., None], *what: object) -> None:
@@ -110,7 +115,7 @@ def give_up(goal: GoalHandle, interrupts: Interrupts, options: Common, shown: Fe
 
 
 def refuse(goal: Goal, options: Common, shown: Feedback, where: str = "") -> int:
-    """Tell of a goal that is REJECTED, be it before it is sent, and return the exit code; `where`: as of `report`."""
+    """Tell of a goal that no server took, and return the exit code; `where`: as of `report`."""
     if options.json:
         show_if_possible(shown.show, goal, Result(goal))
     return report(goal, options, shown, where)
@@ -138,9 +143,13 @@ def wait(options: Common, ids: tuple[str, ...], timeout: float | None, feedback:
     with Interrupts(output=True) as interrupts, options.connect(timeout, interrupt=interrupts.watched) as client:
         goals = client.follow(ids or None, feedback=feedback)
         shown = feedback_for(options, asked=feedback)
-        if feedback:
-            _show(goals, end, interrupts, shown)
-        return _wait(goals, end, options, shown, named=bool(ids))
+        try:
+            if feedback:
+                _show(goals, end, interrupts, shown)
+            return _wait(goals, end, options, shown, named=bool(ids))
+        except TimeoutError:
+            late = next(each.id for each in goals if not each.state.terminal)
+            raise timed_out(timeout, f"{late} has not ended") from None
     return interrupts.exit_code
 
 

@@ -28,7 +28,7 @@ from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from talkcli.client.connection import Connection
+    from talkcli.client.connection import Connection, OnReply
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
 
@@ -149,20 +149,9 @@ class Client:
             audible=audible,
             data=data,
         )
-        check(request)
-        rejected = too_long(request)
-        if rejected is not None:
-            return GoalHandle(self._connection, rejected)
-        handle = GoalHandle(self._connection, Goal("", State.PENDING))
-
-        def accepted(reply: JsonObject, _: list[JsonObject]) -> None:
-            handle.goal = Goal.from_json(reply.get("goal"))
-            handle.attached = reply.get("attached") is True
-            handle.speech_paused = reply.get("paused") is True
-            if request.wait:
-                handle._listen(feedback=feedback)
-
-        self._connection.request(request, accepted, slow=patient)
+        handle, accepted = self._handle(request)
+        if not handle.state.terminal:
+            self._connection.request(request, accepted, slow=patient)
         return handle
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
@@ -296,6 +285,23 @@ class Client:
         return self._take_all(buffer)
 
     # -- inside
+
+    def _handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
+        """Return a handle for a goal that has not been sent, and the function that takes in the server's answer.
+
+        The handle is REJECTED if the text is too long to be sent. UsageError for a value out of its range.
+        """
+        check(request)
+        handle = GoalHandle(self._connection, too_long(request) or Goal("", State.PENDING))
+
+        def accepted(reply: JsonObject, _: list[JsonObject]) -> None:
+            handle.goal = Goal.from_json(reply.get("goal"))
+            handle.attached = reply.get("attached") is True
+            handle.speech_paused = reply.get("paused") is True
+            if request.wait:
+                handle._listen(feedback=request.feedback)
+
+        return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
         """Return the whole id for a number alone, which means a goal of this server; what `check_id` raises."""

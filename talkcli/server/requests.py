@@ -50,6 +50,8 @@ ALL_WAITING = 64 * 1024 * 1024
 #: Bytes that each is counted with besides what it carries. It takes a tenth of that; but so no more than 8,000 wait,
 #: and a cancel of so many is answered within 2 s, too.
 EACH = 8 * 1024
+#: The ttl of a goal whose time was over while it waited for room: 0 would be no limit.
+_LEAST_TTL_S = 0.001
 
 
 class Requests:
@@ -209,6 +211,14 @@ class Requests:
             each.move(self._canceled)
         return [each.resume for each in new]
 
+    async def _await_room(self, call: Call, say: Say) -> Say:
+        """Wait until there is room, and return the goal with what is left of its ttl."""
+        began = self._speech.now().monotonic
+        self._speech.subscribers.keep_alive()
+        await call.wait(self._speech.for_room)
+        waited = self._speech.now().monotonic - began
+        return replace(say, ttl=max(_LEAST_TTL_S, say.ttl - waited)) if say.ttl else say
+
     # -- one method a request
 
     async def _say(self, call: Call, say: Say) -> None:
@@ -220,8 +230,7 @@ class Requests:
                 self._let_go()
             fault = call.fault or self._speech.voices.fault(say.voice, self._scheduler.settings.voice)
             if say.patient and self._scheduler.lacks_room(say, now, fault) and self._keep(call):
-                self._speech.subscribers.keep_alive()
-                await call.wait(self._speech.for_room)
+                say = await self._await_room(call, say)
         voices, usual = self._speech.voices, self._scheduler.settings.voice
         now, fault = self._speech.now(), call.fault or voices.fault(say.voice, usual)
         if not fault:
