@@ -49,6 +49,7 @@ def test_feedback_alone_waits(scripted: Talk) -> None:
     assert scripted.run("say", "--feedback", "fail=audio_lost").code == 4
     done = scripted.run("say", "-f", "-t", "0.3", "never-ends")
     assert done.code == 124
+    assert done.err.splitlines()[-1] == "talk: timed out after 0.3 s"
     assert done.out.splitlines()[-2:] == [
         f"{scripted.watcher.goals()[-1]} {each}" for each in ("PREEMPTING", "PREEMPTED")
     ]
@@ -185,6 +186,6 @@ def test_wait_that_gives_up_cancels_nothing(scripted: Talk) -> None:
     scripted.watcher.wait_for_word(goal_id)
     done = scripted.run("wait", "-f", "-t", "0.2", goal_id)
     assert done.code == 124
-    assert "has not ended" in done.err
+    assert done.err == f"talk: timed out after 0.2 s: {goal_id} has not ended\n"
     assert scripted.run("wait", "-f", "none-1").code == 8
     assert scripted.goal(goal_id)["state"] == "ACTIVE"

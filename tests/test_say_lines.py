@@ -1,4 +1,4 @@
-"""`say --lines`: each line of standard input is a goal as it comes; none is lost, none is spoken twice."""
+"""`say --lines`: each line of standard input is a goal; few are pending, and none is spoken too late or twice."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
+from select import POLLOUT, poll
 from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conformance.bareserve import TALK, environment, run
+from tests.conformance.bareserve import TALK, environment
 from tests.support.forking import Forked
 from tests.support.surroundings import short_directory
 from tests.support.timing import assert_within, limits
@@ -98,7 +98,8 @@ def test_options_hold_for_each_line(scripted: Talk) -> None:
     )
     for line in done.out.splitlines():
         goal = json.loads(line)
-        assert (goal["priority"], goal["ttl"], goal["key"], goal["client"]["name"]) == (3, 9, "k", "reader")
+        assert (goal["priority"], goal["key"], goal["client"]["name"]) == (3, "k", "reader")
+        assert 8 < goal["ttl"] <= 9
 
 
 def test_a_line_that_is_refused_is_reported_by_its_number_and_the_rest_goes_on(scripted: Talk) -> None:
@@ -196,7 +197,114 @@ def test_throttled_lines_are_no_failure(scripted: Talk) -> None:
     assert "line 2: " in alike.err
 
 
+# How many are pending, and for how long
+
+
+@pytest.mark.parametrize(("words", "ahead"), [([], 10), (["--ahead", "2"], 2), (["--ahead", "2", "--wait"], 2)])
+def test_few_goals_are_pending_so_that_others_have_room(scripted: Talk, words: list[str], ahead: int) -> None:
+    typing = Typing(scripted, "say", "--lines", *words)
+    lines = [ENDLESS.rstrip(), *(f"length=0 {number}" for number in range(20))]
+    typing.type("\n".join(lines))
+    ids = [typing.line() for _ in range(ahead + 1)]
+    scripted.watcher.wait_for_word(ids[0])
+    theirs = scripted.run("say", "length=0 theirs").id
+    scripted.run("cancel", ids[0])
+    scripted.watcher.wait_for_terminal(theirs)
+    typing.end()
+    scripted.watcher.wait_until(lambda _: len(scripted.watcher.texts("SUCCEEDED")) == len(lines))
+    assert scripted.watcher.texts("PENDING") == [*lines[: ahead + 1], "length=0 theirs", *lines[ahead + 1 :]]
+
+
+def test_a_line_replaces_the_pending_one_of_its_key_however_few_may_be_pending(scripted: Talk) -> None:
+    typing = Typing(scripted, "say", "--lines", "--key", "k", "--ahead", "1")
+    typing.type(ENDLESS + "length=0 old\nlength=0 older\nlength=0 new\n")
+    ids = [typing.line() for _ in range(4)]
+    assert [scripted.goal(each)["state"] for each in ids] == ["ACTIVE", "RECALLED", "RECALLED", "PENDING"]
+    assert typing.end()[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code"), [([], 0), (["--wait"], 6), (["-q", "--wait"], 6), (["--json", "--wait"], 6), (["--ttl=0"], 0)]
+)
+def test_lines_whose_ttl_is_over_while_they_wait_are_dropped(make_talk: MakeTalk, words: list[str], code: int) -> None:
+    talk = make_talk("--max-queue", "1", scripted=True)
+    theirs = [talk.run("say", each).id for each in (ENDLESS, "never-ends")]
+    talk.watcher.wait_for_word(theirs[0])
+    began = time.monotonic()
+    typing = Typing(talk, "say", "--lines", "--ttl", "0.3", *words)
+    typing.type("length=0 one\nlength=0 two\nlength=0 three\n")
+    if "--ttl=0" in words or "-q" in words:
+        time.sleep(0.4)  # nothing tells that time passes
+    else:
+        assert typing.client.stderr
+        notes = typing.client.stderr.readline() + typing.client.stderr.readline()
+        assert time.monotonic() - began >= 0.3
+        assert notes == "".join(f"talk: line {number} was not sent: its ttl of 0.3 s is over\n" for number in (2, 3))
+    for each in theirs:
+        talk.run("cancel", each)
+    found, out, _ = typing.end()
+    assert found == code
+    assert talk.run("wait").code == 0
+    assert talk.watcher.texts("ACTIVE")[2:] == (
+        [f"length=0 {each}" for each in ("one", "two", "three")] if "--ttl=0" in words else []
+    )  # the first waited for room at the server, which counts, too
+    if "--json" in words:
+        goals = [json.loads(each) for each in out]
+        assert sorted((each["state"], each["reason"], each["text"]) for each in goals) == [
+            ("RECALLED", "expired", f"length=0 {each}") for each in ("one", "three", "two")
+        ]
+
+
+def test_what_is_left_of_the_ttl_is_sent(scripted: Talk) -> None:
+    text = "length=0.5 one\nlength=0 two\nlength=0 three\n"
+    done = scripted.run("--json", "say", "--lines", "--ttl", "10", "--ahead", "1", stdin=text)
+    first, second, third = [json.loads(each)["ttl"] for each in done.out.splitlines()]
+    assert 10 >= first >= second > third
+    assert third <= 9.5
+
+
+@pytest.mark.parametrize("seconds", [5, pytest.param(60, marks=pytest.mark.slow)])
+def test_fifty_lines_a_second_are_spoken_while_they_are_new_and_others_are_spoken_too(
+    scripted: Talk, seconds: int
+) -> None:
+    ttl, typed = 1.0, {}
+    typing = Typing(scripted, "-q", "say", "--lines", "--ttl", f"{ttl}")
+    began = time.monotonic()
+    for number in range(50 * seconds):
+        time.sleep(max(0.0, began + number / 50 - time.monotonic()))
+        typed[f"length=0.3 {number}"] = time.time()
+        typing.type(f"length=0.3 {number}\n")
+        if number == 100:
+            theirs = scripted.start("say", "--wait", "length=0 theirs")
+    assert scripted.finish(theirs).code == 0
+    assert typing.end()[0] == 0
+    assert scripted.run("wait").code == 0
+    goals = [each["goal"] for each in scripted.watcher.events() if each.get("state") == "SUCCEEDED"]
+    ages = [goal["started_at"] - typed[goal["text"]] for goal in goals if goal["text"] in typed]
+    assert len(ages) > 2 * seconds
+    assert max(ages) < ttl + 0.2
+    (other,) = [goal for goal in goals if goal["text"] not in typed]
+    assert other["started_at"] - other["queued_at"] < 1
+
+
 # Room, speed, memory
+
+
+@pytest.mark.parametrize(("words", "most"), [(["--ttl", "60"], 1_000_000), ([], 0)])
+def test_no_more_is_read_than_is_kept(scripted: Talk, words: list[str], most: int) -> None:
+    client = Forked(["say", "--lines", *words], scripted.env, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    assert client.stdin
+    pipe = client.stdin.fileno()
+    os.write(pipe, ENDLESS.encode())
+    os.set_blocking(pipe, False)
+    room, written = poll(), 0
+    room.register(pipe, POLLOUT)
+    with client:
+        while room.poll(10_000 if written < most else 500):
+            written += os.write(pipe, b"length=0 line\n" * 1_000)
+            assert written < most + 400_000  # what the pipe holds, and what is read at once, come on top
+        client.kill()
+        client.wait(10)
 
 
 @pytest.mark.parametrize("words", [[], ["--wait"]])
@@ -296,6 +404,7 @@ def test_timeout_is_for_all_lines(scripted: Talk) -> None:
     code, _, err = typing.end()
     assert code == 124
     assert "Talk preempted" in err
+    assert err.splitlines()[-1] == "talk: timed out after 0.5 s"
     assert [scripted.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED"]
     began = time.monotonic()
     silent = Typing(scripted, "say", "--lines", "-w", "-t", "0.2")
@@ -311,12 +420,23 @@ def test_server_that_goes_away(scripted: Talk, words: list[str]) -> None:
     first = typing.line().split()[0]
     scripted.watcher.wait_for_word(first)
     scripted.kill()
-    if not words:
-        typing.type("into the void\n")
-    code, out, err = typing.end() if not words else (typing.client.wait(10), *typing.end()[1:])
-    assert code == (12 if words else 3), err
-    assert ("it may still be spoken" if words else "line 2 may not have been accepted") in err
+    assert typing.client.wait(10) == (12 if words else 3)  # nothing more can be sent, whatever is still to come
+    _, out, err = typing.end()
+    assert "nothing more can be sent to the server" in err
+    assert ("it may still be spoken" in err) == bool(words)
     assert [each for each in out if "LOST" in each] == ([f"{first} LOST"] if words == ["-f"] else [])
+
+
+def test_a_server_that_went_away_while_nothing_was_spoken_is_told_with_the_next_line(scripted: Talk) -> None:
+    typing = Typing(scripted, "say", "--lines")
+    typing.type("\0\n")
+    assert typing.client.stderr
+    assert "line 1" in typing.client.stderr.readline()
+    scripted.kill()
+    typing.type("into the void\n")
+    code, _, err = typing.end()
+    assert code == 5
+    assert "line 2 may not have been accepted" in err
 
 
 def test_no_server_is_told_before_anything_is_read() -> None:
@@ -390,18 +510,3 @@ def test_standard_input_that_cannot_be_read_is_told(scripted: Talk) -> None:
             )
         assert (done.returncode, done.stdout) == (2, b"")
         assert b"standard input cannot be read: Bad file descriptor" in done.stderr
-
-
-def test_a_thread_that_cannot_be_had_is_told_before_anything_is_read(scripted: Talk) -> None:
-    """As where a unit's TasksMax= is reached."""
-    code = (
-        "import sys, threading\n"
-        'def start(_): raise RuntimeError("can\'t start new thread")\n'
-        "threading.Thread.start = start\n"
-        "from talkcli.cli import run\n"
-        "sys.exit(run(['say', '--lines']))"
-    )
-    done = run([sys.executable, "-c", code], scripted.env)
-    assert (done.code, done.out) == (1, ""), done
-    assert "no thread can be started to wait for the goals: see 'free', 'ulimit -u'" in done.err
-    assert scripted.watcher.texts("PENDING") == []

@@ -54,6 +54,7 @@ def busy(talk: Talk) -> str:
         (["--lines", "-"], ["--lines", "TEXT"]),
         (["--lines", "--id", "mine"], ["--lines", "--id"]),
         (["--lines", "--timeout", "3"], ["--timeout", "--wait"]),
+        (["--ahead", "3", "hello"], ["--ahead", "--lines"]),
         ([], ["TEXT"]),
         (["-o", "x.wav"], ["TEXT"]),
         (["-o", "x.wav", "-w", "--key", "k", "hello"], ["--output", "--wait, --key"]),
@@ -255,7 +256,7 @@ def test_who_attached_cancels_nothing(scripted: Talk, feedback: list[str]) -> No
     scripted.watcher.wait_for_word("mine")
     late = scripted.run("say", "--wait", *feedback, "-t", "0.3", "--id", "mine", text)
     assert late.code == 124
-    assert "goes on" in late.err
+    assert late.err == "talk: timed out after 0.3 s: mine goes on: it was sent before\n"
     for number in (signal.SIGINT, signal.SIGTERM):
         attached = scripted.start("say", "--wait", *feedback, "--id", "mine", text)
         assert attached.stdout

@@ -86,6 +86,8 @@ def test_row_10_timeout_cancels_the_goal(scripted: Talk) -> None:
         done = scripted.run("--json", "say", "--wait", "--timeout", "2", "length=10 words=1")
         goal = json.loads(done.out)
         assert (done.code, goal["state"], goal["reason"]) == (124, "PREEMPTED", "canceled")
+        error = {"code": "timeout", "exit": 124, "message": "timed out after 2 s"}
+        assert json.loads(done.err.splitlines()[-1]) == {"error": error}
         assert goal["ended_at"] - began >= 2
         assert_within(goal["ended_at"] - began, 2 + 0.3, "a timeout of 2 s")
         assert_within(done.seconds, 2 + START, "a client with a timeout of 2 s")
@@ -110,6 +112,7 @@ def test_timeout_holds_whatever_the_server_does_not_say(says: bytes) -> None:
         seconds = time.monotonic() - began
     # Nothing was sent to a server that did not greet: that is no server.
     assert done.returncode == (124 if says else 3), done
+    assert ("timed out after 0.5 s: say was sent" in done.stderr) == bool(says)
     assert_within(seconds, 0.5 + 1 + START, "a timeout of 0.5 s")
 
 
