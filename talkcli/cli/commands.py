@@ -91,7 +91,8 @@ _ROWS = (
 
         Prints the goal's id. Without --wait it returns as soon as the goal is accepted. With --wait it owns the
         goal: Ctrl-C, SIGTERM and SIGHUP cancel it, and so does a reader of its output that goes away, as ssh does.
-        With --lines its exit code is that of the first line that did not succeed.
+        With --lines its exit code is that of the first line that did not succeed. With --ttl a line's time counts
+        from when it was read.
         """,
         runs="say:say",
         several="several:say",

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts, give_up_unread, watched_output
-from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_json
+from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.wait import SILENCE, regardless, rest, show_if_possible, timed_out
 from talkcli.client.connect import Interrupted
-from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_SIGPIPE, TalkError, UsageError
+from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.protocol.requests import Pause, Resume, Status, Wait
 from talkcli.terminal.goals import ending, setting_lines
@@ -120,10 +120,10 @@ def _ask(options: Common, request: Request, timeout: float | None = None, name: 
             give_up_output()
         if owns:
             _cancel(asked, interrupts, found)
-        found.end(asked, "not known to be silent" if owns else "not done")
         if late:
-            raise timed_out(timeout)
-        return interrupts.exit_code
+            show_error(timed_out(timeout), json=options.json)
+        found.end(asked, "not known to be silent" if owns else "not done")
+        return EXIT_TIMEOUT if late else interrupts.exit_code
     return interrupts.exit_code
 
 

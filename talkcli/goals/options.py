@@ -120,7 +120,7 @@ OPTIONS = (
     Option(
         "patient",
         FLAG,
-        "where the queue is full, answer when there is room, instead of REJECTED, `queue_full`",
+        "where the queue is full, answer when there is room, instead of REJECTED, `queue_full`; `ttl` counts meanwhile",
         default=False,
     ),
     Option(

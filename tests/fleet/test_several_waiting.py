@@ -91,6 +91,7 @@ def test_what_is_not_done_in_time_is_cancelled_with_124(pair: RealRobots, desk: 
     lines = [["--robot", to, *words, "--id", goal, "hello"] for to, goal in goals.items()]
     for done, goal in zip(at_once(desk, *lines), goals.values(), strict=True):
         assert_told(done, 124, alike(PAIR, goal, "RECALLED", 6), "0 of 2 as asked")
+        assert "talk: timed out after 0.6 s\n" in done.err
         assert states(pair, goal) == ["RECALLED"] * 2
     assert states(pair, "in-front") == ["ACTIVE"] * 2
 
@@ -106,7 +107,7 @@ def test_who_waits_for_what_others_said_leaves_it_alone(pair: RealRobots, desk: 
     told = "talk: not done: wh-1, wh-2\ntalk: 0 of 2 as asked\n"
     assert (done.code, done.out, done.err) == (130, "", told)
     done = desk.finish(late)
-    assert (done.code, done.out, done.err) == (124, "", told)
+    assert (done.code, done.out, done.err) == (124, "", f"talk: timed out after 0.6 s\n{told}")
     assert states(pair, "others") == ["ACTIVE", "ACTIVE"]
 
 

@@ -397,6 +397,6 @@ def test_contributing_names_every_file_that_an_option_goes_through() -> None:
     # On a broker it is a message's expiry, too; no other option is known there.
     having -= {module for module in having if part(module) == "fleet"}
     assert named - having == {"engine.protocol"}  # which is not told
-    # Examples and help of commands; and a sentence that the doctor says, as any client does.
-    assert having - named == {"cli.commands", "doctor.sentence"}
-    assert len(having) <= 7
+    # Examples and help of commands; a sentence that the doctor says, as any client does; and what waits to be queued.
+    assert having - named == {"cli.commands", "doctor.sentence", "cli.stdin", "server.requests"}
+    assert len(having) <= 9
