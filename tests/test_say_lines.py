@@ -303,6 +303,7 @@ def test_no_more_is_read_than_is_kept(scripted: Talk, words: list[str], most: in
         while room.poll(10_000 if written < most else 500):
             written += os.write(pipe, b"length=0 line\n" * 1_000)
             assert written < most + 400_000  # what the pipe holds, and what is read at once, come on top
+        assert written >= most
         client.kill()
         client.wait(10)
 
