@@ -258,7 +258,9 @@ def test_lines_whose_ttl_is_over_while_they_wait_are_dropped(make_talk: MakeTalk
 def test_what_is_left_of_the_ttl_is_sent(scripted: Talk) -> None:
     text = "length=0.5 one\nlength=0 two\nlength=0 three\n"
     done = scripted.run("--json", "say", "--lines", "--ttl", "10", "--ahead", "1", stdin=text)
-    first, second, third = [json.loads(each)["ttl"] for each in done.out.splitlines()]
+    goals = [json.loads(each) for each in done.out.splitlines()]
+    assert [each["state"] for each in goals] == ["PENDING"] * 3  # as they were accepted
+    first, second, third = [each["ttl"] for each in goals]
     assert 10 >= first >= second > third
     assert third <= 9.5
 

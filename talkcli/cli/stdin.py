@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from talkcli.cli.show import Common
     from talkcli.client.client import Client, GoalHandle
     from talkcli.client.connection import Exchange
+    from talkcli.goals.goal import JsonObject
 
     _T = TypeVar("_T")
 
@@ -229,6 +230,8 @@ class _Lines:
         self._sending: int | None = None
         #: what was sent and has not been answered
         self._sent: tuple[GoalHandle, Exchange] | None = None
+        #: the last goal that was answered, as the server took it
+        self._accepted = Goal("", State.PENDING)
         #: goals that have not ended, in the order of their lines; with --wait, until they were told of
         self._goals: deque[tuple[int, GoalHandle]] = deque()
         #: since when there is something to hear from the server (monotonic)
@@ -331,7 +334,12 @@ class _Lines:
             return
         if not self._goals:
             self._since = time.monotonic()
-        self._sent = handle, self._connection.begin(request, accepted)
+
+        def on_reply(reply: JsonObject, items: list[JsonObject]) -> None:
+            accepted(reply, items)
+            self._accepted = handle.goal  # the handle may hear of the goal's end before this is told
+
+        self._sent = handle, self._connection.begin(request, on_reply)
 
     def _take_answer(self) -> None:
         """Take up the server's answer to what was sent last, if it has come or can't come any more."""
@@ -348,7 +356,7 @@ class _Lines:
         self._tell(introduce, handle, pause_is_known=self._told_of_pause)
         self._told_of_pause = handle.speech_paused
         if not self._wait:
-            self._tell(report, handle.goal)
+            self._tell(report, self._accepted)
         elif not self._goals:
             self._shown.begin([handle.goal])
         self._goals.append((number, handle))
