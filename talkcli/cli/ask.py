@@ -86,8 +86,12 @@ def voices(options: Common, language: str | None) -> None:
     with options.connect() as client:
         found = every = client.voices()
     if language:
-        wanted = language.lower()
-        found = [each for each in every if _language(each) == wanted or _language(each).startswith(f"{wanted}-")]
+        from talkcli.engine.protocol import Voice
+        from talkcli.engine.synthesizers.voices import languages
+
+        listed = [Voice(str(each.get("id")), _language(each), str(each.get("name"))) for each in every]
+        wanted = languages(language, listed)
+        found = [each for each in every if _language(each) in wanted]
         if not found:
             raise TalkError(_no_voice(language, every))
     show_found(options, found, lambda: voice_lines(found))

@@ -291,11 +291,13 @@ _ROWS = (
         name="voices",
         summary="List the voices.",
         about="""
-        List the voices of the server's engine: id, language, name. Any of the three can be given as a voice.
+        List the voices of the server's engine: id, language, name. Any of the three can be given as a voice, and so can
+        a locale or a language in English: de_DE, german.
 
-        Behind the voices are variants: each goes behind any of them. Neural voices come last, and are given by their id
-        alone, as far as it takes to tell one from the others; where one has several speakers, a number or a name goes
-        behind: "piper/NAME#3". Where the server speaks with a neural voice, that one's language means it, too.
+        Behind the voices are variants: each goes behind any of them. Neural voices come last, and are given by as much
+        of their id as it takes to tell one from the others: "joe" is enough for "piper/en_US-joe-medium". If one has
+        several speakers, a number or a name goes behind: "piper/NAME#3". Where the server speaks with a neural voice,
+        that one's language means it, too.
         """,
         runs="ask:voices",
         examples="""
@@ -304,7 +306,9 @@ _ROWS = (
         talk say --voice en-us+f3 "a variant"
         """,
         exit_codes={**ASKING, 0: "listed", 1: "no voice speaks that language, or the engine can't list them"},
-        options=(option("--language", TEXT, "Only this language, with its variants: en, pt-br.", metavar="CODE"),),
+        options=(
+            option("--language", TEXT, "Only this language, with its variants: en, pt-BR, german.", metavar="LANGUAGE"),
+        ),
     ),
     Command(
         name="doctor",

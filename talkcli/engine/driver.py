@@ -187,8 +187,8 @@ class Settings:
 
     def _driver_id(self, wanted: str) -> str:
         found = find_voice(wanted, self._voices)
-        if found is not None and is_neural(wanted) and model_of(wanted) != model_of(found.id):
-            found = None  # a beginning: another voice may have been put there since that it means
+        if found is not None and is_neural(found.id) and model_of(wanted) != model_of(found.id):
+            found = None  # a part of its name: another voice may have been put there since that it means
         if found is None:  # not each time: it takes some milliseconds, and what is new is seldom asked for
             self._voices = list_voices(self._engine)
             found = find_voice(wanted, self._voices)

@@ -223,12 +223,14 @@ def _speak_into(conversation: Conversation, name: str, path: str, says: Iterator
     """Speak all pieces, and return the seconds of audio. What the engine calls `name` is `path` to the user."""
     seconds = 0.0
     silent = None
+    by = ""
     try:
         with conversation as engine:
             began = engine.until(protocol.Ready)
             if began.player is None:
                 raise UsageError(f'the driver "{began.driver}" cannot write a file: leave --driver out, on Linux')
             for say in says:
+                by = "" if say.voice is None else f' while it spoke with the voice "{say.voice}"'
                 engine.say(say)
                 ended = engine.until(protocol.Ended)
                 if ended.outcome == protocol.COMPLETED and ended.duration is not None:
@@ -239,7 +241,7 @@ def _speak_into(conversation: Conversation, name: str, path: str, says: Iterator
                     raise _failure(ended, name, path)
     except EngineFailed as error:
         crashed = error.reason == "engine_crashed"
-        raise RenderFailed(error.reason, f"the engine crashed: {error}" if crashed else str(error)) from error
+        raise RenderFailed(error.reason, f"the engine crashed{by}: {error}" if crashed else f"{error}{by}") from error
     except TimeoutError:
         raise TimeoutError("the text was not rendered in time") from None
     if silent and not seconds:

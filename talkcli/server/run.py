@@ -184,13 +184,14 @@ class Server:
 
         A neural one is no part of its start: it is loaded beside the speech, and what is wrong with it costs nothing.
         """
-        voice, voices = self._settings.goals.voice, self.speech.voices
+        voices = self.speech.voices
+        voice = voices.meant(self._settings.goals.voice)
         if voice is None or not is_neural(voice):
             return voice
         fault = voices.fault(voice)
         if fault:
             raise UsageError(fault[1])
-        self._scheduler.settings = replace(self._scheduler.settings, voice=voices.meant(voice))
+        self._scheduler.settings = replace(self._scheduler.settings, voice=voice)
         return None
 
     def _look_after_socket(self) -> None:

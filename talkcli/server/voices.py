@@ -85,26 +85,34 @@ class Voices:
         """
         if voice is None or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice)):
             return None
-        voices = self._known(voice)
-        found = find_voice(voice, voices, usual)
+        found = self._find(voice, usual)
         if found is None:
-            return "unknown_voice", unknown_voice(voice, voices, self._foreign)
-        lacking = self._lacking(found.id) if is_neural(voice) else None
+            return "unknown_voice", unknown_voice(voice, self._known(voice), self._foreign)
+        lacking = self._lacking(found.id) if is_neural(found.id) else None
         return ("unknown_voice", f"the voice {voice[:60]} cannot be spoken: {lacking}") if lacking else None
 
     def meant(self, voice: str | None, usual: str | None = None) -> str | None:
         """Return a voice as it was asked for, a neural one by its id; `usual`: the one that the server speaks with."""
-        if not voice or voice == DEFAULT_VOICE or not (is_neural(voice) or is_neural(usual or "")):
+        if not voice or voice == DEFAULT_VOICE:
             return voice
-        found = find_voice(voice, self._known(voice), usual)
+        found = self._find(voice, usual)
         return found.id if found and is_neural(found.id) else voice
+
+    def _find(self, voice: str, usual: str | None) -> Voice | None:
+        found = find_voice(voice, self._known(voice), usual)
+        if self.listed and not is_neural(voice) and (found is None or (is_neural(found.id) and found.id != usual)):
+            self.look_for_files()
+            found = find_voice(voice, self.listed, usual)
+        return found
 
     def _known(self, voice: str) -> tuple[Voice, ...]:
         """Return the voices that one may be meant of: of neural ones those whose files are there now."""
-        if not is_neural(voice):
-            return self.listed or self._files()
+        if self.listed and not is_neural(voice):
+            return self.listed
         if self._foreign is not None:
             return ()
+        if not is_neural(voice):
+            return self._files()  # with their languages
         from talkcli.engine.synthesizers import models
 
         return tuple(Voice(NEURAL + name, None, name) for name in models.found())

@@ -407,12 +407,12 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path) -> None:
         (
             "import os; from talkcli.engine import session; session.Session._say = lambda *_: os.abort()",
             "engine_crashed",
-            "the engine crashed: it was killed by SIGABRT",
+            'the engine crashed while it spoke with the voice "en-us": it was killed by SIGABRT',
         ),
         (
             "import time; from talkcli.engine import session; session.Session._say = lambda *_: time.sleep(60)",
             "engine_hung",
-            "the engine gave no sign of life for 0.5 s",
+            'the engine gave no sign of life for 0.5 s while it spoke with the voice "en-us"',
         ),
     ],
 )
@@ -426,7 +426,7 @@ def test_an_engine_that_is_of_no_use_is_told_and_killed(
     )
     monkeypatch.setattr(process, "START_LIMIT", 0.3 if reason == "engine_failed" else 10)
     monkeypatch.setattr(process, "HANG_AFTER", 0.5)
-    error = failed("yes", tmp_path / "x.wav")
+    error = failed("yes", tmp_path / "x.wav", voice="en-us")
     assert error.code == reason
     assert words in str(error)
 

