@@ -251,7 +251,7 @@ OPTIONS = (
         setting=Setting(
             None,
             none=DEFAULT_VOICE,
-            to_set="Voice by id, name or language (en_US, german, joe): see 'talk voices'; 'default' is the engine's own.",
+            to_set="Voice by id, name or language (de_DE, german): see 'talk voices'; 'default' is the engine's own.",
             told="voice {}",
             told_none="voice the driver's own",
         ),
