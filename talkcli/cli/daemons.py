@@ -58,7 +58,7 @@ _SERVE = (
     option(
         "--voice-memory",
         INTEGER,
-        "Megabytes of neural voices that are kept loaded; past it those used least are dropped.",
+        "Megabytes of memory that neural voices may take; past it those not used for longest are dropped.",
         default=300,
         limits=(0, 100_000),
         metavar="MB",

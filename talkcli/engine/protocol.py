@@ -131,10 +131,16 @@ class Followed:
 
 @frozen
 class Load:
-    """Load a neural voice beside what is spoken; `Loaded` comes once for each. Voices by ids without a speaker."""
+    """Load a neural voice beside what is spoken; `Loaded` comes once for each."""
 
-    voice: str
-    drop: tuple[str, ...] = ()  # those that make room for it
+    voice: str  # its id, without a speaker
+
+
+@frozen
+class Drop:
+    """Keep a neural voice no longer; one that speaks is kept until it has spoken. `Grown` comes if that is known."""
+
+    voice: str  # its id, without a speaker
 
 
 @frozen
@@ -190,6 +196,14 @@ class Unloaded:
     """A neural voice is not loaded any more: its files are others than they were."""
 
     voice: str  # its id, without a speaker
+
+
+@frozen
+class Grown:
+    """The process has another size than was told; before `Loaded`, and after sentences and `Drop`."""
+
+    voice: str  # what it is due to: the voice that was loaded or has spoken, by its id without a speaker; "" for `Drop`
+    memory: int  # bytes by which the process has grown since before its first neural voice
 
 
 @frozen
@@ -259,8 +273,10 @@ class Ended:
     player: str | None = None  # what took the sound, where no player is named
 
 
-Command = Configure | Say | Stop | Pause | Resume | Followed | Load
-Event = Ready | StartFailed | Voices | Loaded | Unloaded | Started | Alive | Word | Output | Speaks | Paused | Ended
+Command = Configure | Say | Stop | Pause | Resume | Followed | Load | Drop
+Event = (
+    Ready | StartFailed | Voices | Loaded | Unloaded | Grown | Started | Alive | Word | Output | Speaks | Paused | Ended
+)
 #: The events that belong to a goal, by its `id`.
 OF_A_GOAL = (Started, Alive, Word, Output, Speaks, Paused, Ended)
 

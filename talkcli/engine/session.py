@@ -219,9 +219,9 @@ class Session:
     def _carry_out_now(self, command: Command) -> None:
         """Carry out what concerns the goal in hand; the rest has to wait."""
         goal = self._goal
-        if isinstance(command, protocol.Load):
+        if isinstance(command, (protocol.Load, protocol.Drop)):
             if self._synthesizer is not None:
-                self._synthesizer.begin(command.voice, command.drop)
+                self._synthesizer.obey(command)
         elif goal is None or not isinstance(command, _OF_THE_GOAL):
             self._backlog.append(command)
         elif goal.id != command.id:

@@ -193,8 +193,14 @@ class Supervisor:
             process.send(protocol.Followed(goal_id, followed, by_neural))
 
     def load(self, voice: str, drop: tuple[str, ...] = ()) -> None:
-        """Have the process load a neural voice, as `protocol.Load`; `Loaded` is posted if it lives so long."""
-        self._inbox.call(lambda: self._load(protocol.Load(voice, drop)))
+        """Have the process drop neural voices and load one; `Loaded` is posted if it lives so long."""
+        for each in drop:
+            self.drop(each)
+        self._inbox.call(lambda: self._load(protocol.Load(voice)))
+
+    def drop(self, voice: str) -> None:
+        """Have the process keep a neural voice no longer."""
+        self._inbox.call(lambda: self._order(protocol.Drop(voice)))
 
     def give_up(self, goal_id: str) -> None:
         """Let go of a goal that didn't end in time: its process is left behind, there will be no `Ended`."""
@@ -304,8 +310,11 @@ class Supervisor:
     def _load(self, load: protocol.Load) -> None:
         if self._process and self._process.ready:  # else another will be, of which it is wanted anew
             self._loading, self._load_heard_at = load.voice, time.monotonic()
-            if not self._process.send(load):
-                self._refused(self._process)
+            self._order(load)
+
+    def _order(self, order: protocol.Load | protocol.Drop) -> None:
+        if self._process and self._process.ready and not self._process.send(order):
+            self._refused(self._process)
 
     def _refused(self, process: EngineProcess) -> None:
         self._hear(process)  # where it is dead, it is known how it died

@@ -112,6 +112,7 @@ class Speech:
             protocol.Voices: self._voices_known,
             protocol.Loaded: self._loaded,
             protocol.Unloaded: self._unloaded,
+            protocol.Grown: self._grown,
             protocol.Speaks: self._speaks,
             protocol.Word: self._word,
             protocol.Output: self._output,
@@ -195,7 +196,26 @@ class Speech:
         self.voices.warm = self.voices.warm or loaded.seconds > 0
         self.voices.loaded(loaded.voice, loaded.error, elapsed())
         self.scheduler.loading.end(loaded.voice)
+        self._drop_excess()
         self.apply(self.scheduler.tick(self._now()))
+
+    def _grown(self, grown: protocol.Grown) -> None:
+        self.voices.grown(grown.voice, grown.memory)
+        self._drop_excess()
+        self._load_next()
+
+    def _drop_excess(self) -> None:
+        """Have the engine drop voices, if they take more memory than they may; warn if one takes too much alone."""
+        active, needed = self.scheduler.active, self._needed()
+        first = model_of(active.voice or self._asked(active)) if active else next(iter(needed), "")
+        for each in self.voices.excess(first, needed):
+            log.line(f"voice {log.shown(each)} dropped: the voices take more than --voice-memory allows")
+            if each in self.voices.neural:
+                self.scheduler.loading.wait_for(each)
+            self.engine.drop(each)
+        words = self.voices.too_large()
+        if words:
+            log.line(log.shown(words))
 
     def _unloaded(self, unloaded: protocol.Unloaded) -> None:
         self.voices.unloaded(unloaded.voice, self._needed())

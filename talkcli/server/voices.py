@@ -42,7 +42,7 @@ class Readiness(Enum):
 class Neural:
     """A neural voice that was asked for."""
 
-    #: bytes of its file; it takes as many in memory, and some more
+    #: bytes that it takes in memory, as the engine has measured them; until it has, those of its file
     size: int
     state: Readiness = Readiness.WAITING
     #: why it can't be had, for people
@@ -65,8 +65,11 @@ class Voices:
     """The voices of one server."""
 
     def __init__(self, memory: int) -> None:
-        """`memory`: bytes of neural voices that are kept loaded, beside the one that speaks."""
+        """`memory`: bytes that neural voices may take in the engine, unless the one that speaks takes more alone."""
         self._memory = memory
+        #: bytes by which the engine process has grown by its voices, and what each of them took when it was loaded last
+        self._grown = 0
+        self._measured: dict[str, int] = {}
         #: all that the engine lists; None before it has
         self.listed: tuple[Voice, ...] | None = None
         #: the driver that speaks; None for the usual one, before it is known
@@ -150,7 +153,7 @@ class Voices:
 
     def want(self, voice: str, now: float) -> Readiness:
         """Take note that a neural voice is asked for, and return how it is."""
-        found = self.neural.pop(voice, None) or Neural(self._size(voice))
+        found = self.neural.pop(voice, None) or self._new(voice)
         self.neural[voice] = found
         if found.state is Readiness.FAILED and voice != self._loading and now >= found.again_at:
             found.wanted = True
@@ -192,12 +195,58 @@ class Voices:
         """Take note of what came of loading a voice; `error`: why it can't be had."""
         if voice == self._loading:  # one that a goal insists on is loaded by the engine itself
             self._loading = None
-        found = self.neural.setdefault(voice, Neural(self._size(voice)))
+        found = self.neural.setdefault(voice, self._new(voice))
         found.wanted = False
         if error is None:
             found.state, found.why, found.failures = Readiness.LOADED, None, 0
         else:
             found.fail(error, now)
+
+    def grown(self, voice: str, memory: int) -> None:
+        """Take note of the bytes by which the engine has grown by its voices, the last of them by this one.
+
+        `voice`: the one that has been loaded or has spoken; "" if one was dropped.
+        """
+        found, more = self.neural.get(voice), memory - self._grown
+        self._grown = memory
+        if found:
+            found.size = max(0, found.size + more if found.state is Readiness.LOADED else more)
+            self._measured[voice] = found.size
+
+    def excess(self, first: str, needed: Sequence[str]) -> tuple[str, ...]:
+        """Return what has to be dropped now, as voices take more than was known when they were loaded.
+
+        `first`: the voice that speaks, or will next; it is kept. `needed`: as in `next`; these are dropped last.
+        """
+        loaded = self._loaded()
+        order = [each for each in loaded if each not in needed]
+        order += [each for each in reversed(needed) if each in loaded]
+        drop: list[str] = []
+        total = self._rest() + sum(loaded.values())
+        for each in order:
+            if total > self._memory and each != first and len(drop) < len(loaded) - 1:
+                total -= loaded[each]
+                drop.append(each)
+        for each in drop:
+            self.unloaded(each, needed)
+        return tuple(drop)
+
+    def too_large(self) -> str | None:
+        """Return the words about a voice that takes more than all may, if that is not known; it is spoken with."""
+        loaded = self._loaded()
+        voice = next(iter(loaded), "")
+        taken = self._rest() + sum(loaded.values())
+        if len(loaded) != 1 or not 0 < self._memory < taken or self.neural[voice].why:
+            return None
+        self.neural[voice].why = f"it takes {taken / 1e6:.0f} MB, more than --voice-memory {self._memory / 1e6:.0f}"
+        return f"voice {voice}: {self.neural[voice].why}"
+
+    def _loaded(self) -> dict[str, int]:
+        return {voice: each.size for voice, each in self.neural.items() if each.state is Readiness.LOADED}
+
+    def _rest(self) -> int:
+        """Return the bytes that the engine has grown by beside what each of its voices is known to take."""
+        return max(0, self._grown - sum(self._loaded().values()))
 
     def unloaded(self, voice: str, needed: Sequence[str]) -> None:
         """Take note that a voice is loaded no more; it is to be again where it is needed."""
@@ -211,6 +260,7 @@ class Voices:
         Return it where it is taken for the cause from now on.
         """
         at, self._loading, self.warm = self._loading, None, False
+        self._grown = 0
         for voice, found in list(self.neural.items()):
             if voice == at and found.failures + 1 >= DEATHS:
                 found.fail("the engine process ended while it was being loaded", now)
@@ -233,14 +283,10 @@ class Voices:
 
     def _make_room(self, size: int, keep: Collection[str]) -> tuple[str, ...] | None:
         """Return what has to be dropped for so many bytes in all, the least asked for first; None if that won't do."""
-        others = [
-            (voice, each.size)
-            for voice, each in self.neural.items()
-            if each.state is Readiness.LOADED and voice not in keep
-        ]
-        total = size + sum(each for _, each in others)
+        others = {voice: each for voice, each in self._loaded().items() if voice not in keep}
+        total = size + self._rest() + sum(others.values())
         drop = []
-        for voice, each in others:
+        for voice, each in others.items():
             if total > self._memory:
                 total -= each
                 drop.append(voice)
@@ -252,6 +298,9 @@ class Voices:
                 found.wanted = False
                 if found.state is Readiness.WAITING:
                     del self.neural[voice]
+
+    def _new(self, voice: str) -> Neural:
+        return Neural(self._measured.get(voice) or self._size(voice))
 
     @staticmethod
     def _size(voice: str) -> int:

@@ -560,7 +560,7 @@ def test_the_json_of_a_voice_is_read_again_with_each_load(place: Path) -> None:
         assert engine.spoken("a", "g1", voice=VOICE).outcome == protocol.COMPLETED
         (place / "tiny.onnx.json").write_text(json.dumps({"audio": {}}))
         assert engine.spoken("a", "g2", voice=VOICE).outcome == protocol.COMPLETED
-        engine.send(protocol.Load("piper/other", (VOICE,)))
+        engine.send(protocol.Drop(VOICE))
         assert "does not describe a voice" in _failed(engine.spoken("a", "g3", voice=VOICE))
 
 
@@ -651,13 +651,38 @@ def test_a_voice_that_fails_before_anything_is_heard_is_no_reason_for_silence(
 def test_one_is_dropped_that_is_to_make_room(place: Path) -> None:
     tiny_voice.put(place, "second")
     with _engine(place) as engine:
-        for load in (protocol.Load(VOICE), protocol.Load("piper/second", (VOICE,))):
-            engine.send(load)
+        for voice in (VOICE, "piper/second"):
+            engine.send(protocol.Load(voice))
             assert engine.until(protocol.Loaded).error is None
+        engine.send(protocol.Drop(VOICE))
         assert engine.spoken("a", "g1", voice=VOICE, voice_only=False).outcome == protocol.COMPLETED
         assert _speaks(engine, "g1") == [("gmw/en-US", f"{VOICE} is not loaded")]
         assert engine.spoken("a", "g2", voice="piper/second", voice_only=False).outcome == protocol.COMPLETED
         assert _speaks(engine, "g2") == [("piper/second", None)]
+
+
+def test_the_growth_of_the_process_by_each_voice_is_told_and_what_is_dropped_is_given_back(place: Path) -> None:
+    heavy = """
+from talkcli.engine.synthesizers import inference
+init, kept = inference.Model.__init__, []
+def heavier(self, *rest):
+    init(self, *rest)
+    self.ballast = [b"x" * 60_000 for _ in range(700)]
+    kept.append(b"y" * 1000)  # behind them, so that the C library keeps what is free before it
+inference.Model.__init__ = heavier
+"""
+    tiny_voice.put(place, "second")
+    with _engine(place, before=heavy) as engine:
+        for voice in (VOICE, "piper/second"):
+            engine.send(protocol.Load(voice))
+            assert engine.until(protocol.Grown).voice == voice
+            assert engine.until(protocol.Loaded).error is None
+        engine.send(protocol.Drop("piper/second"))
+        assert engine.until(protocol.Grown).voice == ""
+        sizes = [each.memory for each in engine.events if isinstance(each, protocol.Grown)]
+    assert sizes[0] > 42e6
+    assert sizes[1] - sizes[0] > 40e6
+    assert sizes[1] - sizes[2] > 40e6
 
 
 def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path) -> None:

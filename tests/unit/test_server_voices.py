@@ -88,6 +88,74 @@ def test_what_is_larger_than_the_limit_is_loaded_alone() -> None:
     assert voices.next([A]) == (A, ())
 
 
+def test_what_voices_take_counts_as_the_engine_measures_it() -> None:
+    voices = Asked(100)
+    voices.loads(A, B, C)
+    voices.grown(A, 40)
+    voices.grown(B, 80)
+    assert voices.excess(B, [B]) == ()
+    voices.grown(C, 125)
+    assert voices.excess(C, [C]) == (A,)
+    assert voices.states() == {B: "loaded", C: "loaded"}
+    voices.grown("", 85)
+    assert voices.excess(C, [C]) == ()
+    voices.wants(A)
+    assert voices.next([A]) == (A, (B,)), "what it took is remembered"
+    voices.grown(A, 86)
+    voices.loaded(A, None, 0.0)
+    voices.engine_lost(0.0)
+    voices.wants(D, B)
+    assert voices.next([D, B]) == (D, ())
+
+
+def test_what_the_engine_did_not_get_back_counts_too() -> None:
+    voices = Asked(100)
+    voices.loads(A, B)
+    voices.grown(A, 30)
+    voices.grown(B, 60)
+    voices.unloaded(A, [])
+    voices.grown("", 58)
+    voices.wants(C)
+    voices.neural[C].size = 50
+    assert voices.next([B, C]) is None, "28 + 30 + 50"
+
+
+@pytest.mark.parametrize(
+    ("first", "needed", "dropped", "states"),
+    [
+        ("", [], (A, B), {C: "loaded"}),
+        (A, [], (B, C), {A: "loaded"}),
+        (A, [C, B], (B, C), {A: "loaded", B: "waiting", C: "waiting"}),
+        (C, [C, A], (B, A), {C: "loaded", A: "waiting"}),
+    ],
+)
+def test_the_voice_that_is_needed_last_is_dropped_first(
+    first: str, needed: list[str], dropped: tuple[str, ...], states: dict[str, str]
+) -> None:
+    voices = Asked(50)
+    voices.loads(A, B, C)
+    for number, each in enumerate((A, B, C), 1):
+        voices.grown(each, 60 * number)
+    assert voices.excess(first, needed) == dropped
+    assert voices.states() == states
+
+
+def test_a_voice_that_is_too_large_alone_stays_and_that_is_told_once() -> None:
+    voices = Asked(100_000_000)
+    voices.loads(A)
+    voices.grown(A, 99_000_000)
+    assert voices.too_large() is None
+    voices.grown(A, 120_000_000)
+    assert voices.excess(A, [A]) == ()
+    why = "it takes 120 MB, more than --voice-memory 100"
+    assert voices.too_large() == f"voice {A}: {why}"
+    assert voices.too_large() is None
+    assert voices.to_json() == {A: {"state": "loaded", "why": why}}
+    alone = Asked(0)
+    alone.loads(A)
+    assert alone.too_large() is None, "who allows 0 wants one at a time"
+
+
 def test_one_that_fails_is_tried_again_where_it_is_asked_for_later_and_later() -> None:
     voices = Asked()
     now, waited = 100.0, []

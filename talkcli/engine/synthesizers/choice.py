@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import traceback
 
+from talkcli.engine import protocol
 from talkcli.engine.players.base import CannotSpeak, Stopped
 from talkcli.engine.synthesizers.base import Sound
 from talkcli.engine.synthesizers.voices import is_neural
 from talkcli.frozen import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from talkcli.engine.protocol import Loaded, Unloaded, Voice
+    from talkcli.engine.protocol import Drop, Grown, Load, Loaded, Unloaded, Voice
     from talkcli.engine.synthesizers.base import Output, Synthesizer
     from talkcli.engine.synthesizers.espeak import Espeak
     from talkcli.engine.synthesizers.piper import Piper
@@ -83,14 +82,12 @@ class Choice:
         """The monotonic time at which the voice that is being loaded is given up."""
         return self._piper().loader.due
 
-    def begin(self, voice: str, drop: Iterable[str]) -> None:
-        """Load a neural voice, by its id without a speaker, beside what is spoken; before that drop others."""
+    def obey(self, command: Load | Drop) -> None:
+        """Load a neural voice beside what is spoken, or keep it no longer."""
         loader = self._piper().loader
-        for each in drop:
-            loader.drop(each)
-        loader.begin(voice)
+        (loader.drop if isinstance(command, protocol.Drop) else loader.begin)(command.voice)
 
-    def news(self) -> list[Loaded | Unloaded]:
+    def news(self) -> list[Loaded | Unloaded | Grown]:
         """Return what became of neural voices since this was asked last; never waits."""
         return self._neural.loader.news() if self._neural else []
 

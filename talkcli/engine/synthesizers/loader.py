@@ -13,8 +13,8 @@ import traceback
 from collections import deque
 
 from talkcli import install
-from talkcli.engine.protocol import LOAD_LIMIT, Loaded, Unloaded
-from talkcli.engine.synthesizers import models
+from talkcli.engine.protocol import LOAD_LIMIT, Grown, Loaded, Unloaded
+from talkcli.engine.synthesizers import memory, models
 from talkcli.engine.synthesizers.cache import Cache
 from talkcli.engine.synthesizers.inference import Model, load_libraries
 from talkcli.engine.synthesizers.models import BadFile
@@ -25,6 +25,10 @@ from talkcli.paths import cache_directory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+#: Bytes by which the process must have grown with its sentences until what they freed is given back and it is measured:
+#: the next sentence has to get back what it needs of that.
+GROWTH_BYTES = 16_000_000
 
 
 @frozen
@@ -50,7 +54,12 @@ class Loader:
         self._suspect: set[str] = set()
         #: why the last attempt to load a voice failed
         self._errors: dict[str, str] = {}
-        self._news: list[Loaded | Unloaded] = []
+        self._news: list[Loaded | Unloaded | Grown] = []
+        #: the process's own bytes before the first load, and by how many it had grown when that was told last
+        self._at_first: int | None = None
+        self._grown = 0
+        #: the voice that has spoken since the process was measured, "" for one that was dropped; None for none
+        self._unmeasured: str | None = None
 
     @property
     def descriptor(self) -> int | None:
@@ -64,7 +73,8 @@ class Loader:
 
     def drop(self, voice: str) -> None:
         """Keep a voice no longer; one that speaks is there until it has spoken."""
-        self._models.pop(voice, None)
+        if self._models.pop(voice, None):
+            self._unmeasured = ""
         self._suspect.discard(voice)
 
     def begin(self, voice: str) -> None:
@@ -94,9 +104,15 @@ class Loader:
         """Take note that a voice that is loaded could not be spoken with: it is dropped once its files are others."""
         self._suspect.add(voice)
 
-    def news(self) -> list[Loaded | Unloaded]:
+    def spoken(self, voice: str) -> None:
+        """Take note that a voice has spoken: the first sentences need memory that is kept."""
+        self._unmeasured = self._unmeasured or voice
+
+    def news(self) -> list[Loaded | Unloaded | Grown]:
         """Return what became of voices since this was asked last."""
         self._look()
+        if self._unmeasured is not None:
+            self._measure(self._unmeasured, least=GROWTH_BYTES)
         news, self._news = self._news, []
         return news
 
@@ -120,10 +136,21 @@ class Loader:
             self._end(voice, self._took(), f"{voice} cannot be loaded: {type(error).__name__}: {error}")
         else:
             self._models[voice] = made
+            self._measure(voice)
             self._news.append(Loaded(voice, self._took()))
         work.close()
         self._work = None
         self._go_on()
+
+    def _measure(self, voice: str, least: int = 0) -> None:
+        """Tell by how much the process has grown; for a voice that has spoken only from so many bytes more on."""
+        self._unmeasured = None
+        before, now = self._at_first, memory.own_bytes()
+        if before is None or now is None or (voice and least and now - before - self._grown < least):
+            return
+        memory.give_back()
+        self._grown = max(0, (memory.own_bytes() or now) - before)
+        self._news.append(Grown(voice, self._grown))
 
     def _took(self) -> float:
         return round(time.monotonic() - self._began, 3)
@@ -143,6 +170,8 @@ class Loader:
             self._end(self._voice, 0.0, str(error))
             self._go_on()
             return
+        if self._at_first is None:
+            self._at_first = memory.own_bytes()
         self._work = Work(_load(path), room=1)
 
 

@@ -180,6 +180,7 @@ class Piper:
         finally:
             run.end()
             work.close()
+            self.loader.spoken(self._model_id)
 
 
 def _made(model: Model, spelled: Iterator[Piece], speaker: int, sound: Sound, run: Run) -> Iterator[Made]:
