@@ -137,7 +137,7 @@ def test_one_that_cannot_be_spoken_with_says_why_and_what_to_do(
 def test_without_the_extra_it_says_what_to_install(home: str, tmp_path: Path, used: bool) -> None:
     tiny_voice.put(Path(home) / "v", "tiny")
     env = _environment(home, tmp_path, WITHOUT.format(names=["onnxruntime"]))
-    found = doctor({**env, **({"TALK_VOICE": "piper/tiny"} if used else {})})
+    found = doctor({**env, **({"TALK_VOICE": "tiny"} if used else {})})
     step = install.neural()
     assert found["neural"] == {
         "check": "neural",

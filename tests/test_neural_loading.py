@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import time
 from typing import TYPE_CHECKING
@@ -30,7 +31,7 @@ TINY, BROKEN = "piper/tiny", "piper/broken"
 INSTEAD = "gmw/en-US"
 #: Seconds in which anything here must have happened.
 LIMIT = 20.0
-#: Runs first in each Python process: no model is loaded as long as a file is there.
+#: Runs first in each Python process: no model is loaded as long as a file is there, and each may take more memory.
 SITE = """
 import importlib.abc, importlib.util, os, sys, time
 class Held(importlib.abc.MetaPathFinder):
@@ -47,6 +48,7 @@ class Held(importlib.abc.MetaPathFinder):
                 while os.path.exists(os.environ["HOLD"]):
                     time.sleep(0.01)
                 init(model, path, *rest)
+                model.ballast = b"x" * int(os.environ.get("BALLAST_BYTES", 0))
             module.Model.__init__ = held
         spec.loader.exec_module = executed
         return spec
@@ -263,6 +265,25 @@ def test_two_voices_that_there_is_no_room_for_together_speak_in_turn(env: dict[s
         goals = [robot.say(voice=each) for each in (TINY, "piper/second") * 3]
         assert [robot.heard(each) for each in goals] == [("SUCCEEDED", TINY), ("SUCCEEDED", "piper/second")] * 3
         assert "voice piper/tiny dropped, to make room" in robot.server.log
+
+
+def test_what_voices_take_in_memory_counts_and_not_their_files(env: dict[str, str], tmp_path: Path) -> None:
+    tiny_voice.put(tmp_path / "voices", "second")
+    env["BALLAST_BYTES"] = "100000000"
+    with _robot(env, "--voice-memory", "180") as robot:
+        assert robot.heard(robot.say()) == ("SUCCEEDED", TINY)
+        assert robot.heard(robot.say(voice="piper/second")) == ("SUCCEEDED", "piper/second")
+        robot.until(lambda: f"voice {TINY} dropped: the voices take more" in robot.server.log)
+        assert (robot.neural(TINY)["state"], robot.neural("piper/second")["why"]) == (None, None)
+        assert robot.heard(robot.say()) == ("SUCCEEDED", TINY)
+
+
+def test_a_voice_that_takes_more_than_all_may_speaks_and_is_told(env: dict[str, str]) -> None:
+    env["BALLAST_BYTES"] = "100000000"
+    with _robot(env, "--voice-memory", "50") as robot:
+        assert robot.heard(robot.say()) == ("SUCCEEDED", TINY)
+        assert re.search(rf"voice {TINY}: it takes 1\d\d MB, more than --voice-memory 50\n", robot.server.log)
+        assert re.search(rf"{TINY} loaded: it takes 1\d\d MB, more than", run([*TALK, "status"], env).out)
 
 
 # -- an engine that dies

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 from talkcli.doctor import machine, sentence, server, sound, voice
 from talkcli.doctor.report import HEARD
 from talkcli.engine.players import PLAYERS, is_silent
-from talkcli.engine.synthesizers import is_own
-from talkcli.engine.synthesizers.voices import is_neural
+from talkcli.engine.synthesizers import is_own, models
+from talkcli.engine.synthesizers.voices import find_voice, is_neural
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
 from talkcli.goals.states import State
@@ -91,7 +91,9 @@ class Examination:
         self, used: str | None, engine: voice.Engine, here: machine.Session, env: Mapping[str, str], *, running: bool
     ) -> Iterator[Finding]:
         """Look at neural voices, where something asks for one, or any is there."""
-        used, told = used if used and is_neural(used) else None, self._server.get("neural_voices")
+        told = self._server.get("neural_voices")
+        if used and not (is_neural(used) or find_voice(used, models.undescribed(env))):
+            used = None
         if not is_own(self._told("driver")) or not (used or told or engine.neural or env.get("TALK_VOICES")):
             return
         from talkcli.doctor import neural

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from talkcli.engine.protocol import Voice
 from talkcli.engine.synthesizers import is_own
 from talkcli.engine.synthesizers.base import UnknownVoice
 from talkcli.engine.synthesizers.voices import NEURAL, find_voice, is_neural, speaker_number, unknown_voice
@@ -20,6 +19,7 @@ from talkcli.goals.options import DEFAULT_VOICE, SPEAKER
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
+    from talkcli.engine.protocol import Voice
     from talkcli.goals.goal import JsonObject
 
 #: Seconds after which a voice that failed may be loaded again, where a goal asks for it: twice as long each time, up to
@@ -67,8 +67,9 @@ class Voices:
     def __init__(self, memory: int) -> None:
         """`memory`: bytes that neural voices may take in the engine, unless the one that speaks takes more alone."""
         self._memory = memory
-        #: bytes by which the engine process has grown by its voices, and what each of them took when it was loaded last
-        self._grown = 0
+        #: bytes by which the engine process has grown by its voices, as it told last, and without those dropped since
+        self._told = self._grown = 0
+        #: what each voice took when it was loaded last
         self._measured: dict[str, int] = {}
         #: all that the engine lists; None before it has
         self.listed: tuple[Voice, ...] | None = None
@@ -118,7 +119,7 @@ class Voices:
             return self._files()  # with their languages
         from talkcli.engine.synthesizers import models
 
-        return tuple(Voice(NEURAL + name, None, name) for name in models.found())
+        return models.undescribed()
 
     @property
     def _foreign(self) -> str | None:
@@ -207,8 +208,8 @@ class Voices:
 
         `voice`: the one that has been loaded or has spoken; "" if one was dropped.
         """
-        found, more = self.neural.get(voice), memory - self._grown
-        self._grown = memory
+        found, more = self.neural.get(voice), memory - self._told
+        self._told = self._grown = memory
         if found:
             found.size = max(0, found.size + more if found.state is Readiness.LOADED else more)
             self._measured[voice] = found.size
@@ -236,7 +237,7 @@ class Voices:
         loaded = self._loaded()
         voice = next(iter(loaded), "")
         taken = self._rest() + sum(loaded.values())
-        if len(loaded) != 1 or not 0 < self._memory < taken or self.neural[voice].why:
+        if self._loading or len(loaded) != 1 or not 0 < self._memory < taken or self.neural[voice].why:
             return None
         self.neural[voice].why = f"it takes {taken / 1e6:.0f} MB, more than --voice-memory {self._memory / 1e6:.0f}"
         return f"voice {voice}: {self.neural[voice].why}"
@@ -251,6 +252,8 @@ class Voices:
     def unloaded(self, voice: str, needed: Sequence[str]) -> None:
         """Take note that a voice is loaded no more; it is to be again where it is needed."""
         found = self.neural.pop(voice, None)
+        if found and found.state is Readiness.LOADED:
+            self._grown = max(0, self._grown - found.size)  # until the engine tells what it got back
         if found and voice in needed:
             self.neural[voice] = Neural(found.size)
 
@@ -260,7 +263,7 @@ class Voices:
         Return it where it is taken for the cause from now on.
         """
         at, self._loading, self.warm = self._loading, None, False
-        self._grown = 0
+        self._told = self._grown = 0
         for voice, found in list(self.neural.items()):
             if voice == at and found.failures + 1 >= DEATHS:
                 found.fail("the engine process ended while it was being loaded", now)

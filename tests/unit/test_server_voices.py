@@ -97,6 +97,7 @@ def test_what_voices_take_counts_as_the_engine_measures_it() -> None:
     voices.grown(C, 125)
     assert voices.excess(C, [C]) == (A,)
     assert voices.states() == {B: "loaded", C: "loaded"}
+    assert voices.excess(C, [C]) == (), "the engine has not told yet what it got back"
     voices.grown("", 85)
     assert voices.excess(C, [C]) == ()
     voices.wants(A)

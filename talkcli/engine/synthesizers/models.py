@@ -103,6 +103,11 @@ def voices() -> tuple[Voice, ...]:
     return tuple(_voice(name, path) for name, path in found().items())
 
 
+def undescribed(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
+    """Return the voices that there are by their names alone, without a look into their files."""
+    return tuple(Voice(NEURAL + name, None, name) for name in found(environment))
+
+
 def describe(path: str) -> Description:
     """Read what stands beside a model; BadFile."""
     beside = path + JSON
