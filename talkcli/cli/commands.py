@@ -291,8 +291,9 @@ _ROWS = (
         name="voices",
         summary="List the voices.",
         about="""
-        List the voices of the server's engine: id, language, name. Any of the three can be given as a voice, and so can
-        a locale or a language in English: de_DE, german.
+        List the voices of the server's engine: id, language, name. Any of the three can be given as a voice.
+
+        So can a locale, and a language in English: de_DE, german.
 
         Behind the voices are variants: each goes behind any of them. Neural voices come last, and are given by as much
         of their id as it takes to tell one from the others: "joe" is enough for "piper/en_US-joe-medium". If one has

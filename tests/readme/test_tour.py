@@ -157,7 +157,7 @@ def test_sound(speaking: Talk, shell: Shell) -> None:
     done = shell.run(without_serve("A tour: Sound", speaking))
     assert (done.returncode, done.stderr) == (0, "")
     settings = speaking.request("set")["settings"]
-    assert (settings["rate"], settings["voice"]) == (140, "de")
+    assert (settings["rate"], settings["voice"]) == (140, "german")
     assert "German" in done.stdout
 
 
