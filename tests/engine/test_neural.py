@@ -350,7 +350,7 @@ def test_it_is_held_while_it_is_loaded(place: Path) -> None:
         assert_within(engine.pause(), protocol.STOP_LIMIT, "a pause while the voice is loaded")
         held_until = time.monotonic() + 1.5  # past the loading
         while time.monotonic() < held_until:
-            assert isinstance(engine.event(), protocol.Alive | protocol.Loaded)
+            assert isinstance(engine.event(), protocol.Alive | protocol.Grown | protocol.Loaded)
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
 
@@ -667,8 +667,10 @@ from talkcli.engine.synthesizers import inference
 init, kept = inference.Model.__init__, []
 def heavier(self, *rest):
     init(self, *rest)
-    self.ballast = [b"x" * 60_000 for _ in range(700)]
-    kept.append(b"y" * 1000)  # behind them, so that the C library keeps what is free before it
+    self.ballast = []
+    for _ in range(700):
+        self.ballast.append(b"x" * 60_000)
+        kept.append(bytearray(1000))  # between them, so that the C library keeps what is free
 inference.Model.__init__ = heavier
 """
     tiny_voice.put(place, "second")
@@ -682,7 +684,7 @@ inference.Model.__init__ = heavier
         sizes = [each.memory for each in engine.events if isinstance(each, protocol.Grown)]
     assert sizes[0] > 42e6
     assert sizes[1] - sizes[0] > 40e6
-    assert sizes[1] - sizes[2] > 40e6
+    assert sizes[1] - sizes[2] > 35e6, "of each piece its whole pages"
 
 
 def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path) -> None:
