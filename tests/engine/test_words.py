@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 from typing import TYPE_CHECKING
 
@@ -9,11 +10,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from talkcli.engine.synthesizers import espeak
 from talkcli.engine.words import Words, letters
 from tests.support.reference import Sentence, render_with_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+
+def on_32_bits(kind: type) -> type:
+    """Return a C type as a 32-bit system lays it out, where a pointer has 4 bytes."""
+    if not issubclass(kind, (ctypes.Structure, ctypes.Union)):
+        return ctypes.c_uint32 if kind in (ctypes.c_char_p, ctypes.c_void_p) else kind
+    fields = [(each[0], on_32_bits(each[1])) for each in kind._fields_]
+    return type(kind.__name__, kind.__bases__, {"_fields_": fields})
+
+
+def test_an_event_has_the_size_of_the_librarys_with_pointers_of_4_and_8_bytes() -> None:
+    """The sizes of espeak_EVENT in speak_lib.h. If ours is shorter, all words but the first of a callback are lost."""
+    sizes = [ctypes.sizeof(each) for each in (on_32_bits(espeak._EspeakEvent), espeak._EspeakEvent)]
+    assert sizes == [36, 40 if ctypes.sizeof(ctypes.c_void_p) == 8 else 36]
 
 
 def reported(text: str, places: Iterable[tuple[int, int]]) -> list[str]:

@@ -58,6 +58,36 @@ _VARIANTS, _MBROLA = b"variant", b"mbrola"
 _MBROLA_PLACES = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
 
 
+class _EspeakEventId(ctypes.Union):
+    """The id of an event, which takes 8 bytes even if a pointer has 4."""
+
+    _fields_ = (("number", ctypes.c_int), ("name", ctypes.c_char_p), ("string", ctypes.c_char * 8))
+
+
+class _EspeakEvent(ctypes.Structure):
+    """An `espeak_EVENT` of speak_lib.h.
+
+    The structure in pyttsx3's binding has no `id.string`. On a 32-bit system it is therefore 4 bytes too short, and
+    the second of two events cannot be read.
+    """
+
+    _fields_ = (
+        ("type", ctypes.c_int),
+        ("unique_identifier", ctypes.c_uint),
+        ("text_position", ctypes.c_int),
+        ("length", ctypes.c_int),
+        ("audio_position", ctypes.c_int),
+        ("sample", ctypes.c_int),
+        ("user_data", ctypes.c_void_p),
+        ("id", _EspeakEventId),
+    )
+
+
+def _until_terminator(events: Any) -> Iterator[_EspeakEvent]:
+    """Return the events of one callback; an event of type 0 follows the last one."""
+    return itertools.takewhile(lambda each: each.type, iter(ctypes.cast(events, ctypes.POINTER(_EspeakEvent))))
+
+
 def load() -> tuple[Any, str, int]:
     """Load the system's library where there is one, else the wheel's, and initialise it, once a process.
 
@@ -241,7 +271,7 @@ class Espeak:
         return 0
 
     def _hand_on(self, output: Output, samples: Any, count: int, events: Any) -> None:
-        for event in itertools.takewhile(lambda each: each.type, events):
+        for event in _until_terminator(events):
             if event.type == _EVENT_SAMPLERATE:
                 if event.id.number != self._rate:
                     self._rate = event.id.number
@@ -330,7 +360,7 @@ class Spelling:
     def _on_audio(self, _samples: Any, _count: int, events: Any) -> int:
         if self._over:
             return 1  # ends the synthesis
-        for event in itertools.takewhile(lambda each: each.type, events):
+        for event in _until_terminator(events):
             if event.type == self._espeak.EVENT_WORD and (word := _place(event, self._text)):
                 self._places.append(word)
             elif event.type == self._espeak.EVENT_END:
@@ -338,7 +368,7 @@ class Spelling:
         return 0
 
 
-def _place(event: Any, text: str) -> tuple[int, int] | None:
+def _place(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
     """Return where in the text the word of an event is, and its length there; None if there is none."""
     start = event.text_position - 1
     length = event.length if event.length > 0 else letters(text, start)
