@@ -41,15 +41,16 @@ checkout() {
     git -C "$repository" archive HEAD | tar -x -C "$1"
 }
 
-# README's words, from the README of the checkout in DIR. Each fails where the README says something else by now.
-readme_command() { grep -m 1 -E '^python3 -m venv .*talk serve.*talk say' "$1/README.md"; }
-readme_tests() { grep -m 1 -E '^python3 -m venv .*pytest -n 3$' "$1/README.md"; }
+# The README's words, from the checkout in DIR. Each function fails if the README no longer has them.
+readme_command() { grep -m 1 -E '^python3 -m venv .*talk serve.* say "' "$1/README.md"; }
+readme_tests() { grep -m 1 -E '^python3 -m venv .*pytest -n [0-9]+$' "$1/README.md"; }
 readme_packages() { tr '\n' ' ' < "$1/README.md" | grep -oE 'sudo apt-get [a-z0-9.+ &-]*' | grep -m 1 -w -e "$2"; }
-readme_install() {
-    awk '/^#/ { here = /^### Debian, Ubuntu, Raspberry Pi OS$/ } /^```/ { block = /^```sh$/; next } here && block' \
+# readme_block DIR HEADING: the lines of all shell examples under this heading.
+readme_block() {
+    awk -v heading="$2" '/^#/ && !block { here = $0 == heading } /^```/ { block = /^```sh$/; next } here && block' \
         "$1/README.md" | grep .
 }
-readme_sentence() { readme_command "$1" | grep -oP 'talk say "\K[^"]+'; }
+readme_sentence() { readme_command "$1" | grep -oP ' say "\K[^"]+'; }
 
 # listen DIR: a loudspeaker in DIR, which everybody may use; what comes out of it goes into the file DIR/heard.
 listen() {
@@ -69,13 +70,14 @@ deaf() {
     loudspeaker=
 }
 
-# heard DIR SINCE TEXT WAV: says how long after SINCE the text was heard, and compares it with its rendering.
+# heard DIR SINCE TEXT WAV [HOW]: prints how long after SINCE the text was heard, and compares the sound with WAV.
+# HOW is the command of sound.py, "compare" if not given.
 heard() {
     local first last
     read -r first last < "$1/times"
     printf '== heard "%s": its first sample after %s s, all after %s s\n' \
         "$3" "$(seconds "$2" "$first")" "$(seconds "$2" "$last")" | tee -a "$summary"
-    python3 "$here/sound.py" compare "$1/heard" "$4" | tee -a "$summary"
+    python3 "$here/sound.py" "${5:-compare}" "$1/heard" "$4" | tee -a "$summary"
 }
 
 # asoundrc FIFO: ALSA's settings for a machine whose only device is that loudspeaker.
