@@ -6,6 +6,7 @@ played and nothing between, so two sentences follow each other without a pause.
 
     python3 tests/fresh/sound.py listen FIFO FILE     # until SIGTERM; then the times of the first and last sound
     python3 tests/fresh/sound.py compare FILE WAV     # FILE must begin with all samples of WAV, one by one
+    python3 tests/fresh/sound.py length FILE WAV      # FILE must be as long as WAV: a neural voice is never the same
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ HELD = 4096
 EVERY, BUFFER = 0.01, 0.1
 #: Above this a sample is sound.
 LOUD = 50
+#: Part by which two renderings by a neural voice may differ in length. Those of one sentence differed by up to 0.07.
+LENGTH_TOLERANCE = 0.15
 
 
-def listen(fifo: str, path: str) -> None:
-    """Take samples from the FIFO into the file until SIGTERM; print when the first and the last was heard (epoch)."""
+def listen(fifo: str, path: str) -> str:
+    """Take samples from the FIFO into the file until SIGTERM; return when the first and the last was heard (epoch)."""
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _frame: ended.append(number))
     # For reading and writing: players come and go, and none of them makes an end of file.
@@ -48,7 +51,7 @@ def listen(fifo: str, path: str) -> None:
                 last = time.time()
                 first = first or last
         file.write(_read(source, HELD))  # what the player left in the FIFO when it ended
-    print(f"{first:.2f} {last:.2f}")
+    return f"{first:.2f} {last:.2f}"
 
 
 def _read(source: int, most: int) -> bytes:
@@ -60,6 +63,24 @@ def _read(source: int, most: int) -> bytes:
 
 def compare(path: str, reference: str) -> str:
     """Return what was heard, in words; SystemExit if the file doesn't begin with all the reference's samples."""
+    heard, wanted = _samples(path, reference)
+    seconds = len(wanted) / RATE
+    for place, sample in enumerate(wanted):
+        if place == len(heard) or heard[place] != sample:
+            sys.exit(f"FAILED: of {seconds:.2f} s of sound the first {place / RATE:.2f} s were heard as they should be")
+    return f"{seconds:.2f} s of sound, each of {len(wanted)} samples as it should be"
+
+
+def compare_length(path: str, reference: str) -> str:
+    """Return how long the sound in both files is. SystemExit if the lengths differ by more than the tolerance."""
+    heard, wanted = (_seconds_of_sound(each) for each in _samples(path, reference))
+    if abs(heard - wanted) > LENGTH_TOLERANCE * wanted:
+        sys.exit(f"FAILED: {heard:.2f} s of sound were heard; the sentence has {wanted:.2f} s")
+    return f"{heard:.2f} s of sound, {wanted:.2f} s in another rendering; the samples were not compared"
+
+
+def _samples(path: str, reference: str) -> tuple[array.array[int], array.array[int]]:
+    """Return what was heard and what the WAV file has, each from its first sound on. SystemExit if one is silent."""
     heard = array.array("h")
     with open(path, "rb") as file:
         heard.frombytes(file.read())
@@ -71,21 +92,21 @@ def compare(path: str, reference: str) -> str:
         sys.exit("FAILED: nothing was heard")
     if not wanted:
         sys.exit(f"FAILED: {reference} is silent")
-    seconds = len(wanted) / RATE
-    for place, sample in enumerate(wanted):
-        if place == len(heard) or heard[place] != sample:
-            sys.exit(f"FAILED: of {seconds:.2f} s of sound the first {place / RATE:.2f} s were heard as they should be")
-    return f"{seconds:.2f} s of sound, each of {len(wanted)} samples as it should be"
+    return heard, wanted
+
+
+def _seconds_of_sound(samples: array.array[int]) -> float:
+    loud = [place for place, sample in enumerate(samples) if abs(sample) > LOUD]
+    return (loud[-1] - loud[0]) / RATE if loud else 0.0
 
 
 def _from_first_sound(samples: array.array[int]) -> array.array[int]:
     return samples[next((place for place, sample in enumerate(samples) if sample), len(samples)) :]
 
 
+COMMANDS = {"listen": listen, "compare": compare, "length": compare_length}
+
 if __name__ == "__main__":
-    if len(sys.argv) != 4 or sys.argv[1] not in ("listen", "compare"):
+    if len(sys.argv) != 4 or sys.argv[1] not in COMMANDS:
         sys.exit(__doc__)
-    if sys.argv[1] == "listen":
-        listen(*sys.argv[2:])
-    else:
-        print(compare(*sys.argv[2:]))
+    print(COMMANDS[sys.argv[1]](*sys.argv[2:]))
