@@ -21,7 +21,7 @@ serve() {
 
 serve
 "$talk" doctor --silent | tee "$PLACE/doctor.txt"
-grep -E "^done +libespeak-ng .*\($LIBRARY.*\)" "$PLACE/doctor.txt" > /dev/null
+grep -E "^ok +libespeak-ng .*\($LIBRARY.*\)" "$PLACE/doctor.txt" > /dev/null
 kill "$server"
 wait "$server"
 
