@@ -34,16 +34,21 @@ class Environment:
     needs_sudo: bool = False
 
 
-def command(*packages: str) -> str:
-    """Return the command that installs packages into the environment of this process."""
-    return command_for(_environment(), packages)
+def command(*packages: str, again: bool = False) -> str:
+    """Return the command that installs packages into the environment of this process.
+
+    Args:
+        packages: their names.
+        again: whether to install them even if they are installed.
+    """
+    return command_for(_environment(), packages, again=again)
 
 
-def neural(*more: str) -> str:
+def neural(*more: str, again: bool = False) -> str:
     """Return the step that makes neural voices work, with more packages if any are named."""
     if not IS_64_BIT:
         return "neural voices need a 64-bit system: choose one of espeak's voices, such as en"
-    return command(*NEURAL, *more)
+    return command(*NEURAL, *more, again=again)
 
 
 def espeak_library() -> str:
@@ -52,7 +57,7 @@ def espeak_library() -> str:
     return f"{package}, or {command('espeakng-loader')}" if IS_64_BIT else package
 
 
-def command_for(environment: Environment, packages: Sequence[str]) -> str:
+def command_for(environment: Environment, packages: Sequence[str], *, again: bool = False) -> str:
     """Return the shell command that installs packages into this environment."""
     from shlex import join, quote
 
@@ -62,10 +67,12 @@ def command_for(environment: Environment, packages: Sequence[str]) -> str:
         home = os.path.dirname(os.path.dirname(environment.pipx))
         own = home.startswith(f"{environment.user_home}/")
         named = "" if own else f"PIPX_HOME={quote(home)} "
-        return f"{sudo}{named}pipx inject {quote(os.path.basename(environment.pipx))} {names}"
+        force = "--force " if again else ""
+        return f"{sudo}{named}pipx inject {force}{quote(os.path.basename(environment.pipx))} {names}"
     python = quote(environment.python)
     if environment.made_by_uv and not environment.has_pip:
-        return f"{sudo}uv pip install --python {python} {names}"
+        return f"{sudo}uv pip install {'--reinstall ' if again else ''}--python {python} {names}"
+    names = f"--force-reinstall {names}" if again else names
     pip = f"{sudo}{python} -m pip install {names}"
     before = f"{sudo}{python} -m ensurepip"
     if environment.externally_managed:
@@ -93,5 +100,8 @@ def _environment() -> Environment:
 
 
 def _is_made_by_uv() -> bool:
-    with open(os.path.join(sys.prefix, "pyvenv.cfg"), encoding="utf-8") as file:
-        return any(line.startswith("uv =") for line in file)
+    try:
+        with open(os.path.join(sys.prefix, "pyvenv.cfg"), encoding="utf-8") as file:
+            return any(line.startswith("uv =") for line in file)
+    except FileNotFoundError:
+        return False

@@ -172,6 +172,16 @@ def test_a_package_that_cannot_be_imported_is_a_finding(
     assert "neural voice" not in found
 
 
+def test_packages_that_are_imported_too_slowly_are_not_installed_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    needs_packages(*NEEDED)
+    monkeypatch.setattr(neural, "_IMPORT_LIMIT_S", 0.2)
+    (tmp_path / "onnxruntime.py").write_text("import time\ntime.sleep(60)\n")
+    found = neural.judge(neural.look(None, {**os.environ, "PYTHONPATH": str(tmp_path)}, 5.0), server=False)[0]
+    assert (found.state, found.next) == (WARNING, "run talk doctor again when this machine is less busy")
+
+
 def test_where_nothing_neural_is_there_nothing_is_done() -> None:
     code = """
 import sys

@@ -278,6 +278,20 @@ def test_what_voices_take_in_memory_counts_and_not_their_files(env: dict[str, st
         assert robot.heard(robot.say()) == ("SUCCEEDED", TINY)
 
 
+def test_a_voice_that_is_dropped_while_it_speaks_is_not_counted_twice(env: dict[str, str], tmp_path: Path) -> None:
+    tiny_voice.put(tmp_path / "voices", "second")
+    env["BALLAST_BYTES"] = "100000000"
+    with _robot(env, "--voice-memory", "180") as robot:
+        first = robot.say("this goes on and on " * 10)
+        robot.until(lambda: robot.client.goal(first.id).spoken)
+        second = robot.say(voice="piper/second")
+        assert robot.heard(first) == ("SUCCEEDED", TINY)
+        assert robot.heard(second) == ("SUCCEEDED", "piper/second")
+        assert f"voice {TINY} dropped: the voices take more" in robot.server.log
+        assert robot.server.log.count("voice piper/second loaded") == 1
+        assert "it takes" not in robot.server.log
+
+
 def test_a_voice_that_takes_more_than_all_may_speaks_and_is_told(env: dict[str, str]) -> None:
     env["BALLAST_BYTES"] = "100000000"
     with _robot(env, "--voice-memory", "50") as robot:

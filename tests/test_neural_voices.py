@@ -194,6 +194,16 @@ def test_without_the_extra_they_are_listed_and_refused_with_what_to_install(
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
 
 
+@pytest.mark.parametrize(("wanted", "meant"), [("tiny", "piper/tiny"), ("en", "gmw/en")])
+def test_a_server_s_voice_is_neural_only_if_the_driver_has_no_such_voice(
+    env: dict[str, str], tmp_path: Path, wanted: str, meant: str
+) -> None:
+    tiny_voice.put(tmp_path / "voices", "en")
+    with serving(env, "--rate", "450", "--voice", wanted):
+        goal = run([*TALK, "say", "--wait", "hello"], env).out.strip()
+        assert json.loads(run([*TALK, "--json", "status", goal], env).out)["voice"] == meant
+
+
 def test_the_language_of_the_server_s_neural_voice_means_that_one(env: dict[str, str], tmp_path: Path) -> None:
     def heard(voice: str) -> object:
         goal = run([*TALK, "say", "--wait", "--voice", voice, "--voice-only", "hello"], env).out.strip()

@@ -92,8 +92,8 @@ class Examination:
     ) -> Iterator[Finding]:
         """Look at neural voices, where something asks for one, or any is there."""
         told = self._server.get("neural_voices")
-        if used and not (is_neural(used) or find_voice(used, models.undescribed(env))):
-            used = None
+        if used and not is_neural(used):  # the engine knows what a short name means, unless it failed because of that
+            used = used if engine.reason and find_voice(used, models.undescribed(env)) else engine.voice
         if not is_own(self._told("driver")) or not (used or told or engine.neural or env.get("TALK_VOICES")):
             return
         from talkcli.doctor import neural

@@ -48,7 +48,8 @@ for each in sys.argv[1:]:
 """
 #: Seconds that this may take, from an SD card.
 _IMPORT_LIMIT_S = 10.0
-_REINSTALL = f"install it again: {install.neural()} --force-reinstall"
+_LATE = f"it takes more than {_IMPORT_LIMIT_S:g} s"
+_REINSTALL = f"install it again: {install.neural(again=True)}"
 _CHOOSE = "choose one of espeak's: talk set --voice en, or talk serve --voice en"
 
 
@@ -114,7 +115,8 @@ def _broken(env: Mapping[str, str]) -> str | None:
     if said.trouble is None:
         return None
     package = said.out.split()[-1] if said.out else models.NEEDED[0]
-    return f"{_installed(package)} cannot be imported: {said.trouble}"
+    trouble = _LATE if said.late else said.trouble
+    return f"{_installed(package)} cannot be imported: {trouble}"
 
 
 def _installed(package: str) -> str:
@@ -217,6 +219,8 @@ def judge(neural: Neural, *, server: bool, told: object = None) -> list[Finding]
 
 def _reinstall(words: str) -> str:
     """Return what to do about a package that cannot be imported."""
+    if _LATE in words:
+        return "run talk doctor again when this machine is less busy"
     if "SIGILL" in words:
         return "this processor is too old for that version: install an older one, or use an espeak voice"
     return _REINSTALL

@@ -5,6 +5,7 @@ As any client's goal it waits its turn and can be cancelled.
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
 from talkcli.client.connect import Interrupted
@@ -92,8 +93,10 @@ def by_server(client: Client, text: str, limit: float) -> Played:
         try:
             if goal.speech_paused:
                 return Played(goal.cancel().state, "paused", "speech is paused")
-            ended = goal.wait(limit)
-            return replace(_played(ended), player=client.status().server.get("player"))
+            played = _played(goal.wait(limit))
+            with contextlib.suppress(TalkError):  # the sentence was heard, even if the server goes away now
+                played = replace(played, player=client.status().server.get("player"))
+            return played
         except TimeoutError:
             return _taken_back(client, goal, limit)
         except Interrupted:

@@ -11,7 +11,6 @@ import contextlib
 import os
 import re
 import shlex
-import signal
 import socket
 import subprocess
 import tempfile
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING
 from talkcli.doctor.machine import judge_access, judge_cards
 from talkcli.doctor.report import Finding, failed, ok, some, warning
 from talkcli.engine.players import PACKAGES, PLAYERS, is_silent, on_path
-from talkcli.engine.players.child import kill
+from talkcli.engine.players.child import kill, signal_name
 from talkcli.engine.players.devices import DUMMY, sound_servers
 from talkcli.frozen import frozen, replace
 
@@ -151,7 +150,7 @@ def asked(program: str, *words: str, env: Mapping[str, str], limit: float | None
     if code is None:
         return Said(f"no answer within {limit:g} s", said, late=True)
     if code < 0:
-        return Said(f"it was killed by {signal.Signals(-code).name}", said)
+        return Said(f"it was killed by {signal_name(-code)}", said)
     lines = filter(None, map(str.strip, (complaint or said).splitlines()))
     return Said(next(lines, "it said nothing") if code else None, said)
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 INSTALL_LIBRARY = install.espeak_library()
 _INSTALL_PYTTSX3 = install.command("pyttsx3")
 _INSTALL_NEURAL = install.neural()
-#: What a server says of an engine that speaks, or will in a moment.
+#: A server's words for an engine that works.
 WORKING = ("ready", "starting")
 
 
@@ -46,6 +46,8 @@ class Engine:
     neural: int = 0
     #: the player that it would try first; None if there is none, or it is not known
     player: str | None = None
+    #: id of the neural voice that it was told to speak with; None for any other voice
+    voice: str | None = None
     #: why it didn't start, for programs and in its own words; None where it did
     reason: str | None = None
     words: str = ""
@@ -85,7 +87,7 @@ def look(setting: Setting) -> Engine:
     try:
         with conversation(setting) as engine:
             ready = engine.until(protocol.Ready)
-            found = Engine(ready.driver, ready.version, player=ready.player)
+            found = Engine(ready.driver, ready.version, player=ready.player, voice=ready.voice)
             voices = engine.until(protocol.Voices).voices
             return replace(found, voices=len(voices), neural=sum(is_neural(each.id) for each in voices))
     except EngineFailed as error:
@@ -114,12 +116,12 @@ def fault(error: EngineFailed) -> tuple[str, str]:
 def judge(pyttsx3: str | None, engine: Engine, *, server: str | None) -> list[Finding]:
     """Judge the voice; `pyttsx3`: its version.
 
-    `server`: what a server says of its own engine. If that works, a sentence needs nothing of this.
+    `server`: what a server says of its own engine. If that engine works, findings about this one are warnings.
     """
     broken = warning if server in WORKING else failed
     if server not in {None, *WORKING} and engine.reason is None:
         engine = Engine(reason="engine_failed", words=f"the server's engine: {server}")
-    words = engine.words
+    words = _without_step(engine.words)
     if engine.reason is None:
         return [ok("pyttsx3", f"{pyttsx3 or 'of an unknown version'}, driver {engine.driver}"), *_library(engine)]
     if "pyttsx3 is missing" in words or pyttsx3 is None:
@@ -142,6 +144,13 @@ def judge(pyttsx3: str | None, engine: Engine, *, server: str | None) -> list[Fi
         # It asks PulseAudio at its start, though it is to play nothing itself.
         step = "restart the sound server if that hangs (see below): libespeak-ng waits for it at its start"
     return [found, broken("libespeak-ng", words, step)]
+
+
+def _without_step(words: str) -> str:
+    """Return an engine's words without the next step, which the finding shows by itself."""
+    for step in (_INSTALL_PYTTSX3, INSTALL_LIBRARY):
+        words = words.removesuffix(f": {step}")
+    return words
 
 
 def _library(engine: Engine) -> list[Finding]:

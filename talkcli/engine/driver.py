@@ -58,11 +58,13 @@ def start(configure: Configure, session: Session) -> Ready:
     _start_loop(engine, name)
     try:
         settings.set_voice(configure.voice)
+        voice = settings.driver_id(configure.voice) if configure.voice else ""
     except CannotSpeak as error:
         unknown = error.reason == "unknown_voice"
         raise CannotStart(str(error), error.reason, lasting=unknown, usage=unknown) from error
     session.open(engine, settings.apply, None if own else _pump(name), made)
-    return Ready(shown, made.version if made else None, session.players.first() if own else None)
+    neural = voice if is_neural(voice) else None
+    return Ready(shown, made.version if made else None, session.players.first() if own else None, neural)
 
 
 def _register_own(synthesizer: str, driver: str, session: Session) -> Choice:
@@ -175,7 +177,7 @@ class Settings:
             return
         if self._voice is None:
             self._default_voice = self._engine.getProperty("voice")
-        self._put("voice", self._default_voice if wanted is None else self._driver_id(wanted), f"the voice {wanted}")
+        self._put("voice", self._default_voice if wanted is None else self.driver_id(wanted), f"the voice {wanted}")
         self._voice = wanted
 
     def _set_language(self, language: str) -> None:
@@ -185,7 +187,8 @@ class Settings:
                 return
         self.set_voice(None)
 
-    def _driver_id(self, wanted: str) -> str:
+    def driver_id(self, wanted: str) -> str:
+        """Return the id of a voice; CannotSpeak if there is no such voice."""
         found = find_voice(wanted, self._voices)
         if found is not None and is_neural(found.id) and model_of(wanted) != model_of(found.id):
             found = None  # a part of its name: another voice may have been put there since that it means

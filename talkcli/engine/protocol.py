@@ -163,6 +163,7 @@ class Ready:
     driver: str
     version: str | None  # of the synthesiser, for people: "eSpeak NG 1.51 (system)"
     player: str | None  # what will be tried first, for people
+    voice: str | None = None  # id of the neural voice that `Configure.voice` names; None for any other voice
 
 
 @frozen

@@ -207,8 +207,10 @@ class Speech:
     def _drop_excess(self) -> None:
         """Have the engine drop voices, if they take more memory than they may; warn if one takes too much alone."""
         active, needed = self.scheduler.active, self._needed()
-        first = model_of(active.voice or self._asked(active)) if active else next(iter(needed), "")
-        for each in self.voices.excess(first, needed):
+        speaking = model_of(active.voice) if active and active.voice else ""
+        if is_neural(speaking) and not self.voices.is_loaded(speaking):
+            return  # it was dropped, and keeps its memory until it has spoken: then the engine measures again
+        for each in self.voices.excess(next(iter(needed), speaking), needed):
             log.line(f"voice {log.shown(each)} dropped: the voices take more than --voice-memory allows")
             if each in self.voices.neural:
                 self.scheduler.loading.wait_for(each)
@@ -397,7 +399,9 @@ class Speech:
         self.apply(self.scheduler.engine_missing(missing.words, self.now()))
 
     def _ready(self, ready: protocol.Ready) -> None:
-        if self.ready != ready:
+        if self.ready is None and ready.voice is not None:
+            self.scheduler.settings = replace(self.scheduler.settings, voice=ready.voice)
+        if self.ready is None or self.ready != replace(ready, player=self.ready.player):
             server_log.ready(ready, self._for_player)
         self.ready, self.engine_words, self.voices.driver = ready, READY, ready.driver
         self.engine_known.set()

@@ -97,29 +97,31 @@ class Voices:
 
     def meant(self, voice: str | None, usual: str | None = None) -> str | None:
         """Return a voice as it was asked for, a neural one by its id; `usual`: the one that the server speaks with."""
-        if not voice or voice == DEFAULT_VOICE:
+        if not voice or voice == DEFAULT_VOICE or not (self.listed or is_neural(voice)):
             return voice
         found = self._find(voice, usual)
         return found.id if found and is_neural(found.id) else voice
 
     def _find(self, voice: str, usual: str | None) -> Voice | None:
-        found = find_voice(voice, self._known(voice), usual)
-        if self.listed and not is_neural(voice) and (found is None or (is_neural(found.id) and found.id != usual)):
-            self.look_for_files()
-            found = find_voice(voice, self.listed, usual)
-        return found
+        if not (is_neural(voice) or is_neural(usual or "")):
+            found = find_voice(voice, self._of_driver)
+            if found is not None:
+                return found  # without a look into the directories of neural voices
+        return find_voice(voice, self._known(voice), usual)
+
+    @property
+    def _of_driver(self) -> tuple[Voice, ...]:
+        return tuple(each for each in self.listed or () if not is_neural(each.id))
 
     def _known(self, voice: str) -> tuple[Voice, ...]:
-        """Return the voices that one may be meant of: of neural ones those whose files are there now."""
-        if self.listed and not is_neural(voice):
-            return self.listed
+        """Return the voices that a word may mean: of neural ones those whose files are there now."""
         if self._foreign is not None:
-            return ()
-        if not is_neural(voice):
-            return self._files()  # with their languages
+            return () if is_neural(voice) else self._of_driver
         from talkcli.engine.synthesizers import models
 
-        return models.undescribed()
+        listed = {each.id: each for each in self.listed or ()}
+        neural = (listed.get(each.id, each) for each in models.undescribed())
+        return (*(() if is_neural(voice) else self._of_driver), *neural)
 
     @property
     def _foreign(self) -> str | None:
@@ -217,7 +219,8 @@ class Voices:
     def excess(self, first: str, needed: Sequence[str]) -> tuple[str, ...]:
         """Return what has to be dropped now, as voices take more than was known when they were loaded.
 
-        `first`: the voice that speaks, or will next; it is kept. `needed`: as in `next`; these are dropped last.
+        `first`: the voice that will speak next, or else the one that speaks; it is kept. `needed`: as in `next`; these
+        are dropped last.
         """
         loaded = self._loaded()
         order = [each for each in loaded if each not in needed]
@@ -233,7 +236,7 @@ class Voices:
         return tuple(drop)
 
     def too_large(self) -> str | None:
-        """Return the words about a voice that takes more than all may, if that is not known; it is spoken with."""
+        """Return a warning about the only loaded voice if it takes too much memory; None if it was told before."""
         loaded = self._loaded()
         voice = next(iter(loaded), "")
         taken = self._rest() + sum(loaded.values())
@@ -241,6 +244,10 @@ class Voices:
             return None
         self.neural[voice].why = f"it takes {taken / 1e6:.0f} MB, more than --voice-memory {self._memory / 1e6:.0f}"
         return f"voice {voice}: {self.neural[voice].why}"
+
+    def is_loaded(self, voice: str) -> bool:
+        """Tell whether a neural voice is loaded, and has not been dropped."""
+        return voice in self._loaded()
 
     def _loaded(self) -> dict[str, int]:
         return {voice: each.size for voice, each in self.neural.items() if each.state is Readiness.LOADED}

@@ -173,6 +173,7 @@ NEURAL = (
         ("chinese", None),
         ("only", "piper/xx_XX-only"),
         ("joe", "piper/en_US-joe-medium"),
+        ("piper/joe", "piper/en_US-joe-medium"),
         ("Joe-Medium#3", "piper/en_US-joe-medium#3"),
         ("joe#", None),
         ("joe+f3", None),
@@ -252,6 +253,7 @@ def test_of_another_driver_and_another_system_no_neural_voice_is_proposed(monkey
         ("en_US-jo-medium", "unknown voice \"en_US-jo-medium\": did you mean 'en_US-joe-medium'?"),
         ("piper/zzzzzzzzzzz", 'unknown voice "piper/zzzzzzzzzzz": put NAME.onnx and NAME.onnx.json into '),
         ("nosuch", 'unknown voice "nosuch": "talk voices" lists them'),
+        ("joe+f3", "unknown voice \"joe+f3\": did you mean 'joe'?"),
     ],
 )
 def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, words: str) -> None:

@@ -58,6 +58,21 @@ def test_the_command_fits_the_environment(environment: Environment, command: str
     assert command_for(environment, ["numpy"]) == command
 
 
+@pytest.mark.parametrize(
+    ("environment", "command"),
+    [
+        (VENV, "/home/pi/talk/.venv/bin/python -m pip install --force-reinstall numpy"),
+        (PIPX, "pipx inject --force talkcli numpy"),
+        (
+            replace(VENV, has_pip=False, made_by_uv=True),
+            "uv pip install --reinstall --python /home/pi/talk/.venv/bin/python numpy",
+        ),
+    ],
+)
+def test_a_package_is_installed_again(environment: Environment, command: str) -> None:
+    assert command_for(environment, ["numpy"], again=True) == command
+
+
 def test_the_command_names_the_python_that_runs() -> None:
     assert sys.executable in shlex.split(install.command("numpy"))
 

@@ -26,8 +26,8 @@ from talkcli.paths import cache_directory
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-#: Bytes by which the process must have grown with its sentences until what they freed is given back and it is measured:
-#: the next sentence has to get back what it needs of that.
+#: Bytes of growth after which freed memory is given back, and the process is measured. Less is left alone, because the
+#: next sentence needs it again.
 GROWTH_BYTES = 16_000_000
 
 
@@ -106,7 +106,10 @@ class Loader:
 
     def spoken(self, voice: str) -> None:
         """Take note that a voice has spoken: the first sentences need memory that is kept."""
-        self._unmeasured = self._unmeasured or voice
+        if voice not in self._models:
+            self._unmeasured = ""  # it was dropped meanwhile, and is freed only now
+        elif self._unmeasured is None:
+            self._unmeasured = voice
 
     def news(self) -> list[Loaded | Unloaded | Grown]:
         """Return what became of voices since this was asked last."""

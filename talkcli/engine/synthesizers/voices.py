@@ -89,12 +89,15 @@ def _fitting(wanted: str, voices: tuple[Voice, ...], preferred: str | None = Non
 
 
 def _readings(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield what a word may mean that no voice has, the most likely first; all in one list are as likely."""
+    """Yield lists of names that an unknown word may mean, the likeliest list first."""
     name, mark, speaker = wanted.partition(SPEAKER)
     word = _fold(name)
     neural = [each.id for each in voices if is_neural(each.id)]
     if is_neural(wanted):
+        yield [each + mark + speaker for each in neural if each.casefold().startswith(name.casefold())]
         yield [each + mark + speaker for each in neural if _fold(each).startswith(word)]
+        short = word.removeprefix(NEURAL)
+        yield [each + mark + speaker for each in neural if short in map(_fold, _short_names(each))]
         return
     base, plus, variant = wanted.partition(VARIANT)
     region = _WITH_REGION.fullmatch(_fold(base))
@@ -128,9 +131,9 @@ def _english_names(voice: Voice) -> list[str]:
 
 
 def _short_names(neural: str) -> list[str]:
-    """Return what the id of a neural voice is called without its beginning: "joe" and "en_US-joe" of "en_US-joe-low".
+    """Return the short names of a neural voice: "joe", "en_US-joe" and three more for "piper/en_US-joe-low".
 
-    None is its language alone.
+    Its language alone is no name.
     """
     parts = neural.removeprefix(NEURAL).split("-")
     first = 1 if _WITH_REGION.fullmatch(_fold(parts[0])) else 0
@@ -217,7 +220,7 @@ def _near_ones(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
     if is_neural(wanted):
         return _near(wanted.partition(SPEAKER)[0], {each.id: each for each in neural})
     name, plus, suffix = wanted.partition(VARIANT)
-    if plus and variants and (not name or find_voice(name, voices)):
+    if plus and variants and (not name or find_voice(name, (*plain, *variants))):
         near = _near(suffix, {each.id.removeprefix(VARIANT): each for each in variants})
         return [f"{name}{VARIANT}{each}" for each in near]
     words: dict[str, Voice] = {}
