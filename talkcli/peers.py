@@ -12,6 +12,11 @@ import sys
 #: Characters of a command line that are kept: enough for an interpreter, a script and its first arguments.
 MAX_COMMAND = 200
 
+#: Programs that start another one and wait for it. The script that called them is above them.
+_STARTERS = frozenset({b"timeout", b"time", b"flock", b"xargs", b"sudo"})
+#: Processes that are looked at above a client, at most.
+_MAX_PARENTS = 8
+
 _LOCAL_PEERCRED = 0x001  # <sys/un.h> on macOS
 _LOCAL_PEERPID = 0x002
 _SOL_LOCAL = 0
@@ -38,12 +43,22 @@ def command_of(pid: int) -> str | None:
 
 
 def parent_command_of(pid: int) -> str | None:
-    """Return the command line of the process that started this one, or None if it can't be known."""
-    parent = stat_of(pid)[1:2]
-    line = contents(f"/proc/{int(parent[0])}/cmdline") if parent else None
-    if not line:
-        return None
-    return line.rstrip(b"\0").replace(b"\0", b" ").decode(errors="replace")[:MAX_COMMAND]
+    """Return the command line of the process that started this one, or None if it can't be known.
+
+    `timeout 5 talk say …` and its like are passed over: the script that called them is the sender.
+    """
+    line = None
+    for _ in range(_MAX_PARENTS):
+        parent = stat_of(pid)[1:2]
+        pid = int(parent[0]) if parent else 0
+        above = contents(f"/proc/{pid}/cmdline")
+        if not above or (line and pid == 1):
+            break
+        line = above
+        program, *arguments = (each.rpartition(b"/")[2] for each in line.split(b"\0"))
+        if program not in _STARTERS or b"talk" not in arguments:
+            break
+    return line.rstrip(b"\0").replace(b"\0", b" ").decode(errors="replace")[:MAX_COMMAND] if line else None
 
 
 def stat_of(pid: int) -> list[bytes]:

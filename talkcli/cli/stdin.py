@@ -12,6 +12,7 @@ import select
 import time
 from collections import deque
 from functools import partial
+from itertools import islice
 
 from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts
@@ -32,6 +33,7 @@ from talkcli.client.connection import BaseConnection
 from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
+from talkcli.goals.option import figure
 from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS, Say
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, Result, unfinished
@@ -56,8 +58,10 @@ _TEXT_BYTES = MAX_BYTES + len("\r\n")
 _AHEAD_BYTES = 1_000_000
 #: Goals that may be pending if --ahead says nothing else.
 _AHEAD = 10
-#: Goals that have not been told of: of those that end before an older goal does, no more than this are kept.
-_MAX_UNTOLD = 1_000
+#: Goals, beside the pending ones, that are kept until they have been reported.
+_MAX_UNREPORTED_GOALS = 1_000
+#: Lines that are dropped before signals and the server are looked at again.
+_DROPPED_AT_ONCE = 1_000
 #: The least ttl that is sent: 0 would be no limit.
 _LEAST_TTL_S = 0.01
 
@@ -98,7 +102,7 @@ class Line:
     text: str
     #: bytes of a line that is too long to be spoken, else 0
     excess: int = 0
-    #: until when it means anything (monotonic); None for ever
+    #: the monotonic time at which its ttl ends; None without a ttl
     end: float | None = None
 
 
@@ -106,7 +110,7 @@ class LineBuffer:
     """Lines that were read and have not been sent. It has no clock: the time comes in as an argument."""
 
     def __init__(self, ttl: float | None = None) -> None:
-        """`ttl`: seconds after which a line means nothing any more, counted from when it was read; None for ever."""
+        """`ttl`: seconds from when a line was read; None for no limit."""
         self._ttl = ttl
         # One byte above the longest text: the CR of a line that ends in CRLF.
         self._splitter = LineSplitter(MAX_BYTES + 1)
@@ -126,7 +130,7 @@ class LineBuffer:
 
     @property
     def first(self) -> Line | None:
-        """The oldest line that has anything to say."""
+        """The oldest line that is not blank."""
         while not self._lines and self._chunks:
             now, data = self._chunks.popleft()
             self.size -= len(data)
@@ -285,7 +289,7 @@ class _Lines:
         pending = sum(each.state is State.PENDING for _, each in self._goals)
         # A line with a key replaces the one that is pending, so it adds none.
         enough = pending >= self._ahead and self._chosen["key"] is None
-        return enough or len(self._goals) >= _MAX_UNTOLD
+        return enough or len(self._goals) - pending >= _MAX_UNREPORTED_GOALS
 
     @property
     def _reads(self) -> bool:
@@ -299,7 +303,7 @@ class _Lines:
     def _step(self) -> None:
         """Do what can be done now, then wait for more to do."""
         if self._error is None:
-            for line in self._buffer.take_late(time.monotonic()):
+            for line in islice(self._buffer.take_late(time.monotonic()), _DROPPED_AT_ONCE):
                 self._drop(line)
             while self._buffer.first and not (self._sent or self._full):
                 self._send(self._buffer.take())
@@ -368,7 +372,7 @@ class _Lines:
 
     def _drop(self, line: Line) -> None:
         """Tell of a line that can't be sent in time, and go on."""
-        words = f"line {line.number} was not sent: its ttl of {self._ttl:g} s is over"
+        words = f"line {line.number} was not sent: its ttl of {figure(self._ttl)} s is over"
         goal = Goal("", State.RECALLED, text=line.text, reason="expired", message=words)
         code = self._tell(refuse, goal)
         if self._wait:
@@ -396,6 +400,8 @@ class _Lines:
         def something() -> bool:
             if self._sent and self._sent[1].over:
                 return True
+            if not self._wait and any(each.state.terminal for _, each in self._goals):
+                return True  # without a goal, the server owes no sign of life
             return self._full != was_full or (self._wait and bool(self._goals) and self._goals[0][1]._has_next())
 
         hear = partial(self._connection.wait_until, something, since=self._since)

@@ -13,6 +13,7 @@ from talkcli.cli.show import Feedback, give_up_failed, give_up_output, reader_is
 from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable, TimedOut
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.option import figure
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
 
@@ -37,7 +38,7 @@ def rest(end: float | None) -> float | None:
 
 def timed_out(timeout: float | None, words: str = "") -> TimedOut:
     """Return the error of a command that --timeout has ended; `words`: what is told besides."""
-    return TimedOut(f"timed out after {timeout or 0:g} s{words and f': {words}'}")
+    return TimedOut(f"timed out after {figure(timeout or 0)} s{words and f': {words}'}")
 
 
 def show_if_possible(put: Callable[..., None], *what: object) -> None:

@@ -157,7 +157,10 @@ class Askers:
         self.look()
 
     def known(self, goal: Goal, boot: str) -> None:
-        """Note a goal that the server knows, if it came by the broker: an earlier bridge may have sent it."""
+        """Note a goal that the server knows, if it came by the broker: an earlier bridge may have sent it.
+
+        It counts in the share, even if it preempts: a goal doesn't tell.
+        """
         ours = goal.client and (goal.client.name or "").startswith(AFAR)
         if ours and self.ids.boot_of(goal.id) != boot:
             self.ids.note(goal.id, boot)

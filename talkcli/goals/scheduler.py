@@ -155,25 +155,37 @@ class Scheduler:
     # -- what clients ask for
 
     def submit(
-        self, say: Say, sender: Sender, now: Now, fault: tuple[str, str] | None = None, canceled: By | None = None
+        self,
+        say: Say,
+        sender: Sender,
+        now: Now,
+        fault: tuple[str, str] | None = None,
+        canceled: By | None = None,
+        waited: float = 0.0,
     ) -> Submitted:
         """Accept or reject a goal. Admission is one step: a goal that is REJECTED has done nothing to the others.
 
-        `fault`: reason and words, where something was found wrong with it that can't be known here; `canceled`: who
-        cancelled it while it waited for room, so that it is RECALLED at once.
+        Args:
+            say: the goal.
+            sender: its sender.
+            now: the time.
+            fault: reason and words, if something is wrong with it that can't be known here.
+            canceled: who cancelled it while it waited for room; it is RECALLED at once, and does nothing to the others.
+            waited: seconds for which it waited for room; if its ttl is over, it is RECALLED likewise.
         """
         first = self.find(say.id) if say.id is not None and is_clients_id(say.id) else None
         if first is not None and first.has_text(say.text):
             return Submitted(first, [], attached=True)
         self._count += 1
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
-        expires_at = None if ttl is None else now.monotonic + ttl
+        expires_at = None if ttl is None else now.monotonic + ttl - waited
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
         record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._preempts(say), expires_at)
         by = canceled or self._early.find(say.id, now.monotonic)
         refused = self._refuse(say, fault, first) or (None if canceled else self._throttle(say, record, now))
+        expired = expires_at is not None and expires_at <= now.monotonic
         way = self._way(say)
-        if way is None and not (by or refused):
+        if way is None and not (by or refused or expired):
             refused = "queue_full", f"{len(self._queue)} goals are waiting already (`talk serve --max-queue`)"
         if refused:
             record.reason, words = refused
@@ -186,6 +198,8 @@ class Scheduler:
         if by:
             words = "canceled before it was spoken" if canceled else "canceled before it arrived"
             return Submitted(record, effects + self._recalled(record, "canceled", words, by, now))
+        if expired:
+            return Submitted(record, effects + self._recalled(record, "expired", _expired(record), None, now))
         effects += self._make_way(record, way or [], now)
         return Submitted(record, effects + self._start_next(now))
 
@@ -418,8 +432,7 @@ class Scheduler:
     def _expire(self, now: Now) -> list[Effect]:
         effects: list[Effect] = []
         for record in self._queue.expired(now.monotonic):
-            words = f"its time to live of {figure(record.say.ttl)} s was over before it was spoken"
-            effects += self._recall(record, "expired", words, None, now)
+            effects += self._recall(record, "expired", _expired(record), None, now)
         return effects
 
     def _active_deadline(self) -> float | None:
@@ -500,3 +513,7 @@ class Scheduler:
             return [Changed(record, state)]
         self.active = None
         return [Changed(record, state), *self._start_next(now)]
+
+
+def _expired(record: Record) -> str:
+    return f"its time to live of {figure(record.say.ttl)} s was over before it was spoken"

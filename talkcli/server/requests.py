@@ -50,8 +50,6 @@ ALL_WAITING = 64 * 1024 * 1024
 #: Bytes that each is counted with besides what it carries. It takes a tenth of that; but so no more than 8,000 wait,
 #: and a cancel of so many is answered within 2 s, too.
 EACH = 8 * 1024
-#: The ttl of a goal whose time was over while it waited for room: 0 would be no limit.
-_LEAST_TTL_S = 0.001
 
 
 class Requests:
@@ -211,18 +209,20 @@ class Requests:
             each.move(self._canceled)
         return [each.resume for each in new]
 
-    async def _await_room(self, call: Call, say: Say) -> Say:
-        """Wait until there is room, and return the goal with what is left of its ttl."""
+    async def _await_room(self, call: Call, say: Say) -> float:
+        """Wait until there is room or the goal's ttl is over, and return the seconds that count towards its ttl."""
+        ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
         began = self._speech.now().monotonic
         self._speech.subscribers.keep_alive()
-        await call.wait(self._speech.for_room)
+        in_time = await call.wait(self._speech.for_room, ttl)
         waited = self._speech.now().monotonic - began
-        return replace(say, ttl=max(_LEAST_TTL_S, say.ttl - waited)) if say.ttl else say
+        return waited if in_time or ttl is None else max(waited, ttl)
 
     # -- one method a request
 
     async def _say(self, call: Call, say: Say) -> None:
         connection, sender = call.connection, call.connection.sender
+        waited = 0.0
         if call.by is None:
             now = self._speech.now()
             if self._turn:  # a goal that comes now must not take the room of one that waits
@@ -230,7 +230,7 @@ class Requests:
                 self._let_go()
             fault = call.fault or self._speech.voices.fault(say.voice, self._scheduler.settings.voice)
             if say.patient and self._scheduler.lacks_room(say, now, fault) and self._keep(call):
-                say = await self._await_room(call, say)
+                waited = await self._await_room(call, say)
         voices, usual = self._speech.voices, self._scheduler.settings.voice
         now, fault = self._speech.now(), call.fault or voices.fault(say.voice, usual)
         if not fault:
@@ -238,7 +238,7 @@ class Requests:
             fault = _unpitched(say)
         if not fault:
             self._speech.want(say.voice or usual)
-        submitted = self._scheduler.submit(say, sender, now, fault, call.by)
+        submitted = self._scheduler.submit(say, sender, now, fault, call.by, waited)
         record = submitted.record
         extra: JsonObject = {"paused": True} if self._scheduler.paused else {}
         if submitted.attached:

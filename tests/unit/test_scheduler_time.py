@@ -29,6 +29,20 @@ def test_a_goal_whose_time_is_over_before_it_began_is_recalled_and_never_spoken(
     assert robot.speaks_the_rest() == []
 
 
+@pytest.mark.parametrize(
+    ("say", "ttl"),
+    [(Say("stop", ttl=1, preempt=True), 0.0), (Say("stop", ttl=1, flush=True), 0.0), (Say("stop", key="k"), 1.0)],
+)
+def test_a_goal_whose_time_is_over_while_it_waits_for_room_does_nothing_to_the_others(say: Say, ttl: float) -> None:
+    robot = Robot(max_queue=1, ttl=ttl)
+    robot.says()
+    robot.asks(Say("left", ttl=0, key="k"))
+    late = robot.scheduler.submit(say, ARM, robot.now, waited=1.0).record
+    assert ending(late) == (State.RECALLED, "expired", None)
+    assert late.message == "Talk recalled: its time to live of 1 s was over before it was spoken"
+    assert [each.state.name for each in robot.scheduler.unfinished()] == ["ACTIVE", "PENDING"]
+
+
 def test_a_goal_that_has_begun_may_take_its_time() -> None:
     robot = Robot()
     goal = robot.asks(Say("turn left", ttl=1))
