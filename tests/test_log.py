@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 import sys
 from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import peers
 from talkcli.goals.option import MAX_LOG
 from talkcli.terminal.text import width
 from tests.conformance.bareserve import TALK, environment, run
@@ -16,6 +18,8 @@ from tests.support.surroundings import short_directory
 from tests.support.terminal import Terminal
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tests.support.processes import Talk
 
 LONG = "please step back from the door and from the lift " * 5
@@ -138,3 +142,16 @@ def test_80_columns_have_who_sent_it_and_who_ended_it(scripted: Talk, command: s
     assert '"  from "the door"' in speaking
     assert '"  from "battery", priority' in waits
     assert re.search(r'"  (canceled )?by \S', recalled)
+
+
+@pytest.mark.parametrize("starter", ["timeout 20", "nice timeout 20"])
+def test_the_script_is_shown_that_starts_talk_by_way_of_another_program(tmp_path: Path, starter: str) -> None:
+    (tmp_path / "talk").write_text("#!/bin/sh\necho $$\nread -r _\n")
+    (tmp_path / "talk").chmod(0o755)
+    script = tmp_path / "patrol.sh"
+    script.write_text(f"{starter} {tmp_path}/talk say hello\ntrue\n")
+    with subprocess.Popen(["sh", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as started:
+        assert started.stdin
+        assert started.stdout
+        assert peers.parent_command_of(int(started.stdout.readline())) == f"sh {script}"
+        started.stdin.write("\n")
