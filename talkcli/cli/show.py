@@ -132,7 +132,7 @@ def ended(command: Callable[[], object], options: Common) -> int:
         if sys.stdout:
             sys.stdout.flush()
     except (TalkError, TimeoutError) as error:
-        if isinstance(error, TimeoutError):  # what was asked for was not done in the time that it was given
+        if isinstance(error, TimeoutError):
             error = TimedOut(str(error))
         show_error(error, json=options.json)
         return error.exit_code

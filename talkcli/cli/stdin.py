@@ -1,8 +1,8 @@
 """`say` from standard input: read as one text, or spoken line by line, each line a goal, over one connection.
 
-Of one text it never holds more than the longest one. Of lines, one thread does everything: it reads them into a
+One text is read up to the length of the longest text allowed. Lines are handled by one thread: it reads them into a
 `LineBuffer`, sends them while few enough of its goals are pending, and sees how its goals end. The input may have no
-end, so nothing is kept of a goal that was told of.
+end, so a goal is forgotten once it was reported.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class LineBuffer:
         self._ttl = ttl
         # One byte above the longest text: the CR of a line that ends in CRLF.
         self._splitter = LineSplitter(MAX_BYTES + 1)
-        #: what was read and has not been cut into lines, and when: so a million short lines take no more than 1 MB
+        #: chunks with the time at which each was read; they are cut late, so that many short lines stay within 1 MB
         self._chunks: deque[tuple[float, bytes]] = deque()
         self._lines: deque[Line] = deque()
         self._number = 0
@@ -123,7 +123,7 @@ class LineBuffer:
         self.ended = False
 
     def feed(self, data: bytes, now: float) -> None:
-        """Take up what was read; nothing is the input's end, where the last line may lack its newline."""
+        """Add a chunk that was read. An empty chunk is the end of the input, and ends the last line."""
         self.ended = not data
         self.size += len(data)
         self._chunks.append((now, data))
@@ -190,8 +190,14 @@ def say_lines(
 ) -> int:
     """Speak standard input line by line, and return the exit code.
 
-    `name`: what the sender calls itself; `chosen`: options of each goal; `timeout`: seconds for all of it; `ahead`:
-    goals that may be pending at once.
+    Args:
+        options: the options of every command.
+        name: the sender's name.
+        chosen: the options of each goal.
+        wait: whether to wait until the goals have ended.
+        feedback: whether to show each word as it is heard.
+        timeout: seconds for all of it; None for no limit.
+        ahead: goals that may be pending at once; None for the default.
     """
     shown = feedback_for(options, asked=feedback)
     try:
@@ -232,7 +238,7 @@ class _Lines:
         self._buffer = LineBuffer(self._ttl)
         #: the number of the line that is being sent, until it is accepted or refused
         self._sending: int | None = None
-        #: what was sent and has not been answered
+        #: the goal that was sent and has not been answered, with its request
         self._sent: tuple[GoalHandle, Exchange] | None = None
         #: the last goal that was answered, as the server took it
         self._accepted = Goal("", State.PENDING)
@@ -241,7 +247,7 @@ class _Lines:
         #: since when there is something to hear from the server (monotonic)
         self._since = 0.0
         self._told_of_pause = False
-        #: why nothing more is read or sent
+        #: the error after which nothing more is read or sent
         self._error: TalkError | None = None
         #: the first line that did not succeed, and its exit code
         self._failure: tuple[int, int] | None = None
@@ -287,7 +293,7 @@ class _Lines:
     def _full(self) -> bool:
         """Whether no line may be sent, because enough goals are pending."""
         pending = sum(each.state is State.PENDING for _, each in self._goals)
-        # A line with a key replaces the one that is pending, so it adds none.
+        # A line with a key replaces the pending line of that key, so the number stays.
         enough = pending >= self._ahead and self._chosen["key"] is None
         return enough or len(self._goals) - pending >= _MAX_UNREPORTED_GOALS
 
@@ -301,7 +307,7 @@ class _Lines:
         return not (self._buffer.first or self._sent or self._full)
 
     def _step(self) -> None:
-        """Do what can be done now, then wait for more to do."""
+        """Send and drop the lines that can be, then wait for more."""
         if self._error is None:
             for line in islice(self._buffer.take_late(time.monotonic()), _DROPPED_AT_ONCE):
                 self._drop(line)
@@ -346,7 +352,7 @@ class _Lines:
         self._sent = handle, self._connection.begin(request, on_reply)
 
     def _take_answer(self) -> None:
-        """Take up the server's answer to what was sent last, if it has come or can't come any more."""
+        """Handle the server's answer to the line that was sent, if it has come or the connection has ended."""
         if self._sent is None or not (self._sent[1].over or self._connection.ended):
             return
         (handle, exchange), number = self._sent, self._sending or 0
@@ -391,7 +397,7 @@ class _Lines:
     # -- waiting
 
     def _hear(self) -> None:
-        """Wait until there is something to do: more input, an answer, news of a goal, a line whose time is over."""
+        """Wait for more input, an answer, an event of a goal, or the end of a line's ttl."""
         watched = self._interrupts.watched
         first = self._buffer.first
         end = first.end if first and self._error is None else None
@@ -425,7 +431,7 @@ class _Lines:
             watched.pop(0, None)
 
     def _see_ends(self) -> None:
-        """Tell what has happened to the goals, in their order, and forget those that have ended."""
+        """Report the events of the goals in their order, and forget the goals that have ended."""
         if not self._wait:
             self._goals = deque(each for each in self._goals if not each[1].state.terminal)
             return
