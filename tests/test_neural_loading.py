@@ -282,7 +282,7 @@ def test_a_voice_that_is_dropped_while_it_speaks_is_not_counted_twice(env: dict[
     tiny_voice.put(tmp_path / "voices", "second")
     env["BALLAST_BYTES"] = "100000000"
     with _robot(env, "--voice-memory", "180") as robot:
-        first = robot.say("this goes on and on " * 10)
+        first = robot.say("this goes on and on " * 4)
         robot.until(lambda: robot.client.goal(first.id).spoken)
         second = robot.say(voice="piper/second")
         assert robot.heard(first) == ("SUCCEEDED", TINY)

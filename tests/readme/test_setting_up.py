@@ -109,7 +109,7 @@ def test_first_command_is_heard(newcomer: Shell, sink: Sink) -> None:
     """From a checkout to the sentence, and `kill %1` ends the server."""
     needs("bash")
     _needs_a_registry(newcomer, "click")
-    said = re.search('talk say "([^"]+)"', block("Start"))
+    said = re.search(' say "([^"]+)"', block("Start"))
     assert said, "the README's first command says nothing"
     text = said[1]
     with sink.record() as recording:
