@@ -8,20 +8,18 @@ import subprocess
 import sys
 import threading
 import time
-from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from talkcli.errors import TalkError
 from talkcli.fleet.broker import from_environment
 from talkcli.fleet.roster import roster
-from tests.bench import machine
-from tests.bench.failure import FailedError
-from tests.bench.idle import megabytes, taken
-from tests.bench.table import Limit, Row, as_markdown, as_text
 from tests.fleet.many import RealRobots, Roll, SimulatedRobots
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
 from tests.support.mqtt import Listener
+from tests.tools.bench import machine
+from tests.tools.bench.machine import megabytes, taken
+from tests.tools.bench.table import Limit, Row, as_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -67,18 +65,18 @@ class Asked:
             each.start()
 
     def finish(self, code: int | None = 0) -> Asked:
-        """Wait for the end; FailedError where its exit code is another."""
+        """Wait for the end; AssertionError where its exit code is another."""
         try:
             found = self._process.wait(_PATIENCE)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-            raise FailedError(f"talk {self.words} does not end: {self._told()}") from None
+            raise AssertionError(f"talk {self.words} does not end: {self._told()}") from None
         self.ended = time.monotonic()
         for each in self._readers:
             each.join(_PATIENCE)
         if code is not None and found != code:
-            raise FailedError(f"talk {self.words}: exit code {found}: {self._told()}")
+            raise AssertionError(f"talk {self.words}: exit code {found}: {self._told()}")
         return self
 
     def _read(self) -> None:
@@ -153,7 +151,7 @@ def memory(stage: Stage) -> list[Row]:
     """Measure what is there, and a desk while all speak."""
     rows = [_memory("the broker", stage.broker.pid)]
     each = sum(megabytes(pid, "Pss") for pid in stage.simulated.pids) / len(stage.simulated.names)
-    rows.append(Row("memory", "memory of a simulated robot, its part of its process", "MB", (each,)))
+    rows.append(Row("memory of a simulated robot, its part of its process", "MB", (each,)))
     goal, asked = stage.say(2)
     stage.await_spoken(goal)
     rows.append(_memory("a desk that waits for all", asked.pid))
@@ -178,7 +176,7 @@ def presences(stage: Stage) -> list[Row]:
         found = roster(broker, _PATIENCE)
         times.append(time.monotonic() - began)
         assert len(found) == len(stage.names), f"{len(found)} of {len(stage.names)} robots"
-    rows = [_row("roster", "the roster, in a program that runs", times, 0.5)]
+    rows = [_row("the roster, in a program that runs", times, 0.5)]
     if subprocess.run(
         [sys.executable, "-m", "talkcli", "fleet", "--help"], env=stage.env, capture_output=True, check=False
     ).returncode:
@@ -186,7 +184,7 @@ def presences(stage: Stage) -> list[Row]:
     asked = [stage.talk("fleet", "status").finish() for _ in range(stage.options.rounds)]
     return [
         *rows,
-        _row("roster", "`talk fleet status`, start to end", [each.ended - each.began for each in asked], 0.5),
+        _row("`talk fleet status`, start to end", [each.ended - each.began for each in asked], 0.5),
     ]
 
 
@@ -195,9 +193,9 @@ def cancel(stage: Stage) -> list[Row]:
     alone, alone_whole = _cancelled(stage, wait=False)
     both, _ = _cancelled(stage, wait=True)
     return [
-        _row("cancel", "`talk --robot @all cancel`: on its way → last acknowledgement", alone, 1),
-        _row("cancel", "… start to end of the command", alone_whole),
-        _row("cancel", "… on its way → last acknowledgement, where another desk waits for all ends", both),
+        _row("`talk --robot @all cancel`: on its way → last acknowledgement", alone, 1),
+        _row("… start to end of the command", alone_whole),
+        _row("… on its way → last acknowledgement, where another desk waits for all ends", both),
     ]
 
 
@@ -228,7 +226,7 @@ def say(stage: Stage) -> list[Row]:
         stage.check(goal, asked)
         times.append(asked.ended - asked.began)
         stage.rest()
-    return [_row("say", "`talk --robot @all say -w` of 1 s, start to end of the command", times, 3)]
+    return [_row("`talk --robot @all say -w` of 1 s, start to end of the command", times, 3)]
 
 
 def broker_gone(stage: Stage) -> list[Row]:
@@ -248,8 +246,8 @@ def broker_gone(stage: Stage) -> list[Row]:
     then.finish()
     stage.check(again, then)
     return [
-        _row("broker", "broker back → the last robot, too", [back], 15),
-        _row("broker", "… → the desk has the last result of a sentence of 5 s", [max(0.0, asked.ended - up)]),
+        _row("broker back → the last robot, too", [back], 15),
+        _row("… → the desk has the last result of a sentence of 5 s", [max(0.0, asked.ended - up)]),
     ]
 
 
@@ -265,13 +263,13 @@ def idle(stage: Stage) -> list[Row]:
     after = _carried(stage.broker)
     a_second = {name: (after[name] - before[name]) / (after["at"] - before["at"]) / robots for name in _COUNTED}
     return [
-        Row("idle", "idle: messages to the broker a second, of each robot", "/s", (a_second["received"],)),
-        Row("idle", "… from the broker", "/s", (a_second["sent"],)),
-        Row("idle", "… bytes to the broker", "B/s", (a_second["bytes received"],)),
-        Row("idle", "… bytes from the broker", "B/s", (a_second["bytes sent"],)),
-        Row("idle", "… processor of the broker, for all", "%", (100 * brokers.processor / seconds,)),
-        Row("idle", "… processor of all simulated robots", "%", (100 * ours.processor / seconds,)),
-        Row("idle", "… context switches of all simulated robots", "/s", (ours.switches / seconds,)),
+        Row("idle: messages to the broker a second, of each robot", "/s", (a_second["received"],)),
+        Row("… from the broker", "/s", (a_second["sent"],)),
+        Row("… bytes to the broker", "B/s", (a_second["bytes received"],)),
+        Row("… bytes from the broker", "B/s", (a_second["bytes sent"],)),
+        Row("… processor of the broker, for all", "%", (100 * brokers.processor / seconds,)),
+        Row("… processor of all simulated robots", "%", (100 * ours.processor / seconds,)),
+        Row("… context switches of all simulated robots", "/s", (ours.switches / seconds,)),
     ]
 
 
@@ -286,9 +284,9 @@ def sentence(stage: Stage) -> list[Row]:
     stage.check(goal, asked)
     each = {name: (after[name] - before[name]) / len(stage.names) for name in _COUNTED}
     return [
-        Row("sentence", "a sentence to all: messages to the broker, of each robot", "", (each["received"],)),
-        Row("sentence", "… from the broker", "", (each["sent"],)),
-        Row("sentence", "… messages that the broker has dropped by now", "", (after["dropped"],)),
+        Row("a sentence to all: messages to the broker, of each robot", "", (each["received"],)),
+        Row("… from the broker", "", (each["sent"],)),
+        Row("… messages that the broker has dropped by now", "", (after["dropped"],)),
     ]
 
 
@@ -318,12 +316,12 @@ def _carried(broker: Broker) -> dict[str, float]:
 
 
 def _memory(name: str, pid: int) -> Row:
-    return Row("memory", f"memory of {name} (Pss)", "MB", (megabytes(pid, "Pss"),))
+    return Row(f"memory of {name} (Pss)", "MB", (megabytes(pid, "Pss"),))
 
 
-def _row(group: str, name: str, seconds: Sequence[float], limit: float | None = None) -> Row:
+def _row(name: str, seconds: Sequence[float], limit: float | None = None) -> Row:
     limits = () if limit is None else (Limit("p99", limit),)
-    return Row(group, name, "s", tuple(seconds), limits=limits)
+    return Row(name, "s", tuple(seconds), limits=limits)
 
 
 GROUPS: dict[str, Callable[[Stage], list[Row]]] = {
@@ -341,8 +339,8 @@ def measure(name: str, stage: Stage) -> list[Row]:
     """Return the rows of a group; one row that says why, where they could not be measured."""
     try:
         return GROUPS[name](stage)
-    except (FailedError, TalkError, AssertionError, TimeoutError, OSError) as error:
-        return [Row(name, f"({name})", "", failure=f"{type(error).__name__}: {error}")]
+    except (TalkError, AssertionError, TimeoutError, OSError) as error:
+        return [Row(f"({name})", "", failure=f"{type(error).__name__}: {error}")]
 
 
 def main() -> None:
@@ -354,9 +352,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5, help="rounds of each row (%(default)s)")
     parser.add_argument("--idle", type=float, default=60, metavar="SECONDS", help="without a request (%(default)g)")
     parser.add_argument("--only", action="append", choices=[*GROUPS], metavar="ROW", help=f"of {', '.join(GROUPS)}")
-    parser.add_argument("--markdown", action="store_true", help="print the table in Markdown")
     asked = parser.parse_args()
-    found = machine.head(None, peers=False) | {"paho-mqtt": version("paho-mqtt")}
+    found = machine.head()
     rows: list[Row] = []
     began = time.monotonic()
     with Stage(asked) as stage:
@@ -366,7 +363,7 @@ def main() -> None:
             rows += measure(name, stage)
         stage.simulated.stop()
     print("; ".join(f"{name} {value}" for name, value in found.items()))
-    print(as_markdown(rows) if asked.markdown else as_text(rows))
+    print(as_table(rows))
     sys.exit(any(each.failure is not None for each in rows))
 
 

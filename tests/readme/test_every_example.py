@@ -20,7 +20,7 @@ ELSEWHERE = {
     "Two clients": "tests/wire/test_examples.py::test_client_in_shell",
     "Two clients #2": "tests/wire/test_examples.py::test_client_in_plain_python",
     "Completion": "tests/test_completion.py::test_start_files_of_the_readme_load_it",
-    "Speed": "tests/bench/test_bench_rows.py::*",
+    "Speed": "tests/test_bench.py::*",
 }
 for _path in Path(__file__).parent.glob("test_*.py"):
     if _path != Path(__file__):

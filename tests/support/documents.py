@@ -48,7 +48,7 @@ COMMAND_LINE = Document("talkcli/cli/README.md")
 WIRE = Document("talkcli/protocol/README.md")
 FLEET = Document("talkcli/fleet/README.md")
 HOUSE = Document("talkcli/README.md")
-SPEED = Document("tests/bench/README.md")
+SPEED = Document("tests/tools/bench/README.md")
 CONTRIBUTING = Document(".github/CONTRIBUTING.md")
 #: All of them.
 DOCUMENTS = (

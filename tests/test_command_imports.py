@@ -1,4 +1,4 @@
-"""What each command that ends by itself imports: its whole time is mostly that, on a small machine above all."""
+"""The imports of each command that ends by itself: most of its time is spent on them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.bench.whole_process import OTHERS
+from tests.tools.bench.processes import OTHERS
 
 if TYPE_CHECKING:
     from tests.support.processes import Talk
 
-#: What no client has a use for: long imports of the standard library, and the server's part of the package.
+#: Modules that no client uses: slow ones of the standard library, and the server's part of the package.
 HEAVY = [
     *("asyncio", "concurrent", "multiprocessing", "subprocess", "ssl", "tempfile", "logging", "dataclasses", "pathlib"),
     *("pyttsx3", "espeakng_loader", "platformdirs"),
@@ -26,13 +26,13 @@ HEAVY = [
         "talkcli.server.speech",
     ),
 ]
-#: What only a command that talks to a server needs.
+#: Modules that only a command that talks to a server needs.
 CLIENT = ["socket", "select", "talkcli.client.client", "talkcli.client.connection"]
 ALONE = {"serve --print-unit user", "--version", "--help"}
 
 
 def imported(env: dict[str, str], *command: str) -> set[str]:
-    """Return the modules that Python imports for this."""
+    """Return the modules that Python imports for a command."""
     done = subprocess.run(
         [sys.executable, "-X", "importtime", *command],
         env=env,
@@ -47,9 +47,9 @@ def imported(env: dict[str, str], *command: str) -> set[str]:
 
 
 @pytest.mark.parametrize("words", OTHERS, ids=" ".join)
-def test_a_command_imports_nothing_that_it_has_no_use_for(scripted: Talk, words: tuple[str, ...]) -> None:
+def test_a_command_imports_nothing_that_it_does_not_use(scripted: Talk, words: tuple[str, ...]) -> None:
     found = imported(scripted.env, "-m", "talkcli", *words)
     assert "talkcli" in found
     useless = {*HEAVY, *(CLIENT if " ".join(words) in ALONE else [])}
-    # What click brings with it is nothing that these could leave out: platform and subprocess with Python 3.10.
+    # A command cannot leave out the imports of click: platform and subprocess with Python 3.10.
     assert useless & (found - imported(scripted.env, "-c", "import click")) == set()

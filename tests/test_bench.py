@@ -1,0 +1,59 @@
+"""The benchmark's rows measure something, and the documents show the rows that it has."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support.documents import README, SPEED, tables
+from tests.support.real_voice import real_voice
+from tests.support.surroundings import needs, needs_packages
+from tests.tools.bench import heard, load, marathon
+from tests.tools.bench.__main__ import GROUPS, NAMED, measure
+from tests.tools.bench.stage import Options, Stage
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+TABLES = tables(SPEED.text)
+
+
+def form(name: str, goal: str) -> tuple[str, str]:
+    """Return a row's name without its numbers, which a short run does not share, and its goal."""
+    return re.sub(r"[0-9][0-9,.]*", "#", name.replace("`", "")), goal
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    needs("pulseaudio", "pactl", "parec", "pacat", "aplay")
+    with Stage(Options(rounds=1, idle=1, sentences=2)) as found:
+        yield found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", [*GROUPS, *NAMED])
+def test_the_rows_of_a_group_measure_something(stage: Stage, group: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if group == "neural":
+        real_voice()
+    if group == "fleet":
+        needs("mosquitto", "openssl")
+        needs_packages("paho")
+    for module, name, less in (
+        *((load, "GOALS", 200), (load, "FEW", 250), (load, "MANY", 300), (load, "PENDING", 300), (load, "CLIENTS", 20)),
+        *((heard, "LONG_TEXT", heard.LONG_TEXT[:500]), (marathon, "SERVERS", 1)),
+    ):
+        monkeypatch.setattr(module, name, less)
+    rows = measure(group, stage)
+    assert [each.failure for each in rows if each.failure] == []
+    assert all(len(each.cells()) == len(TABLES[0][0]) and each.values for each in rows)
+    if group not in ("neural", "marathon"):  # which no table shows
+        known = {form(row[0], row[7]) for table in TABLES for row in table[1:]}
+        assert {form(each.name, each.goal) for each in rows} <= known, f"a table in {SPEED.name} is out of date"
+
+
+def test_readme_tells_what_the_table_has() -> None:
+    told = re.findall(r"\d[\d.,]* (?:ms|MB|%)", README.section("Speed"))
+    assert len(told) > 8
+    assert set(told) <= {cell for row in TABLES[0] for cell in row}

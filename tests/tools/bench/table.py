@@ -1,0 +1,116 @@
+"""The rows of the benchmark, their goals, and the table that shows them."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+Figure = Literal["median", "p99", "least", "ratio", "above"]
+HEADINGS = ("from → to", "n", "median", "99th", "peer", "its median", "ratio", "goal", "met")
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """The highest value that a figure of a row may have, or the lowest."""
+
+    figure: Figure
+    bound: float
+    at_least: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Return whether a figure is within the limit."""
+        return value >= self.bound if self.at_least else value <= self.bound
+
+    def words(self, unit: str) -> str:
+        """Return the limit as the table shows it."""
+        behind = {
+            "median": unit,
+            "p99": f"{unit} 99th",
+            "least": f"{unit} each",
+            "above": f"{unit} above",
+            "ratio": "×",
+        }
+        return f"{'≥' if self.at_least else '≤'} {number(self.bound)} {behind[self.figure]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """The values that were measured, and those of a peer that was measured in turn with them."""
+
+    name: str
+    unit: str
+    values: Sequence[float] = ()
+    peer: str = ""
+    peer_values: Sequence[float] = ()
+    limits: Sequence[Limit] = ()
+    failure: str | None = None
+
+    @property
+    def figures(self) -> dict[Figure, float]:
+        """The figures of the values; without a peer there is no ratio and no difference."""
+        middle = statistics.median(self.values)
+        found: dict[Figure, float] = {"median": middle, "p99": percentile(self.values, 99), "least": min(self.values)}
+        if self.peer_values:
+            theirs = statistics.median(self.peer_values)
+            found |= {"ratio": middle / theirs, "above": middle - theirs}
+        return found
+
+    @property
+    def goal(self) -> str:
+        """The limits in words."""
+        return ", ".join(each.words(self.unit) for each in self.limits)
+
+    @property
+    def met(self) -> str:
+        """Whether all limits hold: "yes" or "no"; "" if there is no limit, or no peer to compare with."""
+        figures = self.figures
+        if not self.limits or any(each.figure not in figures for each in self.limits):
+            return ""
+        return "yes" if all(each.holds(figures[each.figure]) for each in self.limits) else "no"
+
+    def cells(self) -> list[str]:
+        """Return the text under each heading."""
+        if self.failure is not None:
+            return [self.name, "0", f"FAILED: {self.failure}", "", "", "", "", self.goal, "no"]
+        figures = self.figures
+        theirs = ["", "", ""]
+        if self.peer_values:
+            theirs = [
+                self.peer,
+                f"{number(statistics.median(self.peer_values))} {self.unit}",
+                f"{figures['ratio']:.2f}",
+            ]
+        own = [f"{len(self.values):,}", f"{number(figures['median'])} {self.unit}".strip(), number(figures["p99"])]
+        return [self.name, *own, *theirs, self.goal, self.met]
+
+
+def percentile(values: Sequence[float], percent: float) -> float:
+    """Return the smallest measured value that so many percent of the values do not exceed."""
+    ordered = sorted(values)
+    return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)]
+
+
+def number(value: float) -> str:
+    """Return a number with three significant digits."""
+    if value == 0:
+        return "0"
+    size = abs(value)
+    if size >= 100:
+        return f"{value:,.0f}"
+    text = f"{value:.{1 if size >= 10 else 2 if size >= 1 else 3}f}"
+    return text.rstrip("0").rstrip(".") if value == int(value) else text
+
+
+def as_table(rows: Sequence[Row]) -> str:
+    """Return the rows as a Markdown table whose columns are aligned, except for the reasons of failures."""
+    lines = [list(HEADINGS), ["---"] * len(HEADINGS), *(each.cells() for each in rows)]
+    fitting = [line for line in lines if not line[2].startswith("FAILED")]
+    widths = [max(len(line[column]) for line in fitting) for column in range(len(HEADINGS))]
+    return "\n".join(
+        f"| {' | '.join(f'{cell:<{width}}' for cell, width in zip(line, widths, strict=True))} |" for line in lines
+    )
