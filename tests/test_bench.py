@@ -9,10 +9,11 @@ import pytest
 
 from tests.support.documents import README, SPEED, tables
 from tests.support.real_voice import real_voice
+from tests.support.sink import PROGRAMS
 from tests.support.surroundings import needs, needs_packages
 from tests.tools.bench import heard, load, marathon
 from tests.tools.bench.__main__ import GROUPS, NAMED, measure
-from tests.tools.bench.stage import Options, Stage
+from tests.tools.bench.stage import TALK, Options, Stage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,7 +28,7 @@ def form(name: str, goal: str) -> tuple[str, str]:
 
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
-    needs("pulseaudio", "pactl", "parec", "pacat", "aplay")
+    needs(TALK, *PROGRAMS)
     with Stage(Options(rounds=1, idle=1, sentences=2)) as found:
         yield found
 
@@ -42,7 +43,7 @@ def test_the_rows_of_a_group_measure_something(stage: Stage, group: str, monkeyp
         needs_packages("paho")
     for module, name, less in (
         *((load, "GOALS", 200), (load, "FEW", 250), (load, "MANY", 300), (load, "PENDING", 300), (load, "CLIENTS", 20)),
-        *((heard, "LONG_TEXT", heard.LONG_TEXT[:500]), (marathon, "SERVERS", 1)),
+        *((heard, "LONG_TEXT", heard.LONG_TEXT[:50]), (heard, "_TEXTS", 1), (marathon, "SERVERS", 1)),
     ):
         monkeypatch.setattr(module, name, less)
     rows = measure(group, stage)

@@ -62,18 +62,14 @@ def fleet(stage: Stage) -> list[Row]:
     def row(name: str, times: dict[str, list[float]], peer: str, *limits: Limit) -> Row:
         return Row(name, "ms", times["there"], peer, times["here"], limits)
 
+    where = f"idle for {seconds:.0f} s"
     return [
         row("`Client.say()` at a desk → accepted", said, _ON_ROBOT, Limit("median", 10)),
         Row("result at one who waits on the robot → at the desk", "ms", later, limits=(Limit("median", 5),)),
         row("`Client.status()` at a desk", asked, _ON_ROBOT),
         row("`GoalHandle.cancel()` at a desk, of what is spoken", ended, _ON_ROBOT),
         row(f"`talk --robot {_ROBOT} say hi`", whole, "`talk say hi`"),
-        Row(
-            f"idle for {seconds:.0f} s: context switches of the bridge a second",
-            "/s",
-            [switches],
-            limits=(Limit("median", 2),),
-        ),
+        Row(f"{where}: context switches of the bridge a second", "/s", [switches], limits=(Limit("median", 2),)),
         Row("memory of the bridge (Pss)", "MB", [memory["Pss"]], limits=(Limit("median", 25),)),
         # With what it shares with other programs: libssl, libpython.
         Row("… with all that it shares (Rss)", "MB", [memory["Rss"]]),

@@ -12,7 +12,7 @@ from tests.support.espeak import RATE
 from tests.support.sink import Sink
 from tests.tools.bench.heard import silences
 from tests.tools.bench.stage import VOICED, fine_blocks, serving
-from tests.tools.bench.table import Limit, Row, percentile
+from tests.tools.bench.table import Limit, Row
 
 if TYPE_CHECKING:
     from tests.support.connection import Wire
@@ -36,7 +36,6 @@ def marathon(stage: Stage) -> list[Row]:
         onsets, gaps = zip(*(each for server in found for each in server), strict=True)
     return [
         Row("a sentence of the marathon → first sample", "ms", onsets),
-        Row("… 99.9th percentile", "ms", [percentile(onsets, 99.9)]),
         Row("… longest", "ms", [max(onsets)]),
         Row("silences within a sentence of the marathon", "", [sum(gaps)], limits=(Limit("median", 0),)),
     ]
