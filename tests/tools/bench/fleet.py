@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _ROBOT, _ON_ROBOT = "anna", "on the robot"
 _LONG = "please step back from the moving platform, and wait until it stands still"
 #: Words per minute of sentences that are spoken to their end: as fast as possible.
-_RATE = 450
+_RATE_WPM = 450
 #: These rows are short.
 _MORE_ROUNDS = 4
 _PATIENCE_S = 10.0
@@ -120,7 +120,7 @@ def _cancelled(client: Client) -> float:
 
 def _result_later(desk: Client, local: Client) -> float:
     """Return by how many seconds a desk has a result later than a client that waits for the goal on the robot."""
-    goal = desk.say(SHORT, rate=_RATE)
+    goal = desk.say(SHORT, rate=_RATE_WPM)
     (same,) = local.follow([goal.id])
     times: list[float] = []
 

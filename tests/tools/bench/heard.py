@@ -41,7 +41,7 @@ _MORE_ROUNDS = 7
 #: Sentences without a pause that is as long as the one between two of them.
 _QUEUED = ("battery low", "coming home", "all is well", "moving along")
 #: Samples of quiet that are a pause between sentences; that of espeak-ng is 235 ms long.
-_PAUSE = RATE * 150 // 1000
+_PAUSE_SAMPLES = RATE * 150 // 1000
 LONG_TEXT = ("I am ready to go. We are leaving now. Please follow me. " * 200)[:10_000]
 #: Begins with the same words as the long text.
 _TEN = "I am ready"
@@ -85,7 +85,7 @@ def onset(stage: Stage) -> list[Row]:
             "--lines": line,
             "aplay": stage.command(*_player(stage, "rendering", render([TEXT])[0])),
         }
-        if stage.peers:
+        if stage.has_peers:
             subjects["spd-say -w"] = stage.command("spd-say", "-w", TEXT)
             subjects["pyttsx3 script"] = stage.command(PYTHON, "-c", _PYTTSX3)
             subjects["espeak-ng"] = stage.command("espeak-ng", "-s", "200", TEXT)
@@ -110,7 +110,7 @@ def at_once(stage: Stage) -> list[Row]:
         "talk say -w": stage.command(TALK, "say", "-w", "--", SHORT),
         "Client.say": partial(_say_whole, stage.client, SHORT),
     }
-    if stage.peers:
+    if stage.has_peers:
         subjects["spd-say -w"] = stage.command("spd-say", "-w", SHORT)
     silent = {"python": partial(stage.until_end, [PYTHON, "-c", "pass"])}
     times = stage.in_turn({name: partial(stage.until_sound, each) for name, each in subjects.items()} | silent)
@@ -127,7 +127,7 @@ def cancel(stage: Stage) -> list[Row]:
     """Measure the commands that stop a sentence."""
     say, spd = partial(_say, stage.client), "spd-say"
     subjects = {"talk": partial(stage.until_silence, say, stage.command(TALK, "cancel"))}
-    if stage.peers:
+    if stage.has_peers:
         hush = stage.command(spd, "-S")
         subjects[spd] = partial(stage.until_silence, stage.command(spd, VOICED), hush)
     times = stage.in_turn(subjects)
@@ -189,7 +189,7 @@ def gap(stage: Stage) -> list[Row]:
             found = _pauses(stage, expected, partial(client.say, follow=False))
             # By its priority "message" they queue; by the usual one, "text", each replaces the one before it.
             spd = lambda text: stage.until_end(["spd-say", "-P", "message", text])  # noqa: E731
-            peer = _pauses(stage, expected, spd) if stage.peers else []
+            peer = _pauses(stage, expected, spd) if stage.has_peers else []
             if number:  # the first warms up
                 ours += found
                 theirs += peer
@@ -280,7 +280,7 @@ def _pauses(stage: Stage, expected: Sequence[Samples], say: Callable[[str], obje
             say(each)
         recording.wait_for_sound()
         recording.wait_until_quiet(0.6)
-    found = silences(recording.samples, _PAUSE)
+    found = silences(recording.samples, _PAUSE_SAMPLES)
     assert len(found) == len(_QUEUED) - 1, f"{len(found) + 1} sentences are heard"
     sounds = [extent(each) or (0, 0) for each in expected]
     lengths = [len(each) for each in expected]

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 #: Servers side by side, each with a sound server of its own: most of the time is waiting.
 SERVERS = 6
 #: Samples of digital silence within a sentence that are a gap: at this rate it has up to 8 ms of its own.
-_GAP = RATE * 12 // 1000
+_GAP_SAMPLES = RATE * 12 // 1000
 _QUIET_S = 0.03
-#: The ends of the sentences, in the order of the seed.
+#: What is done to a sentence. Each is chosen as often as it stands here.
 _ACTS = ("stop", "stop", "stop", "preempt", "pause", "whole")
 
 
@@ -72,5 +72,5 @@ def _sentence(sink: Sink, wire: Wire, chance: random.Random) -> tuple[float, int
         ended = wire.receive_event("result", timeout=10)["goal"]
         assert ended["id"] == goal, ended
         recording.wait_until_quiet(_QUIET_S)
-        gaps = silences(recording.samples, _GAP, 0) if act in ("stop", "whole") else []
+        gaps = silences(recording.samples, _GAP_SAMPLES, 0) if act in ("stop", "whole") else []
     return (first - began) * 1000, len(gaps)

@@ -64,7 +64,7 @@ class Stage(contextlib.ExitStack):
     def __init__(self, options: Options) -> None:
         super().__init__()
         self.options = options
-        self.peers = peers.installed()
+        self.has_peers = peers.installed()
         self._chance = random.Random(5)
 
     @cached_property
@@ -87,7 +87,7 @@ class Stage(contextlib.ExitStack):
     @cached_property
     def env(self) -> dict[str, str]:
         """The environment of commands: they find this server, the sink and speech-dispatcher."""
-        return self.talk.env | (self.enter_context(peers.dispatcher(self.sink)) if self.peers else {})
+        return self.talk.env | (self.enter_context(peers.dispatcher(self.sink)) if self.has_peers else {})
 
     def jitter(self) -> None:
         """Sleep for a random part of two blocks."""
