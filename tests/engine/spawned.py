@@ -14,7 +14,7 @@ from talkcli.engine.synthesizers.voices import is_neural
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from types import TracebackType
+    from typing import Any
 
 _E = TypeVar("_E", bound=protocol.Event)
 
@@ -53,6 +53,7 @@ class Spawned:
         self.events: list[protocol.Event] = []
         self._rate = FAST if driver in (None, "espeak") else USUAL
         self._rest = b""
+        self._ahead: list[protocol.Event | None] = []
         self._pauses = 0
         self._socket, theirs = socket.socketpair()
         self._socket.settimeout(PATIENCE)
@@ -76,11 +77,11 @@ class Spawned:
         self.send(protocol.Configure(server or os.getpid(), driver, player, device, voice, lead_in, list_voices))
 
     def __enter__(self) -> Spawned:
+        """Wait for the first event, behind which it takes commands; it can still be read."""
+        self._ahead.append(self.event())
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.process.kill()
         self.process.wait()
         self._socket.close()
@@ -112,12 +113,13 @@ class Spawned:
         voice: str | None = None,
         pitch: int = 50,
         lead_in: int | None = None,
+        followed: bool = False,
         voice_only: bool | None = None,
     ) -> None:
         if voice_only is None:
             voice_only = voice is not None and is_neural(voice)  # what is asked for is heard, or it fails
-        asked = protocol.Say(goal, text, rate or self._rate, 1.0, voice, pitch, lead_in=lead_in, voice_only=voice_only)
-        self.send(asked)
+        rate = rate or self._rate
+        self.send(protocol.Say(goal, text, rate, 1.0, voice, pitch, followed, lead_in=lead_in, voice_only=voice_only))
 
     def pause(self, goal: str = "g1") -> float:
         """Hold the sentence and return the seconds until the process said that it is silent."""
@@ -130,8 +132,24 @@ class Spawned:
     def resume(self, goal: str = "g1") -> None:
         self.send(protocol.Resume(goal))
 
+    def until_word(self, number: int = 1) -> protocol.Word:
+        """Return the word of this number, or the first one after it."""
+        while (word := self.until(protocol.Word)).number < number:
+            pass
+        return word
+
+    def stop(self, goal: str = "g1") -> float:
+        """Stop the sentence and return the seconds until the process said that it has ended."""
+        asked = time.monotonic()
+        self.send(protocol.Stop(goal))
+        ended = self.until(protocol.Ended)
+        assert (ended.id, ended.outcome) == (goal, protocol.STOPPED), ended
+        return time.monotonic() - asked
+
     def event(self) -> protocol.Event | None:
         """Return the next event, None at the end of the connection."""
+        if self._ahead:
+            return self._ahead.pop()
         while b"\n" not in self._rest:
             data = self._socket.recv(65536)
             if not data:
@@ -149,18 +167,9 @@ class Spawned:
                 return event
         raise AssertionError(f"no {kind.__name__} before the process ended: {self.errors()}")
 
-    def spoken(
-        self,
-        text: str,
-        goal: str = "g1",
-        *,
-        rate: int | None = None,
-        voice: str | None = None,
-        lead_in: int | None = None,
-        voice_only: bool | None = None,
-    ) -> protocol.Ended:
-        """Say a sentence and return how it ended."""
-        self.say(text, goal, rate=rate, voice=voice, lead_in=lead_in, voice_only=voice_only)
+    def spoken(self, text: str, goal: str = "g1", **more: Any) -> protocol.Ended:
+        """Say a sentence and return how it ended; `more`: as in `say`."""
+        self.say(text, goal, **more)
         return self.until(protocol.Ended)
 
     def words(self, goal: str = "g1") -> list[protocol.Word]:

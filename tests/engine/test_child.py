@@ -17,7 +17,6 @@ from talkcli.engine.players import child as child_module
 from talkcli.engine.players.child import Child
 from talkcli.engine.players.program import ProgramPlayer
 from tests.engine.spawned import FAST, Spawned
-from tests.engine.test_player_faults import Player
 from tests.support import census
 from tests.support.processes import children
 from tests.support.reference import played, render
@@ -25,7 +24,9 @@ from tests.support.reference import played, render
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: What happens when: a line for each player that is started, each text that is looked at, each fork.
+    from tests.engine.programs import Player
+
+#: Tells when a player is started, a text is looked at, and a process is forked: a line each.
 _WATCHED = """
 from talkcli.engine.synthesizers import guard
 tell = lambda what: sys.stderr.write(what + "\\n")
@@ -33,11 +34,6 @@ sys.addaudithook(lambda name, _: name in ("os.posix_spawn", "os.fork", "subproce
 guarded = guard.guarded
 guard.guarded = lambda *text: (tell("text"), guarded(*text))[1]
 """
-
-
-@pytest.fixture
-def player(tmp_path: Path) -> Player:
-    return Player(tmp_path)
 
 
 def _status(child: Child, seconds: float = 10.0) -> int:
@@ -54,7 +50,7 @@ def _run(script: str, *inherited: int) -> Child:
     return Child(("/bin/sh", "-c", script), inherited)
 
 
-def test_who_holds_a_pipe_is_looked_for_no_longer_than_it_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_holders_of_a_pipe_are_looked_for_no_longer_than_it_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
     reading, writing = os.pipe()
     looked: list[str] = []
 
@@ -74,13 +70,21 @@ def test_who_holds_a_pipe_is_looked_for_no_longer_than_it_is_held(monkeypatch: p
 # -- a child
 
 
-def test_its_status_is_that_of_its_end() -> None:
-    assert _status(_run("exit 0")) == 0
-    assert _status(_run("exit 7")) == 7
-    assert _status(_run("kill -TERM $$")) == -signal.SIGTERM
+@pytest.mark.parametrize(
+    ("script", "status"),
+    [
+        ("exit 0", 0),
+        ("exit 7", 7),
+        ("kill -TERM $$", -signal.SIGTERM),
+        # Python ignores SIGPIPE; a player that went on ignoring it would never end.
+        ("kill -PIPE $$; exit 3", -signal.SIGPIPE),
+    ],
+)
+def test_its_status_is_that_of_its_end(script: str, status: int) -> None:
+    assert _status(_run(script)) == status
 
 
-def test_what_cannot_be_started_is_an_error_and_leaves_nothing_open(
+def test_a_program_that_cannot_be_started_is_an_error_and_leaves_nothing_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))  # of folders that this user may enter: of others the error is theirs
@@ -94,7 +98,7 @@ def test_what_cannot_be_started_is_an_error_and_leaves_nothing_open(
     assert os.listdir("/proc/self/fd") == before
 
 
-def test_it_has_three_streams_what_it_inherits_and_its_leash() -> None:
+def test_it_has_three_streams_the_inherited_descriptors_and_its_leash() -> None:
     reading, writing = os.pipe()
     before = census.descriptors(os.getpid())
     child = _run("kill -STOP $$", writing)
@@ -114,12 +118,6 @@ def test_it_has_three_streams_what_it_inherits_and_its_leash() -> None:
     os.close(writing)
 
 
-def test_it_may_be_ended_by_a_pipe_that_nobody_reads() -> None:
-    """Python ignores that signal; a player that went on ignoring it would never end."""
-    child = _run("kill -PIPE $$; exit 3")
-    assert _status(child) == -signal.SIGPIPE
-
-
 def test_it_is_killed_with_all_that_it_has_started() -> None:
     reading, writing = os.pipe()
     child = _run("sleep 100 & echo . >&2; wait", writing)
@@ -133,7 +131,7 @@ def test_it_is_killed_with_all_that_it_has_started() -> None:
     os.close(reading)
 
 
-#: Starts what it is told to, in a session of its own, and lives no longer itself.
+#: Starts a process in a session of its own, and lives no longer itself.
 _LEAVES = """
 import os, sys, time
 ready, begun = os.pipe()
@@ -151,7 +149,7 @@ def _leaving(then: str, *inherited: int) -> Child:
     return Child((sys.executable, "-S", "-c", _LEAVES.format(then=then)), inherited)
 
 
-def test_what_left_its_session_is_killed_too_before_it_counts_as_ended() -> None:
+def test_a_process_that_left_its_session_is_killed_too_before_it_counts_as_ended() -> None:
     reading, writing = os.pipe()
     child = _leaving("os.write(begun, b'.')", writing)
     os.close(writing)
@@ -162,7 +160,7 @@ def test_what_left_its_session_is_killed_too_before_it_counts_as_ended() -> None
     os.close(reading)
 
 
-def test_what_left_its_session_and_closed_what_it_had_is_left_alone() -> None:
+def test_a_process_that_left_its_session_and_closed_its_descriptors_is_left_alone() -> None:
     reading, writing = os.pipe()
     child = _leaving(f"os.dup2({writing}, 1); os.closerange(2, 100); os.write(1, b'%d' % os.getpid())", writing)
     os.close(writing)
@@ -173,58 +171,6 @@ def test_what_left_its_session_and_closed_what_it_had_is_left_alone() -> None:
         os.read(reading, 1)  # it lives, as it holds this
     os.kill(stranger, signal.SIGKILL)
     os.close(reading)
-
-
-# -- in an engine process
-
-
-def test_no_memory_is_copied_for_it_and_it_starts_before_the_text_is_read(player: Player) -> None:
-    """A fork takes 3 ms, the synthesis 2, and the player itself 5 to 15: together, not one after the other."""
-    with Spawned(player.plays(), before=_WATCHED) as engine:
-        engine.until(protocol.Ready)
-        assert engine.spoken("battery low").outcome == protocol.COMPLETED
-        engine.leave()
-        assert engine.errors().split() == ["os.posix_spawn", "text"]
-
-
-def test_a_text_without_a_sound_is_no_fault_of_the_player(tmp_path: Path) -> None:
-    broken = tmp_path / "broken"
-    broken.write_text("#!/no/such/interpreter")
-    broken.chmod(0o755)
-    with Spawned(str(broken)) as engine:
-        engine.until(protocol.Ready)
-        silent, spoken = engine.spoken("...", "g1"), engine.spoken("battery low", "g2")
-        assert (silent.reason, spoken.reason) == ("nothing_to_say", "no_player")
-        assert children(engine.process.pid) == []
-
-
-def test_a_player_for_another_rate_is_replaced_before_the_first_sample(player: Player) -> None:
-    before = """
-from talkcli.engine.synthesizers import espeak
-load = espeak.load
-espeak.load = lambda: (*load()[:2], 16_000)
-"""
-    rates = player.heard.with_name("rates")
-    program = player.plays(f"open({str(rates)!r}, 'a').write(sys.argv[2] + ' ')")
-    with Spawned(f"{program} {{rate}}", before=before) as engine:
-        engine.until(protocol.Voices)
-        assert engine.spoken("battery low").outcome == protocol.COMPLETED
-    assert set(rates.read_text().split()) == {"22050"}
-    assert player.heard.read_bytes() == played(render(["battery low"], rate=FAST)[0]).tobytes()
-
-
-def test_all_that_a_player_has_started_dies_with_a_killed_process(tmp_path: Path) -> None:
-    """What a shell starts behind itself, too: it would go on with what it holds. Sound comes to one that is tied."""
-    begun, script = tmp_path / "begun", tmp_path / "pipeline"
-    os.mkfifo(begun)
-    script.write_text(f"#!/bin/sh\nsleep 100 &\nhead -c 1 > /dev/null\necho > {begun}\nwait\n")
-    script.chmod(0o755)
-    with Spawned(str(script)) as engine:
-        engine.until(protocol.Ready)
-        engine.say("one two three")
-        begun.read_text()
-        os.kill(engine.process.pid, signal.SIGKILL)
-        assert engine.all_gone()
 
 
 @pytest.mark.parametrize(("at_start", "pieces"), [(0, 1), (3528, 4), (2000, 3)])
@@ -242,3 +188,50 @@ def test_a_player_that_starts_finds_what_it_needs_to_begin_and_later_a_piece_at_
     while not player.gone():
         assert time.monotonic() < end, "it has not ended"
         time.sleep(0.001)  # on a busy machine it is killed later than `kill` waits for
+
+
+# -- in an engine process
+
+
+def test_no_memory_is_copied_for_it_and_it_starts_before_the_text_is_read(player: Player) -> None:
+    """A fork takes 3 ms, the synthesis 2, and the player itself 5 to 15: together, not one after the other."""
+    with Spawned(player.plays(), before=_WATCHED) as engine:
+        assert engine.spoken("battery low").outcome == protocol.COMPLETED
+        engine.leave()
+        assert engine.errors().split() == ["os.posix_spawn", "text"]
+
+
+def test_a_text_without_a_sound_is_no_fault_of_the_player(player: Player) -> None:
+    broken = player.program("")
+    broken.write_text("#!/no/such/interpreter")
+    with Spawned(str(broken)) as engine:
+        silent, spoken = engine.spoken("...", "g1"), engine.spoken("battery low", "g2")
+        assert (silent.reason, spoken.reason) == ("nothing_to_say", "no_player")
+        assert children(engine.process.pid) == []
+
+
+def test_a_player_for_another_rate_is_replaced_before_the_first_sample(player: Player) -> None:
+    before = """
+from talkcli.engine.synthesizers import espeak
+load = espeak.load
+espeak.load = lambda: (*load()[:2], 16_000)
+"""
+    rates = player.heard.with_name("rates")
+    program = player.plays(f"open({str(rates)!r}, 'a').write(sys.argv[2] + ' ')")
+    with Spawned(f"{program} {{rate}}", before=before) as engine:
+        assert engine.spoken("battery low").outcome == protocol.COMPLETED
+    assert set(rates.read_text().split()) == {"22050"}
+    assert player.heard.read_bytes() == played(render(["battery low"], rate=FAST)[0]).tobytes()
+
+
+def test_all_that_a_player_has_started_dies_with_a_killed_process(tmp_path: Path) -> None:
+    """What a shell starts behind itself, too: it would go on with what it holds. Sound comes to one that is tied."""
+    begun, script = tmp_path / "begun", tmp_path / "pipeline"
+    os.mkfifo(begun)
+    script.write_text(f"#!/bin/sh\nsleep 100 &\nhead -c 1 > /dev/null\necho > {begun}\nwait\n")
+    script.chmod(0o755)
+    with Spawned(str(script)) as engine:
+        engine.say("one two three")
+        begun.read_text()
+        os.kill(engine.process.pid, signal.SIGKILL)
+        assert engine.all_gone()

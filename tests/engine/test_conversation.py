@@ -28,7 +28,7 @@ def say(number: int, text: str) -> protocol.Say:
 
 
 @pytest.fixture
-def scripted(monkeypatch: pytest.MonkeyPatch) -> None:
+def scripted_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, scripted_engine.__file__])
 
 
@@ -51,7 +51,7 @@ def conversation(texts: list[str]) -> list[protocol.Ended]:
     return ended
 
 
-@pytest.mark.usefixtures("scripted")
+@pytest.mark.usefixtures("scripted_process")
 def test_texts_are_spoken_in_their_order_and_the_process_is_gone_then() -> None:
     assert conversation(["length=0.1", "length=0", "length=0.2"]) == [
         protocol.Ended(f"{number}", protocol.COMPLETED, duration=length)
@@ -59,7 +59,7 @@ def test_texts_are_spoken_in_their_order_and_the_process_is_gone_then() -> None:
     ]
 
 
-@pytest.mark.usefixtures("scripted")
+@pytest.mark.usefixtures("scripted_process")
 def test_who_says_something_to_a_process_that_has_died_hears_how() -> None:
     with Conversation(CONFIGURE) as engine:
         events = engine.events
@@ -71,7 +71,7 @@ def test_who_says_something_to_a_process_that_has_died_hears_how() -> None:
         assert failed.value.reason == "engine_crashed"
 
 
-@pytest.mark.usefixtures("scripted")
+@pytest.mark.usefixtures("scripted_process")
 def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None:
     with Conversation(CONFIGURE, deadline=time.monotonic() + 0.7) as engine:
         heard: list[protocol.Event] = []
@@ -86,7 +86,7 @@ def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None
 # What doctor makes of it
 
 
-@pytest.mark.usefixtures("scripted")
+@pytest.mark.usefixtures("scripted_process")
 def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(process, "HANG_AFTER", 0.4)
     hung = Played(State.ABORTED, "engine_hung", "the engine process said nothing for 0.4 s")
@@ -99,7 +99,7 @@ def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pyte
     assert voice.look(Setting()) == Engine(reason="engine_hung", words=words)
 
 
-@pytest.mark.usefixtures("scripted")
+@pytest.mark.usefixtures("scripted_process")
 def test_doctor_tells_how_an_engine_process_died_and_what_takes_too_long() -> None:
     died = Played(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
     assert sentence.by_engine("silent-start crash", Setting(), 1.0, 20.0) == died

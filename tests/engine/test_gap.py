@@ -11,22 +11,18 @@ from talkcli.engine import protocol
 from talkcli.engine.players.choice import LONGEST, MOST, REMEMBERED, Gap
 from talkcli.engine.stream import QUIET, Samples
 from tests.engine.spawned import FAST, Spawned
-from tests.engine.test_player_faults import Player
 from tests.support.reference import RATE, played, render
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from tests.engine.programs import Player
 
 TEXTS = ["battery low", "coming home", "please help"]
 #: Seconds that are left out where a test says so, and what that is in bytes: even a fast sentence ends in as much.
 LEFT_OUT = 0.02
 _BYTES = int(LEFT_OUT * RATE) * 2
 _SAYS_SO = f"from talkcli.engine.players.choice import Gap\nGap.allowance = lambda *_: {LEFT_OUT}"
-
-
-@pytest.fixture
-def player(tmp_path: Path) -> Player:
-    return Player(tmp_path)
 
 
 def _say(text: str, goal: str, *, followed: bool, rate: int = FAST) -> protocol.Say:

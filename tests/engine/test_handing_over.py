@@ -13,7 +13,7 @@ import pytest
 import talkcli
 from talkcli.engine import protocol, supervisor
 from talkcli.engine.supervisor import EngineDied, Supervisor
-from tests.engine.threads import PATIENCE, Thread, start
+from tests.engine.threads import PATIENCE, Thread
 
 if TYPE_CHECKING:
     import selectors
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from talkcli.engine.process import EngineProcess
     from talkcli.engine.supervisor import Report
-
-__all__ = ["start"]
 
 
 #: An engine process that says of each goal, in one piece, that it was begun and played: one thing to wake up for.

@@ -1,7 +1,8 @@
-"""Silence before a sentence, for devices that wake up slowly: only where the device was idle, and never counted."""
+"""Silence before a sentence, for devices that wake up slowly: only if the device was idle, and never counted."""
 
 from __future__ import annotations
 
+import itertools
 import time
 import wave
 from typing import TYPE_CHECKING
@@ -10,8 +11,8 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.players import choice
+from tests.engine.programs import SWALLOWS, Player, sound
 from tests.engine.spawned import FAST, SOON, Spawned
-from tests.engine.test_player_faults import Player, player
 from tests.support import compare
 from tests.support.processes import children
 from tests.support.reference import RATE, played, render
@@ -22,16 +23,21 @@ if TYPE_CHECKING:
 
     from tests.support.sink import Sink
 
-__all__ = ["player"]
-
-TEXTS = ["battery low, please come home", "thank you very much"]
-#: Milliseconds, and the bytes of that.
-LEAD_IN = 400
-_LEAD = LEAD_IN * RATE // 1000 * 2
+TEXT, SECOND = "battery low", "thank you"
+#: Milliseconds.
+LEAD_IN, OWN = 300, 200
 
 
-def _bytes(texts: list[str] = TEXTS) -> list[bytes]:
-    return [played(samples).astype("<i2").tobytes() for samples in render(texts, rate=FAST)]
+def _silence(milliseconds: int) -> bytes:
+    return bytes(milliseconds * RATE // 1000 * 2)
+
+
+def _sentence() -> bytes:
+    return played(render([TEXT], rate=FAST)[0]).astype("<i2").tobytes()
+
+
+def _idle_after(seconds: float) -> str:
+    return f"from talkcli.engine.players import choice\nchoice.IDLE_AFTER = {seconds}"
 
 
 def test_it_is_heard_before_the_first_sentence_and_not_before_the_next(sink: Sink) -> None:
@@ -39,138 +45,85 @@ def test_it_is_heard_before_the_first_sentence_and_not_before_the_next(sink: Sin
         engine.until(protocol.Voices)
         onsets = []
         with sink.record() as recording:
-            for number, text in enumerate(TEXTS):
-                goal = f"g{number}"
+            for text in (TEXT, SECOND):
                 asked = time.monotonic()
-                engine.say(text, goal)
+                engine.say(text, text)
                 word = engine.until(protocol.Word)
                 heard = time.monotonic()
                 onset = recording.wait_for_sound()
                 onsets.append(onset - asked)
                 assert word.time < 0.1
                 assert_within(abs(onset - (heard - word.time)), 0.1, "the word, beside its sound,")
-                ended = engine.until(protocol.Ended)
-                assert ended.outcome == protocol.COMPLETED
+                assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
                 recording.wait_until_quiet(0.1)
-        compare.assert_heard(recording, [played(each) for each in render(TEXTS, rate=FAST)])
+        compare.assert_heard(recording, [played(each) for each in render([TEXT, SECOND], rate=FAST)])
         assert onsets[0] > LEAD_IN / 1000
         assert_within(onsets[0], LEAD_IN / 1000 + 0.2, "the first sentence")
         assert_within(onsets[1], 0.2, "the second sentence")
 
 
-def test_a_player_gets_it_once_and_it_does_not_count(player: Player) -> None:
-    sentences = _bytes()
-    with Spawned(player.plays(), lead_in=LEAD_IN) as engine:
-        engine.until(protocol.Voices)
-        began = time.monotonic()
-        for number, text in enumerate(TEXTS):
-            ended = engine.spoken(text, f"g{number}")
+@pytest.mark.parametrize(
+    ("servers", "idle_after", "own", "expected"),
+    [
+        (LEAD_IN, 10.0, [None, None], [LEAD_IN, 0]),
+        (LEAD_IN, 0.0, [None, None], [LEAD_IN, LEAD_IN]),
+        (0, 10.0, [OWN, OWN, None], [OWN, OWN, 0]),
+        (LEAD_IN, 0.0, [0, OWN, None], [0, OWN, LEAD_IN]),
+    ],
+    ids=["the first sentence", "idle again", "the sentence's own", "instead of the server's"],
+)
+def test_a_player_gets_it_and_it_does_not_count(
+    player: Player, servers: int, idle_after: float, own: list[int | None], expected: list[int]
+) -> None:
+    texts = [TEXT, SECOND, SECOND][: len(own)]
+    sentences = [played(each).astype("<i2").tobytes() for each in render(texts, rate=FAST)]
+    with Spawned(player.plays(), lead_in=servers, before=_idle_after(idle_after)) as engine:
+        for number, (text, lead_in, sentence) in enumerate(zip(texts, own, sentences, strict=True)):
+            began = time.monotonic()
+            ended = engine.spoken(text, f"g{number}", lead_in=lead_in)
             assert ended.outcome == protocol.COMPLETED
-            duration = len(sentences[number]) / RATE / 2
+            duration = len(sentence) / RATE / 2
             assert ended.duration == pytest.approx(duration, abs=1e-4)
-            if number == 0:
-                assert time.monotonic() - began >= duration + LEAD_IN / 1000 - 0.1
-    assert player.heard.read_bytes() == bytes(_LEAD) + sentences[0] + sentences[1]
+            assert time.monotonic() - began >= duration + expected[number] / 1000 - 0.1
+    wanted = itertools.chain(*zip(map(_silence, expected), sentences, strict=True))
+    assert player.heard.read_bytes() == b"".join(wanted)
 
 
-def test_a_device_that_was_idle_gets_it_again(player: Player) -> None:
-    sentences = _bytes()
-    before = "from talkcli.engine.players import choice\nchoice.IDLE_AFTER = 0.0"
-    with Spawned(player.plays(), lead_in=LEAD_IN, before=before) as engine:
-        engine.until(protocol.Voices)
-        for number, text in enumerate(TEXTS):
-            assert engine.spoken(text, f"g{number}").outcome == protocol.COMPLETED
-    assert player.heard.read_bytes() == bytes(_LEAD) + sentences[0] + bytes(_LEAD) + sentences[1]
-
-
-def test_a_player_after_a_long_pause_gets_it_again(player: Player) -> None:
-    before = "from talkcli.engine.players import choice\nchoice.IDLE_AFTER = 0.2"
-    constants = {"RELEASE_AFTER": 0.1}
-    with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=0.3) as engine:
-        engine.until(protocol.Voices)
-        engine.say(TEXTS[0])
-        engine.until(protocol.Word)
-        engine.pause()
-        assert isinstance(engine.event(), protocol.Alive)
-        held = player.heard.stat().st_size
-        engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-    heard = player.heard.read_bytes()
-    assert heard[held : held + _LEAD] == bytes(_LEAD)
-    sentence = _bytes()[0]
-    rest = heard[held + _LEAD :]
-    assert sentence.endswith(rest)
-    assert heard[_LEAD : len(sentence) - len(rest) + _LEAD] == sentence[: -len(rest)]
-
-
-def test_a_sentence_that_goes_on_as_soon_as_the_device_was_let_go_of_gets_it_again(player: Player) -> None:
-    before, constants = "from talkcli.engine.players import choice\nchoice.IDLE_AFTER = 0.3", {"RELEASE_AFTER": 0.3}
+@pytest.mark.parametrize(
+    ("own", "idle_after", "again"),
+    [(None, 0.3, LEAD_IN), (None, 10.0, 0), (OWN, 0.3, OWN), (OWN, 10.0, 0)],
+    ids=["idle", "not idle", "own, idle", "own, not idle"],
+)
+def test_it_comes_again_after_a_pause_if_the_device_was_let_go_of_and_idle(
+    player: Player, own: int | None, idle_after: float, again: int
+) -> None:
+    """The device is idle as soon as it was let go of, for as long as it has played silence."""
+    before, constants = _idle_after(idle_after), {"RELEASE_AFTER": 0.3}
     with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=SOON) as engine:
         engine.until(protocol.Voices)
-        engine.say(TEXTS[0])
-        engine.until(protocol.Word)
+        engine.say(TEXT, lead_in=own)
+        engine.until_word()
         engine.pause()
         while children(engine.process.pid):
             assert isinstance(engine.event(), protocol.Alive)
         held = player.heard.stat().st_size
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-    heard = player.heard.read_bytes()
-    assert heard[held : held + _LEAD] == bytes(_LEAD)
-    assert _bytes()[0].endswith(heard[held + _LEAD :])
-
-
-def test_a_sentence_s_own_comes_before_it_wherever_the_output_is(player: Player) -> None:
-    sentences = _bytes([*TEXTS, TEXTS[1]])
-    with Spawned(player.plays()) as engine:
-        engine.until(protocol.Voices)
-        for number, (text, lead_in) in enumerate([(TEXTS[0], LEAD_IN), (TEXTS[1], LEAD_IN), (TEXTS[1], None)]):
-            ended = engine.spoken(text, f"g{number}", lead_in=lead_in)
-            assert ended.outcome == protocol.COMPLETED
-            assert ended.duration == pytest.approx(len(sentences[number]) / RATE / 2, abs=1e-4)
-    assert player.heard.read_bytes() == bytes(_LEAD) + sentences[0] + bytes(_LEAD) + sentences[1] + sentences[2]
-
-
-def test_a_sentence_s_own_stands_for_the_server_s_and_0_is_none(player: Player) -> None:
-    sentences = _bytes([*TEXTS, TEXTS[1]])
-    before = "from talkcli.engine.players import choice\nchoice.IDLE_AFTER = 0.0"
-    with Spawned(player.plays(), lead_in=LEAD_IN, before=before) as engine:
-        engine.until(protocol.Voices)
-        assert engine.spoken(TEXTS[0], "g1", lead_in=0).outcome == protocol.COMPLETED
-        assert engine.spoken(TEXTS[1], "g2", lead_in=LEAD_IN // 2).outcome == protocol.COMPLETED
-        assert engine.spoken(TEXTS[1], "g3").outcome == protocol.COMPLETED
-    heard = player.heard.read_bytes()
-    assert heard == sentences[0] + bytes(_LEAD // 2) + sentences[1] + bytes(_LEAD) + sentences[2]
-
-
-@pytest.mark.parametrize(("idle", "again"), [(0.2, _LEAD // 2), (10.0, 0)], ids=["idle", "not idle"])
-def test_a_sentence_s_own_comes_again_after_a_pause_only_where_the_device_was_idle(
-    player: Player, idle: float, again: int
-) -> None:
-    before = f"from talkcli.engine.players import choice\nchoice.IDLE_AFTER = {idle}"
-    with Spawned(
-        player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": 0.1}, before=before, alive_every=0.3
-    ) as engine:
-        engine.until(protocol.Voices)
-        engine.say(TEXTS[0], lead_in=LEAD_IN // 2)
-        engine.until(protocol.Word)
-        engine.pause()
-        assert isinstance(engine.event(), protocol.Alive)
-        held = player.heard.stat().st_size
-        engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-    rest = player.heard.read_bytes()[held:]
-    assert rest[:again] == bytes(again)
-    assert _bytes()[0].endswith(rest[again:])
+    heard, sentence, first = player.heard.read_bytes(), _sentence(), len(_silence(LEAD_IN if own is None else own))
+    assert heard[held:].startswith(_silence(again))
+    rest = heard[held + len(_silence(again)) :]
+    assert sentence.endswith(rest)
+    assert heard[first : first + len(sentence) - len(rest)] == sentence[: -len(rest)]
 
 
 #: Holds 0.4 s of what it has read, as a Bluetooth output does, and keeps it.
 SLOW_OUTPUT = """
-import os, time
+import os, sys, time
+tape = open(sys.argv[1], "ab", buffering=0)
 began, read = None, 0
 while data := os.read(0, 4096):
     began = began or time.monotonic()
-    os.write(tape, data)
+    tape.write(data)
     read += len(data)
     time.sleep(max(0, began + read / 44100 - 0.4 - time.monotonic()))
 time.sleep(max(0, (began or 0) + read / 44100 - time.monotonic()))
@@ -178,68 +131,41 @@ time.sleep(max(0, (began or 0) + read / 44100 - time.monotonic()))
 
 
 def test_a_sentence_that_was_held_in_its_own_begins_with_all_of_it_again(player: Player) -> None:
-    command = player.command(
-        f"import os\ntape = os.open({str(player.heard)!r}, os.O_WRONLY | os.O_CREAT | os.O_APPEND)\n{SLOW_OUTPUT}"
-    )
-    with Spawned(command) as engine:
-        engine.until(protocol.Voices)
-        engine.say(TEXTS[0], lead_in=800)
+    with Spawned(player.command(SLOW_OUTPUT)) as engine:
+        engine.say(TEXT, lead_in=800)
         engine.until(protocol.Started)
-        while not (
-            player.heard.exists() and player.heard.stat().st_size > 0.35 * RATE * 2
-        ):  # of which little was heard
-            time.sleep(0.002)  # what another process writes is no event
+        _await_size(player, 0.35)  # of which little was heard
         engine.pause()
         held = player.heard.stat().st_size
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-    assert player.heard.read_bytes()[held:] == bytes(2 * _LEAD) + _bytes()[0]
-
-
-def test_a_driver_that_plays_by_itself_can_have_none() -> None:
-    with Spawned(driver="dummy") as engine:
-        engine.until(protocol.Ready)
-        ended = engine.spoken(TEXTS[0], "g1", lead_in=LEAD_IN)
-        assert (ended.outcome, ended.reason) == (protocol.FAILED, "bad_option")
-        assert ended.message == "this driver plays by itself: it can't be given a lead-in"
-        assert engine.spoken(TEXTS[0], "g2", lead_in=0).outcome == protocol.COMPLETED
-
-
-def test_a_short_pause_in_which_the_device_was_let_go_of_gets_none(player: Player) -> None:
-    with Spawned(player.plays(), lead_in=LEAD_IN, limits={"RELEASE_AFTER": 0.1}) as engine:
-        engine.until(protocol.Voices)
-        engine.say(TEXTS[0])
-        engine.until(protocol.Word)
-        engine.pause()
-        while children(engine.process.pid):
-            time.sleep(0.01)  # that it is gone is no event for others
-        held = player.heard.stat().st_size
-        engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-    assert _bytes()[0].endswith(player.heard.read_bytes()[held:])
+    assert player.heard.read_bytes()[held:] == _silence(800) + _sentence()
 
 
 def test_a_pause_within_it_loses_nothing(player: Player) -> None:
     with Spawned(player.plays(), lead_in=LEAD_IN) as engine:
-        engine.until(protocol.Voices)
-        engine.say(TEXTS[0])
+        engine.say(TEXT)
         engine.until(protocol.Started)
-        while not (player.heard.exists() and player.heard.stat().st_size):
-            time.sleep(0.002)  # what another process writes is no event
+        _await_size(player, 0)
         engine.pause()
         assert engine.words() == []
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-    heard, sentence = player.heard.read_bytes(), _bytes()[0]
+    heard, sentence = player.heard.read_bytes(), _sentence()
     assert heard.endswith(sentence)
-    assert len(heard) > _LEAD + len(sentence)
+    assert len(heard) > len(_silence(LEAD_IN) + sentence)
     assert not any(heard[: -len(sentence)])
+
+
+def _await_size(player: Player, seconds: float) -> None:
+    """Wait until the player has more than so many seconds of sound."""
+    while not (player.heard.exists() and player.heard.stat().st_size > seconds * RATE * 2):
+        time.sleep(0.002)  # what another process writes is no event
 
 
 @limits()
 def test_a_player_that_ends_within_it_did_not_say_the_sentence(player: Player) -> None:
-    with Spawned(player.command("import os\nwhile os.read(0, 65536): pass"), lead_in=2000) as engine:
-        engine.until(protocol.Voices)
+    with Spawned(player.command(SWALLOWS), lead_in=2000) as engine:
         began = time.monotonic()
         ended = engine.spoken("yes")
         assert_within(time.monotonic() - began, 1.5, "the end of the sentence")
@@ -249,10 +175,9 @@ def test_a_player_that_ends_within_it_did_not_say_the_sentence(player: Player) -
 def test_a_file_gets_none(tmp_path: Path) -> None:
     target = tmp_path / "speech.wav"
     with Spawned(f"file:{target}", lead_in=LEAD_IN) as engine:
-        engine.until(protocol.Ready)
-        assert engine.spoken(TEXTS[0], lead_in=LEAD_IN).outcome == protocol.COMPLETED
+        assert engine.spoken(TEXT, lead_in=LEAD_IN).outcome == protocol.COMPLETED
     with wave.open(str(target), "rb") as file:
-        assert file.readframes(file.getnframes()) == render(TEXTS, rate=FAST)[0].astype("<i2").tobytes()
+        assert file.readframes(file.getnframes()) == sound(TEXT)
 
 
 def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,9 +18,8 @@ import pytest
 from talkcli import install
 from talkcli.engine import protocol
 from talkcli.engine.synthesizers.models import NEEDED
+from tests.engine.programs import Player, without_silence
 from tests.engine.spawned import SOON, Spawned
-from tests.engine.test_pausing_players import without_silence
-from tests.engine.test_player_faults import Player, player
 from tests.support import tiny_voice
 from tests.support.espeak import RATE
 from tests.support.processes import children
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
     from typing import Any
 
     from tests.support.sink import Sink
-
-__all__ = ["player"]
 
 TEXT = "battery low, please come home"
 VOICE = "piper/tiny"

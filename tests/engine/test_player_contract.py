@@ -295,20 +295,7 @@ def _play_for_ever(player: Player) -> None:
         player.consumed()
 
 
-# -- what it is
-
-
-@every
-def test_it_has_a_name_and_says_whether_it_takes_time(case: Case, tmp_path: Path) -> None:
-    player = case.opens(tmp_path)
-    before = (player.name, player.real_time)
-    _offer(player, SOUND)
-    _finish(player)
-    assert before == (player.name, player.real_time)
-    assert isinstance(player.name, str)
-    assert player.name
-    assert isinstance(player.real_time, bool)
-    _end(player)
+# -- opening
 
 
 @those("refused")
@@ -323,29 +310,35 @@ def test_one_that_cannot_be_opened_says_so(case: Case, tmp_path: Path) -> None:
 # -- playing
 
 
-@those("played")
-def test_all_that_it_took_is_played_in_order_and_once(case: Case, tmp_path: Path) -> None:
-    assert case.played is not None
-    player = case.opens(tmp_path)
-    _offer(player, SOUND)
-    _finish(player)
-    assert case.played(tmp_path) == SOUND
-    _end(player)
-    assert case.played(tmp_path) == SOUND
-
-
 @every
-def test_what_it_was_offered_may_be_overwritten_afterwards(case: Case, tmp_path: Path) -> None:
+def test_a_sound_is_played_whole_in_order_and_once(case: Case, tmp_path: Path) -> None:
+    """Its name stays, what it was offered may be overwritten, what it consumed grows to all, and then it has ended."""
     player = case.opens(tmp_path)
+    before = (player.name, player.real_time)
+    assert isinstance(player.name, str)
+    assert player.name
+    assert isinstance(player.real_time, bool)
+    assert not player.ended()
+    seen = [(player.consumed(), player.proven)]
     for start in range(0, len(SOUND), _PIECE):
         piece = bytearray(SOUND[start : start + _PIECE])
         _offer(player, piece)
+        seen.append((player.consumed(), player.proven))
+        assert seen[-1][0] <= start + len(piece)
         piece[:] = b"\xff" * len(piece)
         piece.clear()  # BufferError if it keeps a view of it
+    assert not player.ended()
     _finish(player)
+    assert player.ended()
+    seen.append((player.consumed(), player.proven))
+    assert seen == sorted(seen)
+    assert seen[-1] == (len(SOUND), True)
+    assert before == (player.name, player.real_time)
     if case.played is not None:
         assert case.played(tmp_path) == SOUND
     _end(player)
+    if case.played is not None:
+        assert case.played(tmp_path) == SOUND
 
 
 @every
@@ -353,17 +346,6 @@ def test_no_sample_at_all_ends_well(case: Case, tmp_path: Path) -> None:
     player = case.opens(tmp_path)
     _finish(player)
     assert player.consumed() == 0
-    _end(player)
-
-
-@every
-def test_it_has_not_ended_before_its_input_has(case: Case, tmp_path: Path) -> None:
-    player = case.opens(tmp_path)
-    assert not player.ended()
-    _offer(player, SOUND)
-    assert not player.ended()
-    _finish(player)
-    assert player.ended()
     _end(player)
 
 
@@ -381,40 +363,19 @@ def test_the_silent_one_takes_the_time_that_its_sound_would() -> None:
     _end(player)
 
 
-@every
-def test_what_it_consumed_grows_to_all_of_it_and_never_beyond(case: Case, tmp_path: Path) -> None:
-    player = case.opens(tmp_path)
-    seen = [(player.consumed(), player.proven)]
-    sent = 0
-    while sent < len(SOUND):
-        taken = player.offer(memoryview(SOUND)[sent : sent + _PIECE])
-        sent += taken
-        seen.append((player.consumed(), player.proven))
-        assert seen[-1][0] <= sent
-        if not taken:
-            _await(player)
-    player.close()
-    while not player.ended():
-        seen.append((player.consumed(), player.proven))
-        _await(player)
-    seen.append((player.consumed(), player.proven))
-    assert seen == sorted(seen)
-    assert seen[-1] == (len(SOUND), True)
-    _end(player)
-
-
 # -- waiting
 
 
 @every
 @limits()
-def test_no_call_waits(case: Case, tmp_path: Path) -> None:
+def test_no_call_waits_and_one_that_is_stuck_never_ends(case: Case, tmp_path: Path) -> None:
     with _quick("to open it"):
         player = (case.stuck or case.opens)(tmp_path)
-    if case.stuck is not None:
-        _fill(player)
+    sent = _fill(player) if case.stuck is not None else 0
     with _quick("an offer"):
-        player.offer(memoryview(bytes(_PIECE)))
+        sent += player.offer(memoryview(bytes(_PIECE)))
+    assert player.consumed() <= sent
+    assert not player.ended()
     for what in (player.consumed, player.interests, player.wake_at, player.ended, player.close, player.ended):
         with _quick(what.__name__):
             what()
@@ -422,24 +383,6 @@ def test_no_call_waits(case: Case, tmp_path: Path) -> None:
         player.kill()
     with _quick("gone"):
         player.gone()
-    _end(player)
-
-
-@those("stuck")
-def test_one_that_is_stuck_never_ends(case: Case, tmp_path: Path) -> None:
-    assert case.stuck is not None
-    player = case.stuck(tmp_path)
-    sent = _fill(player)
-    assert player.consumed() <= sent
-    assert not player.ended()
-    _end(player)
-
-
-@every
-def test_it_is_woken_when_it_can_go_on_and_not_for_nothing(case: Case, tmp_path: Path) -> None:
-    player = case.opens(tmp_path)
-    _offer(player, SOUND)
-    _finish(player)
     _end(player)
 
 

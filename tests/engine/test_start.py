@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
+from typing import TYPE_CHECKING
 
 import pytest
 
 from talkcli.engine import protocol
 from tests.engine.spawned import Spawned
-from tests.engine.test_player_faults import Player, player
 
-__all__ = ["player"]
+if TYPE_CHECKING:
+    from tests.engine.programs import Player
 
 #: Each takes milliseconds of the start, on a Raspberry Pi ten times as many, and nothing in the process needs it.
 _NOT_NEEDED = (

@@ -12,13 +12,11 @@ import pytest
 import talkcli
 from talkcli.engine import protocol, supervisor
 from talkcli.engine.supervisor import LINES, EngineDied, EngineMissing, EngineSaid
-from tests.engine.threads import Thread, start
+from tests.engine.threads import Thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
-
-__all__ = ["start"]
 
 
 def test_a_goal_is_held_and_goes_on_where_it_was(start: Callable[[], Thread]) -> None:

@@ -1,4 +1,4 @@
-"""An engine thread that runs, and what it has posted: what its tests are made of."""
+"""An engine thread that runs, and the reports that it has posted."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ import queue
 import sys
 from typing import TYPE_CHECKING, TypeVar
 
-import pytest
-
+import talkcli
 from talkcli.engine import protocol
 from talkcli.engine.supervisor import Supervisor
-from tests.support import scripted_engine
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from talkcli.engine.supervisor import Report
 
@@ -23,15 +21,40 @@ _R = TypeVar("_R")
 
 #: Seconds after which a report is late on the busiest machine.
 PATIENCE = 20.0
+CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None)
+#: An engine process that is ready at once; `say` and `other` are its answers to a goal and to any other command.
+_ANSWERS = """
+import os, sys
+sys.path.insert(0, {root!r})
+from talkcli.engine import protocol
+def tell(*events):
+    os.write(0, b"".join(map(protocol.encode, events)))
+for line in os.fdopen(0, "rb"):
+    command = protocol.decode(line, protocol.COMMANDS)
+    if isinstance(command, protocol.Configure):
+        tell(protocol.Ready("answers", None, None))
+    elif isinstance(command, protocol.Say):
+        {say}
+    else:
+        {other}
+"""
+
+
+def answering(folder: Path, say: str, other: str = "pass") -> list[str]:
+    """Return the command line of an engine process that answers by these lines of Python."""
+    program = folder / "engine.py"
+    root = os.path.dirname(os.path.dirname(talkcli.__file__))
+    program.write_text(_ANSWERS.format(root=root, say=say.replace("\n", "\n        "), other=other))
+    return [sys.executable, str(program)]
 
 
 class Thread:
-    """A running engine thread and what it has posted."""
+    """A running engine thread and its reports."""
 
     def __init__(self) -> None:
         self.seen: list[Report] = []
         self._posted: queue.Queue[Report] = queue.Queue()
-        self.engine = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), self._posted.put)
+        self.engine = Supervisor(CONFIGURE, self._posted.put)
         self.engine.thread.start()
 
     def say(self, text: str, goal: str = "g1") -> None:
@@ -50,20 +73,11 @@ class Thread:
                 return report
         raise AssertionError(f"no {kind.__name__} in {self.seen}")
 
+    def spoken(self, text: str, goal: str = "g1") -> protocol.Ended:
+        """Say a text and return how it ended."""
+        self.say(text, goal)
+        return self.until(protocol.Ended)
+
     def close(self) -> None:
         self.engine.close()
         self.engine.thread.join(PATIENCE)
-
-
-@pytest.fixture
-def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], Thread]]:
-    """Starts an engine thread with the scripted engine as its process."""
-    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, scripted_engine.__file__])
-    with contextlib.ExitStack() as stack:
-
-        def make() -> Thread:
-            thread = Thread()
-            stack.callback(thread.close)
-            return thread
-
-        yield make

@@ -1,0 +1,36 @@
+"""Fixtures of the engine's tests: player programs, and engine threads with a scripted process."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.engine.programs import Player
+from tests.engine.threads import Thread
+from tests.support import scripted_engine
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+
+@pytest.fixture
+def player(tmp_path: Path) -> Player:
+    """Makes player programs."""
+    return Player(tmp_path)
+
+
+@pytest.fixture
+def scripted_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the scripted engine started as the engine process."""
+    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, scripted_engine.__file__])
+
+
+@pytest.fixture
+def start(scripted_process: None) -> Iterator[Callable[[], Thread]]:  # noqa: ARG001 - it is what is started
+    """Starts engine threads with the scripted engine as their process."""
+    with contextlib.ExitStack() as stack:
+        yield lambda: stack.enter_context(contextlib.closing(Thread()))
