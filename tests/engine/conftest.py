@@ -11,6 +11,7 @@ import pytest
 from tests.engine.programs import Player
 from tests.engine.threads import Thread
 from tests.support import scripted_engine
+from tests.support.real_voice import real_voice
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -34,3 +35,10 @@ def start(scripted_process: None) -> Iterator[Callable[[], Thread]]:  # noqa: AR
     """Starts engine threads with the scripted engine as their process."""
     with contextlib.ExitStack() as stack:
         yield lambda: stack.enter_context(contextlib.closing(Thread()))
+
+
+@pytest.fixture(scope="session")
+def real(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Return the environment of engine processes that have a real voice, and keep what they make of its model."""
+    real_voice()
+    return {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
