@@ -1,4 +1,4 @@
-"""The clock of a sentence's playback: what has been heard, and which words have begun."""
+"""The clock of a sentence's playback: how much has been heard, and which words have begun."""
 
 from __future__ import annotations
 
@@ -65,3 +65,22 @@ def test_another_stream_begins_where_the_audio_goes_on() -> None:
     assert clock.due(200.0) == [missed]
     assert clock.next_due() == pytest.approx(200.75)
     assert clock.heard(200.5) == pytest.approx(2.25)
+
+
+def test_the_outputs_own_clock_stands_until_something_is_heard() -> None:
+    clock = WordClock()
+    clock.add(TimedWord(0, 1, 0.5))
+    clock.start(100.0)
+    clock.tell(100.2, 0.0)
+    assert (clock.elapsed(100.2), clock.next_due()) == (0.0, None)
+    clock.tell(100.4, 0.1)
+    assert clock.elapsed(100.4) == pytest.approx(0.1)
+    assert clock.next_due() == pytest.approx(100.8)
+
+
+def test_words_in_zeros_that_are_left_out_begin_with_the_sound() -> None:
+    clock = WordClock()
+    for position in (0.0, 0.2):
+        clock.add(TimedWord(0, 1, position))
+    clock.leave_out(0.1)
+    assert [each.position for each in clock.rest()] == [0.1, 0.2]

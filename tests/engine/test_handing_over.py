@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
-import sys
 import threading
 from typing import TYPE_CHECKING, cast
 
 import pytest
 
-import talkcli
 from talkcli.engine import protocol, supervisor
 from talkcli.engine.supervisor import EngineDied, Supervisor
-from tests.engine.threads import PATIENCE, Thread
+from tests.engine.threads import CONFIGURE, PATIENCE, Thread, answering
 
 if TYPE_CHECKING:
     import selectors
@@ -24,65 +23,29 @@ if TYPE_CHECKING:
     from talkcli.engine.supervisor import Report
 
 
-#: An engine process that says of each goal, in one piece, that it was begun and played: one thing to wake up for.
-PROMPT = """
-import os, sys
-sys.path.insert(0, {root!r})
-from talkcli.engine import protocol
-for line in os.fdopen(0, "rb"):
-    command = protocol.decode(line, protocol.COMMANDS)
-    if isinstance(command, protocol.Configure):
-        os.write(0, protocol.encode(protocol.Ready("prompt", None, None)))
-    elif isinstance(command, protocol.Say):
-        told = protocol.Started(command.id), protocol.Ended(command.id, protocol.COMPLETED)
-        os.write(0, b"".join(map(protocol.encode, told)))
-"""
-
-#: One that has played a goal as soon as it hears that another follows, or that none does any more.
-FOLLOWED = """
-import os, sys
-sys.path.insert(0, {root!r})
-from talkcli.engine import protocol
-for line in os.fdopen(0, "rb"):
-    command = protocol.decode(line, protocol.COMMANDS)
-    if isinstance(command, protocol.Configure):
-        os.write(0, protocol.encode(protocol.Ready("followed", None, None)))
-    elif isinstance(command, protocol.Say):
-        os.write(0, protocol.encode(protocol.Started(command.id)))
-    elif isinstance(command, protocol.Followed):
-        told = f"{{command.followed}} {{command.by_neural}}"
-        os.write(0, protocol.encode(protocol.Ended(command.id, protocol.COMPLETED, told)))
-"""
-
-
 @pytest.mark.parametrize("followed", [True, False])
-def test_the_process_is_told_what_becomes_of_the_goals_behind(
+def test_the_process_is_told_whether_a_goal_follows(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, followed: bool
 ) -> None:
-    program = tmp_path / "engine.py"
-    program.write_text(FOLLOWED.format(root=os.path.dirname(os.path.dirname(talkcli.__file__))))
-    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, str(program)])
-    thread = Thread()
-    try:
+    told = 'protocol.Ended(command.id, protocol.COMPLETED, f"{command.followed} {command.by_neural}")'
+    program = answering(tmp_path, "tell(protocol.Started(command.id))", f"tell({told})")
+    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: program)
+    with contextlib.closing(Thread()) as thread:
         thread.engine.follow("g1", followed, by_neural=True)  # there is none yet that could be told
         thread.until(protocol.Ready)
         thread.say("battery low")
         thread.engine.follow("g1", followed, by_neural=True)
         assert thread.until(protocol.Ended) == protocol.Ended("g1", protocol.COMPLETED, f"{followed} True")
-    finally:
-        thread.close()
 
 
 def test_a_goal_behind_another_wakes_the_thread_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    program = tmp_path / "engine.py"
-    program.write_text(PROMPT.format(root=os.path.dirname(os.path.dirname(talkcli.__file__))))
-    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, str(program)])
+    """By its answer, which comes in one piece: it was begun and played."""
+    program = answering(tmp_path, "tell(protocol.Started(command.id), protocol.Ended(command.id, protocol.COMPLETED))")
+    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: program)
     monkeypatch.setattr(supervisor, "HANG_AFTER", 600.0)  # so that no goal is slow enough on any machine
-    thread = Thread()
-    try:
+    with contextlib.closing(Thread()) as thread:
         thread.until(protocol.Ready)
-        thread.say("the first may find it asleep for longer", "g0")
-        thread.until(protocol.Ended)
+        thread.spoken("the first may find it asleep for longer", "g0")
         woken: list[list[int]] = []
         select = thread.engine._selector.select
 
@@ -93,32 +56,26 @@ def test_a_goal_behind_another_wakes_the_thread_once(monkeypatch: pytest.MonkeyP
 
         monkeypatch.setattr(thread.engine._selector, "select", counted)
         for number in range(1, 51):
-            thread.say("yes", f"g{number}")
-            assert thread.until(protocol.Ended) == protocol.Ended(f"g{number}", protocol.COMPLETED)
+            assert thread.spoken("yes", f"g{number}") == protocol.Ended(f"g{number}", protocol.COMPLETED)
         # By what the process said, and by nothing else; its answer to the first may have come to a `select` before.
         process = thread.engine._process
         assert process is not None
         assert {each for fds in woken for each in fds} == {process.socket.fileno()}
         # A thread that was not asleep yet looks once more; where it is, that is one for a goal.
         assert sum(bool(fds) for fds in woken) <= 50
-    finally:
-        thread.close()
 
 
 def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(
     start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor, "HANG_AFTER", 0.7)
+    monkeypatch.setattr(supervisor, "HANG_AFTER", 0.5)
     thread = start()
-    thread.say("length=0")
-    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
-    thread.say("length=0.05 hang", "g2")  # handed over while the thread dozes
-    assert thread.until(protocol.Ended).reason == "engine_hung"
-    thread.say("yes", "g3")
-    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
-    assert thread.next(1.0) is None  # it does not doze any more
-    thread.say("length=0.05 hang", "g4")
-    assert thread.until(protocol.Ended).reason == "engine_hung"
+    assert thread.spoken("length=0").outcome == protocol.COMPLETED
+    # handed over while the thread dozes
+    assert thread.spoken("length=0.05 hang", "g2").reason == "engine_hung"
+    assert thread.spoken("yes", "g3").outcome == protocol.COMPLETED
+    assert thread.next(0.7) is None  # it does not doze any more
+    assert thread.spoken("length=0.05 hang", "g4").reason == "engine_hung"
 
 
 class Swift:
@@ -140,7 +97,7 @@ def test_the_answer_to_a_goal_is_understood_although_the_goal_has_not_been_noted
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     posted: list[Report] = []
-    engine, process = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), posted.append), Swift()
+    engine, process = Supervisor(CONFIGURE, posted.append), Swift()
     for name in ("_process", "_open"):
         monkeypatch.setattr(engine, name, process)
     engine.say(protocol.Say("g1", "yes", 200, 1.0, None, 50))
@@ -167,8 +124,7 @@ def test_a_goal_that_was_sent_to_a_process_that_is_lost_is_spoken_by_the_next(
     thread = start()
     thread.until(protocol.Ready)
     monkeypatch.setattr(thread.engine, "_open", Lost(takes=takes))
-    thread.say("yes")
-    assert thread.until(protocol.Ended) == protocol.Ended("g1", protocol.COMPLETED, duration=0.1)
+    assert thread.spoken("yes") == protocol.Ended("g1", protocol.COMPLETED, duration=0.1)
     assert not any(isinstance(each, EngineDied) for each in thread.seen)
 
 
@@ -188,22 +144,20 @@ def test_a_process_that_takes_no_goal_is_ended_and_the_goal_is_the_next_ones(
 def test_a_goal_that_is_sent_to_a_process_in_its_death_is_spoken_by_the_next(start: Callable[[], Thread]) -> None:
     thread = start()
     thread.until(protocol.Ready)
-    for number in range(20):
+    for number in range(10):
         process = thread.engine._process
         assert process is not None
         os.kill(process.pid, signal.SIGKILL)
-        thread.say("length=0.01", f"g{number}")
-        assert thread.until(protocol.Ended) == protocol.Ended(f"g{number}", protocol.COMPLETED, duration=0.01)
+        ended = thread.spoken("length=0.01", f"g{number}")
+        assert ended == protocol.Ended(f"g{number}", protocol.COMPLETED, duration=0.01)
 
 
 def test_a_goal_for_which_two_processes_die_before_they_begin_with_it_ends(start: Callable[[], Thread]) -> None:
     thread = start()
-    thread.say("silent-start length=0 crash")
-    ended = thread.until(protocol.Ended)
+    ended = thread.spoken("silent-start length=0 crash")
     assert (ended.outcome, ended.reason) == (protocol.FAILED, "engine_crashed")
     assert sum(isinstance(each, EngineDied) for each in thread.seen) == 2
-    thread.say("yes", "g2")
-    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert thread.spoken("yes", "g2").outcome == protocol.COMPLETED
 
 
 def test_a_process_that_was_given_up_gets_no_other_goal(start: Callable[[], Thread]) -> None:
@@ -212,20 +166,17 @@ def test_a_process_that_was_given_up_gets_no_other_goal(start: Callable[[], Thre
     thread.until(protocol.Word)
     lost = thread.engine._process
     thread.engine.give_up("g1")
-    thread.say("yes", "g2")
-    assert thread.until(protocol.Ended) == protocol.Ended("g2", protocol.COMPLETED, duration=0.1)
+    assert thread.spoken("yes", "g2") == protocol.Ended("g2", protocol.COMPLETED, duration=0.1)
     assert thread.engine._process is not lost
 
 
 def test_a_goal_that_ended_before_it_was_given_up_costs_no_process(start: Callable[[], Thread]) -> None:
     thread = start()
-    thread.say("length=0")
-    thread.until(protocol.Ended)
+    thread.spoken("length=0")
     process = thread.engine._process
     thread.engine.give_up("g1")
     for number in (2, 3):
-        thread.say("yes", f"g{number}")
-        assert thread.until(protocol.Ended).id == f"g{number}"
+        assert thread.spoken("yes", f"g{number}").id == f"g{number}"
     assert thread.engine._process is process
     assert thread.engine._open is process
 
@@ -251,8 +202,7 @@ def test_a_goal_that_is_handed_in_just_before_the_end_has_its_end(
             held.wait(PATIENCE)  # both come while it is at work, and finds next that it is to end
 
     monkeypatch.setattr(thread.engine, "_post", slow)
-    thread.say("length=0", "g0")
-    assert thread.until(protocol.Ended).id == "g0"
+    assert thread.spoken("length=0", "g0").id == "g0"
     thread.say("never-ends")
     thread.engine.close()
     held.set()

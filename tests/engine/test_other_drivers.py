@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import time
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -13,82 +14,76 @@ from talkcli.engine import protocol
 from tests.engine.spawned import Spawned
 from tests.support.timing import assert_within, limits
 
-#: A driver like macOS's: it speaks by itself, gives words as names, and confirms a stop some time later.
-SLOW_DRIVER = """
-import time, types
-class Driver:
-    def __init__(self, proxy):
-        self.proxy, self.due, self.words, self.completed = proxy, None, [], True
-    def destroy(self): pass
-    def iterate(self):
-        self.proxy.setBusy(False)
-        while True:
-            if self.words:
-                word, at = self.words.pop(0)
-                self.proxy.notify("started-word", name=word, location=at, length=len(word))
-            if self.due is not None and time.monotonic() >= self.due:
-                self.due = None
-                self.proxy.notify("finished-utterance", completed=self.completed)
-                self.proxy.setBusy(False)
-            yield
-    def say(self, text):
-        self.proxy.setBusy(True)
-        if text == "raise":
-            raise RuntimeError("no tongue")
-        self.completed, self.due = True, time.monotonic() + 0.4
-        self.words = [(word, text.index(word)) for word in text.split()]
-    def stop(self):
-        self.completed = False
-        if self.due is not None:
-            self.due = time.monotonic() + 0.03
-    def getProperty(self, name):
-        return {"voices": [], "voice": "only"}[name]
-    def setProperty(self, name, value):
-        raise KeyError(f"unknown property {name}")
-module = types.ModuleType("pyttsx3.drivers.slow")
-module.buildDriver = Driver
-sys.modules[module.__name__] = module
-"""
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from typing import Any
 
-#: A driver that reports each word as it says it, 0.1 s a word, and writes what it is told to say to standard error.
-TIMED_DRIVER = """
+#: The parts of a driver that all have here: it has no properties, and puts itself among pyttsx3's.
+_DRIVER = """
 import re, time, types
-class Driver:
+class Base:
     def __init__(self, proxy):
-        self.proxy, self.plan, self.stopped = proxy, [], False
+        self.proxy, self.plan, self.completed = proxy, [], True
     def destroy(self): pass
     def iterate(self):
         self.proxy.setBusy(False)
         while True:
             while self.plan and time.monotonic() >= self.plan[0][0]:
                 _, topic, values = self.plan.pop(0)
+                self.proxy.notify(topic, **values)
                 if topic == "finished-utterance":
-                    self.proxy.notify(topic, completed=not self.stopped)
                     self.proxy.setBusy(False)
                     break
-                self.proxy.notify(topic, **values)
             yield
     def say(self, text):
         self.proxy.setBusy(True)
-        self.stopped = False
-        print(text, file=sys.stderr, flush=True)
         at = time.monotonic()
-        for match in re.finditer(r"[^ ]+", text):
-            at += 0.1
-            values = {"name": None, "location": match.start(), "length": len(match.group())}
-            self.plan.append((at, "started-word", values))
-        self.plan.append((at + 0.1, "finished-utterance", {}))
+        for match in re.finditer("[^ ]+", text):
+            at += self.WORD
+            self.plan.append((at, "started-word", self.word(match)))
+        self.plan.append((at + self.END, "finished-utterance", dict(completed=True)))
     def stop(self):
         if self.plan:
-            self.stopped, self.plan = True, [(time.monotonic() + 0.2, "finished-utterance", {})]
+            self.plan = [(time.monotonic() + self.STOP, "finished-utterance", dict(completed=False))]
     def getProperty(self, name):
-        return {"voices": [], "voice": "only"}[name]
+        return {{"voices": [], "voice": "only"}}[name]
     def setProperty(self, name, value):
-        raise KeyError(f"unknown property {name}")
-module = types.ModuleType("pyttsx3.drivers.timed")
+        raise KeyError(f"unknown property {{name}}")
+{driver}
+module = types.ModuleType("pyttsx3.drivers.{name}")
 module.buildDriver = Driver
 sys.modules[module.__name__] = module
 """
+
+#: A driver like macOS's: it speaks by itself, gives words as names, and confirms a stop some time later.
+SLOW_DRIVER = _DRIVER.format(
+    name="slow",
+    driver="""
+class Driver(Base):
+    WORD, END, STOP = 0, 0.4, 0.03
+    def word(self, match):
+        return dict(name=match.group(), location=match.start(), length=len(match.group()))
+    def say(self, text):
+        super().say(text)
+        if text == "raise":
+            self.plan.clear()
+            raise RuntimeError("no tongue")
+""",
+)
+
+#: A driver that reports each word as it says it, 0.1 s a word, and writes what it is told to say to standard error.
+TIMED_DRIVER = _DRIVER.format(
+    name="timed",
+    driver="""
+class Driver(Base):
+    WORD, END, STOP = 0.1, 0.1, 0.2
+    def word(self, match):
+        return dict(name=None, location=match.start(), length=len(match.group()))
+    def say(self, text):
+        print(text, file=sys.stderr, flush=True)
+        super().say(text)
+""",
+)
 
 #: A system whose library is not there.
 NO_LIBRARY = """
@@ -110,63 +105,68 @@ def _start_failure(driver: str | None = None, voice: str | None = None, before: 
         return failed
 
 
-def test_the_dummy_driver_speaks_and_reports_words() -> None:
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Spawned]:
+    with Spawned(driver="dummy") as engine:
+        yield engine
+
+
+@pytest.fixture
+def dummy(shared: Spawned) -> Spawned:
+    """Return a process with pyttsx3's dummy driver that the tests share, without the events of the tests before."""
+    shared.events.clear()
+    return shared
+
+
+def test_the_dummy_driver_lists_its_voices() -> None:
     with Spawned(driver="dummy") as engine:
         ready = engine.until(protocol.Ready)
         assert (ready.driver, ready.player) == ("dummy", None)
         assert engine.until(protocol.Voices).voices[0].id == "dummy.voice1"
+
+
+@pytest.mark.parametrize(("driver", "before"), [("dummy", ""), ("slow", SLOW_DRIVER)])
+def test_a_driver_is_stepped_to_the_end_of_each_sentence_and_reports_words(driver: str, before: str) -> None:
+    with Spawned(driver=driver, before=before) as engine:
         for goal in ("g1", "g2"):
             assert engine.spoken("battery low", goal).outcome == protocol.COMPLETED
             assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
 
 
-def test_a_driver_without_pitch_fails_only_who_asks_for_it() -> None:
-    with Spawned(driver="dummy") as engine:
-        engine.until(protocol.Ready)
-        engine.say("yes", pitch=80)
-        ended = engine.until(protocol.Ended)
-        assert (ended.outcome, ended.reason) == (protocol.FAILED, "bad_option")
-        assert ended.message == "the driver dummy cannot set pitch to 80: unknown property pitch"
-        assert engine.spoken("yes", "g2", rate=150).outcome == protocol.COMPLETED
+@pytest.mark.parametrize(
+    ("more", "reason", "message"),
+    [
+        ({"pitch": 80}, "bad_option", "the driver dummy cannot set pitch to 80: unknown property pitch"),
+        ({"lead_in": 400}, "bad_option", "this driver plays by itself: it can't be given a lead-in"),
+        ({"voice": "dummy.voice9"}, "unknown_voice", "'dummy.voice2'"),
+        ({"voice": "piper/en_US-joe-medium"}, "unknown_voice", '"piper/en_US-joe-medium" is a neural voice, and the'),
+    ],
+)
+def test_an_option_that_the_driver_lacks_fails_the_goal_that_asks_for_it(
+    dummy: Spawned, more: dict[str, Any], reason: str, message: str
+) -> None:
+    ended = dummy.spoken("yes", **more)
+    assert (ended.outcome, ended.reason) == (protocol.FAILED, reason)
+    assert ended.message is not None
+    assert message in ended.message
+    assert dummy.spoken("yes", "g2", rate=150, lead_in=0).outcome == protocol.COMPLETED
 
 
-def test_an_unknown_voice_of_another_driver_fails() -> None:
-    with Spawned(driver="dummy") as engine:
-        engine.until(protocol.Ready)
-        ended = engine.spoken("yes", voice="dummy.voice9")
-        assert ended.reason == "unknown_voice"
-        assert ended.message is not None
-        assert "'dummy.voice2'" in ended.message
-
-
-def test_a_neural_voice_of_another_driver_is_refused_as_one() -> None:
+def test_a_neural_voice_of_another_driver_is_refused_at_the_start() -> None:
     words = '"piper/en_US-joe-medium" is a neural voice, and the driver "dummy" has none: leave --driver out'
     failed = _start_failure("dummy", "piper/en_US-joe-medium")
     assert (failed.message, failed.reason, failed.usage) == (words, "unknown_voice", True)
-    with Spawned(driver="dummy") as engine:
-        engine.until(protocol.Ready)
-        ended = engine.spoken("yes", voice="piper/en_US-joe-medium")
-        assert (ended.reason, ended.message) == ("unknown_voice", words)
 
 
-def test_a_driver_that_speaks_by_itself_is_stepped_to_its_end() -> None:
+@limits()
+def test_a_stop_of_a_slow_driver_ends_when_it_says_so_and_an_error_of_it_fails_its_goal_alone() -> None:
     with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
-        engine.until(protocol.Ready)
-        for goal in ("g1", "g2"):
-            assert engine.spoken("battery low", goal).outcome == protocol.COMPLETED
-            assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
-
-
-def test_a_stop_of_a_slow_driver_ends_when_it_says_so() -> None:
-    with limits(), Spawned(driver="slow", before=SLOW_DRIVER) as engine:
-        engine.until(protocol.Ready)
         engine.say("battery low")
-        engine.until(protocol.Word)
-        asked = time.monotonic()
-        engine.send(protocol.Stop("g1"))
-        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
-        assert_within(time.monotonic() - asked, 0.15, "the stop")
-        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+        engine.until_word()
+        assert_within(engine.stop(), 0.15, "the stop")
+        ended = engine.spoken("raise", "g2")
+        assert (ended.reason, ended.message) == ("engine_failed", "RuntimeError: no tongue")
+        assert engine.spoken("yes", "g3").outcome == protocol.COMPLETED
 
 
 def _timed(text: str = "battery low, please come home") -> Spawned:
@@ -182,29 +182,17 @@ def _texts(engine: Spawned) -> list[str]:
     return engine.errors().splitlines()
 
 
-def test_a_driver_without_a_pause_goes_on_from_the_last_word() -> None:
-    with _timed() as engine:
-        while engine.until(protocol.Word).number < 3:
-            pass
-        assert engine.pause() >= 0.2, "it is silent only when the driver says so"
-        assert isinstance(engine.event(), protocol.Alive)
-        engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-        assert [word.start for word in engine.words()] == [0, 8, 13, 20, 25]
-        assert [word.number for word in engine.words()] == [1, 2, 3, 4, 5]
-        assert engine.words()[-1].time < 0.5 + 0.2 + 0.1 + 0.15, "the pause counts"
-        assert _texts(engine) == ["battery low, please come home", "please come home"]
-
-
-def test_a_driver_is_paused_twice_in_a_sentence() -> None:
+def test_a_driver_without_a_pause_goes_on_from_the_last_word_each_time() -> None:
     with _timed() as engine:
         for number in (2, 4):
-            while engine.until(protocol.Word).number < number:
-                pass
-            engine.pause()
+            engine.until_word(number)
+            assert engine.pause() >= 0.2, "it is silent only when the driver says so"
+            assert isinstance(engine.event(), protocol.Alive)
             engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
         assert [word.start for word in engine.words()] == [0, 8, 13, 20, 25]
+        assert [word.number for word in engine.words()] == [1, 2, 3, 4, 5]
+        assert engine.words()[-1].time < 0.5 + 2 * (0.2 + 0.1 + 0.15), "the pauses do not count"
         assert _texts(engine) == ["battery low, please come home", "low, please come home", "come home"]
 
 
@@ -242,26 +230,14 @@ def test_a_stop_ends_a_driver_that_is_paused(silent: bool) -> None:
         assert _texts(engine) == ["battery low, please come home", "yes"]
 
 
-def test_a_driver_that_raises_fails_the_goal_and_not_the_next() -> None:
-    with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
-        engine.until(protocol.Ready)
-        ended = engine.spoken("raise")
-        assert (ended.reason, ended.message) == ("engine_failed", "RuntimeError: no tongue")
-        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
-
-
 @limits()
 def test_a_driver_that_never_ends_shows_no_sign_of_life_after_a_while() -> None:
     patience = "from talkcli.engine import session\nsession.PATIENCE, session.WORDS_A_CHARACTER = 0.7, 0\n"
-    never = "Driver.stop = lambda self: None\nFOR_EVER = 1e9\n"
-    never += (
-        "say = Driver.say\ndef never(self, text):\n    say(self, text)\n    self.due += FOR_EVER\nDriver.say = never\n"
-    )
+    never = "Driver.stop = lambda self: None\nDriver.END = 1e9\n"
     with Spawned(driver="slow", before=patience + SLOW_DRIVER + never) as engine:
         engine.until(protocol.Voices)
         engine.say("battery low")
-        while engine.until(protocol.Word).number < 2:
-            pass
+        engine.until_word(2)
         began = time.monotonic()
         alive = 0
         while select.select([engine._socket], [], [], 2 * protocol.ALIVE_EVERY + 0.2)[0]:
@@ -325,8 +301,7 @@ def test_an_unknown_driver_is_named_with_those_there_are() -> None:
 
 
 def test_a_driver_for_another_system_says_what_it_lacks() -> None:
-    failed = _start_failure("nsss")
-    assert failed.message == "the driver \"nsss\" cannot be loaded: No module named 'objc'"
+    assert _start_failure("nsss").message == "the driver \"nsss\" cannot be loaded: No module named 'objc'"
 
 
 def test_a_driver_that_cannot_be_stepped_is_refused_at_once() -> None:
@@ -336,9 +311,8 @@ def test_a_driver_that_cannot_be_stepped_is_refused_at_once() -> None:
     assert "leave --driver out" in failed.message
 
 
-@pytest.mark.parametrize("driver", ["espeak", None])
-def test_espeak_means_talks_own_driver(driver: str) -> None:
-    with Spawned(driver=driver) as engine:
+def test_espeak_means_talks_own_driver() -> None:
+    with Spawned(driver="espeak") as engine:
         assert engine.until(protocol.Ready).driver == "espeak"
         assert engine.spoken("yes").outcome == protocol.COMPLETED
 

@@ -1,4 +1,4 @@
-"""Players that have a name: their table, which are tried, and the command lines of those that are programs."""
+"""Players that have a name: their table, which are tried, their command lines and their words of an error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from talkcli.engine import players, protocol
 from talkcli.engine.players import PACKAGES, PLAYERS, commands
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.choice import Players
-from talkcli.engine.players.program import ProgramPlayer
+from talkcli.engine.players.program import LONGEST_LINE, Complaint, ProgramPlayer
 
 if TYPE_CHECKING:
     from tests.support.sink import Sink
@@ -29,7 +29,7 @@ def _names(player: str | None, last: str | None = None) -> list[str]:
     return [command.name for command in commands(player, None, 22050, last)]
 
 
-def test_what_is_there_is_tried_and_what_worked_comes_first(there: There) -> None:
+def test_the_players_that_are_there_are_tried_and_the_one_that_worked_comes_first(there: There) -> None:
     there({"aplay", "pw-cat", "pacat"})
     assert _names(None) == ["aplay", "pacat", "pw-cat"]
     assert _names(None, "pw-cat") == ["pw-cat", "aplay", "pacat"]
@@ -68,9 +68,54 @@ def test_a_command_line_is_split_without_a_shell(there: There) -> None:
     assert command.name == "my"
 
 
-@pytest.mark.parametrize("player", ["pacat", "sox -", "", "  ", "'"])
-def test_a_player_that_is_not_there_is_an_error(there: There, player: str) -> None:
+@pytest.mark.parametrize(
+    ("player", "words"),
+    [
+        ("pacat", 'player "pacat" not found: install pulseaudio-utils'),
+        ("sox -", 'player "sox" not found'),
+        ("", "player command is empty"),
+        ("  ", "player command is empty"),
+        ("'", "no closing quotation"),
+    ],
+)
+def test_a_player_that_is_not_there_is_an_error(there: There, player: str, words: str) -> None:
     there(set())
-    with pytest.raises(CannotSpeak) as caught:
+    with pytest.raises(CannotSpeak, match=words) as caught:
         commands(player, None, 22050)
     assert caught.value.reason == "no_player"
+
+
+@pytest.mark.parametrize(
+    ("said", "line"),
+    [
+        ("", None),
+        ("underrun!!! (at least 12.3 ms long)\n", None),
+        ("ALSA lib conf.c:5180:(snd_config_expand) Evaluate error: No such file or directory\n", None),
+        (
+            "aplay: main:831: audio open error: No such file or directory\n",
+            "aplay: audio open error: No such file or directory",
+        ),
+        (
+            "aplay: set_params:1416: Unable to install hw params:\nACCESS:  RW_INTERLEAVED\nFORMAT:  S16_LE\n",
+            "aplay: Unable to install hw params:",
+        ),
+        ("Connection failure: Connection refused\n", "Connection failure: Connection refused"),
+        ("Stream error: No such entity", "Stream error: No such entity"),
+        ("hello\nworld\n", "hello"),
+        ("hello\npw-cat: error: Host is down\n", "pw-cat: error: Host is down"),
+        ("first error\nsecond error\n", "first error"),
+        ("caf\xe9\n", "café"),
+    ],
+)
+def test_the_line_that_names_the_error_is_found(said: str, line: str | None) -> None:
+    complaint = Complaint()
+    for byte in said.encode():
+        complaint.feed(bytes([byte]))
+    assert complaint.line() == line
+
+
+def test_a_flood_of_standard_error_is_not_kept() -> None:
+    complaint = Complaint()
+    for _ in range(100):
+        complaint.feed(b"x" * 10_000)
+    assert complaint.line() == "x" * LONGEST_LINE

@@ -27,10 +27,10 @@ from talkcli.engine.supervisor import (
     Restarts,
     Supervisor,
 )
+from tests.engine.threads import CONFIGURE
 
 if TYPE_CHECKING:
     from talkcli.engine.supervisor import Report
-
 
 LACKING = "no library"
 YES = protocol.Say("g1", "yes", 200, 1.0, None, 50)
@@ -89,8 +89,7 @@ def test_a_start_costs_a_goal_only_where_it_began_long_after_there_was_a_process
 def _complaining(script: str) -> tuple[list[str], str]:
     """Return the lines that a process passes on which writes to standard error, and its last words."""
     lines: list[str] = []
-    configure = protocol.Configure(os.getpid(), None, None, None, None)
-    process = EngineProcess(configure, lines.append, command=[sys.executable, "-c", f"import os\n{script}"])
+    process = EngineProcess(CONFIGURE, lines.append, command=[sys.executable, "-c", f"import os\n{script}"])
     while process.stderr in ready({process.stderr: select.POLLIN}, 20.0) and process.read_stderr():
         pass
     words = process.last_words()
@@ -110,7 +109,7 @@ def test_a_line_that_never_ends_is_not_kept() -> None:
 
 def test_what_is_too_much_is_counted_and_told_with_the_next_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     passed: list[Report] = []
-    engine, now = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), passed.append), 1000.0
+    engine, now = Supervisor(CONFIGURE, passed.append), 1000.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
     for number in range(100):
         now = 1000.0 + number / 10
@@ -145,7 +144,7 @@ class Undying:
 
 def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
     """Return an engine thread that doesn't run, with this process."""
-    engine = Supervisor(protocol.Configure(os.getpid(), None, None, None, None), posted.append)
+    engine = Supervisor(CONFIGURE, posted.append)
     for descriptor in (process.socket.fileno(), process.liveness):
         engine._selector.register(descriptor, selectors.EVENT_READ, process)
     engine._process = process

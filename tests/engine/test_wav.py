@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine import protocol
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
 from tests.engine.spawned import Spawned
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 
@@ -30,12 +30,16 @@ def _read(path: Path) -> bytes:
         return file.readframes(file.getnframes())
 
 
-def test_sentences_are_appended(tmp_path: Path) -> None:
+def test_sentences_are_appended_to_an_empty_file_and_behind_them_rests_of_a_crash_are_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "x.wav"
+    path.touch()
     _write(path, b"one ")
     assert _read(path) == b"one "
+    with path.open("ab") as file:
+        file.write(b"torn!")
     _write(path, b"two ")
     assert _read(path) == b"one two "
+    assert path.stat().st_size == 44 + 8
 
 
 def test_a_killed_sentence_leaves_a_valid_file(tmp_path: Path) -> None:
@@ -45,23 +49,6 @@ def test_a_killed_sentence_leaves_a_valid_file(tmp_path: Path) -> None:
     file.kill()
     file.kill()
     assert file.gone()
-    assert _read(path) == b"one "
-
-
-def test_what_a_crash_left_is_cut_off(tmp_path: Path) -> None:
-    path = tmp_path / "x.wav"
-    _write(path, b"one ")
-    with path.open("ab") as file:
-        file.write(b"torn!")
-    _write(path, b"two ")
-    assert _read(path) == b"one two "
-    assert path.stat().st_size == 44 + 8
-
-
-def test_an_empty_file_is_filled(tmp_path: Path) -> None:
-    path = tmp_path / "x.wav"
-    path.touch()
-    _write(path, b"one ")
     assert _read(path) == b"one "
 
 
@@ -94,15 +81,14 @@ def _other_rate(path: Path) -> None:
 
 
 def _of_unknown_length(path: Path) -> None:
-    """What `say -o -` writes."""
+    """Write as `say -o -` does."""
     with path.open("wb") as file:
         WavStreamPlayer(file.fileno(), 22050, first=True).offer(memoryview(b"one "))
 
 
 @pytest.mark.parametrize("make", [_of_unknown_length, _stereo, _with_a_chunk_behind, _cut_short, _text, _other_rate])
-def test_other_content_is_refused_and_left_alone(tmp_path: Path, make: object) -> None:
+def test_other_content_is_refused_and_left_alone(tmp_path: Path, make: Callable[[Path], None]) -> None:
     path = tmp_path / "x.wav"
-    assert callable(make)
     make(path)
     before = path.read_bytes()
     with pytest.raises(CannotSpeak) as caught:
@@ -112,43 +98,28 @@ def test_other_content_is_refused_and_left_alone(tmp_path: Path, make: object) -
     assert path.read_bytes() == before
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
+def test_a_path_that_takes_no_samples_is_refused_and_no_descriptor_is_left(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path, tmp_path / "pipe", tmp_path / "missing" / "x.wav", "", "/dev/null"):
+    before = os.listdir("/proc/self/fd")
+    for path in (tmp_path, tmp_path / "pipe", tmp_path / "missing" / "x.wav", "", "/dev/null", "/dev/full"):
         with pytest.raises(CannotSpeak) as caught:
             WavPlayer(str(path), 22050)
         assert caught.value.reason == "audio_device"
-
-
-def test_a_full_disk_is_an_error_and_no_descriptor_is_left() -> None:
-    before = os.listdir("/proc/self/fd")
-    with pytest.raises(CannotSpeak):
-        WavPlayer("/dev/full", 22050)
     assert os.listdir("/proc/self/fd") == before
 
 
-def test_the_error_reaches_the_goal(tmp_path: Path) -> None:
-    with Spawned(f"file:{tmp_path / 'missing' / 'x.wav'}") as engine:
-        engine.until(protocol.Ready)
-        ended = engine.spoken("yes")
-        assert ended.reason == "audio_device"
-        assert ended.message == f"{tmp_path / 'missing' / 'x.wav'} cannot be written: No such file or directory"
-        (tmp_path / "missing").mkdir()
-        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
-        assert _read(tmp_path / "missing" / "x.wav")
-
-
-def test_a_stop_while_writing_leaves_a_valid_file(tmp_path: Path) -> None:
-    path = tmp_path / "x.wav"
+def test_the_error_reaches_the_goal_and_a_stop_leaves_a_valid_file(tmp_path: Path) -> None:
+    path = tmp_path / "missing" / "x.wav"
     with Spawned(f"file:{path}") as engine:
-        engine.until(protocol.Ready)
-        engine.say("one two three four five. " * 300)
-        engine.until(protocol.Word)
-        engine.send(protocol.Stop("g1"))
-        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        ended = engine.spoken("yes", "g1")
+        assert (ended.reason, ended.message) == ("audio_device", f"{path} cannot be written: No such file or directory")
+        path.parent.mkdir()
+        engine.say("one two three four five. " * 300, "g2")
+        engine.until_word()
+        engine.stop("g2")
         length = len(_read(path))
         assert length > 0
         assert path.stat().st_size == 44 + length
-        ended = engine.spoken("yes", "g2")
+        ended = engine.spoken("yes", "g3")
         assert ended.duration is not None
         assert len(_read(path)) == length + round(ended.duration * 22050) * 2
