@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,6 @@ from talkcli.doctor.voice import Engine, Setting
 from talkcli.engine import process, protocol
 from talkcli.engine.process import Conversation, EngineFailed
 from talkcli.goals.states import State
-from tests.support import scripted_engine
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,13 +21,11 @@ if TYPE_CHECKING:
 CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None, list_voices=False)
 
 
+pytestmark = pytest.mark.usefixtures("scripted_process")
+
+
 def say(number: int, text: str) -> protocol.Say:
     return protocol.Say(f"{number}", text, 200, 1.0, None, 50)
-
-
-@pytest.fixture
-def scripted_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, scripted_engine.__file__])
 
 
 def conversation(texts: list[str]) -> list[protocol.Ended]:
@@ -51,7 +47,6 @@ def conversation(texts: list[str]) -> list[protocol.Ended]:
     return ended
 
 
-@pytest.mark.usefixtures("scripted_process")
 def test_texts_are_spoken_in_their_order_and_the_process_is_gone_then() -> None:
     assert conversation(["length=0.1", "length=0", "length=0.2"]) == [
         protocol.Ended(f"{number}", protocol.COMPLETED, duration=length)
@@ -59,8 +54,7 @@ def test_texts_are_spoken_in_their_order_and_the_process_is_gone_then() -> None:
     ]
 
 
-@pytest.mark.usefixtures("scripted_process")
-def test_who_says_something_to_a_process_that_has_died_hears_how() -> None:
+def test_saying_something_to_a_process_that_has_died_raises_how_it_died() -> None:
     with Conversation(CONFIGURE) as engine:
         events = engine.events
         assert isinstance(next(events), protocol.Ready)
@@ -71,7 +65,6 @@ def test_who_says_something_to_a_process_that_has_died_hears_how() -> None:
         assert failed.value.reason == "engine_crashed"
 
 
-@pytest.mark.usefixtures("scripted_process")
 def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None:
     with Conversation(CONFIGURE, deadline=time.monotonic() + 0.7) as engine:
         heard: list[protocol.Event] = []
@@ -86,7 +79,6 @@ def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None
 # What doctor makes of it
 
 
-@pytest.mark.usefixtures("scripted_process")
 def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(process, "HANG_AFTER", 0.4)
     hung = Played(State.ABORTED, "engine_hung", "the engine process said nothing for 0.4 s")
@@ -99,8 +91,7 @@ def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pyte
     assert voice.look(Setting()) == Engine(reason="engine_hung", words=words)
 
 
-@pytest.mark.usefixtures("scripted_process")
-def test_doctor_tells_how_an_engine_process_died_and_what_takes_too_long() -> None:
+def test_doctor_tells_how_an_engine_process_died_and_that_a_sentence_takes_too_long() -> None:
     died = Played(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
     assert sentence.by_engine("silent-start crash", Setting(), 1.0, 20.0) == died
     late = Played(State.ABORTED, "engine_hung", "it was not over after 0.5 s")

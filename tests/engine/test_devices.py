@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import pytest
@@ -29,16 +30,21 @@ def put(path: Path, text: str = "") -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def nothing(tmp_path: Path, env: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> bool:
+@pytest.fixture
+def nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, str]], bool]:
+    """Tells whether nothing sounds in an environment of that container."""
     monkeypatch.setattr(os, "getuid", lambda: 4_242_424)  # this machine's user may have a sound server
     monkeypatch.setattr(devices, "_SYSTEM_WIDE", f"{tmp_path}/system")  # and this machine
-    return devices.nothing_sounds(env, f"{tmp_path}/snd", f"{tmp_path}/etc")
+    return lambda env: devices.nothing_sounds(env, f"{tmp_path}/snd", f"{tmp_path}/etc")
 
 
-def test_nothing_is_there(tmp_path: Path, bare: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    assert nothing(tmp_path, bare, monkeypatch)
-    assert nothing(tmp_path, {}, monkeypatch)
-    assert devices.nothing_sounds({}, f"{tmp_path}/gone", f"{tmp_path}/gone") == nothing(tmp_path, {}, monkeypatch)
+Nothing = Callable[[dict[str, str]], bool]
+
+
+def test_nothing_is_there(tmp_path: Path, bare: dict[str, str], nothing: Nothing) -> None:
+    assert nothing(bare)
+    assert nothing({})
+    assert devices.nothing_sounds({}, f"{tmp_path}/gone", f"{tmp_path}/gone")
 
 
 @pytest.mark.parametrize(
@@ -53,29 +59,27 @@ def test_nothing_is_there(tmp_path: Path, bare: dict[str, str], monkeypatch: pyt
         "etc/asound.conf",
     ],
 )
-def test_what_is_there_may_sound(
-    tmp_path: Path, bare: dict[str, str], monkeypatch: pytest.MonkeyPatch, path: str
+def test_a_device_a_server_or_settings_may_sound(
+    tmp_path: Path, bare: dict[str, str], nothing: Nothing, path: str
 ) -> None:
     put(tmp_path / path)
-    assert not nothing(tmp_path, bare, monkeypatch)
+    assert not nothing(bare)
 
 
 @pytest.mark.parametrize("path", ["home/.config/pulse/client.conf", "etc/pulse/client.conf.d/00-host.conf"])
 def test_a_sound_server_that_settings_name_may_sound(
-    tmp_path: Path, bare: dict[str, str], monkeypatch: pytest.MonkeyPatch, path: str
+    tmp_path: Path, bare: dict[str, str], nothing: Nothing, path: str
 ) -> None:
     put(tmp_path / path, "autospawn = no\n")
-    assert nothing(tmp_path, bare, monkeypatch)
+    assert nothing(bare)
     put(tmp_path / path, "autospawn = no\n  default-server = unix:/run/host/pulse\n")
-    assert not nothing(tmp_path, bare, monkeypatch)
+    assert not nothing(bare)
 
 
 @pytest.mark.parametrize("name", ["PULSE_SERVER", "PULSE_CLIENTCONFIG", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH"])
-def test_what_a_variable_names_may_sound(
-    tmp_path: Path, bare: dict[str, str], monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    assert nothing(tmp_path, {**bare, name: ""}, monkeypatch)
-    assert not nothing(tmp_path, {**bare, name: "somewhere"}, monkeypatch)
+def test_a_place_that_a_variable_names_may_sound(bare: dict[str, str], nothing: Nothing, name: str) -> None:
+    assert nothing({**bare, name: ""})
+    assert not nothing({**bare, name: "somewhere"})
 
 
 def test_sound_servers_are_those_of_the_environment_and_of_the_users(tmp_path: Path) -> None:

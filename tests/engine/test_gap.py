@@ -25,10 +25,6 @@ _BYTES = int(LEFT_OUT * RATE) * 2
 _SAYS_SO = f"from talkcli.engine.players.choice import Gap\nGap.allowance = lambda *_: {LEFT_OUT}"
 
 
-def _say(text: str, goal: str, *, followed: bool, rate: int = FAST) -> protocol.Say:
-    return protocol.Say(goal, text, rate, 1.0, None, 50, followed)
-
-
 def _sentences(rate: int = FAST) -> list[bytes]:
     """Return what is played of each: of those that follow another, all."""
     first, *others = render(TEXTS, rate=rate)
@@ -45,20 +41,18 @@ def _changed(gap: Gap, took: float, player: str = "aplay", *, neural: bool = Fal
 # -- how much
 
 
-def test_nothing_is_left_out_before_two_sentences_have_followed_each_other() -> None:
+def test_it_is_what_the_last_changes_took_and_a_late_one_counts_for_no_more_than_another() -> None:
     gap = Gap()
     gap.began("aplay", 100.0)
     assert gap.allowance("aplay") == 0.0
-
-
-def test_it_is_what_the_last_changes_took_and_a_late_one_counts_for_no_more_than_another() -> None:
-    gap = Gap()
     for took in (0.03, 0.031, 0.09, 0.029, 0.032):
         _changed(gap, took)
     assert gap.allowance("aplay") == pytest.approx(0.031)
     for _ in range(REMEMBERED):
         _changed(gap, 0.01)
     assert gap.allowance("aplay") == pytest.approx(0.01)
+    _changed(gap, 0.4, "pacat")
+    assert gap.allowance("pacat") == MOST < 0.235 / 2 + 0.01, "never more than half of the pause between sentences"
 
 
 def test_each_player_has_its_own() -> None:
@@ -80,14 +74,8 @@ def test_a_neural_voice_takes_longer_and_that_is_left_out_before_one_alone() -> 
     assert gap.allowance("aplay") == pytest.approx(0.1)
 
 
-def test_it_is_never_more_than_half_of_the_pause_between_sentences() -> None:
-    gap = Gap()
-    _changed(gap, 0.4)
-    assert gap.allowance("aplay") == MOST < 0.235 / 2 + 0.01
-
-
-def test_what_was_no_change_does_not_count() -> None:
-    """Nobody waited; or who waited was recalled, and another came much later."""
+def test_a_start_without_a_goal_that_waited_is_no_change() -> None:
+    """Nobody waited; or the goal that waited was recalled, and another came much later."""
     gap = Gap()
     gap.ended("aplay", 100.0)
     gap.began("aplay", 100.03)
@@ -117,10 +105,9 @@ def test_a_sentence_behind_which_a_goal_waits_ends_sooner_by_silence_alone(playe
     """The next one follows, whole, and the results say how long what was played is."""
     first, second, third = _sentences()
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
-        engine.until(protocol.Voices)
         ended = []
         for number, text in enumerate(TEXTS):
-            engine.send(_say(text, f"g{number}", followed=number < 2))
+            engine.say(text, f"g{number}", followed=number < 2)
             ended.append(engine.until(protocol.Ended))
     assert [each.outcome for each in ended] == [protocol.COMPLETED] * 3
     assert player.heard.read_bytes() == first[:-_BYTES] + second[:-_BYTES] + third
@@ -134,8 +121,7 @@ def test_it_counts_what_is_so_at_the_end_of_a_sentence(player: Player, followed:
     """A goal that comes while it is spoken waits behind it; one that is recalled does not."""
     first = _sentences()[0]
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
-        engine.until(protocol.Voices)
-        engine.send(_say(TEXTS[0], "g0", followed=not followed))
+        engine.say(TEXTS[0], "g0", followed=not followed)
         engine.until(protocol.Word)
         engine.send(protocol.Followed("another", not followed))
         engine.send(protocol.Followed("g0", followed))
@@ -146,8 +132,7 @@ def test_it_counts_what_is_so_at_the_end_of_a_sentence(player: Player, followed:
 def test_no_sample_that_is_sound_is_left_out(player: Player) -> None:
     louder_than_nothing = f"{_SAYS_SO}\nfrom talkcli.engine import stream\nstream.QUIET = -1"
     with Spawned(player.plays(), before=louder_than_nothing) as engine:
-        engine.until(protocol.Voices)
-        engine.send(_say(TEXTS[0], "g0", followed=True))
+        engine.say(TEXTS[0], "g0", followed=True)
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     assert player.heard.read_bytes() == _sentences()[0]
 
@@ -155,9 +140,8 @@ def test_no_sample_that_is_sound_is_left_out(player: Player) -> None:
 def test_a_file_gets_every_sample(tmp_path: Path) -> None:
     target = tmp_path / "speech.wav"
     with Spawned(f"file:{target}", before=_SAYS_SO) as engine:
-        engine.until(protocol.Voices)
         for number, text in enumerate(TEXTS):
-            engine.send(_say(text, f"g{number}", followed=True))
+            engine.say(text, f"g{number}", followed=True)
             assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     assert target.read_bytes()[44:] == b"".join(each.tobytes() for each in render(TEXTS, rate=FAST))
 
@@ -169,8 +153,7 @@ def test_a_player_that_ends_too_early_is_seen_as_before(player: Player) -> None:
     before = "from talkcli.engine.players.choice import Gap\nGap.allowance = lambda *_: 0.2"
     hurried = "import os\nwhile os.read(0, 65536): pass"  # it is over by what it gets, which is 0.2 s less
     with Spawned(player.command(hurried), before=before, limits={"EARLY_END": length - 0.2}) as engine:
-        engine.until(protocol.Voices)
-        engine.send(_say(TEXTS[0], "g0", followed=True, rate=rate))
+        engine.say(TEXTS[0], "g0", followed=True, rate=rate)
         ended = engine.until(protocol.Ended)
         assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_lost")
 
@@ -178,8 +161,7 @@ def test_a_player_that_ends_too_early_is_seen_as_before(player: Player) -> None:
 def test_a_sentence_that_is_held_and_goes_on_leaves_out_no_more(player: Player) -> None:
     first = _sentences()[0]
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
-        engine.until(protocol.Voices)
-        engine.send(_say(TEXTS[0], "g0", followed=True))
+        engine.say(TEXTS[0], "g0", followed=True)
         engine.until(protocol.Word)
         engine.pause("g0")
         engine.resume("g0")
@@ -194,9 +176,8 @@ def test_the_engine_measures_what_a_change_takes(player: Player) -> None:
     """The first two sentences are played whole; how long the change took is known from then on."""
     sentences = _sentences()
     with Spawned(player.plays()) as engine:
-        engine.until(protocol.Voices)
         for number, text in enumerate(TEXTS):
-            engine.send(_say(text, f"g{number}", followed=True))
+            engine.say(text, f"g{number}", followed=True)
             assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     left_out = len(b"".join(sentences)) - player.heard.stat().st_size
     assert 0 < left_out <= 2 * 2 * MOST * RATE

@@ -1,4 +1,4 @@
-"""What is left for a thread that waits is done, in its order, and wakes the thread only where it must."""
+"""Actions that are left for a thread that waits are done in order, and wake the thread only if they must."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], Sleeper
         each.close()
 
 
-def test_what_is_left_for_a_thread_that_dozes_does_not_wake_it_and_is_done_before_what_comes_next(
+def test_an_action_left_for_a_thread_that_dozes_does_not_wake_it_and_is_done_before_the_next(
     start: Callable[[float], Sleeper],
 ) -> None:
     sleeper, done = start(1000.0), list[str]()
@@ -96,7 +96,7 @@ def test_what_is_left_for_a_thread_that_dozes_does_not_wake_it_and_is_done_befor
     assert sleeper.wakes == wakes + 1
 
 
-def test_what_must_be_done_sooner_than_the_thread_would_wake_wakes_it(start: Callable[[float], Sleeper]) -> None:
+def test_an_action_that_is_due_before_the_thread_would_wake_wakes_it(start: Callable[[float], Sleeper]) -> None:
     sleeper, done = start(0.0), threading.Event()
     sleeper.do(lambda: None)
     wakes = sleeper.wakes
@@ -105,7 +105,9 @@ def test_what_must_be_done_sooner_than_the_thread_would_wake_wakes_it(start: Cal
     assert sleeper.wakes == wakes + 1
 
 
-def test_a_thread_that_dozes_looks_at_what_was_left_when_it_would_sleep_on(start: Callable[[float], Sleeper]) -> None:
+def test_a_thread_that_dozes_does_the_actions_left_for_it_when_it_would_sleep_on(
+    start: Callable[[float], Sleeper],
+) -> None:
     sleeper, done = start(0.2), threading.Event()
     sleeper.do(lambda: None)
     wakes = sleeper.wakes
@@ -116,7 +118,7 @@ def test_a_thread_that_dozes_looks_at_what_was_left_when_it_would_sleep_on(start
 
 def test_nothing_is_lost_and_nothing_overtakes_while_several_threads_hand_in(start: Callable[[float], Sleeper]) -> None:
     sleeper, done = start(0.001), list[tuple[int, int]]()
-    count = 3000
+    count = 1000
 
     def hand_in(who: int) -> None:
         for number in range(count):

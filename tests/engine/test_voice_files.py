@@ -1,4 +1,4 @@
-"""Neural voices as files: where they are found, which are trusted, and what is kept of them for the next start."""
+"""Neural voices as files: where they are found, which are trusted, and the halves kept for the next start."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -115,7 +116,7 @@ def test_a_speaker_goes_by_its_number_where_its_name_cannot_be_typed(
     assert voice.speakers == ("amused", "1", "2", "3", "4", "calm")
 
 
-def test_what_is_very_long_in_a_json_is_cut_where_it_is_told(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_very_long_name_in_a_json_is_cut_if_it_is_told(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TALK_VOICES", str(home / "v"))
     told = tiny_voice.description(language="l" * 1000, dataset="d" * 1000)
     told["audio"] = {"sample_rate": 8000, "quality": "q" * 1000}
@@ -127,12 +128,11 @@ def test_what_is_very_long_in_a_json_is_cut_where_it_is_told(home: Path, monkeyp
     assert (voice.language, voice.quality) == (f"{'l' * 40}…", f"{'q' * 40}…")
 
 
-@pytest.mark.parametrize("what", ["model", "json", "directory", "above"])
-def test_what_everybody_may_write_is_refused(home: Path, what: str) -> None:
+@pytest.mark.parametrize("where", ["model", "json", "directory", "above"])
+def test_a_file_that_everybody_may_write_is_refused(home: Path, where: str) -> None:
     path = tiny_voice.put(home / "up" / "v", "a")
-    places = {"model": path, "json": beside(path), "directory": path.parent, "above": path.parent.parent}
-    wrong = places[what]
-    wrong.chmod(0o646 if what in {"model", "json"} else 0o757)
+    wrong = {"model": path, "json": beside(path), "directory": path.parent, "above": path.parent.parent}[where]
+    wrong.chmod(0o646 if wrong.is_file() else 0o757)
     with pytest.raises(BadFile, match=f"^{wrong} can be written by others, .*: chmod go-w {wrong}$"):
         open_checked(str(beside(path)), model=str(path))
     wrong.chmod(0o755)
@@ -154,19 +154,6 @@ def test_all_that_others_may_write_is_named_with_one_command_that_mends_it(home:
 
 #: A group that nobody has, and so a user's own that could be any.
 SHARED = 47110815
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file to any group")
-def test_what_a_group_may_write_is_refused(home: Path) -> None:
-    path = tiny_voice.put(home / "v", "a")
-    path.chmod(0o664)
-    os.chown(path, -1, SHARED)
-    with pytest.raises(BadFile, match=f"{path} can be written by others"):
-        open_checked(str(path))
-    path.chmod(0o644)
-    open_checked(str(path)).close()
-
-
 ME = os.geteuid()
 
 
@@ -185,7 +172,7 @@ ME = os.geteuid()
     ids=["own", "its member", "another member", "another name", "another's own", "not its own", "unknown", "nobody's"],
 )
 @pytest.mark.skipif(ME != 0, reason="only root may give a file to any group")
-def test_what_only_the_user_s_own_group_may_write_is_the_user_s(
+def test_a_file_that_only_the_users_own_group_may_write_is_the_users(
     home: Path,
     monkeypatch: pytest.MonkeyPatch,
     user: tuple[str, int] | None,
@@ -247,43 +234,40 @@ def test_a_directory_that_is_everybodys_may_be_above_if_it_is_sticky_but_not_hol
         open_checked(str(path))
 
 
-def test_what_a_link_points_to_is_looked_at_too(home: Path) -> None:
-    path = tiny_voice.put(home / "there", "a")
-    link = tiny_voice.put(home / "v", "a")
-    link.unlink()
-    link.symlink_to(path)
-    open_checked(str(link)).close()
-    path.parent.chmod(0o777)
-    with pytest.raises(BadFile, match=f"{path.parent} can be written"):
-        open_checked(str(link))
-
-
 @pytest.mark.parametrize("what", ["file", "directory"])
-def test_a_link_on_the_way_may_not_be_where_everybody_may_write(home: Path, what: str) -> None:
+@pytest.mark.parametrize("where", ["between", "there"])
+def test_neither_a_link_on_the_way_nor_its_target_may_be_where_everybody_may_write(
+    home: Path, what: str, where: str
+) -> None:
     path = tiny_voice.put(home / "there", "a")
-    begin, end = (path, path) if what == "file" else (path.parent, path.parent)
-    between, link = home / "between", home / "v"
-    for each in (between, link):
-        each.mkdir()
-        (each / begin.name).symlink_to(os.path.relpath(end, each))
-        end = each / begin.name
+    end = path if what == "file" else path.parent
+    for name in ("between", "v"):
+        link = home / name / end.name
+        link.parent.mkdir()
+        link.symlink_to(os.path.relpath(end, link.parent))
+        end = link
     way = end if what == "file" else end / path.name
     open_checked(str(way)).close()
-    between.chmod(0o777)
-    with pytest.raises(BadFile, match=f"^{between} can be written by others, .*: chmod go-w {between}$"):
+    wrong = home / where
+    wrong.chmod(0o777)
+    with pytest.raises(BadFile, match=f"^{wrong} can be written by others, .*: chmod go-w {wrong}$"):
         open_checked(str(way))
 
 
-def test_links_that_go_round_are_told(home: Path) -> None:
+def test_a_link_to_itself_and_a_pipe_are_refused_and_not_waited_for(home: Path) -> None:
     path = tiny_voice.put(home / "v", "a")
     path.unlink()
     path.symlink_to(path)
     with pytest.raises(BadFile, match=f"^{path} cannot be read: {os.strerror(errno.ELOOP)}$"):
         open_checked(str(path))
+    path.unlink()
+    os.mkfifo(path, 0o600)
+    with pytest.raises(BadFile, match="is no file"):
+        open_checked(str(path))
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
-def test_another_users_link_is_refused_where_it_could_be_turned(home: Path) -> None:
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file away")
+def test_another_users_file_or_link_is_refused(home: Path) -> None:
     path = tiny_voice.put(home / "there", "a")
     everybodys = home / "tmp"
     everybodys.mkdir()
@@ -294,21 +278,8 @@ def test_another_users_link_is_refused_where_it_could_be_turned(home: Path) -> N
     os.chown(link, 4711, -1, follow_symlinks=False)
     with pytest.raises(BadFile, match=rf"^{link} is another user's \(#4711\)"):
         open_checked(str(link / path.name))
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file away")
-def test_another_users_file_is_refused(home: Path) -> None:
-    path = tiny_voice.put(home / "v", "a")
     os.chown(path, 4711, -1)
     with pytest.raises(BadFile, match=r"is another user's \(#4711\)"):
-        open_checked(str(path))
-
-
-def test_what_is_no_file_is_refused_and_not_waited_for(home: Path) -> None:
-    path = tiny_voice.put(home / "v", "a")
-    path.unlink()
-    os.mkfifo(path, 0o600)
-    with pytest.raises(BadFile, match="is no file"):
         open_checked(str(path))
 
 
@@ -332,25 +303,21 @@ def test_what_is_no_file_is_refused_and_not_waited_for(home: Path) -> None:
     ],
 )
 def test_a_json_that_describes_no_voice_is_refused_in_words(
-    home: Path, beside: bytes | dict[str, object], why: str
+    home: Path, beside: bytes | dict[str, Any], why: str
 ) -> None:
     path = tiny_voice.put(home / "v", "a")
     told = path.parent / "a.onnx.json"
-    told.write_bytes(beside if isinstance(beside, bytes) else json.dumps(tiny_voice.description(**beside)).encode())  # type: ignore[arg-type]
+    told.write_bytes(beside if isinstance(beside, bytes) else json.dumps(tiny_voice.description(**beside)).encode())
     with pytest.raises(BadFile, match=why) as caught:
         describe(str(path))
     assert str(told) in str(caught.value)
     assert "get it anew" in str(caught.value)
-
-
-def test_a_model_without_a_json_says_where_to_get_it(home: Path) -> None:
-    path = tiny_voice.put(home / "v", "a")
-    (path.parent / "a.onnx.json").unlink()
+    told.unlink()
     with pytest.raises(BadFile, match=r"a\.onnx\.json is not there: it belongs to the model"):
         describe(str(path))
 
 
-# -- what is kept
+# -- kept halves
 
 
 def _key(letter: str) -> str:
@@ -378,29 +345,26 @@ def _keep(cache: Cache, key: str, content: bytes = b"encoder") -> str | None:
     return given[-1]
 
 
-def test_what_is_kept_is_found_again_by_its_key(home: Path) -> None:
+def test_halves_are_found_again_by_their_key_and_half_of_them_is_nothing(home: Path) -> None:
     cache = Cache(str(home / "c"))
     assert cache.find(KEY) is None
     _keep(cache, KEY)
+    encoder = home / "c" / f"{KEY}.encoder.onnx"
+    os.utime(encoder, (1, 1))
     paths = cache.find(KEY)
     assert paths is not None
+    assert time.time() - encoder.stat().st_mtime < 60, "it is marked as used"
     assert [Path(each).read_bytes() for each in paths] == [b"encoder", b"decoder"]
     assert stat.S_IMODE((home / "c").stat().st_mode) == 0o700
     assert _kept(home / "c") == [f"{KEY}.decoder.onnx", f"{KEY}.encoder.onnx"]
+    encoder.unlink()
+    assert cache.find(KEY) is None
+    _keep(cache, KEY)
     cache.forget(KEY)
     assert cache.find(KEY) is None
 
 
-def test_half_of_it_is_nothing(home: Path) -> None:
-    cache = Cache(str(home / "c"))
-    _keep(cache, KEY)
-    (home / "c" / f"{KEY}.encoder.onnx").unlink()
-    assert cache.find(KEY) is None
-
-
-def test_the_oldest_go_past_the_limit_and_nothing_but_what_is_the_caches_own(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_oldest_halves_go_past_the_limit_and_no_other_file(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(caches, "LARGEST", 85)
     cache = Cache(str(home / "c"))
     others = ["joe.onnx", "notes.new", "x.encoder.onnx", f"{KEY}.txt", "settings"]
@@ -420,7 +384,7 @@ def test_the_oldest_go_past_the_limit_and_nothing_but_what_is_the_caches_own(
 
 
 @pytest.mark.parametrize(("hours", "left"), [(0.9, 1), (1.1, 0)])
-def test_what_a_writer_left_unfinished_goes_after_an_hour(home: Path, hours: float, left: int) -> None:
+def test_the_unfinished_halves_of_a_writer_go_after_an_hour(home: Path, hours: float, left: int) -> None:
     cache = Cache(str(home / "c"))
     folder = home / "c" / f"{_key('b')}x7f3.new"
     folder.mkdir()
@@ -430,13 +394,7 @@ def test_what_a_writer_left_unfinished_goes_after_an_hour(home: Path, hours: flo
     assert len([each for each in _kept(home / "c") if each.endswith(".new")]) == left
 
 
-def test_where_it_cannot_be_written_it_is_made_without(home: Path) -> None:
-    cache = Cache(str(home / "c"))
-    os.rename(home / "c", home / "gone")
-    assert _keep(cache, KEY) is None
-
-
-def test_what_fails_of_itself_fails_without_being_kept_too(home: Path) -> None:
+def test_a_writer_that_fails_keeps_nothing_and_a_cache_that_is_gone_is_done_without(home: Path) -> None:
     def fails(_: str | None) -> None:
         raise ValueError("broken")
 
@@ -445,6 +403,8 @@ def test_what_fails_of_itself_fails_without_being_kept_too(home: Path) -> None:
         cache.keep(KEY, fails, [])
     assert cache.find(KEY) is None
     assert not [each for each in _kept(home / "c") if each.endswith(".new")]
+    os.rename(home / "c", home / "gone")
+    assert _keep(cache, KEY) is None
 
 
 @pytest.mark.parametrize("mode", [0o755, 0o777])
@@ -453,11 +413,3 @@ def test_a_cache_that_others_may_read_or_write_is_none(home: Path, mode: int) ->
     (home / "c").chmod(mode)
     with pytest.raises(PermissionError, match="is not this user's alone"):
         Cache(str(home / "c"))
-
-
-def test_what_is_used_is_marked_so(home: Path) -> None:
-    cache = Cache(str(home / "c"))
-    _keep(cache, KEY)
-    os.utime(home / "c" / f"{KEY}.encoder.onnx", (1, 1))
-    cache.find(KEY)
-    assert time.time() - (home / "c" / f"{KEY}.encoder.onnx").stat().st_mtime < 60

@@ -1,4 +1,4 @@
-"""The words of a text as libespeak-ng tells them: each once, forward, with its own place."""
+"""The words of a text as libespeak-ng tells them: each once, forward, with its own place; and when each is heard."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.engine.synthesizers import espeak
-from talkcli.engine.words import Words, letters
+from talkcli.engine.words import TimedWord, WordClock, Words, letters
 from tests.support.reference import Sentence, render_with_words
 
 if TYPE_CHECKING:
@@ -40,50 +40,45 @@ def reported(text: str, places: Iterable[tuple[int, int]]) -> list[str]:
     return [text[start:end] for start, end, _ in found]
 
 
-def spoken(text: str, voice: str = "gmw/en") -> list[str]:
-    """Return the words of what libespeak-ng itself tells."""
-    (rendering,) = render_with_words([Sentence(text, voice=voice)])
+#: Sentences by language, and their words as they are told.
+SENTENCES = [
+    ("gmw/en", "battery low, please!", "battery low please"),
+    ("gmw/en", "is in the kitchen", "is in kitchen"),
+    ("gmw/en", "I go. this one is. the box. of the man. end", "I go this is the box of man end"),
+    ("gmw/en", "it's don’t they're", "it's don’t they're"),
+    ("gmw/en", "well-known e-mail, state-of-the-art", "well-known e-mail state-of-the-art"),
+    ("gmw/en", "3.14 1,000 10:30 12345 50% 2-3 next", "3.14 1,000 10 30 12345 50 % 2 - 3 next"),
+    ("gmw/en", "in the U.S.A. today", "in U.S.A today"),
+    ("gmw/en", "café 日本 é 😀 now 😀. then 😀", "café 日本 é 😀 now 😀 then 😀"),
+    ("gmw/en", "foo_bar foo/bar fooBar v1.2", "foo _bar foo / bar foo Bar v 1.2"),
+    ("gmw/en", "привет мир", "привет мир"),
+    ("gmw/en", "one\ttwo\n three\n\nfour", "one two three four"),
+    ("gmw/en", "say «hello» now", "say hello now"),
+    ("gmw/en", "„Hallo“ and “the old man’s” sea", "Hallo and the old man’s sea"),
+    ("gmw/en", "a «it's» or «U.S.A.» b — c x—y", "a it's or U.S.A b c x y"),
+    ("roa/fr", "l'homme est là", "l'homme est là"),
+    ("roa/it", "dell'acqua c'è", "dell'acqua c'è"),
+    ("sit/cmn", "世界、人", "世 界 人"),
+    ("sit/cmn", "「世界」人", "世 界 人"),
+    ("zle/ru", "«привет мир» да", "привет мир да"),
+    ("inc/hi", "«मैं जा» रहा", "मैं जा रहा"),
+]
+
+
+@pytest.mark.parametrize("number", range(len(SENTENCES)))
+def test_the_words_of_a_sentence_are_those_that_libespeak_itself_tells(number: int) -> None:
+    """All are rendered in one process, whose words are the same each time."""
+    _, text, words = SENTENCES[number]
+    rendering = render_with_words([Sentence(text, voice=voice) for voice, text, _ in SENTENCES])[number]
     places = ((start, end - start or letters(text, start)) for start, end, _ in rendering.words)
-    return reported(text, [(start, length) for start, length in places if length > 0])
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("battery low, please!", "battery low please"),
-        ("is in the kitchen", "is in kitchen"),
-        ("I go. this one is. the box. of the man. end", "I go this is the box of man end"),
-        ("it's don’t they're", "it's don’t they're"),
-        ("well-known e-mail, state-of-the-art", "well-known e-mail state-of-the-art"),
-        ("3.14 1,000 10:30 12345 50% 2-3 next", "3.14 1,000 10 30 12345 50 % 2 - 3 next"),
-        ("in the U.S.A. today", "in U.S.A today"),
-        ("café 日本 é 😀 now 😀. then 😀", "café 日本 é 😀 now 😀 then 😀"),
-        ("foo_bar foo/bar fooBar v1.2", "foo _bar foo / bar foo Bar v 1.2"),
-        ("привет мир", "привет мир"),
-        ("one\ttwo\n three\n\nfour", "one two three four"),
-        ("say «hello» now", "say hello now"),
-        ("„Hallo“ and “the old man’s” sea", "Hallo and the old man’s sea"),
-        ("a «it's» or «U.S.A.» b — c x—y", "a it's or U.S.A b c x y"),
-    ],
-)
-def test_the_words_of_a_sentence(text: str, words: str) -> None:
-    assert spoken(text) == words.split()
-
-
-def test_the_words_of_other_languages() -> None:
-    assert spoken("l'homme est là", "roa/fr") == ["l'homme", "est", "là"]
-    assert spoken("dell'acqua c'è", "roa/it") == ["dell'acqua", "c'è"]
-    assert spoken("世界、人", "sit/cmn") == ["世", "界", "人"]
-    assert spoken("「世界」人", "sit/cmn") == ["世", "界", "人"]
-    assert spoken("«привет мир» да", "zle/ru") == ["привет", "мир", "да"]
-    assert spoken("«मैं जा» रहा", "inc/hi") == ["मैं", "जा", "रहा"]
+    assert reported(text, [(start, length) for start, length in places if length > 0]) == words.split()
 
 
 def test_a_word_without_a_length_goes_as_far_as_its_letters() -> None:
     assert [letters("«né» 日本e\u0301", place) for place in range(-1, 11)] == [0, 0, 2, 1, 0, 0, 4, 3, 2, 1, 0, 0]
 
 
-def test_what_is_repeated_behind_or_outside_is_none() -> None:
+def test_a_place_that_is_repeated_behind_or_outside_is_none() -> None:
     text = "this one é 日本 😀 ! battery"
     places = [(0, 4), (0, 4), (5, 0), (9, 1), (-1, 0), (-1, 5), (11, 2), (11, 2), (3, 2), (13, 1), (14, 1), (18, 99)]
     assert reported(text, places) == ["this", "é", "日本", "😀", "battery"]
@@ -91,7 +86,7 @@ def test_what_is_repeated_behind_or_outside_is_none() -> None:
 
 
 @given(st.text(max_size=40), st.lists(st.tuples(st.integers(-3, 45), st.integers(-1, 10)), max_size=30))
-def test_whatever_is_reported_words_go_forward_within_the_text(text: str, places: list[tuple[int, int]]) -> None:
+def test_words_go_forward_within_the_text_whatever_is_reported(text: str, places: list[tuple[int, int]]) -> None:
     words = Words(text)
     end = 0
     for location, length in places:
@@ -102,21 +97,83 @@ def test_whatever_is_reported_words_go_forward_within_the_text(text: str, places
             assert text[start:end].split() == [text[start:end]]
 
 
-def test_words_only_move_forward() -> None:
-    words = Words("this one é 日本 😀 ! battery")
-    reported = [(0, 4), (0, 4), (5, 0), (9, 1), (-1, 0), (11, 2), (11, 2), (3, 2), (13, 1), (14, 1), (16, 11), (18, 7)]
-    found = [words.next(*place) for place in reported]
-    assert [word for word in found if word] == [
-        (0, 4, 1),
-        (9, 10, 2),
-        (11, 13, 3),
-        (14, 15, 4),
-        (16, 17, 5),
-        (18, 25, 6),
-    ]
+# -- when they are heard
 
 
-def test_a_word_beyond_the_text_is_none() -> None:
-    words = Words("a")
-    assert words.next(5, 3) is None
-    assert words.next(0, 50) is not None
+def test_the_clock_stands_until_it_is_started_and_is_held_back_by_the_player() -> None:
+    clock = WordClock()
+    first, second = TimedWord(0, 1, 0.0), TimedWord(2, 1, 0.5)
+    clock.add(first)
+    clock.add(second)
+    assert clock.due(100.0) == []
+    assert clock.next_due() is None
+    clock.start(100.0)
+    assert clock.due(100.0) == [first]
+    assert clock.next_due() == 100.5
+    clock.hold(100.4, 0.1)
+    assert clock.elapsed(100.4) == pytest.approx(0.1)
+    assert clock.due(100.6) == []
+    assert clock.next_due() == pytest.approx(100.8)
+    clock.hold(100.5, 10.0)
+    assert clock.next_due() == pytest.approx(100.8)
+    assert clock.rest() == [second]
+    assert clock.due(200.0) == []
+
+
+def test_silence_in_the_stream_moves_the_words_after_it_and_is_not_heard() -> None:
+    clock = WordClock()
+    before, at, after = TimedWord(0, 1, 0.4), TimedWord(2, 1, 0.5), TimedWord(4, 1, 1.0)
+    clock.begin(0.0)
+    clock.insert(0.0, 0.25)
+    clock.start(100.0)
+    clock.add(before)
+    clock.add(at)
+    assert clock.heard(100.125) == 0.0
+    assert clock.heard(100.5) == 0.25
+    assert clock.next_due() == pytest.approx(100.65)
+    clock.insert(0.5, 1.0)
+    clock.insert(0.5, 1.0)
+    clock.add(after)
+    assert clock.next_due() == pytest.approx(100.65)
+    assert clock.due(102.5) == [before]
+    assert clock.heard(102.5) == 0.5
+    assert clock.next_due() == pytest.approx(102.75)
+    assert clock.due(102.76) == [at]
+    assert clock.heard(103.0) == pytest.approx(0.75)
+    assert clock.next_due() == pytest.approx(103.25)
+
+
+def test_another_stream_begins_where_the_audio_goes_on() -> None:
+    clock = WordClock()
+    missed, word = TimedWord(0, 1, 1.0), TimedWord(2, 1, 2.5)
+    clock.start(100.0)
+    clock.insert(0.5, 3.0)
+    clock.begin(2.0)
+    clock.add(missed)
+    clock.add(word)
+    assert clock.next_due() is None
+    assert clock.heard(200.0) == 2.0
+    clock.insert(2.0, 0.25)
+    clock.start(200.0)
+    assert clock.due(200.0) == [missed]
+    assert clock.next_due() == pytest.approx(200.75)
+    assert clock.heard(200.5) == pytest.approx(2.25)
+
+
+def test_the_outputs_own_clock_stands_until_something_is_heard() -> None:
+    clock = WordClock()
+    clock.add(TimedWord(0, 1, 0.5))
+    clock.start(100.0)
+    clock.tell(100.2, 0.0)
+    assert (clock.elapsed(100.2), clock.next_due()) == (0.0, None)
+    clock.tell(100.4, 0.1)
+    assert clock.elapsed(100.4) == pytest.approx(0.1)
+    assert clock.next_due() == pytest.approx(100.8)
+
+
+def test_words_in_zeros_that_are_left_out_begin_with_the_sound() -> None:
+    clock = WordClock()
+    for position in (0.0, 0.2):
+        clock.add(TimedWord(0, 1, position))
+    clock.leave_out(0.1)
+    assert [each.position for each in clock.rest()] == [0.1, 0.2]
