@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import random
 import select
+import signal
 import socket
 import stat
 import struct
@@ -14,6 +16,7 @@ import threading
 import time
 import uuid
 import wave
+from subprocess import Popen
 from typing import IO, TYPE_CHECKING
 
 import pytest
@@ -34,7 +37,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 TEXT = "battery low, please recharge"
-#: Some seconds of work: 10,000 characters.
+#: Some seconds of work.
 LONGEST = "one two three. " * 666
 BEFORE = b"what was there before"
 
@@ -64,23 +67,17 @@ def failed(text: str, path: Path | str, **settings: object) -> TalkError:
     return caught.value
 
 
-def test_the_file_has_espeak_ngs_own_samples(tmp_path: Path) -> None:
-    path = tmp_path / "x.wav"
+def test_the_file_has_espeak_ngs_own_samples_by_the_settings_of_a_goal(tmp_path: Path) -> None:
+    path, own = tmp_path / "x.wav", tmp_path / "own.wav"
     seconds = render(TEXT, str(path))
-    (expected,) = reference([TEXT])
-    assert samples(path) == expected.tobytes()
-    assert seconds == pytest.approx(len(expected) / RATE, abs=1e-5)
+    assert seconds == pytest.approx(len(samples(path)) / 2 / RATE, abs=1e-5)
     needs("espeak-ng")
-    subprocess.run(["espeak-ng", "-s", "200", "-w", str(tmp_path / "own.wav"), TEXT], check=True)
-    assert path.read_bytes() == (tmp_path / "own.wav").read_bytes()
-    assert sorted(os.listdir(tmp_path)) == ["own.wav", "x.wav"]
-
-
-def test_settings_are_those_of_a_goal(tmp_path: Path) -> None:
-    path = tmp_path / "x.wav"
+    subprocess.run(["espeak-ng", "-s", "200", "-w", str(own), TEXT], check=True)
+    assert path.read_bytes() == own.read_bytes()
     render(TEXT, str(path), rate=120, volume=0.5, voice="en-GB+F3", pitch=80)
     (expected,) = reference([Sentence(TEXT, 120, 0.5, "gmw/en+f3", 80)])
     assert samples(path) == expected.tobytes()
+    assert sorted(os.listdir(tmp_path)) == ["own.wav", "x.wav"]
 
 
 def test_a_text_longer_than_a_goal_may_be_is_rendered_as_if_it_were_whole(
@@ -112,14 +109,7 @@ def test_pieces_are_the_text_and_none_is_too_long(text: str) -> None:
     assert max(map(len, found)) <= 10_000
 
 
-def test_the_longest_text_is_rendered(tmp_path: Path) -> None:
-    path = tmp_path / "x.wav"
-    seconds = render(LONGEST, str(path))
-    assert len(samples(path)) == round(seconds * RATE) * 2
-    assert seconds > 300
-
-
-def test_what_was_there_is_replaced_and_the_umask_decides_who_may_read(tmp_path: Path) -> None:
+def test_a_file_is_replaced_and_the_umask_decides_who_may_read_it(tmp_path: Path) -> None:
     path = tmp_path / "x.wav"
     path.write_bytes(BEFORE)
     before = os.umask(0o027)
@@ -133,20 +123,20 @@ def test_what_was_there_is_replaced_and_the_umask_decides_who_may_read(tmp_path:
 
 def test_a_relative_path_and_names_of_any_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    names = ["x.wav", "a b'\"\n😀.wav", "n" * 255, os.fsdecode(b"\xff.wav"), "-x", "file:x"]
+    names = ["a b'\"\n😀.wav", "n" * 255, os.fsdecode(b"\xff.wav"), "-x", "file:x"]
     for name in names:
-        render("yes", name)
+        render("a", name)
         assert samples(tmp_path / name)
     assert sorted(os.listdir(tmp_path)) == sorted(names)
 
 
-def test_what_a_link_points_to_is_replaced_and_the_link_stays(tmp_path: Path) -> None:
+def test_the_target_of_a_link_is_replaced_and_the_link_stays(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     for name in ("old.wav", "new.wav"):
         (tmp_path / name).symlink_to(tmp_path / "there" / name)
     (tmp_path / "there" / "old.wav").write_bytes(BEFORE)
     for name in ("old.wav", "new.wav"):
-        render("yes", str(tmp_path / name))
+        render("a", str(tmp_path / name))
         assert (tmp_path / name).is_symlink()
         assert samples(tmp_path / "there" / name)
     assert sorted(os.listdir(tmp_path / "there")) == ["new.wav", "old.wav"]
@@ -166,7 +156,7 @@ def test_what_a_link_points_to_is_replaced_and_the_link_stays(tmp_path: Path) ->
         ("{0}/" + "n" * 256, "cannot be written: File name too long"),
     ],
 )
-def test_what_cannot_be_written_is_told_before_anything_is_started(
+def test_a_path_that_cannot_be_written_is_told_before_anything_is_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, words: str
 ) -> None:
     monkeypatch.setattr(process, "EngineProcess", None)  # calling it would be a TypeError
@@ -181,13 +171,19 @@ def test_what_cannot_be_written_is_told_before_anything_is_started(
     assert (error.code, error.exit_code) == ("cannot_write", 1)
 
 
-#: A program that renders "yes" to what is its argument.
-RENDERS = "import sys; sys.path[:] = {path!r}; from talkcli.engine.render import render; render('yes', sys.argv[1])"
+#: A program that renders a text to a path, its arguments.
+RENDERS = """
+import sys
+sys.path[:] = {path!r}
+from talkcli.engine.render import render
+print("begun", file=sys.stderr, flush=True)
+render(sys.argv[1], sys.argv[2])
+"""
 
 
-def renders(path: str, stdout: IO[bytes] | int) -> subprocess.Popen[bytes]:
-    code = RENDERS.format(path=sys.path)
-    return subprocess.Popen([sys.executable, "-c", code, path], stdout=stdout, stderr=subprocess.PIPE)
+def renders(path: str, stdout: IO[bytes] | int, text: str = "yes", env: dict[str, str] | None = None) -> Popen[bytes]:
+    command = [sys.executable, "-c", RENDERS.format(path=sys.path), text, path]
+    return Popen(command, stdout=stdout, stderr=subprocess.PIPE, env={**os.environ, **(env or {})})
 
 
 def streamed(data: bytes) -> bytes:
@@ -201,28 +197,33 @@ def streamed(data: bytes) -> bytes:
 @pytest.mark.parametrize("path", ["-", "/dev/stdout", "/dev/fd/1"])
 def test_standard_output_gets_it_as_it_is_made(tmp_path: Path, path: str) -> None:
     (expected,) = reference(["yes"])
-    with renders(path, subprocess.PIPE) as process:
-        out, err = process.communicate(timeout=60)
-    assert (process.returncode, streamed(out), err) == (0, expected.tobytes(), b"")
+    if path == "-":
+        with renders(path, subprocess.PIPE) as process:
+            out, err = process.communicate(timeout=60)
+        assert (process.returncode, streamed(out), err) == (0, expected.tobytes(), b"begun\n")
     with (tmp_path / "out").open("wb") as file:
         file.write(b"before")
         file.flush()
         with renders(path, file) as process:
-            assert process.communicate(timeout=60)[1] == b""
+            assert process.communicate(timeout=60)[1] == b"begun\n"
         os.lseek(file.fileno(), 0, os.SEEK_END)
         file.write(b"after")
     data = (tmp_path / "out").read_bytes()
     assert (data[:6], streamed(data[6:-5]), data[-5:]) == (b"before", expected.tobytes(), b"after")
 
 
+def have_engines_run(monkeypatch: pytest.MonkeyPatch, before: str) -> None:
+    """Have each engine process run this code first."""
+    interpreter, option, code = engine_command()
+    path, rest = code.split("; from ", 1)
+    command = [interpreter, option, f"{path}\n{before}\nfrom {rest}"]
+    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: command)
+
+
 def test_a_reader_that_takes_its_time_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """More than a pipe holds, and it is read later than a player that is stuck would be given up."""
     limits = "from talkcli.engine import playback; playback.FIRST_WITHIN = playback.STALLED_AFTER = 0.1"
-    interpreter, option, code = engine_command()
-    path, rest = code.split("; from ", 1)
-    monkeypatch.setattr(
-        "talkcli.engine.process.engine_command", lambda: [interpreter, option, f"{path}\n{limits}\nfrom {rest}"]
-    )
+    have_engines_run(monkeypatch, limits)
     text = TEXT * 4
     (expected,) = reference([text])
     assert len(expected) * 2 > 3 * 65536
@@ -294,34 +295,31 @@ def test_a_file_that_the_shell_has_open_for_our_output_is_not_replaced(tmp_path:
     assert path.read_bytes() == b""
 
 
-#: A program that has no right to write there: root, who may write everywhere, becomes nobody first.
+#: Code that makes root, who may write everywhere, nobody.
 AS_NOBODY = """
-import os, sys
-sys.path[:] = {path!r}
-from talkcli.engine.render import CannotWrite, render
+import os
 if os.geteuid() == 0:
     os.setgroups([])
-    os.setgid({nobody})
-    os.setuid({nobody})
-try:
-    render("yes", sys.argv[1])
-except CannotWrite as error:
-    print(error)
+    os.setgid(65534)
+    os.setuid(65534)
 """
 
 
 @pytest.mark.parametrize("protected", ["directory", "file"])
-def test_a_protected_directory_or_file_is_told_and_left_as_it_was(protected: str) -> None:
+def test_a_protected_directory_or_file_is_told_and_left_as_it_was(
+    monkeypatch: pytest.MonkeyPatch, protected: str
+) -> None:
     with tempfile.TemporaryDirectory() as directory:  # pytest's own can't be entered by nobody
         path = os.path.join(directory, "x.wav")
         with open(path, "wb") as file:
             file.write(BEFORE)
         os.chmod(path, 0o444 if protected == "file" else 0o666)
         os.chmod(directory, 0o777 if protected == "file" else 0o555)
-        program = [sys.executable, "-c", AS_NOBODY.format(path=sys.path, nobody=65534), path]
-        told = subprocess.run(program, capture_output=True, text=True, timeout=60, check=True).stdout
+        monkeypatch.setitem(globals(), "RENDERS", RENDERS.replace("print(", f"{AS_NOBODY}print("))
+        with renders(path, subprocess.PIPE) as process:
+            _, err = process.communicate(timeout=60)
         os.chmod(directory, 0o755)
-        assert told.startswith(f"{path} cannot be written: ")
+        assert f"CannotWrite: {path} cannot be written: " in err.decode()
         assert os.listdir(directory) == ["x.wav"]
         with open(path, "rb") as file:
             assert file.read() == BEFORE
@@ -363,7 +361,7 @@ def test_a_full_disk_is_told_and_what_was_there_is_left(small_disk: Path) -> Non
         ("...", {}, "nothing_to_say", 4, "nothing in the text can be spoken"),
     ],
 )
-def test_what_fails_leaves_the_file_as_it_was(
+def test_a_text_that_fails_leaves_the_file_as_it_was(
     tmp_path: Path, text: str, settings: dict[str, str], code: str, exit_code: int, words: str
 ) -> None:
     path = tmp_path / "x.wav"
@@ -419,11 +417,7 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path) -> None:
 def test_an_engine_that_is_of_no_use_is_told_and_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, reason: str, words: str
 ) -> None:
-    interpreter, option, code = engine_command()
-    path, rest = code.split("; from ", 1)
-    monkeypatch.setattr(
-        "talkcli.engine.process.engine_command", lambda: [interpreter, option, f"{path}\n{before}\nfrom {rest}"]
-    )
+    have_engines_run(monkeypatch, before)
     monkeypatch.setattr(process, "START_LIMIT", 0.3 if reason == "engine_failed" else 10)
     monkeypatch.setattr(process, "HANG_AFTER", 0.5)
     error = failed("yes", tmp_path / "x.wav", voice="en-us")
@@ -435,3 +429,40 @@ def test_an_interpreter_that_cannot_be_started_is_told(tmp_path: Path, monkeypat
     monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: ["/nonesuch"])
     error = failed("yes", tmp_path / "x.wav")
     assert (error.code, "/nonesuch" in str(error)) == ("engine_failed", True)
+
+
+@pytest.mark.parametrize("times", [4, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_killed_at_any_moment_there_is_no_half_file_and_no_process(
+    tmp_path: Path, how: signal.Signals, times: int
+) -> None:
+    text = "one two three four five. " * 20
+    (expected,) = reference([text])
+    path = tmp_path / "x.wav"
+    began = time.monotonic()
+    render(text, str(path))
+    whole = time.monotonic() - began
+    moments = random.Random(how)
+    outcomes = set()
+    for _ in range(times):
+        path.write_bytes(BEFORE)
+        mark = uuid.uuid4().hex
+        with renders(str(path), subprocess.DEVNULL, text, {MARK: mark}) as program:
+            assert program.stderr is not None
+            program.stderr.readline()
+            time.sleep(moments.uniform(0, whole))  # any moment is the point, there is nothing to wait for
+            program.send_signal(how)
+        assert_none_left(mark, 2)
+        hidden = [each for each in os.listdir(tmp_path) if each != "x.wav"]
+        if how == signal.SIGKILL:
+            assert len(hidden) <= 1
+            for each in hidden:
+                assert each.startswith(".talk-")
+                os.unlink(tmp_path / each)
+        else:
+            assert hidden == []
+        done = path.read_bytes() != BEFORE
+        outcomes.add(done)
+        if done:
+            assert samples(path) == expected.tobytes()
+    assert False in outcomes
