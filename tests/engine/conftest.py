@@ -8,14 +8,18 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.engine import supervisor
 from tests.engine.programs import Player
 from tests.engine.threads import Thread
 from tests.support import scripted_engine
 from tests.support.real_voice import real_voice
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
+    from typing import Any
+
+    from tests.engine.threads import Start
 
 
 @pytest.fixture
@@ -31,10 +35,17 @@ def scripted_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def start(scripted_process: None) -> Iterator[Callable[[], Thread]]:  # noqa: ARG001 - it is what is started
+def start(scripted_process: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:  # noqa: ARG001 - it is started
     """Starts engine threads with the scripted engine as their process."""
     with contextlib.ExitStack() as stack:
-        yield lambda: stack.enter_context(contextlib.closing(Thread()))
+
+        def make(begins: str = "", **limits: Any) -> Thread:
+            monkeypatch.setenv("SCRIPTED_START", begins)
+            for name, value in limits.items():
+                monkeypatch.setattr(supervisor, name, value)
+            return stack.enter_context(contextlib.closing(Thread()))
+
+        yield make
 
 
 @pytest.fixture(scope="session")

@@ -1,20 +1,52 @@
-"""The engine thread holds goals, watches its process and passes on what it says, with the scripted engine as that."""
+"""The engine thread holds goals, watches its process and passes on what it says, with the scripted engine as that.
+
+A goal goes to the process without a detour. Whatever happens to the process, the goal is spoken or ends.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import select
+import selectors
+import signal
+import socket
 import sys
+import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from talkcli.client.connect import ready
 from talkcli.engine import protocol, supervisor
-from talkcli.engine.supervisor import LINES, EngineDied, EngineMissing, EngineSaid
-from tests.engine.threads import Thread, answering
+from talkcli.engine.process import LONGEST, EngineProcess
+from talkcli.engine.protocol import COMPLETED, FAILED, SILENCE_LIMIT, STOPPED
+from talkcli.engine.supervisor import (
+    BACK_OFF,
+    LINES,
+    SHORT_LIFE,
+    WHILE,
+    EngineDied,
+    EngineMissing,
+    EngineSaid,
+    Handed,
+    Restarts,
+    Supervisor,
+)
+from talkcli.engine.supervisor import PATIENCE as WAITED
+from tests.engine.threads import CONFIGURE, PATIENCE, Thread, answering
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from talkcli.engine.supervisor import Report
+    from tests.engine.threads import Start
+
+YES = protocol.Say("g1", "yes", 200, 1.0, None, 50)
+#: How "yes" ends.
+SPOKEN = protocol.Ended("g1", COMPLETED, duration=0.1)
 
 
 def _pauses(thread: Thread) -> int:
@@ -29,50 +61,46 @@ def _hold(thread: Thread, text: str) -> None:
     thread.engine.pause("g1", 1)
 
 
+def _process(thread: Thread) -> EngineProcess:
+    thread.until(protocol.Ready)
+    assert thread.engine._process is not None
+    return thread.engine._process
+
+
 # -- pauses
 
 
-def test_a_goal_is_held_beyond_any_limit_and_goes_on_where_it_was(
-    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(supervisor, "HANG_AFTER", 0.7)
-    monkeypatch.setattr(supervisor, "PAUSE_LIMIT", 0.7)
-    thread = start()
+def test_a_goal_is_held_beyond_any_limit_and_goes_on_where_it_was(start: Start) -> None:
+    thread = start(HANG_AFTER=0.7, PAUSE_LIMIT=0.7)
     began = time.monotonic()
     _hold(thread, "length=0.4 slow-pause=0.1 two three four")
     assert thread.until(protocol.Paused).id == "g1"
     assert thread.next(1.0) is None
     thread.engine.resume("g1")
-    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert thread.until(protocol.Ended).outcome == COMPLETED
     assert time.monotonic() - began >= 0.4 + 1.0
     assert [each.number for each in thread.seen if isinstance(each, protocol.Word)] == [1, 2, 3, 4, 5]
 
 
-def test_a_pause_has_no_limit_once_the_goal_goes_on(
-    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(supervisor, "PAUSE_LIMIT", 0.2)
-    thread = start()
+def test_a_pause_has_no_limit_once_the_goal_goes_on(start: Start) -> None:
+    thread = start(PAUSE_LIMIT=0.2)
     _hold(thread, "length=0.5 ignore-pause")
     thread.engine.resume("g1")
-    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert thread.until(protocol.Ended).outcome == COMPLETED
     assert not _pauses(thread)
 
 
-def test_a_pause_that_is_not_confirmed_ends_the_process(
-    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(supervisor, "PAUSE_LIMIT", 0.3)
-    thread = start()
+def test_a_pause_that_is_not_confirmed_ends_the_process(start: Start) -> None:
+    thread = start(PAUSE_LIMIT=0.3)
     asked = time.monotonic()
     _hold(thread, "never-ends ignore-pause")
     ended = thread.until(protocol.Ended)
     assert time.monotonic() - asked >= 0.3
     assert (ended.reason, ended.message) == ("engine_hung", "the engine did not confirm a pause within 0.3 s")
-    assert thread.spoken("yes", "g2").outcome == protocol.COMPLETED
+    assert thread.spoken("yes", "g2").outcome == COMPLETED
 
 
-def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(start: Callable[[], Thread]) -> None:
+def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(start: Start) -> None:
     thread = start()
     asked = time.monotonic()
     _hold(thread, "length=0.7 slow-pause=0.3")
@@ -85,7 +113,7 @@ def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(star
     assert _pauses(thread) == 1
 
 
-def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Callable[[], Thread]) -> None:
+def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Start) -> None:
     thread = start()
     _hold(thread, "length=0.6 stale-pause slow-pause=0.2")
     thread.engine.resume("g1")
@@ -96,11 +124,8 @@ def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Callable[
     assert _pauses(thread) == 1
 
 
-def test_a_goal_that_waits_for_a_process_is_held_by_the_thread(
-    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SCRIPTED_START", "slow=0.4")
-    thread = start()
+def test_a_goal_that_waits_for_a_process_is_held_by_the_thread(start: Start) -> None:
+    thread = start("slow=0.4")
     thread.say("two words")
     thread.engine.pause("g1", 1)
     assert thread.next() == protocol.Paused("g1", 1)
@@ -108,59 +133,235 @@ def test_a_goal_that_waits_for_a_process_is_held_by_the_thread(
     assert thread.next(0.4) is None
     thread.engine.resume("g1")
     assert isinstance(thread.next(), protocol.Word)
-    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert thread.until(protocol.Ended).outcome == COMPLETED
 
 
-def test_a_goal_that_is_held_by_the_thread_is_stopped_at_once(
-    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SCRIPTED_START", "slow=0.5")
-    thread = start()
+def test_a_goal_that_is_held_by_the_thread_is_stopped_at_once(start: Start) -> None:
+    thread = start("slow=0.5")
     thread.say("two words")
     thread.engine.pause("g1", 1)
     thread.engine.stop("g1")
-    assert [thread.next(), thread.next()] == [protocol.Paused("g1", 1), protocol.Ended("g1", protocol.STOPPED)]
-    assert thread.spoken("the next is not held", "g2") == protocol.Ended("g2", protocol.COMPLETED, duration=0.1)
+    assert [thread.next(), thread.next()] == [protocol.Paused("g1", 1), protocol.Ended("g1", STOPPED)]
+    assert thread.spoken("the next is not held", "g2") == protocol.Ended("g2", COMPLETED, duration=0.1)
 
 
 @pytest.mark.parametrize("on_stop", ["", "on-stop=crash"])
-def test_a_paused_goal_is_stopped(start: Callable[[], Thread], on_stop: str) -> None:
+def test_a_paused_goal_is_stopped(start: Start, on_stop: str) -> None:
     thread = start()
     _hold(thread, f"never-ends {on_stop}")
     thread.until(protocol.Paused)
     thread.engine.stop("g1")
     thread.engine.pause("g1", 1)
-    assert thread.until(protocol.Ended).outcome == protocol.STOPPED
+    assert thread.until(protocol.Ended).outcome == STOPPED
     assert _pauses(thread) == 1
 
 
-def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: Callable[[], Thread]) -> None:
+def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: Start) -> None:
     thread = start()
     _hold(thread, "length=0.2 at=0.9 crash slow-pause=5")
     ended = thread.until(protocol.Ended)
-    assert (ended.outcome, ended.reason) == (protocol.FAILED, "engine_crashed")
+    assert (ended.outcome, ended.reason) == (FAILED, "engine_crashed")
     thread.engine.resume("g1")
-    assert thread.spoken("yes", "g2").outcome == protocol.COMPLETED
+    assert thread.spoken("yes", "g2").outcome == COMPLETED
 
 
-def test_a_pause_or_resume_of_another_goal_changes_nothing(start: Callable[[], Thread]) -> None:
+def test_a_pause_or_resume_of_another_goal_changes_nothing(start: Start) -> None:
     thread = start()
     thread.engine.pause("g1", 1)
     thread.say("length=0.2")
     thread.engine.pause("g0", 1)
     thread.engine.resume("g1")
-    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert thread.until(protocol.Ended).outcome == COMPLETED
     assert not _pauses(thread)
+
+
+# -- the way of a goal to its process
+
+
+@pytest.fixture
+def answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., Thread]]:
+    """Starts an engine thread with a process that answers by lines of Python, as in `answering`."""
+    with contextlib.ExitStack() as stack:
+
+        def make(*lines: str) -> Thread:
+            monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: answering(tmp_path, *lines))
+            return stack.enter_context(contextlib.closing(Thread()))
+
+        yield make
+
+
+@pytest.mark.parametrize("followed", [True, False])
+def test_the_process_is_told_whether_a_goal_follows(answers: Callable[..., Thread], followed: bool) -> None:
+    told = 'protocol.Ended(command.id, protocol.COMPLETED, f"{command.followed} {command.by_neural}")'
+    thread = answers("tell(protocol.Started(command.id))", f"tell({told})")
+    thread.engine.follow("g1", followed, by_neural=True)  # there is none yet that could be told
+    thread.until(protocol.Ready)
+    thread.say("battery low")
+    thread.engine.follow("g1", followed, by_neural=True)
+    assert thread.until(protocol.Ended) == protocol.Ended("g1", COMPLETED, f"{followed} True")
+
+
+def test_a_goal_behind_another_wakes_the_thread_once(
+    monkeypatch: pytest.MonkeyPatch, answers: Callable[..., Thread]
+) -> None:
+    """By its answer, which comes in one piece: it was begun and played."""
+    monkeypatch.setattr(supervisor, "HANG_AFTER", 600.0)  # so that no goal is slow enough on any machine
+    thread = answers("tell(protocol.Started(command.id), protocol.Ended(command.id, protocol.COMPLETED))")
+    process = _process(thread)
+    thread.spoken("the first may find it asleep for longer", "g0")
+    woken: list[list[int]] = []
+    select = thread.engine._selector.select
+
+    def counted(timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        found = select(timeout)
+        woken.append([key.fd for key, _ in found])
+        return found
+
+    monkeypatch.setattr(thread.engine._selector, "select", counted)
+    for number in range(1, 51):
+        assert thread.spoken("yes", f"g{number}") == protocol.Ended(f"g{number}", COMPLETED)
+    # By what the process said, and by nothing else; its answer to the first may have come to a `select` before.
+    assert {each for fds in woken for each in fds} == {process.socket.fileno()}
+    # A thread that was not asleep yet looks once more; if it is, that is one for a goal.
+    assert sum(bool(fds) for fds in woken) <= 50
+
+
+def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(start: Start) -> None:
+    thread = start(HANG_AFTER=0.5)
+    assert thread.spoken("length=0").outcome == COMPLETED
+    # handed over while the thread dozes
+    assert thread.spoken("length=0.05 hang", "g2").reason == "engine_hung"
+    assert thread.spoken("yes", "g3").outcome == COMPLETED
+    assert thread.next(0.7) is None  # it does not doze any more
+    assert thread.spoken("length=0.05 hang", "g4").reason == "engine_hung"
+
+
+class Swift:
+    """Stands for a process that has answered before anybody looked."""
+
+    def __init__(self) -> None:
+        self._said: list[str] = []
+
+    def send(self, command: protocol.Command) -> bool:
+        if isinstance(command, protocol.Say):
+            self._said.append(command.id)
+        return True
+
+    def receive(self) -> list[protocol.Event]:
+        return [protocol.Ended(each, COMPLETED) for each in self._said]
+
+
+def test_the_answer_to_a_goal_is_understood_before_the_goal_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    posted: list[Report] = []
+    engine, process = Supervisor(CONFIGURE, posted.append), Swift()
+    for name in ("_process", "_open"):
+        monkeypatch.setattr(engine, name, process)
+    engine.say(YES)
+    engine._hear(cast("EngineProcess", process))
+    assert posted == [protocol.Ended("g1", COMPLETED)]
+    engine._inbox.close()
+
+
+class Lost:
+    """Stands for a process that is lost while a goal is being sent to it."""
+
+    def __init__(self, *, takes: bool) -> None:
+        self._takes = takes
+
+    def send(self, _: protocol.Command) -> bool:
+        return self._takes
+
+
+@pytest.mark.parametrize("takes", [True, False], ids=["taken by the system", "refused"])
+def test_a_goal_that_was_sent_to_a_lost_process_is_spoken_by_the_next(
+    start: Start, monkeypatch: pytest.MonkeyPatch, takes: bool
+) -> None:
+    thread = start(HANG_AFTER=1.0)  # so long a thread may doze that nothing wakes
+    thread.until(protocol.Ready)
+    monkeypatch.setattr(thread.engine, "_open", Lost(takes=takes))
+    assert thread.spoken("yes") == SPOKEN
+    assert not any(isinstance(each, EngineDied) for each in thread.seen)
+
+
+def test_a_process_that_takes_no_goal_is_ended(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The goal is the next one's."""
+    thread = start()
+    monkeypatch.setattr(_process(thread), "send", lambda _: False)
+    thread.say("yes")
+    assert thread.until(EngineDied).words == "the engine takes no commands"
+    assert thread.until(protocol.Ended) == SPOKEN
+
+
+def test_a_goal_that_is_sent_to_a_process_in_its_death_is_spoken_by_the_next(start: Start) -> None:
+    thread = start()
+    thread.until(protocol.Ready)
+    for number in range(10):
+        process = thread.engine._process
+        assert process is not None
+        os.kill(process.pid, signal.SIGKILL)
+        ended = thread.spoken("length=0.01", f"g{number}")
+        assert ended == protocol.Ended(f"g{number}", COMPLETED, duration=0.01)
+
+
+def test_a_goal_for_which_two_processes_die_before_they_begin_with_it_ends(start: Start) -> None:
+    thread = start()
+    ended = thread.spoken("silent-start length=0 crash")
+    assert (ended.outcome, ended.reason) == (FAILED, "engine_crashed")
+    assert sum(isinstance(each, EngineDied) for each in thread.seen) == 2
+    assert thread.spoken("yes", "g2").outcome == COMPLETED
+
+
+def test_a_process_that_was_given_up_gets_no_other_goal(start: Start) -> None:
+    thread = start()
+    thread.say("never-ends ignore-stop")
+    thread.until(protocol.Word)
+    lost = thread.engine._process
+    thread.engine.give_up("g1")
+    assert thread.spoken("yes", "g2") == protocol.Ended("g2", COMPLETED, duration=0.1)
+    assert thread.engine._process is not lost
+
+
+def test_a_goal_that_ended_before_it_was_given_up_costs_no_process(start: Start) -> None:
+    thread = start()
+    thread.spoken("length=0")
+    process = thread.engine._process
+    thread.engine.give_up("g1")
+    for number in (2, 3):
+        assert thread.spoken("yes", f"g{number}").id == f"g{number}"
+    assert thread.engine._process is process
+    assert thread.engine._open is process
+
+
+def test_a_closed_process_takes_no_command(start: Start) -> None:
+    thread = start()
+    process = _process(thread)
+    thread.close()
+    assert not process.send(protocol.Stop("g1"))
+
+
+def test_a_goal_that_is_handed_in_just_before_the_end_ends(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    thread, held = start(), threading.Event()
+    post = thread.engine._post
+
+    def slow(report: Report) -> None:
+        post(report)
+        if isinstance(report, protocol.Ended) and report.id == "g0":
+            held.wait(PATIENCE)  # both come while it is at work, and finds next that it is to end
+
+    monkeypatch.setattr(thread.engine, "_post", slow)
+    assert thread.spoken("length=0", "g0").id == "g0"
+    thread.say("never-ends")
+    thread.engine.close()
+    held.set()
+    ended = thread.until(protocol.Ended)
+    assert (ended.id, ended.reason) == ("g1", "shutdown")
 
 
 # -- the process
 
 
-def test_a_thread_that_stood_still_hears_the_engine_before_it_judges_it(
-    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As in a machine that was suspended, or a server that was stopped, between two lines of it."""
-    monkeypatch.setattr(supervisor, "HANG_AFTER", 0.5)
+def test_a_thread_that_stood_still_hears_the_engine_first(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before it judges it; as in a machine that was suspended, or a server that was stopped, between two lines."""
     standing = [0.7]
 
     class Clock:
@@ -173,83 +374,210 @@ def test_a_thread_that_stood_still_hears_the_engine_before_it_judges_it(
             return time.monotonic()
 
     words: list[protocol.Word] = []
-    thread = start()
+    thread = start(HANG_AFTER=0.5)
     monkeypatch.setattr(supervisor, "time", Clock())
     thread.say("length=1.1 b c d e f g h i j k")
     words.append(thread.until(protocol.Word))
-    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert thread.until(protocol.Ended).outcome == COMPLETED
     assert not standing
 
 
-def test_the_voices_are_listed_by_the_first_process_alone(start: Callable[[], Thread]) -> None:
+def test_the_voices_are_listed_by_the_first_process_alone(start: Start) -> None:
     thread = start()
     thread.spoken("crash")
-    assert thread.spoken("yes", "g2").outcome == protocol.COMPLETED
+    assert thread.spoken("yes", "g2").outcome == COMPLETED
     assert sum(isinstance(each, protocol.Ready) for each in thread.seen) == 2
     assert sum(isinstance(each, protocol.Voices) for each in thread.seen) == 1
 
 
 def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_while(
-    start: Callable[[], Thread], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     behaviour = tmp_path / "start"
     behaviour.write_text("hang")
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
-    monkeypatch.setattr(supervisor, "START_LIMIT", 0.3)
-    monkeypatch.setattr(supervisor, "PATIENCE", 0.5)
-    monkeypatch.setattr(supervisor, "BACK_OFF", (0.0,))
-    thread = start()
+    thread = start(START_LIMIT=0.3, PATIENCE=0.5, BACK_OFF=(0.0,))
     began = time.monotonic()
     words = "the engine was not ready after 0.3 s"
-    assert thread.spoken("battery low") == protocol.Ended("g1", protocol.FAILED, "engine_failed", words)
+    assert thread.spoken("battery low") == protocol.Ended("g1", FAILED, "engine_failed", words)
     assert time.monotonic() - began >= 3 * 0.3, "only a start that began after the time of patience costs a goal"
     assert thread.until(EngineMissing) == EngineMissing(words), "no goal is in hand: who hands them in has to end one"
     thread.say("coming home", "g2")
     behaviour.write_text("")
     monkeypatch.setattr(supervisor, "START_LIMIT", 10.0)
-    assert thread.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert thread.until(protocol.Ended).outcome == COMPLETED
 
 
-#: Complains about each goal, and ends in its middle if it is told to.
-COMPLAINS = """
+class Undying:
+    """Stands for a process that is ready, and that no kill ends for long."""
+
+    def __init__(self) -> None:
+        self.ready, self.used, self.failed, self.gone_by = True, False, None, 0.0
+        self.socket, self._other = socket.socketpair()
+        self.stderr = self._other.fileno()
+        self.liveness = os.dup(self.stderr)
+        self.kills = 0
+
+    def kill(self) -> None:
+        self.kills += 1
+
+    def close(self) -> None:
+        self.socket.close()
+        self._other.close()
+        os.close(self.liveness)
+
+
+def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
+    """Return an engine thread that doesn't run, with this process."""
+    engine = Supervisor(CONFIGURE, posted.append)
+    for descriptor in (process.socket.fileno(), process.liveness):
+        engine._selector.register(descriptor, selectors.EVENT_READ, process)
+    engine._process = process
+    engine._started_at = time.monotonic()
+    return engine
+
+
+@pytest.mark.parametrize("spoken", [True, False])
+def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool) -> None:
+    process = cast("EngineProcess", Undying())
+    engine = _watching(process, [])
+    engine._restarts.failed(0.0, 0.0, None)
+    if spoken:
+        engine._goal = Handed(YES, heard_at=0.0)
+        engine._note(process, SPOKEN)
+    engine._note(process, protocol.Alive(""))  # as one does that loads a voice
+    before = time.monotonic()
+    engine._lose_process("it is killed", "engine_crashed")
+    assert (engine._restarts.due_at - before < BACK_OFF[1]) == spoken
+    engine._bury(process)
+    engine._inbox.close()
+
+
+@pytest.mark.parametrize("in_time", [True, False])
+def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pytest.MonkeyPatch, in_time: bool) -> None:
+    posted: list[Report] = []
+    undying = Undying()
+    process = cast("EngineProcess", undying)
+    engine = _watching(process, posted)
+    monkeypatch.setattr(engine, "_start", lambda: None)
+    engine._goal = Handed(YES, heard_at=0.0, started=True)
+    engine._lose_process("it hangs", "engine_hung")
+    due = process.gone_by
+    engine._keep_limits(due - SILENCE_LIMIT / 2)
+    assert [type(each).__name__ for each in posted] == ["EngineDied"]
+    assert undying.kills == 1
+    if not in_time:
+        engine._keep_limits(due)
+        assert undying.kills == 2
+        engine._keep_limits(due + 1)
+        assert undying.kills == 2, "it was overdue once"
+    engine._bury(process)
+    reason = "engine_hung" if in_time else "not_silent"
+    assert [each.reason for each in posted[1:] if isinstance(each, protocol.Ended)] == [reason]
+    assert len(posted) == 2
+    assert not engine._dying
+    engine._inbox.close()
+
+
+# -- when it is started again
+
+LACKING = "no library"
+
+
+def test_the_wait_grows_with_each_process_that_never_got_ready_or_died_as_soon_as_it_was() -> None:
+    failing, dying, now = Restarts(100.0), Restarts(100.0), 100.0
+    for wait in (*BACK_OFF, BACK_OFF[-1], BACK_OFF[-1]):
+        failing.failed(now, now, LACKING)
+        dying.died(now, age=SHORT_LIFE / 2, had_goal=False)
+        assert failing.due_at == dying.due_at == now + wait
+        now = failing.due_at
+
+
+@pytest.mark.parametrize(("age", "had_goal"), [(SHORT_LIFE / 2, True), (SHORT_LIFE * 2, False)])
+def test_a_process_that_was_of_use_costs_no_wait_and_resets_it(age: float, had_goal: bool) -> None:
+    restarts = Restarts(100.0)
+    for _ in range(4):
+        restarts.failed(100.0, 100.0, None)
+    restarts.died(200.0, age=age, had_goal=had_goal)
+    assert restarts.due_at == 200.0
+    restarts.failed(200.0, 200.0, None)
+    assert restarts.due_at == 200.0 + BACK_OFF[0]
+
+
+def test_a_cause_that_stays_is_an_error_until_the_next_start_says_otherwise() -> None:
+    restarts = Restarts(100.0)
+    assert not restarts.failed(100.0, 100.0, LACKING)
+    assert restarts.error == LACKING
+    restarts.error = None
+    restarts.died(200.0, age=SHORT_LIFE * 2, had_goal=False)
+    restarts.failed(200.0, 200.0, LACKING)
+    assert restarts.failed(200.0 + WAITED, 200.0 + WAITED, None), "goals wait again, and not for ever"
+    assert restarts.error is None
+
+
+def test_a_start_costs_a_goal_only_if_it_began_long_after_there_was_a_process() -> None:
+    restarts = Restarts(100.0)
+    assert not restarts.failed(100.0 + WAITED + 5, 100.0 + WAITED - 0.1, None)
+    assert restarts.failed(100.0 + WAITED, 100.0 + WAITED, None)
+    assert restarts.failed(100.0 + WAITED + 10, 100.0 + WAITED + 10, None)
+    restarts.died(300.0, age=SHORT_LIFE * 2, had_goal=False)
+    assert not restarts.failed(300.0, 300.0, None)
+    assert restarts.failed(300.0 + WAITED, 300.0 + WAITED, None)
+
+
+# -- standard error of the process
+
+
+def _complaining(script: str) -> tuple[list[str], str]:
+    """Return the lines that a process passes on which writes to standard error, and its last words."""
+    lines: list[str] = []
+    process = EngineProcess(CONFIGURE, lines.append, command=[sys.executable, "-c", f"import os\n{script}"])
+    while process.stderr in ready({process.stderr: select.POLLIN}, 20.0) and process.read_stderr():
+        pass
+    words = process.last_words()
+    process.close()
+    return lines, words
+
+
+def test_lines_are_passed_on_when_they_are_whole_and_the_last_is_a_crashs_own() -> None:
+    lines, words = _complaining("for each in (b'one\\ntw', b'o\\n\\n  \\n thr\\xffee'): os.write(2, each)")
+    assert lines == ["one", "two", " thr\ufffdee"]
+    assert words == "it exited with status 0 (thr\ufffdee)"
+    assert _complaining("for _ in range(100): os.write(2, b'x' * 65536)")[0] == ["x" * LONGEST], "one that never ends"
+
+
+def test_lines_that_are_too_many_are_counted_and_told_with_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    passed: list[Report] = []
+    engine, now = Supervisor(CONFIGURE, passed.append), 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    for number in range(100):
+        now = 1000.0 + number / 10
+        engine._complain("x")
+    assert passed == [EngineSaid("x")] * LINES
+    for later in (WHILE - 0.1, WHILE, 2 * WHILE):
+        now = 1000.0 + later
+        engine._complain(f"{later}")
+    told = [f"({100 + 1 - LINES} lines were left out)", f"{WHILE}", f"{2 * WHILE}"]
+    assert passed[LINES:] == [EngineSaid(each) for each in told]
+    engine._inbox.close()
+
+
+def test_standard_error_is_posted_and_a_traceback_before_the_crash(answers: Callable[..., Thread]) -> None:
+    complains = """
 for word in command.text.split():
     if word == "raise":
         raise ValueError("no tongue")
     sys.stderr.write(word + "\\n")
-sys.stderr.write("half a line")
 sys.stderr.flush()
 tell(protocol.Ended(command.id, protocol.COMPLETED))
 """
-
-
-@pytest.fixture
-def complaining(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Thread]:
-    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: answering(tmp_path, COMPLAINS))
-    thread = Thread()
-    yield thread
-    thread.close()
-
-
-def _said(thread: Thread) -> list[str]:
-    return [each.words for each in thread.seen if isinstance(each, EngineSaid)]
-
-
-def test_standard_error_of_the_process_is_posted_and_its_traceback_before_the_crash(complaining: Thread) -> None:
-    complaining.say("one two")
-    while len(_said(complaining)) < 2:
-        assert complaining.next() is not None
-    assert _said(complaining) == ["one", "two"]
-    complaining.until(protocol.Ended)
-    complaining.say("three raise", "g2")
-    died = complaining.until(EngineDied)
+    thread = answers(complains)
+    thread.say("one two")
+    while sum(isinstance(each, EngineSaid) for each in thread.seen) < 2:
+        assert thread.next() is not None
+    thread.say("raise", "g2")
+    died = thread.until(EngineDied)
     assert died.words == "the engine crashed: it exited with status 1 (ValueError: no tongue)"
-    said = _said(complaining)[2:]
-    assert said[:2] == ["half a linethree", "Traceback (most recent call last):"]
+    said = [each.words for each in thread.seen if isinstance(each, EngineSaid)]
+    assert said[:3] == ["one", "two", "Traceback (most recent call last):"]
     assert said[-1] == "ValueError: no tongue"
-
-
-def test_a_flood_of_complaints_is_cut_off(complaining: Thread) -> None:
-    complaining.spoken("x " * 5000)
-    complaining.say("raise", "g2")
-    complaining.until(EngineDied)
-    assert _said(complaining) == ["x"] * LINES

@@ -6,7 +6,7 @@ import contextlib
 import os
 import queue
 import sys
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import talkcli
 from talkcli.engine import protocol
@@ -14,6 +14,7 @@ from talkcli.engine.supervisor import Supervisor
 
 if TYPE_CHECKING:
     from pathlib import Path
+    from typing import Any
 
     from talkcli.engine.supervisor import Report
 
@@ -81,3 +82,11 @@ class Thread:
     def close(self) -> None:
         self.engine.close()
         self.engine.thread.join(PATIENCE)
+
+
+class Start(Protocol):
+    """Starts an engine thread; it is closed when the test is over."""
+
+    def __call__(self, begins: str = "", **limits: Any) -> Thread:
+        """`begins`: how the scripted process starts; `limits`: constants of the supervisor."""
+        ...
