@@ -84,9 +84,7 @@ def test_its_status_is_that_of_its_end(script: str, status: int) -> None:
     assert _status(_run(script)) == status
 
 
-def test_a_program_that_cannot_be_started_is_an_error_and_leaves_nothing_open(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))  # of folders that this user may enter: of others the error is theirs
     plain = tmp_path / "plain"
     plain.write_text("no program")
@@ -118,16 +116,19 @@ def test_it_has_three_streams_the_inherited_descriptors_and_its_leash() -> None:
     os.close(writing)
 
 
-def test_it_is_killed_with_all_that_it_has_started() -> None:
+@pytest.mark.parametrize("ends", [True, False], ids=["ended by itself", "killed"])
+def test_all_that_it_has_started_ends_with_it(ends: bool) -> None:
     reading, writing = os.pipe()
-    child = _run("sleep 100 & echo . >&2; wait", writing)
+    child = _run(f"sleep 100 & echo . >&2; {'exit 7' if ends else 'wait'}", writing)
     os.close(writing)
     assert child.stderr is not None
     os.set_blocking(child.stderr, True)
     os.read(child.stderr, 1)
-    child.kill()
-    assert _status(child) == -signal.SIGKILL
-    assert os.read(reading, 1) == b"", "both have let go of it"
+    if not ends:
+        child.kill()
+    assert _status(child) == (7 if ends else -signal.SIGKILL)
+    assert select.select([reading], [], [], 0.1)[0], "somebody holds it"
+    assert os.read(reading, 1) == b""
     os.close(reading)
 
 
@@ -174,9 +175,7 @@ def test_a_process_that_left_its_session_and_closed_its_descriptors_is_left_alon
 
 
 @pytest.mark.parametrize(("at_start", "pieces"), [(0, 1), (3528, 4), (2000, 3)])
-def test_a_player_that_starts_finds_what_it_needs_to_begin_and_later_a_piece_at_a_time(
-    at_start: int, pieces: int
-) -> None:
+def test_a_player_finds_enough_to_begin_and_then_a_piece_at_a_time(at_start: int, pieces: int) -> None:
     player = ProgramPlayer(Command("sleep", ("sleep", "100"), read_ahead=0, at_start=at_start))
     taken = []
     while size := player.offer(memoryview(bytes(882))):

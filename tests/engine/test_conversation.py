@@ -1,4 +1,4 @@
-"""A conversation with one engine process of one's own: texts in their order, and every way in which it fails."""
+"""A conversation with an engine process of one's own, and how it fails; `test_render.py` has the rest."""
 
 from __future__ import annotations
 
@@ -19,39 +19,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None, list_voices=False)
+SAY = protocol.Say("1", "length=0", 200, 1.0, None, 50)
 
 
 pytestmark = pytest.mark.usefixtures("scripted_process")
-
-
-def say(number: int, text: str) -> protocol.Say:
-    return protocol.Say(f"{number}", text, 200, 1.0, None, 50)
-
-
-def conversation(texts: list[str]) -> list[protocol.Ended]:
-    """Return how the texts ended."""
-    ended = []
-    waiting = iter(texts)
-    with Conversation(CONFIGURE) as engine:
-        for event in engine.events:
-            if isinstance(event, protocol.Ended):
-                ended.append(event)
-            if isinstance(event, protocol.Ready | protocol.Ended):
-                text = next(waiting, None)
-                if text is None:
-                    break
-                engine.say(say(len(ended) + 1, text))
-        process = engine._process
-    with pytest.raises(ProcessLookupError):
-        os.kill(process.pid, 0)
-    return ended
-
-
-def test_texts_are_spoken_in_their_order_and_the_process_is_gone_then() -> None:
-    assert conversation(["length=0.1", "length=0", "length=0.2"]) == [
-        protocol.Ended(f"{number}", protocol.COMPLETED, duration=length)
-        for number, length in enumerate((0.1, 0.0, 0.2), 1)
-    ]
 
 
 def test_saying_something_to_a_process_that_has_died_raises_how_it_died() -> None:
@@ -61,22 +32,21 @@ def test_saying_something_to_a_process_that_has_died_raises_how_it_died() -> Non
         os.kill(engine._process.pid, 9)
         os.waitid(os.P_PID, engine._process.pid, os.WEXITED | os.WNOWAIT)
         with pytest.raises(EngineFailed, match=r"^it was killed by SIGKILL$") as failed:
-            engine.say(say(1, "length=0"))
+            engine.say(SAY)
         assert failed.value.reason == "engine_crashed"
 
 
 def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None:
     with Conversation(CONFIGURE, deadline=time.monotonic() + 0.7) as engine:
         heard: list[protocol.Event] = []
-        events = engine.events
-        assert isinstance(next(events), protocol.Ready)
-        engine.say(say(1, "never-ends"))
+        assert isinstance(next(engine.events), protocol.Ready)
+        engine.say(protocol.Say("1", "never-ends", 200, 1.0, None, 50))
         with pytest.raises(TimeoutError):
-            heard.extend(events)
+            heard.extend(engine.events)
         assert any(isinstance(event, protocol.Word) for event in heard)
 
 
-# What doctor makes of it
+# -- as doctor tells it
 
 
 def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -59,17 +59,13 @@ def test_nothing_is_there(tmp_path: Path, bare: dict[str, str], nothing: Nothing
         "etc/asound.conf",
     ],
 )
-def test_a_device_a_server_or_settings_may_sound(
-    tmp_path: Path, bare: dict[str, str], nothing: Nothing, path: str
-) -> None:
+def test_anything_there_may_sound(tmp_path: Path, bare: dict[str, str], nothing: Nothing, path: str) -> None:
     put(tmp_path / path)
     assert not nothing(bare)
 
 
 @pytest.mark.parametrize("path", ["home/.config/pulse/client.conf", "etc/pulse/client.conf.d/00-host.conf"])
-def test_a_sound_server_that_settings_name_may_sound(
-    tmp_path: Path, bare: dict[str, str], nothing: Nothing, path: str
-) -> None:
+def test_a_server_in_settings_may_sound(tmp_path: Path, bare: dict[str, str], nothing: Nothing, path: str) -> None:
     put(tmp_path / path, "autospawn = no\n")
     assert nothing(bare)
     put(tmp_path / path, "autospawn = no\n  default-server = unix:/run/host/pulse\n")

@@ -82,7 +82,7 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], Sleeper
         each.close()
 
 
-def test_an_action_left_for_a_thread_that_dozes_does_not_wake_it_and_is_done_before_the_next(
+def test_an_action_does_not_wake_a_thread_that_dozes_and_is_done_in_order(
     start: Callable[[float], Sleeper],
 ) -> None:
     sleeper, done = start(1000.0), list[str]()
@@ -105,7 +105,7 @@ def test_an_action_that_is_due_before_the_thread_would_wake_wakes_it(start: Call
     assert sleeper.wakes == wakes + 1
 
 
-def test_a_thread_that_dozes_does_the_actions_left_for_it_when_it_would_sleep_on(
+def test_a_thread_that_dozes_does_its_actions_before_it_sleeps_on(
     start: Callable[[float], Sleeper],
 ) -> None:
     sleeper, done = start(0.2), threading.Event()

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 #: Seconds in which a run ends that was told to: it took 1 to 5 ms.
 ENDED = 0.1
+#: Says that a weight is in another file.
+OUTSIDE = tiny_voice.field(13, tiny_voice.field(1, "location") + tiny_voice.field(2, "/etc/passwd"))
 NUMBERS = [1, 0, *(number for sound in range(14, 40) for number in (sound, 0)), 2]
 
 
@@ -105,9 +107,7 @@ def test_a_model_is_loaded_from_its_kept_halves(tmp_path: Path) -> None:
     assert all(each.stat().st_mtime_ns > before for each, before in zip(kept, at, strict=True))
 
 
-def test_halves_are_read_from_files_that_are_gone_when_it_is_loaded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_halves_are_read_from_files_that_are_gone_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bytes would be kept, and copied while no other thread runs."""
     import onnxruntime
 
@@ -158,6 +158,8 @@ def test_kept_halves_that_are_damaged_are_made_anew(tmp_path: Path, damage: byte
     [
         (b"", {}, "is no ONNX model"),
         (tiny_voice.model()[:-200], {}, "is cut short"),
+        (tiny_voice.model(nodes=tiny_voice.node("Evil", ["input"], "x", domain="evil")), {}, "operators of its own"),
+        (tiny_voice.model(weights=tiny_voice.weight("w", [1], 1, more=OUTSIDE)), {}, "its weights in another file"),
         (tiny_voice.model(loud=float("nan")), {}, "what is no number"),
         (tiny_voice.model(lasting=1e4), {}, "more than 200 frames of 5 sounds"),
         (tiny_voice.model(lasting=1e12), {}, "there is no memory for it; end another program"),
@@ -169,9 +171,7 @@ def test_kept_halves_that_are_damaged_are_made_anew(tmp_path: Path, damage: byte
         (tiny_voice.model(weights=tiny_voice.field(12, b"\x0a\x01x")), {}, "cannot be loaded|cannot be run"),
     ],
 )
-def test_a_model_that_is_not_to_be_used_says_why_and_what_to_do(
-    tmp_path: Path, content: bytes, beside: dict[str, Any], why: str
-) -> None:
+def test_a_bad_model_says_why_and_what_to_do(tmp_path: Path, content: bytes, beside: dict[str, Any], why: str) -> None:
     path = tiny_voice.put(tmp_path / "v", "a", content, tiny_voice.description(**beside))
     with pytest.raises(BadFile, match=why) as caught:
         _loaded(path)

@@ -142,7 +142,7 @@ def test_a_driver_is_stepped_to_the_end_of_each_sentence_and_reports_words(drive
         ({"voice": "piper/en_US-joe-medium"}, "unknown_voice", '"piper/en_US-joe-medium" is a neural voice, and the'),
     ],
 )
-def test_an_option_that_the_driver_lacks_fails_the_goal_that_asks_for_it(
+def test_an_option_that_the_driver_lacks_fails_the_goal(
     dummy: Spawned, more: dict[str, Any], reason: str, message: str
 ) -> None:
     ended = dummy.spoken("yes", **more)

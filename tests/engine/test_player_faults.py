@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import select
-import signal
 import time
 from typing import TYPE_CHECKING
 
@@ -121,17 +119,6 @@ def test_a_device_that_is_busy_is_tried_again_for_a_while(player: Player, tmp_pa
         engine.stop("g2")
 
 
-def test_killed_in_mid_sentence(player: Player) -> None:
-    with Spawned(player.plays()) as engine:
-        engine.say(TEXT)
-        engine.until_word(2)
-        (pid,) = children(engine.process.pid)
-        os.kill(pid, signal.SIGKILL)
-        ended = engine.until(protocol.Ended)
-        assert (ended.reason, ended.message) == ("audio_lost", "player was killed by SIGKILL")
-        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
-
-
 def test_a_stop_leaves_no_process_of_a_player_that_plays_or_never_reads(player: Player) -> None:
     with limits(), Spawned(player.plays(), alive_every=SOON) as engine:
         for goal in ("plays", "plays again", "never reads"):
@@ -233,9 +220,6 @@ def test_no_player_at_all_says_what_to_install(tmp_path: Path) -> None:
         assert ended.message == wanted
 
 
-# -- what is left of a player
-
-
 def test_no_descriptor_is_left_over(player: Player) -> None:
     with Spawned(player.command("raise SystemExit(1)")) as engine:
         engine.until(protocol.Voices)  # they are read from files, once
@@ -244,33 +228,3 @@ def test_no_descriptor_is_left_over(player: Player) -> None:
         for number in range(1, 6):
             engine.spoken(TEXT, f"g{number}")
         assert os.listdir(f"/proc/{engine.process.pid}/fd") == before
-
-
-@pytest.mark.parametrize("status", [0, 1])
-def test_a_child_that_a_player_leaves_behind_is_ended(tmp_path: Path, status: int) -> None:
-    script = tmp_path / "pipeline.sh"
-    # Both ends of its input stay open: nobody but us would end what it has started.
-    script.write_text(f"sleep 60 <&0 & echo $! > {tmp_path}/child; exit {status}\n", "utf-8")
-    with Spawned(f"sh {script}") as engine:
-        ended = engine.spoken(TEXT)
-        assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_device" if status else "audio_lost")
-        child = int((tmp_path / "child").read_text("utf-8"))
-        end = time.monotonic() + 1
-        while os.path.exists(f"/proc/{child}/exe"):  # a dead one that waits to be reaped by others has none
-            assert time.monotonic() < end, "what the player had started goes on"
-            time.sleep(0.005)  # the end of somebody else's child is no event
-
-
-def test_a_child_that_a_player_has_started_is_silent_with_it(tmp_path: Path) -> None:
-    script = tmp_path / "pipeline.sh"
-    script.write_text(f"sleep 60 & echo $! > {tmp_path}/child; cat > /dev/null; wait\n", "utf-8")
-    with Spawned(f"sh {script}") as engine:
-        engine.say(TEXT, "g1")
-        engine.until_word()
-        child = int((tmp_path / "child").read_text("utf-8"))
-        descriptor = os.pidfd_open(child)
-        try:
-            engine.stop()
-            assert select.select([descriptor], [], [], 0.1)[0], "what the player had started goes on"
-        finally:
-            os.close(descriptor)

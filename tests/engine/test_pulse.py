@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
     from tests.support.sink import Sink
 
+    MakeRig = Callable[[], AbstractContextManager["Rig"]]
+
 RATE = 22050
 _PIECE = int(PIECE * RATE) * SAMPLE
 #: Seconds of sound: more than the server holds, so that it has to ask for some of it.
@@ -44,7 +46,7 @@ class Rig:
     """A player behind a relay; `wait` is as the playback's, which knows what the player says and no more."""
 
     def __init__(self, relay: Relay | None = None) -> None:
-        self._relay = relay
+        self.relay: Any = relay
         #: seconds after which a wait that nothing ends is taken for the playback's limit; None where none is to be
         self.limit: float | None = None
 
@@ -66,11 +68,6 @@ class Rig:
             raise CannotSpeak("silent", "nothing came any more")
         raise AssertionError(f"nothing has woken it in {PATIENCE:g} s")
 
-    @property
-    def relay(self) -> Relay:
-        assert self._relay
-        return self._relay
-
     def play_alone(self) -> None:
         """Play the sound by a player of its own."""
         player = None
@@ -87,13 +84,13 @@ class Rig:
         poll = select.poll()
         for descriptor, events in player.interests():
             poll.register(descriptor, events)
-        if self._relay is None:
+        if self.relay is None:
             poll.poll(max(0.0, seconds) * 1000)
             return
-        self._relay.register(poll)
+        self.relay.register(poll)
         # a piece that is left is handed on at once
-        poll.poll(0 if self._relay.waiting and self.limit is None else max(0.0, seconds) * 1000)
-        self._relay.pump()
+        poll.poll(0 if self.relay.waiting and self.limit is None else max(0.0, seconds) * 1000)
+        self.relay.pump()
 
     def end(self) -> CannotSpeak | None:
         """Play the sound and return how that failed; None if it has ended well."""
@@ -123,7 +120,7 @@ class Rig:
 
 
 @pytest.fixture
-def rig(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> Callable[[], AbstractContextManager[Rig]]:
+def rig(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> MakeRig:
     """Puts a fresh relay before the sound server."""
     for name, value in sink.env.items():
         monkeypatch.setenv(name, value)
@@ -158,8 +155,8 @@ def answered_between_calls(monkeypatch: pytest.MonkeyPatch, answer: Callable[[],
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_wakeup_is_lost_whenever_the_server_answers_and_in_whatever_pieces(
-    rig: Callable[[], AbstractContextManager[Rig]], monkeypatch: pytest.MonkeyPatch, seed: int
+def test_no_wakeup_is_lost_whenever_the_server_answers(
+    rig: MakeRig, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
     chance = random.Random(seed)
     with rig() as behind:
@@ -180,9 +177,7 @@ def test_no_wakeup_is_lost_whenever_the_server_answers_and_in_whatever_pieces(
 
 
 @pytest.mark.parametrize("number", ERRORS)
-def test_an_error_at_any_step_is_the_end_in_words_or_no_matter(
-    rig: Callable[[], AbstractContextManager[Rig]], number: int
-) -> None:
+def test_an_error_at_any_step_is_the_end_in_words(rig: MakeRig, number: int) -> None:
     ends = []
     for step in range(8):
         with rig() as behind:
@@ -194,9 +189,7 @@ def test_an_error_at_any_step_is_the_end_in_words_or_no_matter(
 
 
 @pytest.mark.parametrize("hush", [False, True], ids=["cut", "silent"])
-def test_a_connection_that_ends_anywhere_is_the_end_in_words(
-    rig: Callable[[], AbstractContextManager[Rig]], hush: bool
-) -> None:
+def test_a_connection_that_ends_anywhere_is_the_end_in_words(rig: MakeRig, hush: bool) -> None:
     with rig() as behind:
         assert behind.end() is None
         whole = behind.relay.handed_on
@@ -212,9 +205,7 @@ def test_a_connection_that_ends_anywhere_is_the_end_in_words(
             assert end.reason in {"audio_device", "audio_lost", "silent"}
 
 
-def test_a_move_that_is_told_together_with_the_end_is_seen(
-    rig: Callable[[], AbstractContextManager[Rig]], sink: Sink
-) -> None:
+def test_a_move_told_together_with_the_end_is_seen(rig: MakeRig, sink: Sink) -> None:
     """To a dummy: what was played there nobody has heard."""
     with rig() as behind, dummy_of(sink):
         player = PulsePlayer(RATE)
@@ -250,7 +241,7 @@ def dummy_of(sink: Sink) -> Iterator[None]:
         sink.pactl("unload-module", module)
 
 
-def test_what_is_not_played_is_not_heard_where_it_had_run_dry(rig: Callable[[], AbstractContextManager[Rig]]) -> None:
+def test_what_is_not_played_is_not_heard_where_it_had_run_dry(rig: MakeRig) -> None:
     """It goes on once it has as much as it began with, and its clock with it."""
     with rig() as behind:
         player = PulsePlayer(RATE)

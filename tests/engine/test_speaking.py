@@ -115,21 +115,15 @@ def test_a_process_gets_no_more_than_half_of_the_machines_memory(less: int) -> N
 # -- sentences
 
 
-def test_a_sentence_lasts_as_long_as_its_audio(engine: Spawned) -> None:
-    began = time.monotonic()
-    length = _length(engine.spoken("battery low"))
-    assert length <= time.monotonic() - began < length + 0.3
-
-
 @limits()
 def test_words_come_as_they_are_heard_and_only_forward(engine: Spawned) -> None:
     text = "this one é 日本 😀 battery low, please."
-    began = time.monotonic()
+    began, late = time.monotonic(), []
     engine.say(text)
-    late = []
     while not isinstance(event := engine.event(), protocol.Ended):
         if isinstance(event, protocol.Word):
             late.append(time.monotonic() - began - event.time)
+    assert _length(event) <= time.monotonic() - began < _length(event) + 0.3
     words = engine.words()
     assert [text[word.start : word.end] for word in words][1:] == ["é", "日本", "😀", "battery", "low", "please"]
     assert [word.number for word in words] == list(range(1, len(words) + 1))
@@ -184,15 +178,6 @@ def test_an_unknown_voice_fails_with_near_matches_and_the_next_goal_is_spoken(en
 # -- stops
 
 
-@limits()
-def test_a_stop_is_silent_within_20_ms_and_the_next_sentence_is_spoken(engine: Spawned) -> None:
-    for number in range(3):
-        engine.say("one two three four five six seven eight nine ten", f"g{number}")
-        engine.until_word()
-        assert_within(engine.stop(f"g{number}"), 0.02, "the stop")
-    assert engine.spoken("yes", "last").outcome == protocol.COMPLETED
-
-
 def test_a_stop_for_another_goal_is_ignored(engine: Spawned) -> None:
     engine.send(protocol.Stop("g0"))
     engine.say("yes")
@@ -235,9 +220,7 @@ def test_an_orphan_ends_before_it_starts() -> None:
         assert engine.process.wait(5) == 0
 
 
-def test_the_process_ends_with_its_server_and_so_does_a_player_that_takes_nothing(
-    player: Player, tmp_path: Path
-) -> None:
+def test_the_process_ends_with_its_server_and_so_does_its_player(player: Player, tmp_path: Path) -> None:
     begun = tmp_path / "begun"
     os.mkfifo(begun)
     with Spawned(player.command(f"open({str(begun)!r}, 'w').close()\n{NEVER_READS}")) as engine:

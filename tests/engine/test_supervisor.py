@@ -273,7 +273,7 @@ class Lost:
 
 
 @pytest.mark.parametrize("takes", [True, False], ids=["taken by the system", "refused"])
-def test_a_goal_that_was_sent_to_a_lost_process_is_spoken_by_the_next(
+def test_a_goal_sent_to_a_lost_process_is_spoken_by_the_next(
     start: Start, monkeypatch: pytest.MonkeyPatch, takes: bool
 ) -> None:
     thread = start(HANG_AFTER=1.0)  # so long a thread may doze that nothing wakes

@@ -244,7 +244,7 @@ def _assert_alike(first: Tape, second: Tape) -> None:
 # -- voices
 
 
-def test_its_voices_have_ids_of_their_own_and_one_of_them_is_its_own_from_the_start(
+def test_its_voices_have_ids_and_one_of_them_is_its_own(
     made: tuple[Synthesizer, str],
 ) -> None:
     synthesizer, own = made

@@ -69,9 +69,7 @@ def test_the_places_are_those_of_platformdirs(monkeypatch: pytest.MonkeyPatch, v
     assert cache_directory() == cache
 
 
-def test_a_voice_is_found_in_any_of_its_places_and_the_first_has_it(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_voice_is_found_in_the_first_of_its_places(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, package = home / "first", home / "lib" / "any_piper_voice" / "data"
     monkeypatch.setenv("TALK_VOICES", f"{home / 'nowhere'}:{first}")
     monkeypatch.setattr(sys, "path", [str(home / "lib")])
@@ -106,9 +104,7 @@ def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path, monkey
     ]
 
 
-def test_a_speaker_goes_by_its_number_where_its_name_cannot_be_typed(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_speaker_without_a_name_to_type_goes_by_its_number(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TALK_VOICES", str(home / "v"))
     names = {"amused": 0, "\x1b[31m": 1, "x" * 65: 2, "": 3, "calm": 5, "beyond": 6}
     tiny_voice.put(home / "v", "a", beside=tiny_voice.description(num_speakers=6, speaker_id_map=names))
@@ -205,9 +201,7 @@ def test_a_file_that_only_the_users_own_group_may_write_is_the_users(
 
 
 @pytest.mark.skipif(not hasattr(os, "setxattr"), reason="access control lists are asked for on Linux alone")
-def test_a_list_of_others_who_may_write_is_seen_behind_the_user_s_own_group(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_access_list_is_seen_behind_the_users_own_group(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tiny_voice.put(home / "v", "a")
     path.chmod(0o664)
     monkeypatch.setattr(models, "_is_alone", lambda _user, _group: True)
@@ -236,9 +230,7 @@ def test_a_directory_that_is_everybodys_may_be_above_if_it_is_sticky_but_not_hol
 
 @pytest.mark.parametrize("what", ["file", "directory"])
 @pytest.mark.parametrize("where", ["between", "there"])
-def test_neither_a_link_on_the_way_nor_its_target_may_be_where_everybody_may_write(
-    home: Path, what: str, where: str
-) -> None:
+def test_no_link_on_the_way_may_be_where_everybody_may_write(home: Path, what: str, where: str) -> None:
     path = tiny_voice.put(home / "there", "a")
     end = path if what == "file" else path.parent
     for name in ("between", "v"):
@@ -302,9 +294,7 @@ def test_another_users_file_or_link_is_refused(home: Path) -> None:
         ({"inference": {"length_scale": 1e9}}, "is no factor"),
     ],
 )
-def test_a_json_that_describes_no_voice_is_refused_in_words(
-    home: Path, beside: bytes | dict[str, Any], why: str
-) -> None:
+def test_a_json_of_no_voice_is_refused_in_words(home: Path, beside: bytes | dict[str, Any], why: str) -> None:
     path = tiny_voice.put(home / "v", "a")
     told = path.parent / "a.onnx.json"
     told.write_bytes(beside if isinstance(beside, bytes) else json.dumps(tiny_voice.description(**beside)).encode())

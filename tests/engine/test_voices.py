@@ -192,9 +192,7 @@ def test_a_voice_is_found_by_the_names_that_people_type(wanted: str, expected: s
         ("piper/de_DE-eva-low", "piper/en", "piper/de_DE-eva-low"),
     ],
 )
-def test_the_language_of_the_servers_neural_voice_means_that_voice(
-    wanted: str, preferred: str, expected: str | None
-) -> None:
+def test_a_language_means_the_servers_neural_voice(wanted: str, preferred: str, expected: str | None) -> None:
     assert found(wanted, preferred) == expected
 
 
