@@ -601,7 +601,7 @@ def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path)
 import threading
 from talkcli import install
 from talkcli.engine import protocol
-protocol.LOAD_LIMIT = 0.3
+protocol.LOAD_LIMIT = 0.6
 from talkcli.engine.synthesizers import inference
 init = inference.Model.__init__
 def hang(self, path, *rest):
@@ -615,7 +615,7 @@ inference.Model.__init__ = hang
         engine.send(protocol.Load("piper/other"))
         engine.send(protocol.Load(VOICE))
         first, second = engine.until(protocol.Loaded), engine.until(protocol.Loaded)
-        assert first.error == "piper/other was not loaded within 0.3 s: are its files on a slow disk?"
+        assert first.error == "piper/other was not loaded within 0.6 s: are its files on a slow disk?"
         assert (second.voice, second.error) == (VOICE, None)
         engine.leave()
         assert engine.process.wait(5) == 0, "a load that hangs keeps no process"

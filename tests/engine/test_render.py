@@ -25,10 +25,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.client.connect import Interrupted
-from talkcli.engine import process
-from talkcli.engine.process import engine_command
+from talkcli.doctor import sentence, voice
+from talkcli.doctor.sentence import Played
+from talkcli.doctor.voice import Engine, Setting
+from talkcli.engine import process, protocol
+from talkcli.engine.process import Conversation, EngineFailed, engine_command
 from talkcli.engine.render import CannotWrite, RenderFailed, pieces, render
 from talkcli.errors import TalkError, UsageError
+from talkcli.goals.states import State
 from tests.support.reference import RATE, Sentence
 from tests.support.reference import render as reference
 from tests.support.surroundings import MARK, assert_none_left, needs
@@ -452,3 +456,57 @@ def test_a_kill_at_any_moment_leaves_no_half_file(tmp_path: Path, how: signal.Si
         if done:
             assert samples(path) == expected.tobytes()
     assert False in outcomes
+
+
+# -- a conversation with an engine process, and as doctor tells it
+
+
+CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None, list_voices=False)
+SAY = protocol.Say("1", "length=0", 200, 1.0, None, 50)
+
+
+@pytest.mark.usefixtures("scripted_process")
+def test_saying_something_to_a_process_that_has_died_raises_how_it_died() -> None:
+    with Conversation(CONFIGURE) as engine:
+        events = engine.events
+        assert isinstance(next(events), protocol.Ready)
+        os.kill(engine._process.pid, 9)
+        os.waitid(os.P_PID, engine._process.pid, os.WEXITED | os.WNOWAIT)
+        with pytest.raises(EngineFailed, match=r"^it was killed by SIGKILL$") as failed:
+            engine.say(SAY)
+        assert failed.value.reason == "engine_crashed"
+
+
+@pytest.mark.usefixtures("scripted_process")
+def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None:
+    with Conversation(CONFIGURE, deadline=time.monotonic() + 0.7) as engine:
+        heard: list[protocol.Event] = []
+        assert isinstance(next(engine.events), protocol.Ready)
+        engine.say(protocol.Say("1", "never-ends", 200, 1.0, None, 50))
+        with pytest.raises(TimeoutError):
+            heard.extend(engine.events)
+        assert any(isinstance(event, protocol.Word) for event in heard)
+
+
+# -- as doctor tells it
+
+
+@pytest.mark.usefixtures("scripted_process")
+def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(process, "HANG_AFTER", 0.4)
+    hung = Played(State.ABORTED, "engine_hung", "the engine process said nothing for 0.4 s")
+    assert sentence.by_engine("hang", Setting(), 1.0, 20.0) == hung
+    behaviour = tmp_path / "start"
+    behaviour.write_text("hang")
+    monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
+    monkeypatch.setattr(process, "START_LIMIT", 0.3)
+    words = "the engine process said nothing for 0.3 s"
+    assert voice.look(Setting()) == Engine(reason="engine_hung", words=words)
+
+
+@pytest.mark.usefixtures("scripted_process")
+def test_doctor_tells_how_an_engine_process_died_and_that_a_sentence_takes_too_long() -> None:
+    died = Played(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
+    assert sentence.by_engine("silent-start crash", Setting(), 1.0, 20.0) == died
+    late = Played(State.ABORTED, "engine_hung", "it was not over after 0.5 s")
+    assert sentence.by_engine("never-ends", Setting(), 1.0, 0.5) == late
