@@ -28,6 +28,32 @@ USUAL = 200
 SOON = 0.1
 
 
+#: Wraps a function of the package.
+_FIRST = """
+import importlib, sys, threading, time
+def wrap(module, path):
+    *names, name = path.split(".")
+    owner = importlib.import_module("talkcli.engine." + module)
+    for each in names:
+        owner = getattr(owner, each)
+    original, seen = getattr(owner, name), []
+    def wrapped(*arguments, **more):
+        {does}
+        return original(*arguments, **more)
+    setattr(owner, name, wrapped)
+wrap({module!r}, {path!r})
+"""
+
+
+def first(function: str, does: str) -> str:
+    """Return code that has a function of the engine, as "players.pulse:PulsePlayer.offer", do something first.
+
+    That is a line of Python, which sees its `arguments`, and a list `seen` that stays.
+    """
+    module, _, path = function.partition(":")
+    return _FIRST.format(module=module, path=path, does=does)
+
+
 class Spawned:
     """A running engine process. Leaving the context kills what is left of it."""
 

@@ -23,7 +23,7 @@ from talkcli import install
 from talkcli.engine import protocol
 from talkcli.engine.synthesizers.models import NEEDED
 from tests.engine.programs import Player, without_silence
-from tests.engine.spawned import SOON, Spawned
+from tests.engine.spawned import SOON, Spawned, first
 from tests.support import tiny_voice
 from tests.support.espeak import RATE
 from tests.support.processes import children
@@ -40,37 +40,9 @@ if TYPE_CHECKING:
 TEXT = "battery low, please come home"
 VOICE = "piper/tiny"
 #: Code that runs in the process first and makes loading slow, as on a slow machine.
-SLOW_TO_LOAD = """
-import time
-from talkcli.engine.synthesizers import inference
-take = inference.Model._take
-def slowly(*arguments):
-    time.sleep({seconds})
-    return take(*arguments)
-inference.Model._take = slowly
-"""
-#: … that tells when libespeak-ng is asked for something, once a text.
-TELLS_OF_SPELLING = """
-import sys
-from talkcli.engine.synthesizers.espeak import Spelling
-method, told = Spelling.{asked}, []
-def telling(self, *arguments):
-    if self not in told:
-        told.append(self)
-        print("{asked}", file=sys.stderr, flush=True)
-    return method(self, *arguments)
-Spelling.{asked} = telling
-"""
+SLOW_TO_LOAD = first("synthesizers.inference:Model._take", "time.sleep(0.8)")
 #: … that makes all but the first sound of a sentence too late.
-SLOW_TO_SPEAK = """
-import time
-from talkcli.engine.synthesizers import inference
-decode = inference.Model.decode
-def slowly(model, frames, begin, *rest):
-    time.sleep(0.8 if begin else 0)
-    return decode(model, frames, begin, *rest)
-inference.Model.decode = slowly
-"""
+SLOW_TO_SPEAK = first("synthesizers.inference:Model.decode", "time.sleep(0.8 if arguments[2] else 0)")
 #: … that hides packages.
 WITHOUT = """
 import sys, importlib.abc
@@ -348,7 +320,7 @@ def test_little_memory_ends_a_sentence_once_and_the_next_is_espeaks(tmp_path: Pa
 
 @limits()
 def test_it_is_held_and_stopped_while_it_is_loaded_and_spoken_with_when_that_is_done(place: Path) -> None:
-    with _engine(place, before=SLOW_TO_LOAD.format(seconds=0.8), alive_every=SOON) as engine:
+    with _engine(place, before=SLOW_TO_LOAD, alive_every=SOON) as engine:
         engine.say(TEXT, voice=VOICE)
         engine.until(protocol.Alive)
         assert_within(engine.pause(), protocol.STOP_LIMIT, "a pause while the voice is loaded")
@@ -371,7 +343,8 @@ def test_it_is_held_and_stopped_while_it_is_loaded_and_spoken_with_when_that_is_
 def test_it_is_stopped_and_held_while_the_sounds_of_a_text_are_looked_up(place: Path, asked: str) -> None:
     """Libespeak-ng needs a tenth of a second at once for a clause of 800 bytes of a script that isn't the voice's."""
     text = "Go. Dr. Who. " + "电池电量低正在返回充电站" * 800
-    with _engine(place, before=TELLS_OF_SPELLING.format(asked=asked)) as engine:
+    tells = f"arguments[0] in seen or seen.append(arguments[0]) or print({asked!r}, file=sys.stderr, flush=True)"
+    with _engine(place, before=first(f"synthesizers.espeak:Spelling.{asked}", tells)) as engine:
         assert engine.spoken("Go. Go", "g0", voice=VOICE).outcome == protocol.COMPLETED
         assert engine.errors_line() == asked
         for number in range(1, 5):
@@ -462,7 +435,7 @@ def test_gaps_are_those_that_are_heard_and_words_are_told_when_they_are(place: P
 @pytest.mark.parametrize("player", [pytest.param("null", marks=pytest.mark.slow), "pulse"])
 def test_a_processor_at_a_fifth_of_its_time_speaks_on_with_gaps(real: dict[str, str], sink: Sink, player: str) -> None:
     """It stands still for a sixth of a second again and again, as under a limit of the kernel's, and its player too."""
-    text = "Please step aside, the robot is about to turn."
+    text = "Please step aside, the robot turns."
     with Spawned(player, environment={**real, **sink.env}) as engine:
         assert engine.spoken("a", "g0", voice=REAL_VOICE).gaps == 0
         with _slowed(engine, running=0.04, standing=0.16):
@@ -520,18 +493,8 @@ def test_a_real_voice_says_a_sentence_with_its_words_in_time(real: dict[str, str
 
 
 def test_voices_are_loaded_one_at_a_time_beside_the_speech_and_told_once_each(place: Path) -> None:
-    slow = """
-import sys, time
-from talkcli.engine.synthesizers import inference
-init, loading = inference.Model.__init__, []
-def counted(self, path, *rest):
-    loading.append(path)
-    assert len(loading) == 1, loading
-    time.sleep(0.3)
-    init(self, path, *rest)
-    loading.clear()
-inference.Model.__init__ = counted
-"""
+    path = "synthesizers.inference:Model._take"
+    slow = first(path, "seen and sys.exit('two at once') or seen.append(1) or time.sleep(0.3) or seen.clear()")
     tiny_voice.put(place, "second")
     with _engine(place, before=slow) as engine:
         for voice in ("piper/second", VOICE, "piper/second", "piper/nobody", VOICE):
@@ -597,25 +560,14 @@ inference.Model.__init__ = heavier
 
 
 def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path) -> None:
-    hangs = """
-import threading
-from talkcli import install
-from talkcli.engine import protocol
-protocol.LOAD_LIMIT = 0.6
-from talkcli.engine.synthesizers import inference
-init = inference.Model.__init__
-def hang(self, path, *rest):
-    if "other" in path:
-        threading.Event().wait()
-    init(self, path, *rest)
-inference.Model.__init__ = hang
-"""
+    hangs = first("synthesizers.inference:Model.__init__", '"other" in arguments[1] and threading.Event().wait()')
+    hangs = f"from talkcli.engine import protocol\nprotocol.LOAD_LIMIT = 0.6\n{hangs}"
     tiny_voice.put(place, "other")
     with _engine(place, before=hangs) as engine:
         engine.send(protocol.Load("piper/other"))
         engine.send(protocol.Load(VOICE))
-        first, second = engine.until(protocol.Loaded), engine.until(protocol.Loaded)
-        assert first.error == "piper/other was not loaded within 0.6 s: are its files on a slow disk?"
-        assert (second.voice, second.error) == (VOICE, None)
+        hung, loaded = engine.until(protocol.Loaded), engine.until(protocol.Loaded)
+        assert hung.error == "piper/other was not loaded within 0.6 s: are its files on a slow disk?"
+        assert (loaded.voice, loaded.error) == (VOICE, None)
         engine.leave()
         assert engine.process.wait(5) == 0, "a load that hangs keeps no process"
