@@ -76,6 +76,7 @@ def test_a_good_player_gets_every_sample_and_underruns_are_no_error(player: Play
         ("", None, "audio_lost", "player ended before the sound did"),
         (_plays("if taken > 8000: sys.exit(0)"), None, "audio_lost", "player ended before the sound did"),
         (_plays("if taken > 8000: sys.exit(3)"), None, "audio_lost", "player exited with status 3"),
+        (_plays("if taken > 8000: os.kill(os.getpid(), 9)"), None, "audio_lost", "player was killed by SIGKILL"),
         (_plays(UNDERRUNS), None, "audio_lost", "aplay: write error: No such device"),
         (SWALLOWS, None, "audio_lost", r"player ended \d\.\d s before the sound did"),
         (_plays(after='sys.exit("drain failed: Broken pipe")'), None, "audio_lost", "drain failed: Broken pipe"),
