@@ -108,14 +108,6 @@ ctypes.CDLL = Missing
 """
 
 
-def _start_failure(driver: str | None = None, voice: str | None = None, before: str = "") -> protocol.StartFailed:
-    with Spawned(driver=driver, voice=voice, before=before) as engine:
-        failed = engine.until(protocol.StartFailed)
-        assert engine.event() is None
-        assert engine.process.wait(5) == 0
-        return failed
-
-
 @pytest.fixture(scope="module")
 def shared() -> Iterator[Spawned]:
     with Spawned(driver="dummy") as engine:
@@ -161,12 +153,6 @@ def test_an_option_that_the_driver_lacks_fails_the_goal(
     assert ended.message is not None
     assert message in ended.message
     assert dummy.spoken("yes", "g2", rate=150, lead_in=0).outcome == protocol.COMPLETED
-
-
-def test_a_neural_voice_of_another_driver_is_refused_at_the_start() -> None:
-    words = '"piper/en_US-joe-medium" is a neural voice, and the driver "dummy" has none: leave --driver out'
-    failed = _start_failure("dummy", "piper/en_US-joe-medium")
-    assert (failed.message, failed.reason, failed.usage) == (words, "unknown_voice", True)
 
 
 @limits()
@@ -276,15 +262,8 @@ def test_the_wheels_library_serves_where_the_system_has_none() -> None:
         assert engine.spoken("yes").outcome == protocol.COMPLETED
 
 
-def test_no_library_at_all_says_what_to_install() -> None:
-    failed = _start_failure(before=NO_LIBRARY + "sys.modules['espeakng_loader'] = None")
-    assert failed.reason == "engine_failed"
-    assert failed.message.startswith("libespeak-ng is missing (libespeak-ng.so.1: ")
-    assert failed.message.endswith(f"): {install.espeak_library()}")
-
-
-def test_a_library_without_a_voice_of_its_own_says_which() -> None:
-    before = """
+#: A library that has not even talk's own voice.
+WITHOUT_ENGLISH = """
 from talkcli.engine.synthesizers import espeak
 load = espeak.load
 def without_english():
@@ -293,45 +272,57 @@ def without_english():
     return library, *more
 espeak.load = without_english
 """
-    failed = _start_failure(before=before)
-    assert failed.message == 'the driver "talk_espeak" cannot be started: UnknownVoice: en'
-    assert not failed.lasting
 
 
-def test_no_pyttsx3_says_what_to_install() -> None:
-    failed = _start_failure(before="sys.modules['pyttsx3'] = None")
-    assert failed.message.startswith("pyttsx3 is missing (")
-    assert failed.message.endswith(f"): {install.command('pyttsx3')}")
-
-
-def test_an_unknown_driver_is_named_with_those_there_are() -> None:
-    failed = _start_failure("parrot")
-    assert failed.reason == "engine_failed"
-    assert failed.message.startswith('unknown driver "parrot": there are ')
-    assert "dummy" in failed.message
-
-
-def test_a_driver_for_another_system_says_what_it_lacks() -> None:
-    assert _start_failure("nsss").message == "the driver \"nsss\" cannot be loaded: No module named 'objc'"
-
-
-def test_a_driver_that_cannot_be_stepped_is_refused_at_once() -> None:
-    before = SLOW_DRIVER + "\nDriver.iterate = lambda self: None"
-    failed = _start_failure("slow", before=before)
-    assert failed.message.startswith('the driver "slow" cannot be stepped')
-    assert "leave --driver out" in failed.message
+@pytest.mark.parametrize(
+    ("options", "words", "more"),
+    [
+        (
+            {"before": NO_LIBRARY + "sys.modules['espeakng_loader'] = None"},
+            ["libespeak-ng is missing (libespeak-ng.so.1: ", f"): {install.espeak_library()}"],
+            {"lasting": True},
+        ),
+        (
+            {"before": WITHOUT_ENGLISH},
+            ['the driver "talk_espeak" cannot be started: UnknownVoice: en'],
+            {"lasting": False},
+        ),
+        (
+            {"before": "sys.modules['pyttsx3'] = None"},
+            ["pyttsx3 is missing (", f"): {install.command('pyttsx3')}"],
+            {"lasting": True},
+        ),
+        ({"driver": "parrot"}, ['unknown driver "parrot": there are ', "dummy"], {"usage": True}),
+        ({"driver": "nsss"}, ["the driver \"nsss\" cannot be loaded: No module named 'objc'"], {"usage": True}),
+        (
+            {"driver": "slow", "before": SLOW_DRIVER + "\nDriver.iterate = lambda self: None"},
+            ['the driver "slow" cannot be stepped', "leave --driver out"],
+            {"usage": True},
+        ),
+        ({"voice": "en-uss"}, ["did you mean 'en-us'"], {"reason": "unknown_voice", "lasting": True, "usage": True}),
+        (
+            {"driver": "dummy", "voice": "piper/en_US-joe-medium"},
+            ['"piper/en_US-joe-medium" is a neural voice, and the driver "dummy" has none: leave --driver out'],
+            {"reason": "unknown_voice", "lasting": True, "usage": True},
+        ),
+    ],
+)
+def test_a_start_that_fails_says_what_to_install_or_to_change(
+    options: dict[str, Any], words: list[str], more: dict[str, Any]
+) -> None:
+    with Spawned(**options) as engine:
+        failed = engine.until(protocol.StartFailed)
+        assert engine.event() is None
+        assert engine.process.wait(5) == 0
+    assert all(each in failed.message for each in words), failed
+    assert {name: getattr(failed, name) for name in more} == more
+    assert failed.reason == more.get("reason", "engine_failed")
 
 
 def test_espeak_means_talks_own_driver() -> None:
     with Spawned(driver="espeak") as engine:
         assert engine.until(protocol.Ready).driver == "espeak"
         assert engine.spoken("yes").outcome == protocol.COMPLETED
-
-
-def test_an_unknown_voice_at_the_start_is_an_error() -> None:
-    failed = _start_failure(voice="en-uss")
-    assert failed.reason == "unknown_voice"
-    assert "did you mean 'en-us'" in failed.message
 
 
 # -- our own driver
