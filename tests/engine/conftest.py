@@ -50,6 +50,6 @@ def start(scripted_process: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[S
 
 @pytest.fixture(scope="session")
 def real(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return the environment of engine processes that have a real voice, and keep what they make of its model."""
+    """Return the environment of engine processes that have a real voice, and share a cache."""
     real_voice()
     return {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}

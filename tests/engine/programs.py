@@ -1,4 +1,4 @@
-"""Player programs made of Python code, for tests that look at what a player gets or have it fail."""
+"""Player programs made of Python code, for tests that look at the samples a player gets or have it fail."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.support.reference import render
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: A player that takes sound in real time, holds 60 ms of it, and writes what it took to the file in its first argument.
+#: A player that takes sound in real time, holds 60 ms of it, and writes it to the file in its first argument.
 PLAYS = """
 import os, sys, time
 heard = open(sys.argv[1], "ab", buffering=0)

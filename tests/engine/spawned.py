@@ -20,11 +20,11 @@ _E = TypeVar("_E", bound=protocol.Event)
 
 #: Seconds after which a message is late on the busiest machine.
 PATIENCE = 20.0
-#: Words a minute where they are not what is tested: a sentence takes less than half as long as at talk's own rate. What
-#: is told to another driver is its own, which it need not set.
+#: Words a minute in tests of something else: a sentence takes less than half as long as at talk's own rate. Another
+#: driver is told its own rate, which it need not set.
 FAST = 450
 USUAL = 200
-#: Seconds between two signs of life where a test waits for one to know that some time has passed.
+#: Seconds between two signs of life in tests that wait for one to let some time pass.
 SOON = 0.1
 
 
@@ -55,7 +55,7 @@ def first(function: str, does: str) -> str:
 
 
 class Spawned:
-    """A running engine process. Leaving the context kills what is left of it."""
+    """A running engine process. Leaving the context kills it and its player."""
 
     def __init__(
         self,
@@ -123,11 +123,11 @@ class Spawned:
         self._socket.sendall(lines)
 
     def leave(self) -> None:
-        """Send nothing more, and let the process end; what it says can still be read."""
+        """Send nothing more, and let the process end; its events can still be read."""
         self._socket.shutdown(socket.SHUT_WR)
 
     def hang_up(self) -> None:
-        """Do what the kernel does when the server dies."""
+        """Close the connection both ways, as the kernel does when the server dies."""
         self._socket.shutdown(socket.SHUT_RDWR)
 
     def say(
@@ -202,7 +202,7 @@ class Spawned:
         return [event for event in self.events if isinstance(event, protocol.Word) and event.id == goal]
 
     def errors(self) -> str:
-        """Return what the process wrote to standard error; waits for its end."""
+        """Return the standard error of the process; waits for its end."""
         assert self.process.stderr is not None
         return self.process.stderr.read().decode()
 

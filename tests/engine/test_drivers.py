@@ -82,7 +82,7 @@ class Driver(Base):
 """,
 )
 
-#: A driver that reports each word as it says it, 0.1 s a word, and writes what it is told to say to standard error.
+#: A driver that reports each word as it says it, 0.1 s a word, and writes each text to standard error.
 TIMED_DRIVER = _DRIVER.format(
     name="timed",
     driver="""
@@ -174,7 +174,7 @@ def _timed(text: str = "battery low, please come home") -> Spawned:
 
 
 def _texts(engine: Spawned) -> list[str]:
-    """Return what the driver was told to say; ends the process."""
+    """Return the texts that the driver was told to say; ends the process."""
     engine.leave()
     return engine.errors().splitlines()
 
@@ -254,7 +254,7 @@ def _processor(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def test_the_wheels_library_serves_where_the_system_has_none() -> None:
+def test_the_wheels_library_serves_if_the_system_has_none() -> None:
     with Spawned(before=NO_LIBRARY) as engine:
         version = engine.until(protocol.Ready).version
         assert version is not None
@@ -373,7 +373,7 @@ class Told:
         pass
 
     def spoken(self, text: str, name: str) -> list[tuple[str, dict[str, Any]]]:
-        """Speak as talk does, and return what was told of it."""
+        """Speak as talk does, and return the notifications."""
         self.told.clear()
         self.beside.clear()
         self.engine.say(text, name)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from talkcli.engine.synthesizers import guard
 
-#: What the rules are about, and what comes near it: initials, stops, apostrophes, scripts of every kind, long words.
+#: The matter of the rules, and its like: initials, stops, apostrophes, scripts of every kind, long words.
 _PIECES = (
     *("a", "b", "A", "é", "ß", "ǅ", "1", "22", "word", "Word", "日", "本", "가", "각", "①", "⠁", "𝐀", "𝐚", "İ", "ª"),
     *("'", "’", ".", ". ", "..", ",", ", ", "! ", "? ", "…", "。", "\u3000", "\xa0", "\u200d", "\u0301", " ", "  "),
@@ -25,7 +25,7 @@ _ORDINARY = (
 
 
 @given(_TEXTS | st.text())
-def test_where_no_initials_are_suspected_there_are_none_to_change(text: str) -> None:
+def test_a_text_without_suspected_initials_has_none_to_change(text: str) -> None:
     if not guard._may_have_long_initials(text):
         assert guard._without_long_initials(text) == text
 
@@ -38,7 +38,7 @@ def test_words_are_ended_as_if_the_whole_text_had_been_gone_through(text: str) -
 @pytest.mark.parametrize(
     "text", ["a." * 85, "e.g. " * 60, "a." + "b" * 170, "a.b." * 3 + "가" * 17, "a " * 230 + "b.c"]
 )
-def test_what_kills_the_library_is_suspected(text: str) -> None:
+def test_a_text_that_kills_the_library_is_suspected(text: str) -> None:
     assert guard._may_have_long_initials(text)
     assert guard.guarded(text) != text
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
@@ -40,6 +41,7 @@ class Sleeper:
         monkeypatch.setattr("os.write", counted)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
+        assert self.asleep.wait(PATIENCE)
 
     def _run(self) -> None:
         while not self._ending:
@@ -59,10 +61,7 @@ class Sleeper:
         assert self.asleep.wait(PATIENCE)
 
     def close(self) -> None:
-        def end() -> None:
-            self._ending = True
-
-        self.inbox.call(end)
+        self.inbox.call(lambda: setattr(self, "_ending", True))
         self._thread.join(PATIENCE)
         assert not self._thread.is_alive()
         self.inbox.close()
@@ -70,16 +69,9 @@ class Sleeper:
 
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], Sleeper]]:
-    started: list[Sleeper] = []
-
-    def make(doze: float) -> Sleeper:
-        started.append(Sleeper(monkeypatch, doze))
-        assert started[-1].asleep.wait(PATIENCE)
-        return started[-1]
-
-    yield make
-    for each in started:
-        each.close()
+    """Starts threads that sleep; each is closed at the end."""
+    with contextlib.ExitStack() as stack:
+        yield lambda doze: stack.enter_context(contextlib.closing(Sleeper(monkeypatch, doze)))
 
 
 def test_an_action_does_not_wake_a_thread_that_dozes_and_is_done_in_order(
@@ -122,11 +114,8 @@ def test_nothing_is_lost_and_nothing_overtakes_while_several_threads_hand_in(sta
 
     def hand_in(who: int) -> None:
         for number in range(count):
-            action = lambda number=number: done.append((who, number))  # noqa: E731
-            if number % 3:
-                sleeper.inbox.call(action)
-            else:
-                sleeper.inbox.call(action, by=time.monotonic() + 0.002 * (number % 2))
+            by = 0.0 if number % 3 else time.monotonic() + 0.002 * (number % 2)
+            sleeper.inbox.call(lambda number=number: done.append((who, number)), by)  # type: ignore[misc]
 
     threads = [threading.Thread(target=hand_in, args=(who,)) for who in range(3)]
     for each in threads:
@@ -146,7 +135,7 @@ def test_nothing_is_done_once_no_more_is_taken() -> None:
     assert done == []
 
 
-def test_it_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_inbox_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """The descriptor could be another file's by then, and get the byte."""
     inbox, closed, write = Inbox(0.0), threading.Event(), os.write
 

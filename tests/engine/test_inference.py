@@ -49,7 +49,7 @@ def _loaded(path: Path, cache: Cache | None = None) -> Model:
 
 
 def _whole(path: Path, speaker: int | None = None) -> Any:
-    """Return what the model makes that nobody has cut."""
+    """Return the samples that the uncut model makes."""
     import numpy as np
     import onnxruntime
 
@@ -128,7 +128,7 @@ def test_halves_are_read_from_files_that_are_gone_then(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("cached", [True, False])
-def test_where_no_file_may_be_written_a_model_is_loaded_all_the_same(tmp_path: Path, cached: bool) -> None:
+def test_a_model_is_loaded_even_if_no_file_may_be_written(tmp_path: Path, cached: bool) -> None:
     path = tiny_voice.put(tmp_path / "v", "a")
     usual = _in_pieces(_loaded(path))
     cache = Cache(str(tmp_path / "c"))

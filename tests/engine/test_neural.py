@@ -1,4 +1,4 @@
-"""A neural voice in the engine process: it speaks, is stopped and held at any time, and says what is wrong with it.
+"""A neural voice in the engine process: it speaks, is stopped and held at any time, and tells its faults.
 
 Tests that leave the process as it is share one, which writes to a file and so takes no time.
 """
@@ -103,7 +103,7 @@ def _speaks(engine: Spawned, goal: str) -> list[tuple[str, str | None]]:
     return [(each.voice, each.why) for each in engine.events if isinstance(each, protocol.Speaks) and each.id == goal]
 
 
-def test_it_speaks_with_its_words_and_espeak_before_and_after(engine: Spawned) -> None:
+def test_a_neural_voice_speaks_with_its_words_and_espeak_before_and_after(engine: Spawned) -> None:
     for number, voice in enumerate([None, VOICE, "en-us", VOICE[:8], None]):
         ended = engine.spoken(TEXT, f"g{number}", voice=voice)
         assert ended.outcome == protocol.COMPLETED, ended
@@ -164,7 +164,7 @@ def test_unknown_sounds_are_left_out_and_a_text_of_nothing_else_fails(place: Pat
     tiny_voice.put(place, "few", beside=about)
     text = "Cat! " + "See! " * 12 + "Cat!"
     assert engine.spoken(text, "g1", voice="piper/few").outcome == protocol.COMPLETED
-    # The first sound of "cat", and of "see" all: who hears a part of a sentence is told of all of its words.
+    # It lacks the first sound of "cat", and all of "see". A sentence of which a part is heard tells all of its words.
     assert [text[each.start : each.end] for each in engine.words("g1")] == ["Cat", "Cat"]
     assert engine.spoken("See a cat see.", "g3", voice="piper/few").outcome == protocol.COMPLETED
     told = [each.time for each in engine.words("g3")]
@@ -207,8 +207,8 @@ def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package:
 # -- faults
 
 
-#: What is wrong with a voice's files: the model, what its JSON has instead, and what is said of it. The models that
-#: are refused when they are loaded are in `test_inference.py`.
+#: Faults of a voice's files: the model, the entries of its JSON, and the words of the error. Models that are refused
+#: when they are loaded are in `test_inference.py`.
 WRONG: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "no json": (tiny_voice.model(), {}, "wrong.onnx.json is not there: it belongs to the model"),
     "cut short": (tiny_voice.model()[:-300], {}, "is cut short, or no ONNX model: get the voice anew"),
@@ -219,7 +219,7 @@ WRONG: dict[str, tuple[bytes, dict[str, Any], str]] = {
 
 
 def _put_wrong(place: Path, wrong: str) -> str:
-    """Put the files there and return what is said of them."""
+    """Put the files there and return the words of the error."""
     model, beside, words = WRONG[wrong]
     path = tiny_voice.put(place, "wrong", model, tiny_voice.description(**beside))
     if wrong == "no json":
@@ -230,7 +230,7 @@ def _put_wrong(place: Path, wrong: str) -> str:
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_fault_of_its_files_ends_one_goal_in_words(place: Path, engine: Spawned, wrong: str) -> None:
+def test_a_fault_of_a_voices_files_ends_one_goal_in_words(place: Path, engine: Spawned, wrong: str) -> None:
     """And it is no reason to be silent for ever: the process lives, and a file that is mended is taken at once."""
     engine.send(protocol.Drop("piper/wrong"))
     words = _put_wrong(place, wrong)
@@ -262,7 +262,7 @@ def test_a_voice_that_fails_at_once_is_no_reason_for_silence(
 
 
 def test_a_machine_without_memory_for_a_model_says_so_and_speaks_on(real: dict[str, str], tmp_path: Path) -> None:
-    """With espeak at once, and with the voice when there is memory again; what was kept of it is kept."""
+    """With espeak at once, and with the voice when there is memory again. The cached halves stay."""
     target = f"file:{tmp_path / 'out.wav'}"
     with Spawned(target, environment=real) as engine:
         assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.COMPLETED
@@ -319,7 +319,7 @@ def test_little_memory_ends_a_sentence_once_and_the_next_is_espeaks(tmp_path: Pa
 
 
 @limits()
-def test_it_is_held_and_stopped_while_it_is_loaded_and_spoken_with_when_that_is_done(place: Path) -> None:
+def test_a_voice_is_held_and_stopped_while_it_is_loaded_and_then_speaks(place: Path) -> None:
     with _engine(place, before=SLOW_TO_LOAD, alive_every=SOON) as engine:
         engine.say(TEXT, voice=VOICE)
         engine.until(protocol.Alive)
@@ -340,7 +340,7 @@ def test_it_is_held_and_stopped_while_it_is_loaded_and_spoken_with_when_that_is_
 
 @limits()
 @pytest.mark.parametrize("asked", ["clauses", "places", "abbreviates"])
-def test_it_is_stopped_and_held_while_the_sounds_of_a_text_are_looked_up(place: Path, asked: str) -> None:
+def test_a_voice_is_stopped_and_held_while_the_sounds_of_a_text_are_looked_up(place: Path, asked: str) -> None:
     """Libespeak-ng needs a tenth of a second at once for a clause of 800 bytes of a script that isn't the voice's."""
     text = "Go. Dr. Who. " + "电池电量低正在返回充电站" * 800
     tells = f"arguments[0] in seen or seen.append(arguments[0]) or print({asked!r}, file=sys.stderr, flush=True)"
@@ -405,7 +405,7 @@ def test_a_program_that_plays_gets_each_sample_once_whether_it_is_held_or_not(pl
 
 
 @pytest.mark.parametrize("player", ["pulse", "aplay"])
-def test_gaps_are_those_that_are_heard_and_words_are_told_when_they_are(place: Path, sink: Sink, player: str) -> None:
+def test_the_gaps_that_are_heard_are_told_and_words_when_they_are_heard(place: Path, sink: Sink, player: str) -> None:
     """A machine that is too slow leaves nothing out, and tells words in the order of the text, however late."""
     text = "one two three four five six seven"
     with sink.record() as recording, _engine(place, player, sink.env, before=SLOW_TO_SPEAK) as engine:
@@ -416,7 +416,7 @@ def test_gaps_are_those_that_are_heard_and_words_are_told_when_they_are(place: P
                 told.append((time.monotonic(), event.time))
         assert event.outcome == protocol.COMPLETED
         recording.wait_until_quiet(0.3)
-        # It hums all the time: where it doesn't, there is a gap.
+        # It hums all the time, so any silence is a gap.
         loud = [at for at, each in enumerate(recording.samples) if abs(int(each)) > 1000]
         assert [text[each.start : each.end] for each in engine.words()] == text.split()
     silent = [(here - before) / RATE for before, here in itertools.pairwise(loud) if here - before > 0.05 * RATE]
@@ -426,7 +426,7 @@ def test_gaps_are_those_that_are_heard_and_words_are_told_when_they_are(place: P
     assert event.duration is not None
     assert event.duration - 0.26 == pytest.approx(len(loud) / RATE, abs=0.05), "less the pause at its end"
     for at, position in told:
-        # A monitor drops some samples where a player ran dry: what is near a gap may be on either side of it.
+        # A monitor drops some samples when a player runs dry: a word near a gap may be on either side of it.
         near = (int((position + each) * RATE) for each in (-0.03, 0, 0.03))
         heard = [recording.time_of(loud[min(len(loud) - 1, max(0, each))]) for each in near]
         assert heard[0] - 0.1 < at < heard[-1] + 0.1

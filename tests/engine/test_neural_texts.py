@@ -29,7 +29,7 @@ MANY = int(os.environ.get("TALK_TEST_NEURAL_TEXTS") or 200)
 SEED = int(os.environ.get("TALK_TEST_SEED") or 18)
 #: … in a default run.
 FEW = 5
-#: Tests that have a part of them each, beside each other; and the characters of one, where nobody asked for many.
+#: Tests that run beside each other, each with a part of the texts; and characters of a text, unless many are asked for.
 PARTS = 4
 LONGEST = None if "TALK_TEST_NEURAL_TEXTS" in os.environ else 60
 #: Seconds of sound that a character may make at 450 words per minute, and a text beside that: the name of a picture, or
@@ -44,14 +44,14 @@ ODD = [
     *("\x01s\x01100A b", "1,000,000.5", "7" * 60, "IV. XIX. 1/2 3°", "e.g. i.e. U.S.A. Dr. Mr. 5."),
     *("\ufffe\uffff", "\u202ea\u202c\u2067b\u2069"),
 ]
-#: … and those that are long, which take half a minute each: all of them where many texts are asked for.
+#: … and long ones, which take half a minute each: all of them if many texts are asked for.
 LONG = {**ENDLESS, "one word": "x" * 10_000, "words of a letter": "a " * 5_000, "words": "word " * 2_000}
 _CHOSEN = LONG if "TALK_TEST_NEURAL_TEXTS" in os.environ else ("digits", "accents", "one word", "words of a letter")
 
 
 @dataclass
 class Tally:
-    """What became of the texts."""
+    """The ends of the texts."""
 
     outcomes: Counter[str] = field(default_factory=Counter)
     deaths: list[str] = field(default_factory=list)  # how a process ended, and of which text

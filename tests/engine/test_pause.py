@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 TEXT = "one two three four five six seven"
 
-#: A player that takes all it gets at once, plays it in real time, and writes what it got to a file of its own.
+#: A player that takes all it gets at once, plays it in real time, and writes it to a file of its own.
 DEEP = """
 import os, sys, time
 heard = open(f"{sys.argv[1]}.{os.getpid()}", "ab", buffering=0)
@@ -243,12 +243,12 @@ def test_no_silence_is_written_to_a_file(tmp_path: Path, held: str) -> None:
 
 # -- another player that goes on with it
 
-#: A player is let go of at once where the sentence is held.
+#: A player is let go of at once if the sentence is held.
 AT_ONCE = {"RELEASE_AFTER": 0.0}
 
 
 def _held(engine: Spawned) -> list[protocol.Output]:
-    """Begin a sentence and hold it behind its second word; return what was told of the output."""
+    """Begin a sentence, hold it behind its second word and return the events about the output."""
     engine.say(TEXT)
     engine.until_word(2)
     engine.pause()

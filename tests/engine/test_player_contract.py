@@ -1,4 +1,4 @@
-"""What the engine's playback relies on in any player: each sentence of `players.base.Player`, for each of them.
+"""The contract of players: each sentence of `players.base.Player`, for each player.
 
 A new player is put through it by a row of `PLAYERS`.
 """
@@ -46,22 +46,22 @@ SOUND = b"".join(number.to_bytes(2, "little") for number in range(RATE // 4))
 SETTLED = RATE // 10
 #: Seconds within which any call returns: nothing waits in them.
 AT_ONCE = 0.05
-#: Times that one waits in a sound, or for its end: a few a piece, for what is heard is asked for as well.
+#: Waits in a sound, or for its end, at most: a few per piece.
 MOST_WAITS = 4 * len(SOUND) // _PIECE
 
 
 @dataclass(frozen=True)
 class Case:
-    """A player, and what of the contract can be brought about with it; `at`: a folder for what it writes."""
+    """A player, and how to bring about parts of the contract; `at`: a folder for its files."""
 
     #: opens one that plays
     opens: Callable[[Path], Player]
-    #: what it has played so far; None where nobody can know
+    #: what it has played so far; None if nobody can know
     played: Callable[[Path], bytes] | None = None
-    #: opens one whose device is lost in mid-sentence, and one whose device isn't there; None where nothing can fail
+    #: opens one whose device is lost in mid-sentence, and one whose device isn't there; None if nothing can fail
     lost: Callable[[Path], Player] | None = None
     refused: Callable[[Path], Player] | None = None
-    #: opens one that takes no more after a while; None where it takes all
+    #: opens one that takes no more after a while; None if it takes all
     stuck: Callable[[Path], Player] | None = None
 
 
@@ -70,7 +70,7 @@ def _program(*argv: str) -> ProgramPlayer:
 
 
 def _stream(at: Path) -> WavStreamPlayer:
-    """Return one that writes to what a shell would have opened."""
+    """Return a player that writes to a file that a shell would have opened."""
     output = os.open(at / "stream.wav", os.O_WRONLY | os.O_CREAT)
     _opened.callback(os.close, output)
     return WavStreamPlayer(output, RATE, first=True)
@@ -107,7 +107,7 @@ def _behind_a_header(path: Path) -> bytes:
 
 
 def _pulse(at: Path) -> PulsePlayer:
-    """Return one at a sink that writes what it plays into a pipe, and the tape that is read from it."""
+    """Return a player at a sink that plays into a pipe, whose samples are written to a tape."""
     os.mkfifo(at / "pipe")
     options = [f"file={at / 'pipe'}", f"rate={RATE}", "channels=1", "format=s16le", "use_system_clock_for_timing=yes"]
     module = _sinks[0].pactl("load-module", "module-pipe-sink", "sink_name=pipe", *options).strip()
@@ -120,7 +120,7 @@ def _pulse(at: Path) -> PulsePlayer:
 
 
 def _taped(at: Path) -> bytes:
-    """Return what such a sink has played, without the silence around it, and where a busy machine let it run dry.
+    """Return the samples that such a sink has played, without silence.
 
     The sink goes on with zeros: what stands before them on the tape is all there is.
     """
@@ -191,7 +191,7 @@ PLAYERS = {
         stuck=lambda _: _pipe(reader=True),
     ),
 }
-#: What the test has opened itself, and closes after it.
+#: The things that a test has opened itself, closed after it.
 _opened = ExitStack()
 #: The sound server of the test that runs.
 _sinks: list[Sink] = []
@@ -229,7 +229,7 @@ def _quick(what: str) -> Iterator[None]:
 
 
 def _await(player: Player) -> None:
-    """Wait as the playback does: for what the player says and nothing else."""
+    """Wait as the playback does: for the player's interests and nothing else."""
     poll = select.poll()
     for descriptor, events in player.interests():
         poll.register(descriptor, events)
@@ -267,7 +267,7 @@ def _finish(player: Player) -> None:
 
 
 def _fill(player: Player) -> int:
-    """Offer pieces until none is taken any more; return what was."""
+    """Offer pieces until none is taken any more; return the bytes taken."""
     sent = 0
     while taken := player.offer(memoryview(bytes(_PIECE))):
         sent += taken
@@ -299,7 +299,7 @@ def _play_for_ever(player: Player) -> None:
 
 
 @those("refused")
-def test_one_that_cannot_be_opened_says_so(case: Case, tmp_path: Path) -> None:
+def test_a_player_that_cannot_be_opened_says_so(case: Case, tmp_path: Path) -> None:
     assert case.refused is not None
     with pytest.raises(CannotSpeak) as caught:
         case.refused(tmp_path)
@@ -312,7 +312,7 @@ def test_one_that_cannot_be_opened_says_so(case: Case, tmp_path: Path) -> None:
 
 @every
 def test_a_sound_is_played_whole_in_order_and_once(case: Case, tmp_path: Path) -> None:
-    """Its name stays, what it was offered may be overwritten, what it consumed grows to all, and then it has ended."""
+    """Its name stays, the samples may be overwritten, the consumed bytes grow to all of them, and then it has ended."""
     player = case.opens(tmp_path)
     before = (player.name, player.real_time)
     assert isinstance(player.name, str)
@@ -349,7 +349,7 @@ def test_no_sample_at_all_ends_well(case: Case, tmp_path: Path) -> None:
     _end(player)
 
 
-def test_the_silent_one_takes_the_time_that_its_sound_would() -> None:
+def test_the_null_player_takes_the_time_that_its_sound_would() -> None:
     """Of the others it is the device that does: at a sink, `conformance/test_heard_sound.py`."""
     player = NullPlayer(RATE)
     began = time.monotonic()
@@ -368,7 +368,7 @@ def test_the_silent_one_takes_the_time_that_its_sound_would() -> None:
 
 @every
 @limits()
-def test_no_call_waits_and_one_that_is_stuck_never_ends(case: Case, tmp_path: Path) -> None:
+def test_no_call_waits_and_a_stuck_player_never_ends(case: Case, tmp_path: Path) -> None:
     with _quick("to open it"):
         player = (case.stuck or case.opens)(tmp_path)
     sent = _fill(player) if case.stuck is not None else 0
@@ -387,7 +387,7 @@ def test_no_call_waits_and_one_that_is_stuck_never_ends(case: Case, tmp_path: Pa
 
 
 @every
-def test_it_waits_for_what_is_open_and_for_room_by_itself(case: Case, tmp_path: Path) -> None:
+def test_a_player_waits_for_open_descriptors_and_for_room_alone(case: Case, tmp_path: Path) -> None:
     player = case.opens(tmp_path)
     _offer(player, SOUND[:_PIECE])
     found = player.interests()
@@ -404,7 +404,7 @@ def test_it_waits_for_what_is_open_and_for_room_by_itself(case: Case, tmp_path: 
 
 @pytest.mark.parametrize("when", ["unused", "in the middle", "after its input", "after its end"])
 @every
-def test_it_is_ended_at_any_point_and_plays_no_more_than_it_took(case: Case, tmp_path: Path, when: str) -> None:
+def test_a_player_is_ended_at_any_point_and_plays_no_more_than_it_took(case: Case, tmp_path: Path, when: str) -> None:
     player = case.opens(tmp_path)
     sound = b"" if when == "unused" else SOUND[: 3 * _PIECE]
     _offer(player, sound)
@@ -421,7 +421,7 @@ def test_it_is_ended_at_any_point_and_plays_no_more_than_it_took(case: Case, tmp
 
 
 @those("lost")
-def test_one_that_is_lost_says_so_each_time_it_is_asked(case: Case, tmp_path: Path) -> None:
+def test_a_lost_player_says_so_each_time_it_is_asked(case: Case, tmp_path: Path) -> None:
     assert case.lost is not None
     player = case.lost(tmp_path)
     for _ in range(2):

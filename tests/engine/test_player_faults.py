@@ -299,7 +299,7 @@ def test_the_holders_of_a_pipe_are_looked_for_no_longer_than_it_is_held(monkeypa
         ("kill -PIPE $$; exit 3", -signal.SIGPIPE),
     ],
 )
-def test_its_status_is_that_of_its_end(script: str, status: int) -> None:
+def test_the_status_of_a_child_is_that_of_its_end(script: str, status: int) -> None:
     assert _status(_run(script)) == status
 
 
@@ -315,11 +315,11 @@ def test_a_failed_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.
     assert os.listdir("/proc/self/fd") == before
 
 
-def test_it_has_three_streams_the_inherited_descriptors_and_its_leash() -> None:
+def test_a_child_has_three_streams_the_inherited_descriptors_and_its_leash() -> None:
     reading, writing = os.pipe()
     before = census.descriptors(os.getpid())
     child = _run("kill -STOP $$", writing)
-    # What a program opens while it is loaded is closed when it has stopped itself.
+    # The files that a program opens while it is loaded are closed when it has stopped itself.
     os.waitid(os.P_PID, child.pid, os.WSTOPPED | os.WNOWAIT)
     its = census.descriptors(child.pid)
     assert its.pop(1) == os.devnull
@@ -336,7 +336,7 @@ def test_it_has_three_streams_the_inherited_descriptors_and_its_leash() -> None:
 
 
 @pytest.mark.parametrize("ends", [True, False], ids=["ended by itself", "killed"])
-def test_all_that_it_has_started_ends_with_it(ends: bool) -> None:
+def test_all_that_a_child_has_started_ends_with_it(ends: bool) -> None:
     reading, writing = os.pipe()
     child = _run(f"sleep 100 & echo . >&2; {'exit 7' if ends else 'wait'}", writing)
     os.close(writing)
@@ -443,7 +443,7 @@ espeak.load = lambda: (*load()[:2], 16_000)
 
 
 def test_all_that_a_player_has_started_dies_with_a_killed_process(tmp_path: Path) -> None:
-    """What a shell starts behind itself, too: it would go on with what it holds. Sound comes to one that is tied."""
+    """Even programs that a shell has started behind itself. No sound comes to a player before it is tied."""
     begun, script = tmp_path / "begun", tmp_path / "pipeline"
     os.mkfifo(begun)
     script.write_text(f"#!/bin/sh\nsleep 100 &\nhead -c 1 > /dev/null\necho > {begun}\nwait\n")

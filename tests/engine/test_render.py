@@ -298,7 +298,7 @@ def test_a_file_that_the_shell_has_open_for_our_output_is_not_replaced(tmp_path:
     assert path.read_bytes() == b""
 
 
-#: Code that makes root, who may write everywhere, nobody.
+#: Code that turns root, who may write everywhere, into nobody.
 AS_NOBODY = """
 import os
 if os.geteuid() == 0:

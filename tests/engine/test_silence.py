@@ -175,14 +175,14 @@ def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.M
 
 
 TEXTS = ["battery low", "coming home", "please help"]
-#: Seconds that are left out where a test says so, and what that is in bytes: even a fast sentence ends in as much.
+#: Seconds that are left out in some tests, and their bytes: even a fast sentence ends in as much silence.
 LEFT_OUT = 0.02
 _BYTES = int(LEFT_OUT * RATE) * 2
 _SAYS_SO = f"from talkcli.engine.players.choice import Gap\nGap.allowance = lambda *_: {LEFT_OUT}"
 
 
 def _all_played(rate: int = FAST) -> list[bytes]:
-    """Return what is played of each: of those that follow another, all."""
+    """Return the samples that are played of each: all of those that follow another."""
     first, *others = render(TEXTS, rate=rate)
     return [each.tobytes() for each in (played(first), *others)]
 
@@ -221,7 +221,7 @@ def test_each_player_has_changes_of_its_own() -> None:
     assert gap.allowance("pacat") == 0.0
 
 
-def test_a_neural_voice_takes_longer_and_that_is_left_out_before_one_alone() -> None:
+def test_the_longer_change_to_a_neural_voice_counts_for_neural_voices_alone() -> None:
     gap = Gap()
     _changed(gap, 0.03)
     _changed(gap, 0.1, neural=True)
@@ -240,7 +240,7 @@ def test_a_start_without_a_goal_that_waited_is_no_change() -> None:
     assert gap.allowance("aplay") == 0.0
 
 
-# -- of what
+# -- which samples
 
 
 def test_silence_is_counted_from_the_end_to_the_last_sample_that_is_louder() -> None:
@@ -258,7 +258,7 @@ def test_silence_is_counted_from_the_end_to_the_last_sample_that_is_louder() -> 
 
 
 def test_a_sentence_behind_which_a_goal_waits_ends_sooner_by_silence_alone(player: Player) -> None:
-    """The next one follows, whole, and the results say how long what was played is."""
+    """The next one follows, whole, and the results tell the length that was played."""
     first, second, third = _all_played()
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
         ended = []
@@ -273,7 +273,7 @@ def test_a_sentence_behind_which_a_goal_waits_ends_sooner_by_silence_alone(playe
 
 @pytest.mark.parametrize("followed", [True, False])
 def test_a_goal_that_waits_counts_if_it_does_at_the_end_of_a_sentence(player: Player, followed: bool) -> None:
-    """A goal that comes while it is spoken waits behind it; one that is recalled does not."""
+    """A goal that comes while the sentence is spoken counts; a goal that is recalled does not."""
     first = _all_played()[0]
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
         engine.say(TEXTS[0], "g0", followed=not followed)
@@ -301,7 +301,7 @@ def test_a_file_gets_every_sample_and_no_lead_in(tmp_path: Path) -> None:
 
 
 def test_a_player_that_ends_too_early_is_seen_if_silence_is_left_out(player: Player) -> None:
-    """A sentence may not end sooner than so much before its whole length, what was left out of it included."""
+    """A sentence may not end much sooner than its whole length, the omitted silence included."""
     rate = 200  # at which the silence at the end is that long
     length = len(_all_played(rate)[0]) / 2 / RATE
     before = "from talkcli.engine.players.choice import Gap\nGap.allowance = lambda *_: 0.2"

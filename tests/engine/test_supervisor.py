@@ -220,7 +220,7 @@ def test_a_goal_behind_another_wakes_the_thread_once(
     monkeypatch.setattr(thread.engine._selector, "select", counted)
     for number in range(1, 51):
         assert thread.spoken("yes", f"g{number}") == protocol.Ended(f"g{number}", COMPLETED)
-    # By what the process said, and by nothing else; its answer to the first may have come to a `select` before.
+    # By the messages of the process, and by nothing else; its answer to the first may have come to a `select` before.
     assert {each for fds in woken for each in fds} == {process.socket.fileno()}
     # A thread that was not asleep yet looks once more; if it is, that is one for a goal.
     assert sum(bool(fds) for fds in woken) <= 50

@@ -1,4 +1,4 @@
-"""What the engine relies on in any synthesizer: each sentence of `synthesizers.base.Synthesizer`, for each of them.
+"""The contract of synthesizers: each sentence of `synthesizers.base.Synthesizer`, for each synthesizer.
 
 A new synthesizer is put through it by a row of `SYNTHESIZERS`. The scripted one keeps the suite to the contract: what
 it does is all that is asked for.
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from talkcli.engine.synthesizers.base import Output, Synthesizer
 
 TEXT = "battery low, please come home"
-#: Texts of all kinds, for what holds of any.
+#: Texts of all kinds.
 TEXTS = [
     TEXT,
     "a",
@@ -95,12 +95,12 @@ class Scripted:
 
 @cache
 def _espeak() -> Espeak:
-    """Return the one that there is in a process: its library can be loaded once, and hangs where it is to end."""
+    """Return the only one of this process: its library can be loaded once, and hangs if it is to end."""
     return Espeak()
 
 
 def _piper(voice: str = "piper/tiny") -> Synthesizer:
-    """Return one that speaks with this voice; "tiny" hums, in some milliseconds."""
+    """Return a synthesizer with this voice; "tiny" hums, in some milliseconds."""
     needs_packages(*NEEDED)
     synthesizer = Piper(_espeak())
     synthesizer.load(voice)
@@ -108,7 +108,7 @@ def _piper(voice: str = "piper/tiny") -> Synthesizer:
 
 
 def _joe() -> Synthesizer:
-    """Return one that speaks with a real voice, without its noise."""
+    """Return a synthesizer with a real voice, without its noise."""
     silence_noise(real_voice(), Path(os.environ["TALK_VOICES"]))
     return _piper(f"piper/{real_voice().stem}")
 
@@ -167,7 +167,7 @@ def synthesizer(made: tuple[Synthesizer, str]) -> Iterator[Synthesizer]:
 
 
 class Tape:
-    """An output that keeps all, checks what holds at each call, and raises what it is told to."""
+    """An output that keeps all, checks the order of its calls, and raises an error if it is told to."""
 
     def __init__(self, *, fails: Exception | None = None, at: str = "", after: int = 0) -> None:
         """`at`: the method that raises, `after` how many calls of it."""
@@ -244,7 +244,7 @@ def _assert_alike(first: Tape, second: Tape) -> None:
 # -- voices
 
 
-def test_its_voices_have_ids_and_one_of_them_is_its_own(
+def test_voices_have_ids_and_one_of_them_is_in_force(
     made: tuple[Synthesizer, str],
 ) -> None:
     synthesizer, own = made
@@ -313,13 +313,13 @@ def test_any_text_is_spoken_with_its_words_if_it_has_any_and_nothing_of_it_stays
     _assert_alike(_spoken(synthesizer), alone)
 
 
-def test_words_are_where_they_stand_in_the_text(synthesizer: Synthesizer) -> None:
+def test_the_words_of_a_sentence_are_told_with_their_places_in_the_text(synthesizer: Synthesizer) -> None:
     tape = _spoken(synthesizer)
     words = [TEXT[start : start + length].strip(",") for start, length, _ in tape.words]
     assert words == TEXT.replace(",", "").split()
 
 
-def test_it_obeys_the_sound_of_this_sentence_or_refuses(synthesizer: Synthesizer, pitched: bool) -> None:
+def test_rate_volume_and_pitch_of_a_sentence_are_obeyed_or_refused(synthesizer: Synthesizer, pitched: bool) -> None:
     usual = _spoken(synthesizer)
     assert _spoken(synthesizer, sound=Sound(rate=400)).seconds < 0.8 * usual.seconds
     assert _spoken(synthesizer, sound=Sound(rate=100)).seconds > 1.3 * usual.seconds

@@ -36,8 +36,9 @@ def beside(path: Path) -> Path:
 
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a home without any voice, and no other place that has one."""
-    for name in ("TALK_VOICES", "XDG_DATA_HOME", "XDG_CACHE_HOME", "CACHE_DIRECTORY"):
+    """Return a home without any voice, and no other place that has one; `v` in it is TALK_VOICES."""
+    monkeypatch.setenv("TALK_VOICES", str(tmp_path / "v"))
+    for name in ("XDG_DATA_HOME", "XDG_CACHE_HOME", "CACHE_DIRECTORY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_DIRS", str(tmp_path / "system"))
@@ -45,7 +46,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-#: What platformdirs says of where data and caches are, in a process of its own, as it looks once.
+#: Prints platformdirs' places of data and caches; in a process of its own, as it looks once.
 _PLATFORMDIRS = """
 import json, platformdirs
 dirs = platformdirs.PlatformDirs("talk", appauthor=False, multipath=True)
@@ -59,7 +60,8 @@ print(json.dumps([[dirs.user_data_dir, *dirs.site_data_dir.split(":")], dirs.use
 )
 @pytest.mark.usefixtures("home")
 def test_the_places_are_those_of_platformdirs(monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]) -> None:
-    monkeypatch.delenv("XDG_DATA_DIRS")
+    for name in ("XDG_DATA_DIRS", "TALK_VOICES"):
+        monkeypatch.delenv(name)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     code = f"import sys; sys.path[:] = {[*SYS_PATH]!r}\n{_PLATFORMDIRS}"
@@ -83,8 +85,7 @@ def test_a_voice_is_found_in_the_first_of_its_places(home: Path, monkeypatch: py
     }
 
 
-def test_only_models_that_can_be_named_are_voices(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TALK_VOICES", str(home / "v"))
+def test_only_models_that_can_be_named_are_voices(home: Path) -> None:
     for name in (".hidden", "a#b", "good", "a\nb", "\x1b[31mred", "\u202eleft", "ni\udcffce"):
         tiny_voice.put(home / "v", name)
     (home / "v" / ".onnx").touch()
@@ -92,8 +93,7 @@ def test_only_models_that_can_be_named_are_voices(home: Path, monkeypatch: pytes
     assert [*found()] == ["good"]
 
 
-def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TALK_VOICES", str(home / "v"))
+def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path) -> None:
     tiny_voice.put(home / "v", "a", beside=tiny_voice.description(speakers=3, language="de_DE"))
     (home / "v" / "b.onnx").touch()
     tiny_voice.put(home / "v", "c")
@@ -104,16 +104,14 @@ def test_a_voice_is_listed_with_language_quality_and_speakers(home: Path, monkey
     ]
 
 
-def test_a_speaker_without_a_name_to_type_goes_by_its_number(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TALK_VOICES", str(home / "v"))
+def test_a_speaker_without_a_name_to_type_goes_by_its_number(home: Path) -> None:
     names = {"amused": 0, "\x1b[31m": 1, "x" * 65: 2, "": 3, "calm": 5, "beyond": 6}
     tiny_voice.put(home / "v", "a", beside=tiny_voice.description(num_speakers=6, speaker_id_map=names))
     (voice,) = voices()
     assert voice.speakers == ("amused", "1", "2", "3", "4", "calm")
 
 
-def test_a_very_long_name_in_a_json_is_cut_if_it_is_told(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TALK_VOICES", str(home / "v"))
+def test_a_very_long_name_in_a_json_is_cut_if_it_is_told(home: Path) -> None:
     told = tiny_voice.description(language="l" * 1000, dataset="d" * 1000)
     told["audio"] = {"sample_rate": 8000, "quality": "q" * 1000}
     told["espeak"] = {"voice": "e" * 1000}

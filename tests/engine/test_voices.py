@@ -220,7 +220,7 @@ def test_the_languages_that_a_code_or_an_english_name_means(wanted: str, expecte
     assert languages(wanted, (*listed(), *NEURAL)) == expected
 
 
-# -- what is said of the others
+# -- words about the others
 
 
 @pytest.mark.parametrize(
@@ -301,7 +301,7 @@ def test_a_language_is_listed_however_another_driver_tells_it(languages: list[ob
     assert list_voices(engine) == (Voice("a", language, "Anna"),)
 
 
-def test_mbrolas_voices_are_there_where_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mbrolas_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known = [Voice("mb/mb-de4-en", "en", "german-mbrola-4-en"), Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
     monkeypatch.setattr(espeak, "_listed", lambda *_: known)
     monkeypatch.setattr(espeak, "_MBROLA_PLACES", (f"{tmp_path}/{{0}}/{{0}}",))

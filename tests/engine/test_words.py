@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def on_32_bits(kind: type) -> type:
-    """Return a C type as a 32-bit system lays it out, where a pointer has 4 bytes."""
+    """Return a C type as a 32-bit system lays it out, with pointers of 4 bytes."""
     if not issubclass(kind, (ctypes.Structure, ctypes.Union)):
         return ctypes.c_uint32 if kind in (ctypes.c_char_p, ctypes.c_void_p) else kind
     fields = [(each[0], on_32_bits(each[1])) for each in kind._fields_]
