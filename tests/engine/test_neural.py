@@ -531,9 +531,7 @@ def test_a_voice_that_is_not_loaded_or_was_dropped_is_spoken_by_espeak_in_its_la
             assert _speaks(engine, goal) == [told]
 
 
-def test_growth_by_each_voice_is_told_and_memory_of_dropped_ones_is_given_back(
-    place: Path,
-) -> None:
+def test_growth_by_each_voice_is_told_and_memory_of_dropped_ones_is_given_back(place: Path) -> None:
     heavy = """
 from talkcli.engine.synthesizers import inference
 init, kept = inference.Model.__init__, []
@@ -551,6 +549,7 @@ inference.Model.__init__ = heavier
             engine.send(protocol.Load(voice))
             assert engine.until(protocol.Grown).voice == voice
             assert engine.until(protocol.Loaded).error is None
+        assert engine.spoken("yes").outcome == protocol.COMPLETED  # the thread that loaded it has ended by then
         engine.send(protocol.Drop("piper/second"))
         assert engine.until(protocol.Grown).voice == ""
         sizes = [each.memory for each in engine.events if isinstance(each, protocol.Grown)]

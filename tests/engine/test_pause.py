@@ -146,11 +146,11 @@ def test_a_player_that_dies_in_a_pause_and_cannot_be_replaced_fails_the_sentence
         assert ended.message == "audio open error: Connection refused"
 
 
-def test_a_player_that_holds_too_much_is_ended_and_the_rest_is_said_again(player: Player) -> None:
-    with Spawned(player.command(DEEP)) as engine:
+def test_a_player_that_holds_too_much_is_ended_at_once_and_the_rest_is_said_again(player: Player) -> None:
+    with limits(), Spawned(player.command(DEEP)) as engine:
         _say_to_word(engine)
         words = [engine.until(protocol.Word) for _ in range(3)]
-        engine.pause()
+        assert_within(engine.pause(), 0.1, "the pause")
         assert children(engine.process.pid) == []
         _go_on_to_the_end(engine)
         assert [word.number for word in engine.words()] == list(range(1, len(engine.words()) + 1))
