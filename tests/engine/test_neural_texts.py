@@ -56,13 +56,10 @@ class Tally:
     outcomes: Counter[str] = field(default_factory=Counter)
     deaths: list[str] = field(default_factory=list)  # how a process ended, and of which text
     faults: list[str] = field(default_factory=list)  # what must not be at all
-    seconds: float = 0.0  # of sound
-    most: tuple[float, str] = (0.0, "")  # seconds of sound a character, and of which text
 
     def __str__(self) -> str:
         ended = ", ".join(f"{count} {name}" for name, count in sorted(self.outcomes.items()))
-        most = f"{self.most[0]:.2f} s of sound a character at most, of {self.most[1][:60]!a}"
-        return f"{ended}; {len(self.deaths)} deaths; {self.seconds:.0f} s of sound, {most}"
+        return f"{ended}; {len(self.deaths)} deaths"
 
 
 def _spoken(texts: Iterable[str], place: Path, env: dict[str, str]) -> Tally:
@@ -92,8 +89,6 @@ def _count(tally: Tally, text: str, ended: protocol.Ended, words: list[protocol.
             tally.faults.append(f"{ended.reason}: {ended.message}: {shown}")
         return
     seconds = ended.duration or 0.0
-    tally.seconds += seconds
-    tally.most = max(tally.most, (seconds / len(text), text))
     if not words:
         tally.faults.append(f"no words: {shown}")
     for before, here in pairwise(words):

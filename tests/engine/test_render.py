@@ -242,17 +242,23 @@ def test_a_reader_that_takes_its_time_is_waited_for(tmp_path: Path, monkeypatch:
     assert found == [pytest.approx(len(expected) / RATE, abs=1e-5)]
 
 
-def test_a_named_pipe_that_nobody_reads_is_waited_for_as_long_as_is_asked(tmp_path: Path) -> None:
+@pytest.fixture
+def interrupt() -> Iterator[dict[int, int]]:
+    """Interrupts at once."""
+    reader, writer = os.pipe()
+    os.write(writer, b"x")
+    yield {reader: select.POLLIN}
+    os.close(reader)
+    os.close(writer)
+
+
+def test_a_pipe_without_a_reader_is_waited_for_as_long_as_is_asked(tmp_path: Path, interrupt: dict[int, int]) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
     with pytest.raises(TimeoutError, match="nobody has opened"):
         render("yes", str(path), timeout=0.1)
-    reader, writer = os.pipe()
-    os.write(writer, b"x")
     with pytest.raises(Interrupted):
-        render("yes", str(path), interrupt={reader: select.POLLIN})
-    os.close(reader)
-    os.close(writer)
+        render("yes", str(path), interrupt=interrupt)
 
 
 def test_a_reader_that_goes_away_is_told(tmp_path: Path) -> None:
@@ -371,21 +377,15 @@ def test_a_driver_that_plays_by_itself_is_refused(tmp_path: Path) -> None:
     assert str(error).startswith('the driver "dummy" cannot write a file')
 
 
-def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path) -> None:
+def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path, interrupt: dict[int, int]) -> None:
     path = tmp_path / "x.wav"
     path.write_bytes(BEFORE)
     began = time.monotonic()
     with pytest.raises(TimeoutError, match="the text was not rendered in time"):
         render(LONGEST, str(path), timeout=0.3)
     assert time.monotonic() - began < 2
-    reader, writer = os.pipe()
-    try:
-        os.write(writer, b"x")
-        with pytest.raises(Interrupted):
-            render(LONGEST, str(path), interrupt={reader: select.POLLIN})
-    finally:
-        os.close(reader)
-        os.close(writer)
+    with pytest.raises(Interrupted):
+        render(LONGEST, str(path), interrupt=interrupt)
     assert path.read_bytes() == BEFORE
 
 

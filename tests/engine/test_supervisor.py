@@ -14,6 +14,7 @@ import socket
 import sys
 import threading
 import time
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
@@ -236,40 +237,23 @@ def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(start: 
     assert thread.spoken("length=0.05 hang", "g4").reason == "engine_hung"
 
 
-class Swift:
-    """Stands for a process that has answered before anybody looked."""
-
-    def __init__(self) -> None:
-        self._said: list[str] = []
-
-    def send(self, command: protocol.Command) -> bool:
-        if isinstance(command, protocol.Say):
-            self._said.append(command.id)
-        return True
-
-    def receive(self) -> list[protocol.Event]:
-        return [protocol.Ended(each, COMPLETED) for each in self._said]
-
-
 def test_the_answer_to_a_goal_is_understood_before_the_goal_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
     posted: list[Report] = []
-    engine, process = Supervisor(CONFIGURE, posted.append), Swift()
+    said: list[protocol.Command] = []
+    engine = Supervisor(CONFIGURE, posted.append)
+
+    def send(command: protocol.Command) -> bool:
+        said.append(command)
+        return True
+
+    # It answers before anybody looks.
+    swift = SimpleNamespace(send=send, receive=lambda: [protocol.Ended("g1", COMPLETED)] * said.count(YES))
     for name in ("_process", "_open"):
-        monkeypatch.setattr(engine, name, process)
+        monkeypatch.setattr(engine, name, swift)
     engine.say(YES)
-    engine._hear(cast("EngineProcess", process))
+    engine._hear(cast("EngineProcess", swift))
     assert posted == [protocol.Ended("g1", COMPLETED)]
     engine._inbox.close()
-
-
-class Lost:
-    """Stands for a process that is lost while a goal is being sent to it."""
-
-    def __init__(self, *, takes: bool) -> None:
-        self._takes = takes
-
-    def send(self, _: protocol.Command) -> bool:
-        return self._takes
 
 
 @pytest.mark.parametrize("takes", [True, False], ids=["taken by the system", "refused"])
@@ -278,7 +262,7 @@ def test_a_goal_sent_to_a_lost_process_is_spoken_by_the_next(
 ) -> None:
     thread = start(HANG_AFTER=1.0)  # so long a thread may doze that nothing wakes
     thread.until(protocol.Ready)
-    monkeypatch.setattr(thread.engine, "_open", Lost(takes=takes))
+    monkeypatch.setattr(thread.engine, "_open", SimpleNamespace(send=lambda _: takes))
     assert thread.spoken("yes") == SPOKEN
     assert not any(isinstance(each, EngineDied) for each in thread.seen)
 
