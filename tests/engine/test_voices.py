@@ -320,7 +320,7 @@ def test_mbrolas_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeyp
 def test_after_a_goals_own_or_an_unknown_voice_the_default_sounds_as_before(tmp_path: Path) -> None:
     """As the library's own, which sets everything anew for each sentence; some voices leave their speed behind."""
     target = tmp_path / "x.wav"
-    unknown = ["nosuch", "en-us+nosuch", "mb-us1"]
+    unknown = ["nosuch", "nosuch", "en-us+nosuch", "mb-us1"]
     order = [None, *unknown, None, "zle/be", None, "piqd", None, "en+fast", *unknown, None, "en-us+whisper", None]
     durations, sentences = [], []
     with Spawned(f"file:{target}") as engine:
