@@ -1,26 +1,38 @@
-"""How `talk doctor` gathers facts: programs that hang, leave children behind or are missing; files of the machine."""
+"""How `talk doctor` gathers facts: sockets, engine processes, programs that hang or are missing, and system files."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
+import espeakng_loader
 import pytest
 
-from talkcli.doctor import machine, sound
+from talkcli.client.connection import SocketConnection
+from talkcli.doctor import machine, server, sound, voice
 from talkcli.doctor.machine import Cards, Session
-from talkcli.doctor.sound import SoundServer
+from talkcli.doctor.report import FAILED
+from talkcli.doctor.sound import Players, SoundServer
+from tests.conformance.bareserve import environment, serving
+from tests.conformance.rawsocket import FakeServer
 from tests.faults.broken import write
-from tests.support.surroundings import clean_environment
+from tests.faults.test_users import NOBODY, impostor
+from tests.support.surroundings import clean_environment, short_directory
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
-#: Of no user on this machine.
+    from talkcli.doctor.report import Finding
+    from tests.conftest import MakeTalk
+
+#: No user of this machine.
 STRANGER = Session(4141, "stranger", groups=("4242",), gids=(4242,))
 PW_NODES = """
 \tid 31, type PipeWire:Interface:Node/3
@@ -32,6 +44,200 @@ PW_NODES = """
 """
 
 
+# Sockets
+
+
+@pytest.fixture
+def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A directory for all sockets of a user who names none."""
+    with short_directory() as path:
+        os.makedirs(f"{path}/run/talk", 0o700)
+        monkeypatch.delenv("TALK_SOCKET", raising=False)
+        monkeypatch.setenv("TMPDIR", path)
+        monkeypatch.setenv("XDG_RUNTIME_DIR", f"{path}/run")
+        yield path
+
+
+def no_server() -> Finding:
+    """Return what is found instead of a server."""
+    client, found = server.connect(None, None)
+    assert client is None
+    finding = server.judge_places(found)
+    assert finding.state == FAILED
+    return finding
+
+
+def leave_socket(path: str) -> None:
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(path)
+
+
+def leave_file(path: str) -> None:
+    with open(path, "w"):
+        pass
+
+
+@pytest.mark.usefixtures("nobody_serves")
+@pytest.mark.parametrize(
+    ("put", "words", "step"),
+    [
+        (lambda _: None, "not there", "talk serve"),
+        (
+            leave_socket,
+            "nobody answers: left over from a server that ended",
+            "talk serve (it takes the place of what was left over)",
+        ),
+        (leave_file, "a file, and no socket", "remove {path}, and: talk serve"),
+    ],
+)
+def test_each_usual_place_is_named_with_what_is_there(
+    home: str, put: Callable[[str], None], words: str, step: str
+) -> None:
+    path = f"{home}/run/talk/talk.sock"
+    put(path)
+    found = no_server()
+    for each in (f"{path}: {words}", "/run/talk/talk.sock: not", f"{home}/runtime-{os.getuid()}/talk/talk.sock: not"):
+        assert each in found.message
+    assert found.next == step.format(path=path)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "step"),
+    [
+        ("run", "run: a directory, and", "name the socket in it: TALK_SOCKET={home}/run/talk.sock"),
+        ("file", "file: a file, and no", "unset TALK_SOCKET, or name a socket"),
+    ],
+)
+def test_a_named_place_that_is_no_socket_is_told(
+    home: str, monkeypatch: pytest.MonkeyPatch, name: str, words: str, step: str
+) -> None:
+    leave_file(f"{home}/file")
+    monkeypatch.setenv("TALK_SOCKET", f"{home}/{name}")
+    found = no_server()
+    assert words in found.message
+    assert found.next == step.format(home=home)
+
+
+@pytest.mark.parametrize(
+    ("greeting", "words", "step"),
+    [
+        (b"220 mail ready\n", "is no talk server", "restart the server on"),
+        (b'{"talk": 2, "version": "9"}\n', "upgrade", "install the same talk on both sides"),
+        (b'{"talk": 1, "error": "permission_denied"}\n', "refuses", "--socket-mode 0660"),
+    ],
+)
+def test_a_process_that_answers_and_takes_no_client_is_named(
+    home: str, monkeypatch: pytest.MonkeyPatch, greeting: bytes, words: str, step: str
+) -> None:
+    monkeypatch.setenv("TALK_SOCKET", f"{home}/s")
+    with FakeServer(f"{home}/s", [greeting], closes=True):
+        found = no_server()
+    assert words in found.message
+    assert step in str(found.next)
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give a server half a second to answer."""
+    monkeypatch.setattr(server, "SocketConnection", partial(SocketConnection, patience=0.5))
+
+
+@pytest.mark.usefixtures("impatient", "home")
+def test_a_server_that_is_stopped_is_named(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
+    talk = make_talk(scripted=True, watched=False)
+    monkeypatch.setenv("TALK_SOCKET", talk.socket)
+    talk.freeze()
+    found = no_server()
+    talk.thaw()
+    assert found.message.endswith(f"{talk.socket}: a process listens that is stopped")
+    assert found.next == f"let it go on: kill -CONT {talk.pid}"
+
+
+@pytest.mark.usefixtures("impatient", "home")
+def test_a_full_server_is_named(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
+    talk = make_talk("--max-clients", "1", scripted=True, watched=False)
+    monkeypatch.setenv("TALK_SOCKET", talk.socket)
+    with talk.connect() as wire:
+        assert wire.request("hello")["ok"]
+        assert "--max-clients" in str(no_server().next)
+
+
+def test_a_wrong_variable_is_told_from_the_server_that_runs_elsewhere(
+    home: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.chmod(f"{home}/run", 0o700)
+    with serving(environment(home, XDG_RUNTIME_DIR=f"{home}/run")):
+        monkeypatch.setenv("TALK_SOCKET", f"{home}/wrong")
+        found = no_server()
+    assert f"named by TALK_SOCKET: {home}/wrong: not there" in found.message
+    assert found.next == f"unset TALK_SOCKET: a server is on {home}/run/talk/talk.sock"
+
+
+@pytest.mark.usefixtures("nobody_serves")
+@pytest.mark.skipif(
+    os.getuid() != 0 or shutil.which("setpriv") is None, reason="only root can act as other users (and setpriv)"
+)
+def test_another_user_s_server_is_named_and_told_nothing(home: str) -> None:
+    os.chmod(home, 0o755)
+    os.chmod(f"{home}/run", 0o755)
+    os.chmod(f"{home}/run/talk", 0o777)
+    path = f"{home}/run/talk/talk.sock"
+    with impostor(path) as heard:
+        found = no_server()
+        assert heard() == b"b''\n", "it hung up without a word"
+    assert f"{path}: another user's server (uid {NOBODY})" in found.message
+    assert f"if you trust uid {NOBODY}: talk --socket {path} doctor" in str(found.next)
+
+
+# Engine processes
+
+
+LOADER = "get_library_path = lambda: {!r}\nget_data_path = lambda: '/gone'"
+
+
+@pytest.mark.parametrize(
+    ("files", "named", "check", "words", "step"),
+    [
+        (
+            {"espeakng_loader.py": "raise ModuleNotFoundError('no wheel', name='espeakng_loader')"},
+            *(None, "libespeak-ng", "libespeak-ng is missing", "apt-get install"),
+        ),
+        (
+            {"espeakng_loader.py": LOADER.format(f"{os.path.dirname(espeakng_loader.__file__)}/libespeak-ng.so")},
+            *(None, "libespeak-ng", "no espeak-ng data", "apt-get install"),
+        ),
+        (
+            {"pyttsx3.py": "import os\nos.kill(os.getpid(), 11)"},
+            *(None, "libespeak-ng", "SIGSEGV", "apt-get install"),
+        ),
+        ({}, "klingon-7", "voices", 'unknown voice "klingon-7"', "talk voices"),
+    ],
+    ids=["no library", "no data", "crash", "no such voice"],
+)
+def test_an_engine_that_cannot_start_says_why(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    files: dict[str, str],
+    named: str | None,
+    check: str,
+    words: str,
+    step: str,
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    for name, text in files.items():
+        write(tmp_path / name, f"{text}\n")
+    if "espeakng_loader.py" in files:
+        (tmp_path / "libespeak-ng.so.1").write_bytes(b"no library")
+    env = environment(str(tmp_path), LD_LIBRARY_PATH=str(tmp_path))
+    found = voice.judge("2.99", voice.look(voice.Setting(voice=named, env=env)), server=None)[-1]
+    assert (found.check, found.state) == (check, FAILED)
+    assert words in found.message
+    assert step in str(found.next)
+
+
+# Programs
+
+
 def env_with(directory: Path, **scripts: str) -> dict[str, str]:
     """Return an environment with these programs and no others on its PATH."""
     for name, does in scripts.items():
@@ -39,7 +245,7 @@ def env_with(directory: Path, **scripts: str) -> dict[str, str]:
     return {"PATH": str(directory)}
 
 
-def test_what_a_program_says_is_kept_and_its_complaint_is_one_line(tmp_path: Path) -> None:
+def test_the_output_of_a_program_is_kept_and_its_complaint_is_one_line(tmp_path: Path) -> None:
     env = env_with(tmp_path, good='echo out; echo "$LC_ALL"', bad="echo; echo 'first line' >&2; echo more >&2; exit 3")
     killed = sound.asked("killed", env=env_with(tmp_path, killed="kill -ILL $$"))
     assert killed.trouble == "it was killed by SIGILL"
@@ -52,9 +258,7 @@ def test_what_a_program_says_is_kept_and_its_complaint_is_one_line(tmp_path: Pat
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
-def test_a_program_that_hangs_is_killed_with_all_that_it_has_started(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_that_hangs_is_killed_with_its_children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sound, "LIMIT", 0.3)
     env = env_with(tmp_path, hangs=f"/bin/sleep 98 & echo $! > {tmp_path}/pid; /bin/sleep 98")
     began = time.monotonic()
@@ -65,8 +269,8 @@ def test_a_program_that_hangs_is_killed_with_all_that_it_has_started(
     child = int((tmp_path / "pid").read_text())
     end = time.monotonic() + 5
     while _runs(child):
-        assert time.monotonic() < end, "what it has started goes on"
-        time.sleep(0.01)  # the end of a process that is no child of ours is no event
+        assert time.monotonic() < end, "its child goes on"
+        time.sleep(0.01)  # nothing tells of the end of a process that is no child of ours
 
 
 def test_a_program_that_leaves_a_child_with_its_output_is_not_waited_for(tmp_path: Path) -> None:
@@ -84,6 +288,14 @@ def _runs(pid: int) -> bool:
         return False
 
 
+def test_the_players_that_are_installed_are_found_in_their_order(tmp_path: Path) -> None:
+    env = env_with(tmp_path, **dict.fromkeys(("pacat", "aplay", "mine"), "exit 0"))
+    assert sound.players({"PATH": "/nowhere"}, None, None) == Players((), None, runs=False)
+    assert sound.players(env, None, "aplay") == Players(("aplay", "pacat"), None, runs=False, first="aplay")
+    runs = {each: sound.players(env, each, None).runs for each in ("pulse", "mine -x", "theirs", "'")}
+    assert runs == {"pulse": True, "mine -x": True, "theirs": False, "'": False}
+
+
 def test_devices_are_named_as_their_player_names_them(tmp_path: Path) -> None:
     aplay = "printf 'null\\n    Discard\\ndefault\\n    Default\\nplughw:CARD=Device,DEV=0\\n    USB\\n'"
     pactl = "printf '0\\tusb\\tm.c\\ts16le 2ch 44100Hz\\tSUSPENDED\\n1\\thdmi\\tm.c\\ts16le 2ch 44100Hz\\tIDLE\\n'"
@@ -98,11 +310,15 @@ def test_devices_are_named_as_their_player_names_them(tmp_path: Path) -> None:
     assert sound.suspended(env) == ("usb",)
 
 
-def test_devices_that_cannot_be_listed_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_programs_that_fail_or_hang_say_why_no_device_or_server_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sound, "LIMIT", 0.3)
     env = env_with(tmp_path, aplay="exec /bin/sleep 98", pactl="echo Connection refused >&2; exit 1")
     troubles = [each.trouble for player in ("aplay", "pacat", "pw-cat") if (each := sound.devices(env, player, None))]
     assert troubles == ["no answer within 0.3 s", "Connection refused", None]
+    assert sound.sound_server(env, STRANGER).hangs is False
+    assert sound.sound_server(env_with(tmp_path, pactl="exec /bin/sleep 98", pw_cli="exit 0"), STRANGER).hangs
 
 
 def test_a_sound_server_is_found_by_its_own_program_or_by_its_socket(tmp_path: Path) -> None:
@@ -132,7 +348,7 @@ def test_a_sound_server_is_found_by_its_own_program_or_by_its_socket(tmp_path: P
         assert sound.sound_server(alone, STRANGER) == SoundServer(f"one listens on {native}")
 
 
-def test_how_loud_it_is_comes_from_the_mixer_that_is_in_charge(tmp_path: Path) -> None:
+def test_the_volume_is_read_from_the_mixer_in_charge(tmp_path: Path) -> None:
     server, cards = SoundServer(name="PipeWire"), Cards(kernel=True, names=("USB",))
     controls = "case $1 in scontrols) echo \"Simple mixer control 'Master',0\";; *) echo 'Mono: 0 [0%] [off]';; esac"
     env = env_with(tmp_path, amixer=controls, wpctl="echo 'Volume: 0.40 [MUTED]'")
@@ -149,7 +365,10 @@ def test_how_loud_it_is_comes_from_the_mixer_that_is_in_charge(tmp_path: Path) -
     assert sound.levels(env, SoundServer(hangs=True), cards) == ()
 
 
-def test_cards_and_who_may_open_them(tmp_path: Path) -> None:
+# System files
+
+
+def test_a_card_may_be_opened_by_its_owner_its_group_or_by_its_mode(tmp_path: Path) -> None:
     kernel, nodes = tmp_path / "asound", tmp_path / "snd"
     kernel.mkdir()
     nodes.mkdir()
@@ -169,9 +388,9 @@ def test_cards_and_who_may_open_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
-def test_a_server_of_the_same_user_is_looked_at_in_its_own_surroundings(tmp_path: Path) -> None:
+def test_a_server_of_the_same_user_is_examined_in_its_own_environment(tmp_path: Path) -> None:
     env = clean_environment(str(tmp_path), {"XDG_RUNTIME_DIR": str(tmp_path), "SSH_CONNECTION": "1 2 3 4"})
-    with subprocess.Popen(["sleep", "98"], env=env) as process:
+    with subprocess.Popen(["sh", "-c", "sleep 98; :", "--player", "x"], env=env, start_new_session=True) as process:
         try:
             end = time.monotonic() + 5
             while machine._environment(process.pid) != env:  # it is another program's until it has begun
@@ -182,7 +401,17 @@ def test_a_server_of_the_same_user_is_looked_at_in_its_own_surroundings(tmp_path
             assert found.runtime_owner == os.getuid()
             assert "an ssh session" in found.kinds
             assert set(found.gids) == {os.getegid(), *os.getgroups()}
+            assert machine.names_a_player(process.pid, {})
         finally:
-            process.kill()
+            os.killpg(process.pid, 9)
+
+
+def test_this_process_is_examined_if_there_is_no_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", f"{tmp_path}/gone")
     found, seen = machine.surroundings(None)
-    assert (found.server, seen) == (None, dict(os.environ))
+    assert (found.server, found.runtime_owner, seen) == (None, None, dict(os.environ))
+    assert f"{tmp_path}/gone, which is not there" in machine.judge_session(found).message
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert machine.surroundings(None)[0].runtime is None
+    assert machine.names_a_player(os.getpid(), {"TALK_PLAYER": "x"})
+    assert not machine.names_a_player(os.getpid(), {})
