@@ -1,22 +1,29 @@
-"""What `talk doctor` makes of facts about voice, socket, server and sentence, and how it shows what it found."""
+"""How `talk doctor` judges facts about voice, socket, server and sentence, and how it shows the findings."""
 
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
 from talkcli import __version__
-from talkcli.doctor import report, sentence, server, sound, voice
+from talkcli.doctor import machine, report, sentence, server, sound, voice
+from talkcli.doctor.examine import Examination
+from talkcli.doctor.machine import Session
 from talkcli.doctor.report import FAILED, OK, WARNING, Finding, failed, heard, next_step, ok, warning
 from talkcli.doctor.sentence import Played, behind
 from talkcli.doctor.server import Place, Places
-from talkcli.doctor.voice import Engine
+from talkcli.doctor.voice import Engine, Setting
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
 from talkcli.paths import ABSENT, FORBIDDEN, STALE
 from talkcli.terminal.text import Screen, width
+
+if TYPE_CHECKING:
+    from talkcli.client.client import Client
 
 MISSING = "libespeak-ng is missing (libespeak-ng.so.1: cannot open): install it"
 ENGINE = Engine("espeak", "eSpeak NG 1.51 (system)", 141)
@@ -47,7 +54,7 @@ def test_the_one_thing_to_do_is_for_the_first_that_failed() -> None:
     assert next_step([group, ok("sentence", "played")]) is None
 
 
-def test_a_sentence_that_found_no_device_is_cured_where_the_device_was_looked_at() -> None:
+def test_the_next_step_for_a_missing_device_is_that_of_its_check() -> None:
     looked = [warning("cards", "none", "plug in"), warning("group", "not in audio", "usermod"), ok("python", "3")]
     assert behind(looked) == "usermod"
     assert behind(looked[2:]) is None
@@ -62,7 +69,7 @@ def test_a_sentence_that_found_no_device_is_cured_where_the_device_was_looked_at
     assert "talk set --voice" in str(cure("nothing_to_say", "nothing"))
 
 
-def test_a_player_of_one_s_own_is_cured_by_itself_unless_it_names_a_cause() -> None:
+def test_a_custom_player_is_to_be_tried_by_hand_unless_it_names_a_cause() -> None:
     cards = warning("cards", "none in this container", "start the container with --device /dev/snd")
     missing = warning("player", "it is not there", "name a program that is there")
     assert behind([cards], custom=True) is None
@@ -78,15 +85,135 @@ def test_a_player_of_one_s_own_is_cured_by_itself_unless_it_names_a_cause() -> N
     assert "another program" in str(cure("audio_device", "Device or resource busy", "sox"))
 
 
-def test_a_device_that_is_busy_is_heard_where_the_server_speaks() -> None:
-    busy = Played(State.ABORTED, "audio_device", "aplay: audio open error: Device or resource busy")
-    assert sentence.judge(replace(busy, beside_speech=True), silent=True).state == OK
-    assert sentence.judge(busy, silent=True).state == FAILED
+BUSY = Played(State.ABORTED, "audio_device", "aplay: audio open error: Device or resource busy")
+
+
+def test_a_device_that_is_busy_with_the_server_s_speech_is_well() -> None:
+    found = sentence.judge(replace(BUSY, beside_speech=True), silent=True)
+    assert (found.state, "busy with what the server speaks" in found.message) == (OK, True)
+    found = sentence.judge(BUSY, silent=True)
+    assert (found.state, "another program holds the device" in str(found.next)) == (FAILED, True)
     gone = Played(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
     assert sentence.judge(replace(gone, beside_speech=True), silent=True).state == FAILED
 
 
-def test_text_of_others_is_escaped_in_every_finding() -> None:
+def status(active: Goal | None = None, *recent: Goal) -> SimpleNamespace:
+    return SimpleNamespace(active=active, recent=recent)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "spoke"),
+    [
+        (status(), status(), False),
+        (status(SPOKEN), status(), True),
+        (status(), status(SPOKEN), True),
+        (status(None, SPOKEN), status(None, SPOKEN), False),
+        (status(), status(None, SPOKEN), True),
+        (status(), status(None, replace(SPOKEN, state=State.PREEMPTED)), True),
+        (status(), status(None, replace(SPOKEN, state=State.RECALLED)), False),
+    ],
+)
+def test_whether_the_server_spoke_is_seen_from_its_goals_before_and_after(
+    monkeypatch: pytest.MonkeyPatch, before: object, after: object, spoke: bool
+) -> None:
+    monkeypatch.setattr(sentence, "by_engine", lambda *_: BUSY)
+    client = cast("Client", SimpleNamespace(status=iter([before, after]).__next__))
+    assert sentence.beside(client, Setting(), 1.0) == replace(BUSY, beside_speech=spoke)
+
+
+STALLED = Played(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
+CLIENT = cast("Client", object())
+WARNED = [warning("sound server", "it hangs", "restart it")]
+
+
+def examined(played: Played, client: Client | None = CLIENT, *, silent: bool = False, **facts: object) -> Finding:
+    """Return what is found of a sentence that was played so; `facts`: those of an `Examination`."""
+    examination = Examination(None, silent=silent)
+    for name, value in {"process": 7, "found": WARNED, **facts}.items():
+        setattr(examination, f"_{name}", value)
+    here = Session(0, "root", server=None if facts.get("env") == {} else 7)
+    engine = Engine(reason=played.reason, words=str(played.words)) if client is None else ENGINE
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("beside", "by_server", "by_engine"):
+            patch.setattr(sentence, name, lambda *_: played)
+        patch.setattr(sound, "suspended", lambda _: ("usb",))
+        return examination._sentence(client, engine, here, {})
+
+
+@pytest.mark.parametrize(
+    ("found", "step"),
+    [
+        (examined(STALLED), "pactl suspend-sink usb 0"),
+        (examined(STALLED, silent=True), "pactl suspend-sink usb 0"),
+        (examined(STALLED, hangs=True), "restart it"),
+        (examined(replace(STALLED, player="mine"), server={"player": "mine"}), "try the player by hand"),
+        (examined(Played(State.ABORTED, "engine_hung", "silence"), None, hangs=True), "restart it"),
+        (examined(Played(State.ABORTED, "engine_hung", "silence"), None), "run talk doctor again"),
+        (examined(STALLED, silent=True, process=None), "run talk doctor --silent there"),
+    ],
+)
+def test_the_next_step_after_a_sentence_depends_on_what_was_found_before(found: Finding, step: str) -> None:
+    assert found.state == FAILED
+    assert str(found.next).startswith(step)
+
+
+def test_beside_another_user_s_server_the_sentence_is_to_be_played_by_that_user(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gone = Played(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
+    monkeypatch.setattr(machine, "owner", lambda path: 33 if path == "/proc/7" else None)
+    step = str(examined(gone, silent=True, env={}).next)
+    assert step.endswith(": sudo -u '#33' talk doctor --silent")
+    monkeypatch.setattr(machine, "owner", lambda _: None)  # as if /proc were mounted with hidepid
+    assert examined(gone, silent=True, env={}).next == "restart it"
+    assert examined(gone, silent=True).next == "restart it"
+
+
+def test_a_player_without_sound_plays_a_sentence_that_is_not_heard() -> None:
+    played = Played(State.SUCCEEDED, duration=1.0, player="null")
+    assert "without sound" in examined(played, server={"player": "null"}).message
+    assert "without sound" not in examined(played, server={"player": "aplay"}).message
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_without_a_server_an_engine_process_plays_by_the_variables(
+    monkeypatch: pytest.MonkeyPatch, silent: bool
+) -> None:
+    monkeypatch.setenv("TALK_PLAYER", "pacat")
+    monkeypatch.setenv("TALK_VOICE", "de")
+    given: list[object] = []
+
+    def by_engine(*arguments: object) -> Played:
+        given.extend(arguments)
+        return Played(State.SUCCEEDED)
+
+    monkeypatch.setattr(sentence, "by_engine", by_engine)
+    assert Examination(None, silent=silent)._sentence(None, ENGINE, Session(0, "root"), {}).state == OK
+    assert given[:3] == [sentence.TEXT, Setting("pacat", None, "de"), 0.0 if silent else 1.0]
+
+
+@pytest.mark.parametrize(
+    ("told", "named", "player", "worked"),
+    [
+        ("aplay", False, None, "aplay"),
+        ("aplay", True, "aplay", None),
+        ("mine -x", False, "mine -x", None),
+        ("file:/tmp/x.wav", True, "null", None),
+        ("null", True, "null", None),
+        (None, False, None, None),
+    ],
+)
+def test_silent_plays_with_the_server_s_settings_and_tries_the_same_players(
+    monkeypatch: pytest.MonkeyPatch, told: str | None, named: bool, player: str | None, worked: str | None
+) -> None:
+    monkeypatch.setattr(machine, "names_a_player", lambda *_: named)
+    examination = Examination(None, silent=True)
+    examination._server = {"player": told, "device": "usb", "voice": "de", "driver": "espeak"}
+    expected = Setting(player, "usb", "de", None, "espeak", worked, {})
+    assert examination._setting_of_server(7, {}) == expected
+
+
+def test_foreign_text_is_escaped_in_every_finding() -> None:
     found = failed("device", "aplay: \x1b[2Jred", "remove \u202e it\n")
     assert found.to_json() == {
         "check": "device", "state": "failed", "message": "aplay: \\x1b[2Jred", "next": "remove \\u202e it\\n"
@@ -94,32 +221,23 @@ def test_text_of_others_is_escaped_in_every_finding() -> None:
 
 
 @pytest.mark.parametrize(
-    ("engine", "pyttsx3", "check", "step"),
+    ("reason", "words", "check", "step"),
     [
-        (Engine(reason="engine_failed", words="pyttsx3 is missing (no module): install it"), "2.99", "pyttsx3", "pip"),
-        (Engine(reason="engine_failed", words="libespeak-ng is missing: install it"), "2.99", "libespeak-ng", "libesp"),
-        (
-            Engine(reason="engine_failed", words="there is no espeak-ng data: install espeak-ng-data"),
-            "2.99",
-            "libespeak-ng",
-            "espeak-ng-data",
-        ),
-        (Engine(reason="engine_crashed", words="it was killed by SIGSEGV"), "2.99", "libespeak-ng", "reinstall"),
-        (
-            Engine(reason="engine_hung", words="the engine process said nothing"),
-            "2.99",
-            "libespeak-ng",
-            "restart the sound server",
-        ),
-        (Engine(reason="unknown_voice", words='unknown voice "x"'), "2.99", "voices", "talk voices"),
+        ("engine_failed", "pyttsx3 is missing (no module): install it", "pyttsx3", "pip"),
+        ("engine_failed", "libespeak-ng is missing: install it", "libespeak-ng", "libesp"),
+        ("engine_failed", "there is no espeak-ng data: install espeak-ng-data", "libespeak-ng", "espeak-ng-data"),
+        ("engine_crashed", "it was killed by SIGSEGV", "libespeak-ng", "reinstall"),
+        ("engine_hung", "the engine process said nothing", "libespeak-ng", "restart the sound server"),
+        ("unknown_voice", 'unknown voice "x"', "voices", "talk voices"),
     ],
 )
-def test_a_voice_that_cannot_speak_is_named(engine: Engine, pyttsx3: str | None, check: str, step: str) -> None:
-    found = of(voice.judge(pyttsx3, engine, server=None), check)
+def test_a_voice_that_cannot_speak_is_named(reason: str, words: str, check: str, step: str) -> None:
+    engine = Engine(reason=reason, words=words)
+    found = of(voice.judge("2.99", engine, server=None), check)
     assert found.state == FAILED
-    assert engine.words in found.message
+    assert words in found.message
     assert step in (found.next or "")
-    assert of(voice.judge(pyttsx3, engine, server="ready"), check).state == WARNING, "the server has its own"
+    assert of(voice.judge("2.99", engine, server="ready"), check).state == WARNING, "the server has its own"
 
 
 def test_a_voice_that_can_speak_is_told_with_its_version_and_voices() -> None:
@@ -132,7 +250,7 @@ def test_a_voice_that_can_speak_is_told_with_its_version_and_voices() -> None:
         assert voice.judge("2.99", Engine("espeak", "eSpeak", voices), server="starting")[-1].state == WARNING
 
 
-def test_a_library_that_the_server_lacks_is_what_is_missing_before_its_silent_player() -> None:
+def test_a_library_that_the_server_lacks_comes_before_its_silent_player() -> None:
     for engine in (ENGINE, Engine(reason="engine_failed", words=MISSING)):
         found = [*voice.judge("2.99", engine, server=MISSING), *sound.judge_silent("null", running=True)]
         assert next_step(found) == voice.INSTALL_LIBRARY
@@ -157,14 +275,14 @@ PATH = "/run/user/1000/talk/talk.sock"
         (Places((Place(PATH, ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
     ],
 )
-def test_where_no_server_is_each_place_is_named_with_what_is_there(found: Places, words: str, step: str) -> None:
+def test_without_a_server_each_place_is_named_with_what_is_there(found: Places, words: str, step: str) -> None:
     judgement = server.judge_places(found)
     assert judgement.state == FAILED
     assert words in judgement.message
     assert step in str(judgement.next)
 
 
-def test_where_a_server_is_what_lies_before_it_is_a_warning() -> None:
+def test_an_obstacle_before_the_server_s_place_is_a_warning() -> None:
     served = Place(PATH, server.SERVER, pid=4711)
     found = server.judge_places(Places((Place("/a", ABSENT), served)))
     assert (found.state, found.message) == (OK, f"the server is on {PATH} (process 4711)")
@@ -186,7 +304,7 @@ def test_where_a_server_is_what_lies_before_it_is_a_warning() -> None:
         ({"volume": 0.1 + 0.2, "ttl": 1.23456789012}, "settings", OK, None),
     ],
 )
-def test_a_server_is_judged_by_what_it_says_of_itself(
+def test_a_server_is_judged_by_its_own_description(
     change: dict[str, object], check: str, state: str, step: str | None
 ) -> None:
     found = of(server.judge({**SERVER, **change}, [], 0.0), check)
@@ -195,7 +313,7 @@ def test_a_server_is_judged_by_what_it_says_of_itself(
     assert not re.search(r"\.\d{5}", found.message)
 
 
-def test_the_last_failures_are_counted_and_the_last_one_told() -> None:
+def test_recent_failures_are_counted_and_the_last_one_is_told() -> None:
     aborted = Goal(
         "4k7f-2", State.ABORTED, reason="audio_device", ended_at=0.0, message="Talk aborted: aplay: device is busy"
     )
@@ -209,7 +327,7 @@ def test_the_last_failures_are_counted_and_the_last_one_told() -> None:
     assert of(server.judge(SERVER, [SPOKEN], 0.0), "recent goals").message == "the last goal did not fail"
 
 
-def test_a_text_without_words_is_cured_by_words() -> None:
+def test_after_a_text_without_words_the_next_step_is_to_send_words() -> None:
     goal = Goal("4k7f-2", State.ABORTED, text="...", reason="nothing_to_say", message="Talk aborted: nothing")
     assert of(server.judge(SERVER, [goal], 0.0), "recent goals").next == (
         "send a text with words: this one has no letters and no digits"
