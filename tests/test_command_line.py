@@ -1,4 +1,4 @@
-"""The command line: options, output, exit codes and errors of every command, as a script or a person meets them."""
+"""The command line: options, output, exit codes and errors of every command, for scripts and for people."""
 
 from __future__ import annotations
 
@@ -48,54 +48,43 @@ def error_of(err: str) -> dict[str, Any]:
     return error
 
 
-# Help, versions, usage
-
-
-def test_version_and_help() -> None:
-    assert (done := alone("--version")).out == f"talk {__version__}\n"
-    assert done.code == 0
-    helps = [alone(*words) for words in (["-h"], ["--help"], [])]
-    assert helps[0].out == helps[1].out
-    assert [each.code for each in helps] == [0, 0, 0]
-    for command, words in [(each.name, each.summary) for each in COMMANDS.values()]:
-        for each in helps:
-            assert re.search(rf"(?m)^  {command} +{re.escape(words)}$", each.out)
+# Usage. `tests/golden/errors.txt` has many more wrong command lines, word by word.
 
 
 @pytest.mark.parametrize(
-    ("words", "hint"),
+    ("words", "said"),
     [
-        (["sya", "hello"], "did you mean 'say'?"),
-        (["stauts"], "did you mean 'status'?"),
-        (["battery", "low"], 'talk say "battery low"'),
-        (["say", "--wiat", "hello"], "--wait"),
-        (["say", "-5", "degrees"], "talk say -- TEXT"),
-        (["say", "--loud", "hello"], "talk say -- TEXT"),
-        (["say"], "TEXT"),
-        (["say", "--timeout", "3", "hello"], "--wait"),
-        (["say", "-t", "0", "-w", "hello"], "--timeout"),
-        (["say", "-t", "nan", "-w", "hello"], "--timeout"),
-        (["say", "-t", "soon", "-w", "hello"], "--timeout"),
-        (["wait", "-t", "-1"], "--timeout"),
-        (["wait", "-t", "nan"], "--timeout"),
-        (["serve", "--volume", "1.5"], "--volume"),
-        (["serve", "--volume", "nan"], "--volume"),
-        (["serve", "--rate", "79"], "--rate"),
-        (["serve", "--pitch", "101"], "--pitch"),
-        (["serve", "--socket-mode", "0400"], "--socket-mode"),
-        (["serve", "--socket-mode", "777"], "--socket-mode"),
-        (["serve", "--player", "null", "--device", "x"], "--device"),
-        (["serve", "extra"], "extra"),
-        (["status", "a-1", "a-2"], "a-2"),
+        (["STATUS"], "no such command 'STATUS': did you mean 'status'?"),
+        (["stop"], "no such command 'stop': did you mean 'cancel'?"),
+        (["start"], "no such command 'start': did you mean 'serve'?"),
+        (["help"], "no such command 'help': write 'talk --help'"),
+        (["help", "say"], "no such command 'help': write 'talk say --help'"),
+        (["good", "morning"], "no such command 'good': to speak it, write: talk say \"good morning\""),
+        (["sudo", "$(reboot)", 'a"b'], "no such command 'sudo': to speak it, write: talk say 'sudo $(reboot) a\"b'"),
+        (["set", "--volum", "1"], "no such option '--volum': did you mean '--volume'?"),
+        (
+            ["say", "--loud", "x"],
+            "no such option '--loud'. To speak a text that starts with '-', write: talk say -- TEXT",
+        ),
+        (["say", "-5"], "no such option '-5'. To speak a text that starts with '-', write: talk say -- TEXT"),
+        (["say", "-t", "nan", "-w", "hello"], "-t / --timeout: nan is not a number"),
+        (["wait", "-t", "0"], "-t / --timeout: '0' is not a number above 0"),
+        (["cancel", "--key", "k\udcff"], "--key: the byte 0xff in it is not UTF-8"),
+        (["set", "--voice", "k\udcff"], "--voice: the byte 0xff in it is not UTF-8"),
+        (["serve", "--voice", "\udcfek"], "--voice: the byte 0xfe in it is not UTF-8"),
+        (["set", "--voice"], "option '--voice' requires an argument"),
+        (["serve", "--max-queue", "10001"], "--max-queue: '10001' is not a whole number from 1 to 10000"),
+        (["serve", "--socket-mode", "0400"], "--socket-mode: '0400' is not a mode such as "),
+        (["serve", "--socket-mode", "777"], "--socket-mode: '777' is not a mode such as "),
     ],
 )
-def test_usage_errors_are_told_and_nothing_is_done(words: list[str], hint: str) -> None:
+def test_a_mistyped_line_is_told_with_the_next_step(words: list[str], said: str) -> None:
     done = alone(*words)
     assert (done.code, done.out) == (2, "")
-    assert hint in done.err
-    as_json = alone("--json", *words)
-    error = error_of(as_json.err)
-    assert (as_json.code, as_json.out, error["code"], error["exit"]) == (2, "", "usage", 2)
+    first, *rest = done.err.splitlines()
+    assert first.startswith(f"talk: {said}")
+    asked = f"talk {words[0]}" if words[0] in COMMANDS else "talk"
+    assert rest == ([] if "--help" in first else [f"talk: see '{asked} --help'"])
 
 
 def test_json_after_the_command_holds_for_usage_errors_too() -> None:
@@ -103,14 +92,14 @@ def test_json_after_the_command_holds_for_usage_errors_too() -> None:
     assert error_of(alone("say", "--loud", "hello", "--json").err)["exit"] == 2
 
 
-def test_name_that_is_too_long_is_refused_and_not_dropped(scripted: Talk) -> None:
+def test_a_name_that_is_too_long_is_refused(scripted: Talk) -> None:
     done = scripted.run("say", "--as", "n" * 65, "hello")
     assert (done.code, done.out) == (2, "")
     assert "64" in done.err
     assert scripted.run("say", "--as", "n" * 64, "hello").code == 0
 
 
-# What is printed
+# Output
 
 
 def test_json_shapes(scripted: Talk) -> None:
@@ -161,24 +150,26 @@ def test_options_before_and_after_the_command(scripted: Talk) -> None:
 
 @pytest.fixture
 def local(scripted: Talk, tmp_path: Path) -> dict[str, str]:
-    """The environment of a user who has this server in the usual place."""
+    """Return the environment of a user whose server is in the usual place."""
     (tmp_path / "talk").mkdir()
     (tmp_path / "talk" / "talk.sock").symlink_to(scripted.socket)
     return {**scripted.env, "TALK_SOCKET": "", "XDG_RUNTIME_DIR": str(tmp_path)}
 
 
-@pytest.mark.parametrize("command", [["status"], ["say", "hello"], ["cancel"], ["watch"], ["doctor"], ["serve"]])
-def test_a_socket_from_a_variable_that_is_not_set_is_not_the_local_one(
-    scripted: Talk, local: dict[str, str], command: list[str]
+@pytest.mark.parametrize(
+    "words",
+    [["--socket", "", "say", "hello"], ["--socket=", "cancel"], ["doctor", "--socket", ""], ["serve", "--socket="]],
+)
+def test_an_empty_socket_option_does_not_mean_the_local_server(
+    scripted: Talk, local: dict[str, str], words: list[str]
 ) -> None:
-    for words in (["--socket", "", *command], ["--socket=", *command], [*command, "--socket", ""]):
-        done = run([*TALK, *words], local)
-        assert (done.code, done.out) == (2, ""), words
-        assert "--socket: empty; is the variable set that it comes from?" in done.err
+    done = run([*TALK, *words], local)
+    assert (done.code, done.out) == (2, "")
+    assert "--socket: empty; is the variable set that it comes from?" in done.err
     assert scripted.watcher.goals() == []
 
 
-def test_variables_that_are_empty_count_as_not_set(scripted: Talk, local: dict[str, str]) -> None:
+def test_empty_variables_count_as_not_set(scripted: Talk, local: dict[str, str]) -> None:
     for words in (["say", "length=0"], ["say", "--lines"], ["wait"], ["status"], ["voices"]):
         done = run([*TALK, *words], {**local, "TALK_NAME": ""})
         assert done.code == 0, done
@@ -191,7 +182,7 @@ def test_variables_that_are_empty_count_as_not_set(scripted: Talk, local: dict[s
             assert client.server_pid == scripted.pid
 
 
-def test_a_name_that_is_no_utf8_speaks_nothing_but_cancels(scripted: Talk, local: dict[str, str]) -> None:
+def test_a_name_that_is_not_utf8_speaks_nothing_but_cancels(scripted: Talk, local: dict[str, str]) -> None:
     env = {**local, "TALK_NAME": "n\udcff"}
     said = run([*TALK, "say", "x"], env)
     assert (said.code, said.out) == (2, "")
@@ -201,7 +192,7 @@ def test_a_name_that_is_no_utf8_speaks_nothing_but_cancels(scripted: Talk, local
     assert scripted.goal(goal)["by"]["client"]["name"] == "n\ufffd"
 
 
-def test_arguments_are_utf8_where_the_locale_is_ascii(scripted: Talk) -> None:
+def test_arguments_are_utf8_if_the_locale_is_ascii(scripted: Talk) -> None:
     env = {**scripted.env, "LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "TALK_NAME": "é"}
     words = ["say", "-w", "--key", "日", "--", "length=0 a\udcff b é"]
     done = run([*TALK, *words], env)
@@ -211,18 +202,7 @@ def test_arguments_are_utf8_where_the_locale_is_ascii(scripted: Talk) -> None:
     assert run([*TALK, "cancel"], env).code == 0
 
 
-def test_standard_output_that_is_closed_is_141(scripted: Talk) -> None:
-    for words in (["status"], ["--json", "status"], ["--help"]):
-        reader, writer = os.pipe()
-        os.close(reader)
-        with os.fdopen(writer, "wb") as closed:
-            done = subprocess.run(
-                [*TALK, *words], env=scripted.env, stdout=closed, stderr=subprocess.PIPE, timeout=20, check=False
-            )
-        assert (done.returncode, done.stderr) == (141, b""), words
-
-
-def test_text_of_others_never_reaches_a_terminal_raw(scripted: Talk) -> None:
+def test_foreign_text_never_reaches_a_terminal_raw(scripted: Talk) -> None:
     goal_id = scripted.run("say", "--as", HOSTILE[:60], "--", f"never-ends {HOSTILE}").id
     scripted.watcher.wait_for_word(goal_id)
     scripted.run("say", "--wait", "--as", "b\x1b]0;title\x07", "-t", "0.1", "--", f"{HOSTILE} pending")
@@ -238,12 +218,8 @@ def test_text_of_others_never_reaches_a_terminal_raw(scripted: Talk) -> None:
     assert r"a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end" in shown[0]
 
 
-@pytest.mark.parametrize(
-    "command", [["status"], ["log"], ["watch"], ["wait", "theirs"], ["say", "--id", "theirs", "-w"]]
-)
-def test_json_on_a_terminal_escapes_what_plain_output_does_and_is_the_same_json(
-    scripted: Talk, command: list[str]
-) -> None:
+@pytest.mark.parametrize("command", [["status"], ["watch"], ["say", "--id", "theirs", "-w"]])
+def test_json_on_a_terminal_is_escaped_and_means_the_same(scripted: Talk, command: list[str]) -> None:
     text = f'length=0 {HOSTILE} \x9b31m \x7f \ue000 \U000e0001 "quoted" \\ Grüße 日本 👩'
     scripted.run("say", "--wait", "--id", "theirs", "--as", "\u202epatrol", "--", text)
     words = ["--json", *command, *(["--", text] if command[0] == "say" else [])]
@@ -269,7 +245,7 @@ def _strings(found: Any) -> set[str]:
     return {each for part in parts for each in _strings(part)}
 
 
-def test_no_colour_but_on_a_terminal(scripted: Talk) -> None:
+def test_colour_is_for_terminals_alone(scripted: Talk) -> None:
     scripted.run("say", "--wait", "length=0")
     for extra in ({}, {"NO_COLOR": "1"}, {"TERM": "dumb"}):
         env = {"TERM": "xterm", **scripted.env, **extra}
@@ -286,7 +262,7 @@ def test_no_colour_but_on_a_terminal(scripted: Talk) -> None:
 # Standard input
 
 
-def test_standard_input_is_read_where_it_is_asked_for_alone(scripted: Talk) -> None:
+def test_standard_input_is_read_only_if_it_is_asked_for(scripted: Talk) -> None:
     assert json.loads(scripted.run("--json", "say", "-", stdin="one\ntwo\n").out)["text"] == "one\ntwo"
     assert json.loads(scripted.run("--json", "say", "-", "and", stdin="unread").out)["text"] == "- and"
     for words in (["say", "hello"], ["status"], ["cancel"], ["wait"]):
@@ -294,25 +270,25 @@ def test_standard_input_is_read_where_it_is_asked_for_alone(scripted: Talk) -> N
         assert client.wait(10) == 0
 
 
-def test_python_m_talkcli_is_talk_whatever_the_locale_is(scripted: Talk) -> None:
+def test_texts_are_utf8_whatever_the_locale_is(scripted: Talk) -> None:
     few: dict[str, str] = {each: scripted.env[each] for each in ("PYTHONPATH", "TALK_SOCKET") if each in scripted.env}
-    for env in ({**scripted.env, "LANG": "C", "LC_ALL": "C"}, {**scripted.env, "LC_ALL": "POSIX"}, few):
+    for env in ({**scripted.env, "LANG": "C", "LC_ALL": "C"}, few):
         done = run([*TALK, "--json", "say", "--wait", "--", "d'été 日本"], env)
         assert (done.code, json.loads(done.out)["text"]) == (0, "d'été 日本")
         assert "日本" in run([*TALK, "status"], env).out
 
 
-def test_timeout_may_be_as_long_as_one_likes(scripted: Talk) -> None:
-    for seconds in ("inf", "1e300", "9999999"):
+def test_a_timeout_may_be_as_long_as_one_likes(scripted: Talk) -> None:
+    for seconds in ("inf", "9999999"):
         done = scripted.run("say", "--wait", "--timeout", seconds, "length=0")
         assert done.code == 0, done.err
         assert scripted.run("wait", "--timeout", seconds, done.id).code == 0
 
 
-# What a client costs, and whom it talks to
+# The script, and the processes that may answer
 
 
-def test_the_installed_script_is_this_one_and_imports_nothing_itself() -> None:
+def test_the_installed_script_is_this_one_and_imports_only_main() -> None:
     """What pip makes of an entry point imports `re` first; the wheel brings its own script."""
     script = Path(cli.__file__).with_name("talk")
     assert os.access(script, os.X_OK)
@@ -323,14 +299,6 @@ def test_the_installed_script_is_this_one_and_imports_nothing_itself() -> None:
     )
     done = run([sys.executable, str(script), "--version"], {**os.environ, "PYTHONPATH": str(script.parents[2])})
     assert (done.code, done.out) == (0, f"talk {__version__}\n")
-
-
-def test_client_imports_nothing_heavy(scripted: Talk) -> None:
-    heavy = ["asyncio", "pyttsx3", "platformdirs", "talkcli.server", "talkcli.goals.scheduler", "talkcli.engine", "ssl"]
-    code = "import sys; from talkcli.cli import run; assert run({}) == 0; print([m for m in {} if m in sys.modules])"
-    for words in (["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"]):
-        done = run([sys.executable, "-c", code.format(words, heavy)], scripted.env)
-        assert done.out.splitlines()[-1] == "[]", done
 
 
 @pytest.mark.parametrize(
@@ -346,7 +314,7 @@ def test_client_imports_nothing_heavy(scripted: Talk) -> None:
         (GREETING, 3, "no_server", "went away"),
     ],
 )
-def test_what_else_may_answer(says: bytes, code: int, error: str, words: str) -> None:
+def test_a_process_that_is_no_server_of_this_protocol_is_told(says: bytes, code: int, error: str, words: str) -> None:
     with short_directory() as home, FakeServer(f"{home}/s", [says], closes=True):
         env = clean_environment(home, {"TALK_SOCKET": f"{home}/s"})
         began = time.monotonic()
@@ -357,28 +325,22 @@ def test_what_else_may_answer(says: bytes, code: int, error: str, words: str) ->
     assert words in told["message"]
 
 
-def test_a_place_that_is_no_socket_is_told_from_what_a_server_left_there(tmp_path: Path) -> None:
-    place = tmp_path / "talk"
+def test_a_place_that_is_no_socket_is_told_from_a_socket_that_a_server_left(tmp_path: Path) -> None:
+    place, file, pipe = (tmp_path / each for each in ("talk", "file", "pipe"))
     place.mkdir()
-    file = tmp_path / "file"
     file.touch()
-    pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    leave_out = "name a socket, or leave out --socket"
     inside = f"{place}/talk.sock"
-    for named, words, by_variable_do, by_option_do in (
-        (
-            place,
-            f"a directory, and no socket: name the one in it, {inside}",
-            f"set TALK_SOCKET to {inside}",
-            f"start one with: talk serve --socket {inside}",
-        ),
-        (file, "a file", "name a socket", leave_out),
-        (pipe, "a file", "name a socket", leave_out),
+    steps = [f"set TALK_SOCKET to {inside}", f"start one with: talk serve --socket {inside}"]
+    others = ["name a socket", "name a socket, or leave out --socket"]
+    for named, words, (by_variable, by_option) in (
+        (place, f"a directory, and no socket: name the one in it, {inside}", steps),
+        (file, "a file", others),
+        (pipe, "a file", others),
     ):
-        by_variable, by_option = alone("status", TALK_SOCKET=str(named)), alone("--socket", str(named), "status")
-        assert (by_variable.code, by_option.code) == (3, 3)
-        assert f"{named}: {words}" in by_variable.err
-        assert f"{named}: {words}" in by_option.err
-        assert f"\n{by_variable_do}\nor unset TALK_SOCKET" in by_variable.err
-        assert by_option.err.endswith(f"\n{by_option_do}\n")
+        done = alone("status", TALK_SOCKET=str(named))
+        assert (done.code, f"{named}: {words}" in done.err) == (3, True)
+        assert f"\n{by_variable}\nor unset TALK_SOCKET" in done.err
+        done = alone("--socket", str(named), "status")
+        assert (done.code, f"{named}: {words}" in done.err) == (3, True)
+        assert done.err.endswith(f"\n{by_option}\n")

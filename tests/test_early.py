@@ -126,7 +126,7 @@ def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
         "assert run({}) == 0\n"
         "print('click' in sys.modules)\n"
     )
-    for words in (["say", "--wait", "length=0"], ["say", "length=0"], ["status"], ["cancel"], ["pause"], ["resume"]):
+    for words in (["say", "--wait", "length=0"], ["status"], ["cancel"], ["pause"]):
         done = run([sys.executable, "-c", code.format(words)], scripted.env)
         assert [done.out.splitlines()[each] for each in (0, -1) if done.out] == ["[]", "False"], done
 
@@ -179,11 +179,17 @@ def test_a_client_stands_back_for_as_long_as_it_has_worked_and_loses_nothing(mon
         assert (os.get_blocking(ours.fileno()), ours.recv(1)) == (False, b"")
 
 
-def test_commands_that_send_one_request_need_no_click(scripted: Talk) -> None:
-    code = "import sys; from talkcli.cli import run; assert run({}) == 0; print('click' in sys.modules)"
-    for words in (["wait"], ["log"], ["voices"], ["set"], ["set", "--rate", "150"], ["status", "-q"]):
-        done = run([sys.executable, "-c", code.format(words)], scripted.env)
-        assert done.out.splitlines()[-1] == "False", done
+def test_plain_commands_import_neither_click_nor_anything_heavy(scripted: Talk) -> None:
+    heavy = ["click", "asyncio", "pyttsx3", "platformdirs", "ssl"]
+    heavy += ["talkcli.server", "talkcli.goals.scheduler", "talkcli.engine"]
+    code = (
+        "import sys; from talkcli.cli import run\n"
+        "for words in {}: assert run(words) == 0\n"
+        "print([each for each in {} if each in sys.modules])"
+    )
+    words = [["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"], ["log"], ["voices"], ["set"]]
+    done = run([sys.executable, "-c", code.format([*words, ["set", "--rate", "150"]], heavy)], scripted.env)
+    assert done.out.splitlines()[-1] == "[]", done
 
 
 def test_ctrl_c_before_anything_was_sent_is_no_traceback() -> None:

@@ -1,4 +1,4 @@
-"""Standard output that is closed, or full: the exit code says so, no traceback does, and nothing is spoken twice."""
+"""Standard output that is closed or full: the exit code says so, without a traceback, and nothing is spoken twice."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 TALK = f"{shlex.quote(sys.executable)} -m talkcli"
 CLOSED = 141
+FULL = "talk: standard output can't be written: No space left on device\n"
 
 
 def bash(talk: Talk, script: str) -> subprocess.CompletedProcess[str]:
@@ -40,12 +41,41 @@ def bash(talk: Talk, script: str) -> subprocess.CompletedProcess[str]:
     return done
 
 
-@pytest.mark.parametrize("command", ["status", "voices", "--json voices", "log", "set"])
-def test_reader_that_has_enough_ends_it_with_141(scripted: Talk, command: str) -> None:
-    if command == "log":
-        scripted.run("say", "--wait", "length=0")
-    done = bash(scripted, f"talk {command} | (exec <&-; true); echo ${{PIPESTATUS[0]}}")
+def to(talk: Talk, output: int | str, *words: str, stdin: str | None = None) -> tuple[int, str]:
+    """Run `talk` with this file as its output; return its exit code and its notes."""
+    descriptor = os.open(output, os.O_WRONLY) if isinstance(output, str) else output
+    source = subprocess.DEVNULL if stdin is None else subprocess.PIPE
+    client = Forked(words, talk.env, stdin=source, stdout=descriptor, stderr=subprocess.PIPE)
+    os.close(descriptor)
+    err = client.communicate(stdin, timeout=20)[1]
+    assert "Traceback" not in err
+    return client.wait(), err
+
+
+def unread(talk: Talk, *words: str) -> tuple[int, str]:
+    """Run `talk` with its output in a pipe whose reader has gone; return its exit code and its notes."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    return to(talk, writer, *words)
+
+
+# A command that prints
+
+
+def test_reader_that_has_enough_ends_it_with_141(scripted: Talk) -> None:
+    scripted.run("say", "--wait", "length=0")
+    for words in (["status"], ["--json", "status"], ["voices"], ["--json", "voices"], ["log"], ["set"], ["--help"]):
+        assert unread(scripted, *words) == (CLOSED, ""), words
+    done = bash(scripted, "talk status | (exec <&-; true); echo ${PIPESTATUS[0]}")
     assert (done.stdout, done.stderr) == (f"{CLOSED}\n", "")
+
+
+def test_the_first_line_is_whole(scripted: Talk) -> None:
+    done = bash(scripted, "talk status | head -n 1; echo ${PIPESTATUS[0]}")
+    first, code = done.stdout.splitlines()
+    assert first.startswith("server   pid ")
+    assert code in {"0", str(CLOSED)}  # the rest may have been written before the reader was gone
+    assert done.stderr == ""
 
 
 def test_watch_ends_when_its_reader_does(scripted: Talk) -> None:
@@ -55,52 +85,41 @@ def test_watch_ends_when_its_reader_does(scripted: Talk) -> None:
     assert done.stderr == ""
 
 
-def test_first_line_is_whole(scripted: Talk) -> None:
-    done = bash(scripted, "talk status | head -n 1; echo ${PIPESTATUS[0]}")
-    first, code = done.stdout.splitlines()
-    assert first.startswith("server   pid ")
-    assert code in {"0", str(CLOSED)}  # the rest may have been written before the reader was gone
-    assert done.stderr == ""
-
-
 @pytest.mark.parametrize("closed", [">&-", "1</dev/null"])
-def test_output_that_was_closed_from_the_beginning(scripted: Talk, closed: str) -> None:
+def test_an_output_that_was_closed_from_the_start_is_141(scripted: Talk, closed: str) -> None:
     done = bash(scripted, f"(talk status; echo $? >&2) {closed}")
     assert (done.stdout, done.stderr) == ("", f"{CLOSED}\n")
 
 
 @pytest.mark.parametrize("command", ["status", "--json status", "say -w length=0", "voices"])
 def test_full_disk_is_told_in_plain_words(scripted: Talk, command: str) -> None:
-    done = bash(scripted, f"talk {command} >/dev/full; echo $?")
-    assert (done.stdout, done.stderr) == ("1\n", "talk: standard output can't be written: No space left on device\n")
+    assert to(scripted, "/dev/full", *command.split()) == (1, FULL)
 
 
-def test_a_broken_disk_is_no_reader_that_went_away(scripted: Talk) -> None:
-    with open("/proc/self/mem", "r+b") as broken:  # at 0 there is nothing that could be written
-        client = Forked(["status"], scripted.env, stdout=broken.fileno(), stderr=subprocess.PIPE)
-        err = client.communicate(timeout=20)[1]
-    assert (client.returncode, err) == (1, "talk: standard output can't be written: Input/output error\n")
+def test_a_broken_disk_is_not_a_reader_that_went_away(scripted: Talk) -> None:
+    with open("/proc/self/mem", "r+b") as broken:  # nothing can be written at 0
+        found = to(scripted, os.dup(broken.fileno()), "status")
+    assert found == (1, "talk: standard output can't be written: Input/output error\n")
+
+
+def test_closed_standard_error_changes_no_exit_code(scripted: Talk) -> None:
+    done = bash(scripted, "talk status 4k7f-99 2>&-; echo $?; talk say -w fail=audio_lost 2>&-; echo $?")
+    assert [each for each in done.stdout.splitlines() if "-" not in each] == ["8", "4"]
+
+
+# A goal whose output cannot be written from the start
 
 
 def test_a_goal_is_spoken_whatever_becomes_of_its_id(scripted: Talk) -> None:
-    for closed in (">&-", ">/dev/full", "| true"):
-        bash(scripted, f"talk say length=0 {closed}")
+    bash(scripted, "talk say length=0 >&-")
+    to(scripted, "/dev/full", "say", "length=0")
+    unread(scripted, "say", "length=0")
     assert [scripted.watcher.wait_for_terminal(each) for each in scripted.watcher.goals()] == ["SUCCEEDED"] * 3
 
 
-def unread(talk: Talk, *words: str) -> tuple[int, str]:
-    """Run `talk` with its output in a pipe whose reader has gone; return its exit code and what it noted."""
-    reader, writer = os.pipe()
-    os.close(reader)
-    client = Forked(words, talk.env, stdout=writer, stderr=subprocess.PIPE)
-    os.close(writer)
-    err = client.communicate(timeout=20)[1]
-    return client.wait(), err
-
-
-@pytest.mark.parametrize("words", ["say", "say -w", "--json say -w", "say -wf", "--json say -wf", "say -wq"])
-def test_output_that_was_closed_from_the_start_matters_to_nothing(scripted: Talk, words: str) -> None:
-    for closed in (">&-", "1</dev/null"):
+@pytest.mark.parametrize("words", ["say", "say -w", "--json say -wf", "say -wq"])
+def test_a_goal_is_waited_for_though_its_output_was_closed_from_the_start(scripted: Talk, words: str) -> None:
+    for closed in [">&-", "1</dev/null"] if words in {"say -w", "--json say -wf"} else []:
         done = bash(scripted, f"(talk {words} length=0.2; echo $? >&2) {closed}")
         assert (done.stdout, done.stderr) == ("", "0\n")
     assert unread(scripted, *words.split(), "length=0.2") == (0, "")
@@ -112,40 +131,39 @@ def test_output_that_was_closed_from_the_start_matters_to_nothing(scripted: Talk
     assert (code, "Talk aborted" in err) == ((0, False) if words == "say" else (4, words != "say -wq"))
 
 
-def test_a_wait_whose_output_was_closed_from_the_start_waits(scripted: Talk) -> None:
-    for words in ("wait", "--json wait -f"):
-        goal = scripted.run("say", "fail=audio_lost length=0.2").id
-        done = bash(scripted, f"talk {words} {goal} >&-; echo $?")
-        assert done.stdout == "4\n"
-        assert scripted.goal(goal)["state"] == "ABORTED"
+def test_a_wait_waits_though_its_output_was_closed_from_the_start(scripted: Talk) -> None:
+    goal = scripted.run("say", "fail=audio_lost length=0.2").id
+    assert bash(scripted, f"talk wait {goal} >&-; echo $?").stdout == "4\n"
+    goal = scripted.run("say", "fail=audio_lost length=0.2").id
+    assert unread(scripted, "--json", "wait", "-f", goal)[0] == 4
+    assert scripted.goal(goal)["state"] == "ABORTED"
 
 
-@pytest.mark.parametrize(
-    "words",
-    ["say -w", "say -wf", "--json say -w", "--json say -wf", "wait", "wait -f", "--json wait", "--json wait -f"],
-)
-def test_a_goal_is_waited_for_though_there_is_no_room_for_what_is_shown(scripted: Talk, words: str) -> None:
-    told = "talk: standard output can't be written: No space left on device"
+@pytest.mark.parametrize("words", ["say -w", "--json say -wf", "wait", "wait -f", "--json wait"])
+def test_a_goal_is_waited_for_though_the_disk_is_full(scripted: Talk, words: str) -> None:
     for text, state, code in (("length=0.2", "SUCCEEDED", 1), ("fail=audio_lost length=0.2", "ABORTED", 4)):
-        what = scripted.run("say", text).id if "wait" in words else text
-        done = bash(scripted, f"talk {words} {what} >/dev/full; echo $?")
+        given = scripted.run("say", text).id if "wait" in words else text
+        ended, err = to(scripted, "/dev/full", *words.split(), given)
         goal = scripted.watcher.goals()[-1]
         assert scripted.goal(goal)["state"] == state  # so it was waited for
-        notes = [] if words == "wait" else [told]
-        notes += [f"talk: {goal}: Talk aborted: scripted audio_lost; see 'talk doctor'"] if state == "ABORTED" else []
-        assert sorted(done.stderr.splitlines()) == sorted(notes)
-        assert done.stdout == f"{0 if words == 'wait' and code == 1 else code}\n"  # which shows nothing
+        notes = [] if words == "wait" else [FULL]
+        notes += [f"talk: {goal}: Talk aborted: scripted audio_lost; see 'talk doctor'\n"] if state == "ABORTED" else []
+        assert sorted(err.splitlines(True)) == sorted(notes)
+        assert ended == (0 if words == "wait" and code == 1 else code)  # `wait` shows nothing
 
 
-@pytest.mark.parametrize("words", ["", "--json", "-w", "--json -w", "-f", "--json -f"])
-def test_lines_are_spoken_though_there_is_no_room_for_what_is_shown(scripted: Talk, words: str) -> None:
-    for first, code in (("length=0 a", 1), ("fail=audio_lost" if words not in {"", "--json"} else "nul \\0", None)):
-        done = bash(scripted, f"printf '{first}\\nlength=0 b\\n' | talk say --lines {words} >/dev/full; echo $?")
+@pytest.mark.parametrize("words", ["", "--json", "-w", "--json -f"])
+def test_lines_are_spoken_though_the_disk_is_full(scripted: Talk, words: str) -> None:
+    for first, code in (("length=0 a", 1), ("fail=audio_lost", 4) if words[-2:] in {"-w", "-f"} else ("nul \0", 5)):
+        lines = f"{first}\nlength=0 b\n"
+        ended, err = to(scripted, "/dev/full", "say", "--lines", *words.split(), stdin=lines)
         goal = scripted.watcher.goals()[-1]
         assert scripted.watcher.wait_for_terminal(goal) == "SUCCEEDED"
         assert scripted.goal(goal)["text"] == "length=0 b"
-        assert done.stderr.count("standard output can't be written") == 1
-        assert int(done.stdout) == (code or (5 if "nul" in first else 4))
+        assert (ended, err.count("standard output can't be written")) == (code, 1)
+
+
+# A reader that goes away meanwhile
 
 
 class Reader:
@@ -168,12 +186,20 @@ class Reader:
 
 
 ENDLESS = "never-ends words=1"
-#: It takes a moment until it is silent.
+#: A goal that takes a moment until it is silent.
 SLOW = f"{ENDLESS} slow-stop=0.2"
 
 
-@pytest.mark.parametrize("way", [{}, {"errors": True}, {"terminal": True}, {"terminal": True, "errors": True}])
-@pytest.mark.parametrize("words", [["say", "-w"], ["--json", "say", "-w"], ["-q", "say", "-w"], ["say", "-wf"]])
+@pytest.mark.parametrize(
+    ("words", "way"),
+    [
+        (["say", "-w"], {}),
+        (["say", "-wf"], {}),
+        (["say", "-wf"], {"terminal": True}),
+        (["--json", "say", "-w"], {"errors": True}),
+        (["-q", "say", "-w"], {"terminal": True, "errors": True}),
+    ],
+)
 def test_a_reader_that_goes_away_while_it_waits_cancels_the_goal(
     scripted: Talk, words: list[str], way: dict[str, bool]
 ) -> None:
@@ -193,12 +219,15 @@ def test_a_reader_that_goes_away_while_its_goal_is_in_the_queue_recalls_it(scrip
     assert scripted.goal(first)["state"] == "ACTIVE"
 
 
-@pytest.mark.parametrize("way", [{}, {"errors": True}, {"terminal": True}])
-@pytest.mark.parametrize("words", ["say -wf", "--json say -wf", "--json say -w"])
-@pytest.mark.parametrize(("first", "number"), [("reader", signal.SIGINT), ("signal", signal.SIGHUP)])
+@pytest.mark.parametrize("first", ["reader", "signal"])
+@pytest.mark.parametrize(
+    ("words", "way"),
+    [("say -wf", {}), ("--json say -wf", {"terminal": True}), ("--json say -w", {"errors": True})],
+)
 def test_a_signal_that_ends_the_reader_too_is_what_counts(
-    scripted: Talk, words: str, way: dict[str, bool], first: str, number: signal.Signals
+    scripted: Talk, words: str, way: dict[str, bool], first: str
 ) -> None:
+    number = signal.SIGINT if first == "reader" else signal.SIGHUP
     reader = Reader(scripted, *words.split(), SLOW, **way)
     goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
     if first == "reader":
@@ -216,8 +245,15 @@ def test_a_signal_that_ends_the_reader_too_is_what_counts(
     assert err.count("Talk preempted") == (not way.get("errors"))
 
 
-@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGHUP])
-@pytest.mark.parametrize("words", ["say -w", "say -wf", "say -w --lines"])
+@pytest.mark.parametrize(
+    ("words", "first"),
+    [
+        ("say -w", signal.SIGINT),
+        ("say -w", signal.SIGHUP),
+        ("say -wf", signal.SIGINT),
+        ("say -w --lines", signal.SIGHUP),
+    ],
+)
 def test_a_terminal_that_is_closed_sends_sighup_more_than_once(
     scripted: Talk, words: str, first: signal.Signals
 ) -> None:
@@ -256,7 +292,7 @@ def test_a_reader_that_goes_away_while_the_text_is_read_has_nothing_spoken(scrip
     assert scripted.watcher.goals() == []
 
 
-def test_a_text_whose_sender_only_has_no_more_is_spoken(scripted: Talk) -> None:
+def test_a_text_is_spoken_if_its_sender_only_ends_its_input(scripted: Talk) -> None:
     ours, theirs = socket.socketpair()
     with ours:
         client = Forked(["say", "-w", "-"], scripted.env, stdin=theirs.fileno(), stdout=theirs.fileno())
@@ -275,7 +311,7 @@ def test_a_reader_that_had_enough_cancels_the_goal(scripted: Talk) -> None:
 
 
 @pytest.mark.parametrize("words", [["say", "-w"], ["say", "-wf"]])
-def test_the_reader_of_who_attached_cancels_nothing(scripted: Talk, words: list[str]) -> None:
+def test_the_reader_of_an_attached_client_cancels_nothing(scripted: Talk, words: list[str]) -> None:
     text = "never-ends length=60 " + "word " * 600  # one in a tenth of a second
     scripted.run("say", "--id", "mine", text)
     scripted.watcher.wait_for_word("mine")
@@ -285,14 +321,14 @@ def test_the_reader_of_who_attached_cancels_nothing(scripted: Talk, words: list[
     assert scripted.goal("mine")["state"] == "ACTIVE"
 
 
-@pytest.mark.parametrize("way", [{}, {"terminal": True}])
-@pytest.mark.parametrize("words", [["wait"], ["wait", "-f"], ["--json", "wait"]])
-def test_the_reader_of_a_wait_ends_it_and_cancels_nothing(
-    scripted: Talk, words: list[str], way: dict[str, bool]
-) -> None:
+@pytest.mark.parametrize(
+    ("words", "terminal"),
+    [(["wait"], True), (["wait", "-f"], False), (["wait", "-f"], True), (["--json", "wait"], False)],
+)
+def test_the_reader_of_a_wait_ends_it_and_cancels_nothing(scripted: Talk, words: list[str], terminal: bool) -> None:
     goal = scripted.run("say", ENDLESS).id
-    reader = Reader(scripted, *words, goal, **way)
-    if way and words == ["wait", "-f"]:
+    reader = Reader(scripted, *words, goal, terminal=terminal)
+    if terminal and words == ["wait", "-f"]:
         assert os.read(reader.descriptor, 1)
     assert reader.leave() == CLOSED
     assert scripted.goal(goal)["state"] in {"PENDING", "ACTIVE"}
@@ -333,8 +369,3 @@ def _wait_until_caught(client: Process, number: int) -> None:
         if caught >> (number - 1) & 1:
             return
         time.sleep(0.002)
-
-
-def test_closed_standard_error_changes_no_exit_code(scripted: Talk) -> None:
-    done = bash(scripted, "talk status 4k7f-99 2>&-; echo $?; talk say -w fail=audio_lost 2>&-; echo $?")
-    assert [each for each in done.stdout.splitlines() if "-" not in each] == ["8", "4"]

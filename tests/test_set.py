@@ -1,4 +1,4 @@
-"""`talk set`: the running server's settings, changed and printed; and those that `serve` starts with."""
+"""`talk set` changes and prints the running server's settings; `talk serve` starts with some."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.bareserve import TALK, environment, run
+from tests.golden import surface
 from tests.support.processes import Talk
 from tests.support.surroundings import short_directory
 
@@ -43,25 +44,25 @@ def settings(talk: Talk) -> dict[str, str]:
     return dict(each.split() for each in done.out.splitlines())
 
 
-def test_alone_it_prints_them(shared: Talk) -> None:
+def test_alone_it_prints_the_settings(shared: Talk) -> None:
     assert settings(shared) == DEFAULTS
     done = shared.run("set", "--json")
     assert json.loads(done.out) == {
         "rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None,
     }  # fmt: skip
     assert done.out.count("\n") == 1
+    done = shared.run("set", "--rate", "200")
+    assert (done.code, done.out, done.err) == (0, "", "")
 
 
 @pytest.mark.parametrize(
     ("words", "name", "value", "shown"),
     [
         (["--rate", "80"], "rate", 80, "80"),
-        (["--rate", "450"], "rate", 450, "450"),
-        (["--volume", "0"], "volume", 0.0, "0"),
         (["--volume", "0.25"], "volume", 0.25, "0.25"),
+        (["--volume", "0"], "volume", 0.0, "0"),
         (["--voice", "en"], "voice", "en", "en"),
         (["--voice", "default"], "voice", None, "default"),
-        (["--pitch", "0"], "pitch", 0, "0"),
         (["--pitch", "100"], "pitch", 100, "100"),
         (["--preempt"], "preempt", True, "yes"),
         (["--no-preempt"], "preempt", False, "no"),
@@ -69,20 +70,17 @@ def test_alone_it_prints_them(shared: Talk) -> None:
         (["--ttl", "0"], "ttl", None, "0"),
     ],
 )
-def test_one_is_changed_and_the_others_stay(
+def test_one_setting_is_changed_and_the_others_stay(
     shared: Talk, words: list[str], name: str, value: object, shown: str
 ) -> None:
-    done = shared.run("set", *words)
-    assert (done.code, done.out, done.err) == (0, "", "")
-    assert settings(shared) == {**DEFAULTS, name: shown}
     changed = json.loads(shared.run("--json", "set", *words).out)
     assert changed[name] == value
-    assert json.loads(shared.run("--json", "set").out) == changed
-    described = json.loads(shared.run("--json", "status").out)["server"]
+    assert settings(shared) == {**DEFAULTS, name: shown}
+    described = shared.request("status")["server"]
     assert {each: described[each] for each in changed} == changed
 
 
-def test_what_is_printed_can_be_given_back(shared: Talk) -> None:
+def test_the_printed_settings_can_be_given_back(shared: Talk) -> None:
     shared.run("set", "--rate", "150", "--volume", str(0.1 + 0.2), "--ttl", "1.5", "--pitch", "60", "--voice", "en")
     assert "volume 0.3, " in shared.log
     before = settings(shared)
@@ -91,24 +89,14 @@ def test_what_is_printed_can_be_given_back(shared: Talk) -> None:
     assert settings(shared) == before
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--rate", "79"], ["--rate", "451"], ["--rate", "fast"], ["--rate", "100.5"], ["--volume", "1.01"],
-        ["--volume", "-0.1"], ["--volume", "nan"], ["--volume", "inf"], ["--pitch", "101"], ["--pitch", "-1"],
-        ["--ttl", "-1"], ["--ttl", "nan"], ["--ttl", "inf"], ["--voice", ""], ["--rate"],
-    ],
-)  # fmt: skip
-def test_out_of_range_is_a_usage_error_and_nothing_is_changed(shared: Talk, words: list[str]) -> None:
-    done = shared.run("set", "--pitch", "60", *words)
-    assert (done.code, done.out, words[0] in done.err) == (2, "", True)
-    as_json = shared.run("--json", "set", *words)
-    assert json.loads(as_json.err)["error"]["exit"] == 2
+def test_a_wrong_value_changes_nothing(shared: Talk) -> None:
+    for words in (["--rate", "79"], ["--volume", "nan"], ["--ttl", "inf"], ["--voice", ""], ["60"]):
+        done = shared.run("set", "--pitch", "60", *words)
+        assert (done.code, done.out, words[0] in done.err) == (2, "", True)
     assert settings(shared) == DEFAULTS
-    assert shared.run("set", "60").code == 2
 
 
-def test_unknown_voice_is_told_with_what_comes_near(shared: Talk) -> None:
+def test_an_unknown_voice_is_told_with_one_that_comes_near(shared: Talk) -> None:
     done = shared.run("set", "--rate", "150", "--voice", "scirpted")
     assert (done.code, done.out) == (2, "")
     assert "did you mean 'scripted'?" in done.err
@@ -118,13 +106,13 @@ def test_unknown_voice_is_told_with_what_comes_near(shared: Talk) -> None:
     assert settings(shared) == DEFAULTS
 
 
-def test_variables_of_serve_change_nothing(shared: Talk) -> None:
+def test_the_variables_of_serve_change_nothing(shared: Talk) -> None:
     env = {**shared.env, "TALK_RATE": "100", "TALK_VOLUME": "0.1", "TALK_VOICE": "none"}
     assert run([*TALK, "set", "--pitch", "50"], env).code == 0
     assert settings(shared) == DEFAULTS
 
 
-def test_changes_hold_for_what_comes(make_talk: MakeTalk) -> None:
+def test_changes_hold_for_later_goals(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     talk.run("set", "--rate", "450", "--ttl", "30")
     fast = json.loads(talk.run("--json", "say", "--wait", "one two three").out)
@@ -134,7 +122,7 @@ def test_changes_hold_for_what_comes(make_talk: MakeTalk) -> None:
     assert slow["duration"] > fast["duration"] * 1.5
 
 
-def test_preempt_holds_for_what_comes(scripted: Talk) -> None:
+def test_preempt_holds_for_later_goals(scripted: Talk) -> None:
     first = scripted.run("say", "never-ends").id
     scripted.watcher.wait_for_word(first)
     scripted.run("set", "--preempt")
@@ -142,7 +130,7 @@ def test_preempt_holds_for_what_comes(scripted: Talk) -> None:
     assert scripted.goal(first)["state"] == "PREEMPTED"
 
 
-def test_serve_begins_with_its_options(make_talk: MakeTalk) -> None:
+def test_serve_starts_with_its_options(make_talk: MakeTalk) -> None:
     talk = make_talk("--ttl", "0.5", "--rate", "100", "--pitch", "40", "--preempt", "--lead-in", "250", scripted=True)
     assert settings(talk) == {**DEFAULTS, "ttl": "0.5", "rate": "100", "pitch": "40", "preempt": "yes"}
     server = json.loads(talk.run("--json", "status").out)["server"]
@@ -159,25 +147,14 @@ def test_serve_begins_with_its_options(make_talk: MakeTalk) -> None:
     talk.run("cancel")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [["--ttl", "-1"], ["--ttl", "nan"], ["--ttl", "inf"], ["--lead-in", "-1"], ["--lead-in", "5001"], ["--voice", ""]],
-)
-def test_serve_refuses_what_is_out_of_range(words: list[str]) -> None:
+@pytest.mark.parametrize("words", [["--ttl", "nan"], ["--lead-in", "-1"], ["--voice", ""]])
+def test_serve_refuses_wrong_values(words: list[str]) -> None:
     with short_directory() as home:
         done = run([*TALK, "serve", *words], environment(home, TALK_SOCKET=f"{home}/s"))
     assert (done.code, done.out, words[0] in done.err) == (2, "", True)
 
 
-def test_help_of_serve_names_what_swallows_a_beginning() -> None:
-    with short_directory() as home:
-        words = " ".join(run([*TALK, "serve", "--help"], environment(home, COLUMNS="80")).out.split())
+def test_help_of_serve_names_the_devices_that_swallow_a_beginning() -> None:
+    words = " ".join((surface.HERE / "help-serve.txt").read_text("utf-8").split())
     for each in ("HDMI", "USB", "Bluetooth", "aplay -L", "pactl list short sinks", "[default: 0"):
         assert each in words
-
-
-def test_without_a_server_it_is_3() -> None:
-    with short_directory() as home:
-        for words in ([], ["--rate", "100"]):
-            done = run([*TALK, "set", *words], environment(home, TALK_SOCKET=f"{home}/s"))
-            assert (done.code, done.out) == (3, "")
