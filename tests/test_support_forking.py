@@ -1,4 +1,4 @@
-"""A forked `talk` behaves as one that was started: its end, its streams, its surroundings, and that it dies with us."""
+"""A forked `talk` behaves like a started one: its end, its streams, its environment; and it dies with its parent."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LIMIT = 20.0
 
 @pytest.fixture
 def env() -> Iterator[dict[str, str]]:
-    """An environment in which nobody serves."""
+    """Return an environment without a server."""
     with short_directory() as home:
         yield clean_environment(home, {"TALK_SOCKET": f"{home}/s"})
 
@@ -36,14 +36,14 @@ def piped(words: list[str], env: dict[str, str]) -> Forked:
 
 
 def ended(words: list[str], env: dict[str, str], text: str | None = None) -> tuple[int, str, str]:
-    """Return how a forked one ended, what it wrote to standard output, and to standard error."""
+    """Return the exit code, output and errors of a forked `talk`."""
     process = piped(words, env)
     out, err = process.communicate(text, LIMIT)
     return process.wait(LIMIT), out, err
 
 
 def serving(env: dict[str, str], *, session: bool = False) -> Forked:
-    """Return a server that serves."""
+    """Return a server that is ready."""
     words = ["serve", "--player", "null"]
     process = Forked(words, env, stderr=subprocess.PIPE, start_new_session=session)
     assert process.stderr
@@ -53,14 +53,9 @@ def serving(env: dict[str, str], *, session: bool = False) -> Forked:
 
 @pytest.mark.parametrize(
     ("words", "code", "out", "err"),
-    [
-        (["--version"], 0, "talk ", ""),
-        (["sya"], 2, "", "did you mean"),
-        (["status"], 3, "", "talk serve"),
-        (["cancel"], 3, "", "talk serve"),
-    ],
+    [(["--version"], 0, "talk ", ""), (["sya"], 2, "", "did you mean"), (["status"], 3, "", "talk serve")],
 )
-def test_it_ends_and_says_what_one_that_was_started_does(
+def test_it_ends_and_prints_as_a_started_one_does(
     env: dict[str, str], words: list[str], code: int, out: str, err: str
 ) -> None:
     found = ended(words, env)
@@ -78,14 +73,14 @@ def test_it_reads_its_standard_input(env: dict[str, str], tmp_path: pathlib.Path
 
 
 def test_a_signal_is_not_lost_however_early_it_comes(env: dict[str, str]) -> None:
-    for _ in range(30):
+    for _ in range(10):
         reading = piped(["say", "-"], env)  # which would wait for ever
         reading.send_signal(signal.SIGINT)
         assert reading.wait(LIMIT) in (130, -signal.SIGINT)
         reading.communicate(timeout=LIMIT)
 
 
-def test_its_streams_may_be_files_and_one_another(env: dict[str, str], tmp_path: pathlib.Path) -> None:
+def test_its_streams_may_be_files(env: dict[str, str], tmp_path: pathlib.Path) -> None:
     with open(tmp_path / "both", "wb") as both, Forked(["status"], env, stdout=both.fileno(), stderr=subprocess.STDOUT):
         pass
     assert "talk serve" in (tmp_path / "both").read_text("utf-8")
@@ -93,10 +88,11 @@ def test_its_streams_may_be_files_and_one_another(env: dict[str, str], tmp_path:
     assert (nowhere.stdin, nowhere.stdout, nowhere.stderr, nowhere.wait(LIMIT)) == (None, None, None, 3)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
-def test_a_signal_that_kills_it_is_a_negative_code(env: dict[str, str], number: signal.Signals) -> None:
-    with serving(env) as process:
+def test_a_signal_that_kills_it_is_a_negative_code(env: dict[str, str]) -> None:
+    number = signal.SIGSEGV
+    with serving(env, session=True) as process:
         assert process.poll() is None
+        assert os.getsid(process.pid) == process.pid != os.getsid(0)
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(0.01)
         process.send_signal(number)
@@ -105,7 +101,7 @@ def test_a_signal_that_kills_it_is_a_negative_code(env: dict[str, str], number: 
         process.send_signal(number)  # it is gone, and nobody else is hit
 
 
-def test_sigint_and_sigterm_are_told_as_a_shell_tells_them(env: dict[str, str]) -> None:
+def test_sigint_and_sigterm_give_a_shell_s_exit_codes(env: dict[str, str]) -> None:
     with serving(env) as server:
         for number in (signal.SIGINT, signal.SIGTERM):
             client = piped(["watch"], env)
@@ -128,12 +124,6 @@ def test_its_environment_and_directory_are_its_own(env: dict[str, str], tmp_path
             patch.chdir(tmp_path / each)
             assert ended(["say", "-o", "here.wav", each], env) == (0, "", "")
     assert sorted(tmp_path.glob("*/here.wav")) == [tmp_path / "one/here.wav", tmp_path / "two/here.wav"]
-
-
-def test_it_has_a_session_of_its_own_if_asked(env: dict[str, str]) -> None:
-    with serving(env, session=True) as process:
-        assert os.getsid(process.pid) == process.pid != os.getsid(0)
-        process.kill()
 
 
 def test_it_is_killed_with_the_process_that_forks(env: dict[str, str]) -> None:
@@ -162,7 +152,7 @@ def test_it_is_killed_with_the_process_that_forks(env: dict[str, str]) -> None:
     [{"PYTHONPATH": "/elsewhere"}, {"PYTHONUTF8": "0"}, {"LD_PRELOAD": "lib.so"}, {"LC_ALL": "C"}, {"LANG": "C"}],
     ids=lambda each: next(iter(each)),
 )
-def test_no_process_is_forked_whose_interpreter_libraries_or_locale_differ(
+def test_a_process_whose_interpreter_libraries_or_locale_differ_is_not_forked(
     env: dict[str, str], extra: dict[str, str]
 ) -> None:
     assert forks(env)
