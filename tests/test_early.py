@@ -1,4 +1,4 @@
-"""A request that is sent before the rest of the client is imported: once, and owned from its first moment."""
+"""A request is sent once, before the rest of the client is imported, and its goal is cancelled with the client."""
 
 from __future__ import annotations
 
@@ -25,44 +25,59 @@ from tests.support.scripted_peer import GREETING, Peer, goal, result, serving
 from tests.support.surroundings import clean_environment, short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from tests.support.processes import Talk
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_before_the_client_is_whole_cancels_the_goal_that_was_sent(number: signal.Signals) -> None:
+def start(path: str) -> subprocess.Popen[str]:
+    """Start `talk say --wait hello` with the server at this place."""
+    env = clean_environment(os.path.dirname(path), {"TALK_SOCKET": path})
+    words = [*TALK, "say", "--wait", "hello"]
+    return subprocess.Popen(words, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@contextlib.contextmanager
+def listening_at(path: str, backlog: int = 8) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(path)
+        listening.listen(backlog)
+        yield listening
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_signal_before_all_is_imported_cancels_the_goal_that_was_sent(number: signal.Signals) -> None:
     def play(peer: Peer) -> None:
         asked = peer.receive("say")
-        # At this moment the client has its request out, and most of its modules before it.
+        # At this moment the client has sent its request, and has most of its modules still to import.
         client.send_signal(number)
         peer.send({"seq": asked["seq"], "ok": True, "goal": goal("PENDING")})
         peer.reply("cancel")
         peer.send(result("RECALLED"))
 
     with serving(play) as path:
-        client = subprocess.Popen(
-            [*TALK, "say", "--wait", "hello"],
-            env=clean_environment(os.path.dirname(path), {"TALK_SOCKET": path}),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        client = start(path)
         out, err = client.communicate(timeout=PATIENCE)
     assert (client.returncode, out) == (128 + number, "g\n"), err
 
 
 def assert_hello_is_sent_once(serve: Callable[[socket.socket], None], said: list[dict[str, Any]]) -> None:
-    """Have `talk say hello` meet this server, which leaves in `said` what it was asked."""
-    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
-        listening.bind(f"{directory}/s")
-        listening.listen()
+    """Run `talk say hello` with this server, which appends the requests that it gets to `said`."""
+    with short_directory() as directory, listening_at(f"{directory}/s") as listening:
         thread = threading.Thread(target=serve, args=[listening], daemon=True)
         thread.start()
         done = run([*TALK, "say", "hello"], clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}))
         thread.join(PATIENCE)
     assert (done.code, done.out, done.err) == (0, "g\n", "")
     assert said == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
+
+
+def answer(connected: socket.socket, said: list[dict[str, Any]]) -> None:
+    """Read two requests, accept the goal, and read until the client hangs up."""
+    with connected.makefile("rb") as file:
+        said.extend(json.loads(file.readline()) for _ in range(2))
+        connected.sendall(json.dumps({"seq": said[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
+        said.extend(json.loads(each) for each in file)
 
 
 @pytest.mark.parametrize(
@@ -76,24 +91,22 @@ def assert_hello_is_sent_once(serve: Callable[[socket.socket], None], said: list
     ],
     ids=["at once", "in parts", "late", "written otherwise", "with more"],
 )
-def test_it_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> None:
+def test_a_request_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> None:
     said: list[dict[str, Any]] = []
 
     def serve(listening: socket.socket) -> None:
         connected, _ = listening.accept()
-        with connected, connected.makefile("rb") as file:
+        with connected:
             for part in greeting:
                 connected.sendall(part)
-                time.sleep(0.3 if part is not greeting[-1] else 0)  # more than a client waits before it is whole
-            said.extend(json.loads(file.readline()) for _ in range(2))
-            connected.sendall(json.dumps({"seq": said[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
-            said.extend(json.loads(each) for each in file)
+                time.sleep(0.3 if part is not greeting[-1] else 0)  # longer than a client waits before it imports all
+            answer(connected, said)
 
     assert_hello_is_sent_once(serve, said)
 
 
-def test_a_server_that_hangs_up_on_whoever_asks_early_is_asked_once_more() -> None:
-    """As one does that ends, where a socket unit starts the next."""
+def test_a_server_that_hangs_up_is_asked_once_more() -> None:
+    """As if the server ended, and a socket unit started the next one."""
     said: list[dict[str, Any]] = []
 
     def serve(listening: socket.socket) -> None:
@@ -101,16 +114,15 @@ def test_a_server_that_hangs_up_on_whoever_asks_early_is_asked_once_more() -> No
         with connected:
             connected.recv(1, socket.MSG_PEEK)  # unread when it is closed, which breaks the connection
         connected, _ = listening.accept()
-        with connected, connected.makefile("rb") as file:
+        with connected:
             connected.sendall(GREETING)
-            said.extend(json.loads(file.readline()) for _ in range(2))
-            connected.sendall(json.dumps({"seq": said[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
+            answer(connected, said)
 
     assert_hello_is_sent_once(serve, said)
 
 
 def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
-    """What it costs whoever waits for the first word: none of what follows is there when the request is out."""
+    """These imports would delay the first word."""
     code = (
         "import sys\n"
         "from talkcli.client import connect\n"
@@ -131,8 +143,8 @@ def test_the_request_goes_before_the_client_is_imported(scripted: Talk) -> None:
         assert [done.out.splitlines()[each] for each in (0, -1) if done.out] == ["[]", "False"], done
 
 
-def test_who_waits_for_a_goal_imports_nothing_until_the_server_has_had_its_time(scripted: Talk) -> None:
-    """They would run beside the engine and the player until the first sound."""
+def test_a_client_that_waits_imports_nothing_until_the_server_has_had_its_time(scripted: Talk) -> None:
+    """The imports would compete with the engine and the player until the first sound."""
     code = (
         "import sys\n"
         "from talkcli.client import connect\n"
@@ -192,18 +204,9 @@ def test_plain_commands_import_neither_click_nor_anything_heavy(scripted: Talk) 
     assert done.out.splitlines()[-1] == "[]", done
 
 
-def test_ctrl_c_before_anything_was_sent_is_no_traceback() -> None:
-    """The server has taken up the connection, and does not greet."""
-    with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
-        listening.bind(f"{directory}/s")
-        listening.listen()
-        client = subprocess.Popen(
-            [*TALK, "say", "--wait", "hello"],
-            env=clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+def test_ctrl_c_before_the_server_has_greeted_is_no_traceback() -> None:
+    with short_directory() as directory, listening_at(f"{directory}/s") as listening:
+        client = start(f"{directory}/s")
         connected, _ = listening.accept()
         with connected:
             assert connected.recv(65536) == b'{"request": "hello"}\n'
@@ -218,9 +221,7 @@ def test_a_server_whose_backlog_is_full_is_not_passed_over_for_the_next_place() 
         first, second = f"{directory}/runtime/talk/talk.sock", f"{directory}/runtime-{os.getuid()}/talk/talk.sock"
         for each in (first, second):
             os.makedirs(os.path.dirname(each))
-            listening = stack.enter_context(socket.socket(socket.AF_UNIX))
-            listening.bind(each)
-            listening.listen(0 if each == first else 8)
+            listening = stack.enter_context(listening_at(each, 0 if each == first else 8))
         with contextlib.suppress(BlockingIOError):
             while True:
                 waiting = stack.enter_context(socket.socket(socket.AF_UNIX))
@@ -258,9 +259,7 @@ def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(ear
         first, second = f"{directory}/first", f"{directory}/second"
         patch.setattr("talkcli.paths.client_sockets", lambda _: [first, second])
         for path, greeting in ((first, refusal), (second, GREETING)):
-            listening = stack.enter_context(socket.socket(socket.AF_UNIX))
-            listening.bind(path)
-            listening.listen()
+            listening = stack.enter_context(listening_at(path))
             thread = threading.Thread(target=serve, args=(listening, greeting), daemon=True)
             thread.start()
             stack.callback(thread.join, PATIENCE)

@@ -1,7 +1,8 @@
-"""Plain command lines, read without click: alike, whatever is typed; and sent before the rest is imported."""
+"""Plain command lines are read without click, but alike, and sent before the rest is imported."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -25,67 +26,36 @@ from talkcli.protocol.lines import encode, write_request
 from talkcli.protocol.requests import Hello, Pause, Resume, Status
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
 PLAIN = [each.name for each in COMMANDS.values() if each.plain]
-#: What a goal is given on a command line.
+#: The options of a goal.
 GIVEN = [each.name for each in Say.options if each.flags and each.name not in {"wait", "feedback"}]
 TYPED = ParameterSource.COMMANDLINE
 ROWS = [*COMMON, *(option for each in COMMANDS.values() if each.plain for option in each.options)]
 SPELLINGS = {form: each for each in ROWS for part in each.flags.split("/") for form in part.split(", ")}
 OPTIONS = sorted(SPELLINGS)
 VALUES = [
-    "0",
-    "1",
-    "7",
-    "0.5",
-    "1.0",
-    "80",
-    "451",
-    "-3",
-    "+5",
-    "1_0",
-    " 5",
-    "1e3",
-    ".5",
-    "5.",
-    "nan",
-    "inf",
-    "",
-    "٣",
+    *("0", "1", "7", "0.5", "1.0", "80", "451", "-3", "+5", "1_0", " 5", "1e3", ".5", "5.", "nan", "inf", "", "٣"),
     "9" * 30,
 ]
 WORDS = [
-    *OPTIONS,
-    *OPTIONS,
-    *PLAIN,
+    *(*OPTIONS, *OPTIONS, *PLAIN, *VALUES),
     *(f"{option}={value}" for option in OPTIONS for value in ("", "5", "a b", "-x")),
-    *VALUES,
     *("-wq", "-wf", "-t5", "-qt", "--", "-", "--wai", "--help", "-h", "--version", "--lines", "-o", "x.wav", "serve"),
-    *(
-        "battery low",
-        "4k7f-12",
-        "12",
-        "Grüße",
-        'a "quoted" word',
-        "back\\slash",
-        "two\nlines",
-        "-x",
-        "\udc80",
-        "\x1b[1m",
-    ),
+    *("4k7f-12", "12", "Grüße", "back\\slash", "-x", "battery low", 'a "quoted" word', "two\nlines", "\udc80"),
+    "\x1b[1m",
 ]
 FLAGS = [form for form, each in SPELLINGS.items() if each.kind is FLAG]
-#: Mostly what is plain: a flag, an option with a value that fits most, words; and now and then anything.
+VALUED = st.tuples(st.sampled_from(OPTIONS), st.sampled_from(["1", "0.5", "90", "k"]))
+#: Mostly plain pieces: a flag, an option with a value that fits most, words; and now and then anything.
 PIECES = st.one_of(
     st.sampled_from(FLAGS).map(lambda each: [each]),
-    st.tuples(st.sampled_from(OPTIONS), st.sampled_from(["1", "0.5", "90", "k"])).map(list),
-    st.tuples(st.sampled_from(OPTIONS), st.sampled_from(["1", "0.5", "90", "k"]))
-    .map("=".join)
-    .map(lambda each: [each]),
+    VALUED.map(list),
+    VALUED.map("=".join).map(lambda each: [each]),
     st.sampled_from([["battery low"], ["12"], ["4k7f-12"], ["Grüße"], ["--", "-3 degrees"]]),
     st.sampled_from(WORDS).map(lambda each: [each]),
 )
@@ -99,7 +69,7 @@ ENVIRONMENTS = st.sampled_from([{}, {"TALK_NAME": "patrol"}, {"TALK_NAME": ""}])
 
 
 def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], Common]:
-    """Return what click reads: the command, its options and arguments, and the common ones; UsageError."""
+    """Return the command, its options and arguments, and the common ones, as click reads them; UsageError."""
     options = Common()
     with talk.make_context("talk", list(arguments), obj=options) as group:
         name, command, rest = talk.resolve_command(group, [*group._protected_args, *group.args])
@@ -110,15 +80,21 @@ def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], Common]:
             return name, context.params, options
 
 
-def assert_read_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
+@contextlib.contextmanager
+def named(environment: Mapping[str, str]) -> Iterator[None]:
+    """Have this variable for the name of the sender, or none."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("TALK_NAME", raising=False)
         for name, value in environment.items():
             patch.setenv(name, value)
-        found = plain.read(arguments, os.environ)
-        if not found:
-            return
-        command, params, options = by_click(arguments)
+        yield
+
+
+def assert_read_alike(arguments: list[str]) -> None:
+    found = plain.read(arguments, os.environ)
+    if not found:
+        return
+    command, params, options = by_click(arguments)
     assert (found.command.name, found.given) == (command, params)
     assert {*found.typed} == {each.name for each in found.command.options if each.name in options.typed}
     assert found.common.get("socket") == options.socket
@@ -126,17 +102,37 @@ def assert_read_alike(arguments: list[str], environment: Mapping[str, str]) -> N
     assert (found.common.get("json", False), found.common.get("quiet", False)) == (options.json, options.quiet)
 
 
+def assert_sent_as_by_the_library(arguments: list[str]) -> None:
+    found = plain.read(arguments, os.environ)
+    sent = found and sent_early(found)
+    if not found or not sent:
+        return
+    request = library_sends(found)[1]
+    assert sent == written(found)
+    if isinstance(request, Say):
+        check(request)
+        assert too_long(request) is None
+
+
 @settings(max_examples=200, deadline=None)
 @given(LINES, ENVIRONMENTS)
-def test_both_read_any_line_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
-    assert_read_alike(arguments, environment)
+def test_any_line_is_read_as_by_click_and_sent_as_by_the_library(
+    arguments: list[str], environment: Mapping[str, str]
+) -> None:
+    with named(environment):
+        assert_read_alike(arguments)
+        assert_sent_as_by_the_library(arguments)
 
 
 @pytest.mark.slow
 @settings(max_examples=5000, deadline=None)
 @given(LINES, ENVIRONMENTS)
-def test_both_read_thousands_of_lines_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
-    assert_read_alike(arguments, environment)
+def test_thousands_of_lines_are_read_as_by_click_and_sent_as_by_the_library(
+    arguments: list[str], environment: Mapping[str, str]
+) -> None:
+    with named(environment):
+        assert_read_alike(arguments)
+        assert_sent_as_by_the_library(arguments)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +150,7 @@ def test_both_read_thousands_of_lines_alike(arguments: list[str], environment: M
         ["wait", "12", "-t", "10", "-f"],
     ],
 )
-def test_what_scripts_say_is_plain(line: list[str]) -> None:
+def test_the_lines_of_scripts_are_plain(line: list[str]) -> None:
     assert plain.read(line, {})
 
 
@@ -162,35 +158,23 @@ def test_what_scripts_say_is_plain(line: list[str]) -> None:
     "line",
     [
         *([], ["serve"], ["sya", "hello"], ["--version"], ["say", "-h"], ["say"], ["say", "--lines", "x"]),
-        *(
-            ["say", "--wiat", "x"],
-            ["say", "-x"],
-            ["say", "x", "--rate", "79"],
-            ["say", "x", "--rate"],
-            ["say", "-w5", "x"],
-        ),
-        *(["say", "x", "--flush", "--queue"], ["say", "x", "-t", "5"], ["say", "-wt", "0", "x"], ["status", "1", "2"]),
-        *(
-            ["say", "x", "--ttl", "nan"],
-            ["say", "x", "--key", ""],
-            ["say", "x", "--key", "k" * 65],
-            ["say", "x", "--priority", "1000001"],
-            ["say", "x", "--wait=1"],
-            ["say", "-o", "x.wav", "x"],
-        ),
+        *(["say", "--wiat", "x"], ["say", "-x"], ["say", "x", "--rate", "79"], ["say", "x", "--rate"]),
+        *(["say", "-w5", "x"], ["say", "x", "--flush", "--queue"], ["say", "x", "-t", "5"], ["say", "-wt", "0", "x"]),
+        *(["status", "1", "2"], ["say", "x", "--ttl", "nan"], ["say", "x", "--key", ""], ["say", "x", "--wait=1"]),
+        *(["say", "x", "--key", "k" * 65], ["say", "x", "--priority", "1000001"], ["say", "-o", "x.wav", "x"]),
     ],
 )
-def test_anything_else_is_click_s(line: list[str]) -> None:
+def test_any_other_line_is_left_to_click(line: list[str]) -> None:
     assert plain.read(line, {}) is None
 
 
 def sent_early(found: plain.Plain) -> tuple[JsonObject, JsonObject] | None:
-    """Return what is said early for a command, None where nothing is."""
+    """Return the requests that are sent early for a command; None if there are none."""
     return plain.first(found) if plain.asks_at_once(found) else None
 
 
 def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
-    """Return what the client library says for a command, with no way of its own around `requests`."""
+    """Return the requests that the client library sends for a command."""
     name, command = found.given.get("name") or os.environ.get("TALK_NAME") or None, found.command.name
     hello = Hello(name, urgent=command in {"cancel", "status"})
     if command == "say":
@@ -205,44 +189,14 @@ def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
 
 
 def written(found: plain.Plain) -> tuple[JsonObject, JsonObject]:
-    """Return what the client library says for a command, as it goes over the wire."""
+    """Return the requests that the client library sends for a command, as they go over the wire."""
     hello, request = library_sends(found)
     return write_request(hello), write_request(request)
 
 
-def assert_sent_as_by_the_library(arguments: list[str], environment: Mapping[str, str]) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.delenv("TALK_NAME", raising=False)
-        for name, value in environment.items():
-            patch.setenv(name, value)
-        found = plain.read(arguments, os.environ)
-        sent = found and sent_early(found)
-        if not found or not sent:
-            return
-        request = library_sends(found)[1]
-        assert sent == written(found)
-    if isinstance(request, Say):
-        check(request)
-        assert too_long(request) is None
-
-
-@settings(max_examples=200, deadline=None)
-@given(LINES, ENVIRONMENTS)
-def test_what_is_sent_early_is_what_the_library_sends(arguments: list[str], environment: Mapping[str, str]) -> None:
-    assert_sent_as_by_the_library(arguments, environment)
-
-
-@pytest.mark.slow
-@settings(max_examples=5000, deadline=None)
-@given(LINES, ENVIRONMENTS)
-def test_thousands_that_are_sent_early_are_what_the_library_sends(
-    arguments: list[str], environment: Mapping[str, str]
-) -> None:
-    assert_sent_as_by_the_library(arguments, environment)
-
-
+@settings(max_examples=50)
 @given(st.text(max_size=40))
-def test_any_text_goes_early_as_it_is(text: str) -> None:
+def test_any_text_is_sent_early_unchanged(text: str) -> None:
     found = plain.read(["say", "--", text], {})
     assert not found or text == "-" or sent_early(found) == (write_request(Hello()), write_request(Say(text)))
 
@@ -254,7 +208,7 @@ def test_any_text_goes_early_as_it_is(text: str) -> None:
         *(["cancel", "4k7f-12"], ["cancel", "--before", "x"], ["cancel", "--key", "k"], ["status", "4k7f-12"]),
     ],
 )
-def test_what_the_server_alone_judges_goes_early(line: list[str]) -> None:
+def test_a_request_that_only_the_server_judges_is_sent_early(line: list[str]) -> None:
     found = plain.read(line, {})
     assert found
     assert sent_early(found) == written(found)
@@ -269,17 +223,17 @@ def test_what_the_server_alone_judges_goes_early(line: list[str]) -> None:
         *(["status", "12"], ["status", "i" * 65], ["cancel", "--key", "k" * 65]),
     ],
 )
-def test_what_the_library_may_change_or_refuse_is_not_sent_early(line: list[str]) -> None:
+def test_a_request_that_the_library_may_change_or_refuse_is_not_sent_early(line: list[str]) -> None:
     found = plain.read(line, {})
     assert found
     assert sent_early(found) is None
 
 
-def test_the_greeting_that_is_looked_for_is_the_server_s() -> None:
+def test_the_expected_greeting_is_the_server_s() -> None:
     assert encode(events.greeting("0.1.0", 1, "4k7f")).startswith(GREETING)
     assert not encode(events.busy_greeting()).startswith(GREETING)
 
 
-def test_click_is_what_is_compared_with() -> None:
+def test_the_comparison_is_with_click() -> None:
     with pytest.raises(click.UsageError):
         by_click(["say", "--wiat", "x"])

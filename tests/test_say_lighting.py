@@ -1,15 +1,14 @@
-"""How a sentence is cut to the terminal while a word of it is heard: pure, whatever its characters are."""
+"""A sentence is cut to the width of the terminal while a word of it is lit, whatever its characters are."""
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.terminal.text import MORE, Sentence, printable, width
 
 LONG = "the quick brown fox jumps over the lazy dog"
-#: Plain, wide, combining, joined, escaped: what widths go wrong with.
+#: Characters whose widths are hard to tell: wide, combining, joined or escaped.
 ODD = st.text(st.sampled_from("ab .日本é\u0301👩\u200d💻❤\ufe0f🇩🇪\n\x1b\\\u202eﷺ"), max_size=80)
 
 
@@ -18,13 +17,13 @@ def word(text: str, view: str) -> tuple[int, int]:
     return start, start + len(view)
 
 
-def test_what_fits_is_shown_whole() -> None:
+def test_a_sentence_that_fits_is_shown_whole() -> None:
     assert Sentence("battery low").view(8, 11, 11) == ("battery ", "low", "")
     assert Sentence("battery low").view(0, 7, 80) == ("", "battery", " low")
     assert Sentence("").view(0, 0, 80) == ("", "", "")
 
 
-def test_a_long_text_is_cut_where_the_word_is_not() -> None:
+def test_a_long_text_is_cut_around_the_word() -> None:
     sentence = Sentence(LONG)
     assert sentence.view(*word(LONG, "the"), 20) == ("", "the", f" quick brown fox{MORE}")
     assert sentence.view(*word(LONG, "jumps"), 20) == (f"{MORE} fox ", "jumps", f" over th{MORE}")
@@ -66,7 +65,6 @@ def test_never_wider_than_the_terminal_and_never_anything_raw(text: str, start: 
         assert shown.removeprefix(MORE).removesuffix(MORE) in sentence.whole
 
 
-@pytest.mark.parametrize("heard", [0, 3, 7, 11, 99])
-def test_what_was_heard_and_what_was_not(heard: int) -> None:
-    before, after = Sentence("battery low").split(heard)
-    assert (before, after) == ("battery low"[:heard], "battery low"[heard:])
+def test_a_sentence_is_split_after_the_words_that_were_heard() -> None:
+    for heard in (0, 3, 7, 11, 99):
+        assert Sentence("battery low").split(heard) == ("battery low"[:heard], "battery low"[heard:])
