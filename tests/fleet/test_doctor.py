@@ -1,4 +1,4 @@
-"""`talk --robot anna doctor`: what stands between a desk, a broker and a robot, and what to do about it."""
+"""`talk --robot anna doctor` names the obstacles between a desk, a broker and a robot, and the next step."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import __version__
+from talkcli.cli.doctor import _examination
+from talkcli.cli.show import Common
 from talkcli.doctor import broker as judging
 from talkcli.doctor.broker import Allowed, Way
 from talkcli.errors import UsageError
@@ -30,15 +32,16 @@ if TYPE_CHECKING:
     from tests.fleet.robot import Robot
     from tests.support.processes import Finished, Talk
 
-#: Seconds in which it ends, whatever it finds: each of its steps has ten.
+#: Seconds in which the doctor ends, whatever it finds: each of its steps has ten.
 LIMIT = 60.0
-#: What there is to be found where all is well.
+#: The checks if all is well.
 WELL = ["broker", "login", "anonymous", "name", "rights", "bridge"]
 PRESENCE: dict[str, Any] = {
     "talk": 1, "version": __version__, "online": True, "session": "5e55", "since": 1000.0, "groups": ["warehouse"],
     "allow": ["status"], "server": {"boot": "4k7f", "pid": 4711, "version": __version__},
 }  # fmt: skip
 TLS = Named("broker.example", 8883, tls=True)
+SERVER: dict[str, object] = {"version": __version__, "engine": "ready", "pending": 0}
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +50,7 @@ def with_paho() -> None:
 
 
 def findings(done: Finished, code: int) -> dict[str, dict[str, str]]:
-    """Return the findings by their checks, in their order, and assert how it ended."""
+    """Return the findings by their checks, in their order, and assert the exit code."""
     assert (done.code, done.err) == (code, ""), done
     found = [json.loads(line) for line in done.out.splitlines()]
     for each in found:
@@ -59,25 +62,21 @@ def doctor(
     at: Broker, name: str = "anna", *, code: int = 4, user: str | None = None, password: str | bool = True,
     cert: str | None = None, env: Mapping[str, str] | None = None,
 ) -> dict[str, dict[str, str]]:  # fmt: skip
-    """Run it at a desk, and return what it finds."""
+    """Run the doctor at a desk, and return its findings."""
     with Desk(at, user=user, password=password, cert=cert, env=env) as desk:
         return findings(desk.run("--json", "--robot", name, "doctor", timeout=LIMIT), code)
 
 
 def is_there(at: Broker, name: str, user: str | None = None, cert: str | None = None, **changed: object) -> None:
-    """Have the broker keep that a robot is there."""
+    """Have the broker keep the presence of a robot."""
     with Listener(at, user=user, cert=cert) as listener:
         listener.publish(topics.robot(name, topics.PRESENCE), PRESENCE | changed, retain=True)
-
-
-def last(found: Mapping[str, Mapping[str, str]]) -> Mapping[str, str]:
-    return list(found.values())[-1]
 
 
 # With a robot
 
 
-def test_a_robot_that_answers_is_asked_by_all_that_is_between_and_nothing_is_left(robot: Robot) -> None:
+def test_a_robot_that_answers_is_asked_and_nothing_is_left_behind(robot: Robot) -> None:
     with Listener(robot.broker, "talk/#") as listener:
         found = findings(robot.desk("--json", "doctor", timeout=LIMIT), 0)
         assert list(found) == WELL
@@ -90,19 +89,11 @@ def test_a_robot_that_answers_is_asked_by_all_that_is_between_and_nothing_is_lef
             topics.robot("anna", each) for each in (topics.PRESENCE, topics.STATUS)
         }
     assert robot.bridge.running
-    done = robot.desk("doctor")
-    assert done.err == "talk: the robot answers; 1 warning\n"
+    assert robot.desk("doctor").err == "talk: the robot answers; 1 warning\n"
     assert not robot.talk.run("log").out
 
 
-def test_a_robot_whose_speech_is_paused_answers_with_a_warning(lasting_robot: Robot) -> None:
-    lasting_robot.talk.run("pause")
-    found = findings(lasting_robot.desk("--json", "doctor"), 0)
-    lasting_robot.talk.run("resume")
-    assert (found["bridge"]["state"], found["bridge"]["next"]) == ("warning", "talk --robot anna resume")
-
-
-def test_a_bridge_goes_on_while_its_own_user_asks_the_doctor(robot: Robot) -> None:
+def test_a_bridge_is_not_disturbed_if_its_own_user_runs_the_doctor(robot: Robot) -> None:
     with Desk(robot.broker, env={"TALK_MQTT_USER": "anna"}) as desk:
         found = findings(desk.run("--json", "--robot", "anna", "doctor"), 0)
     assert list(found) == WELL[:-1]
@@ -111,24 +102,23 @@ def test_a_bridge_goes_on_while_its_own_user_asks_the_doctor(robot: Robot) -> No
     assert "doctor" not in robot.bridge.log
 
 
-def test_a_variable_names_the_robot_as_the_option_does(broker: Broker) -> None:
-    is_there(broker, "anna", online=False)
-    with Desk(broker, env={"TALK_ROBOT": "anna"}) as desk:
-        assert "name" in findings(desk.run("--json", "doctor"), 4)
-        assert "python" in findings(desk.run("--json", "--socket", "/nowhere", "doctor", timeout=LIMIT), 4)
+def test_a_variable_names_the_robot_as_the_option_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TALK_ROBOT", "anna")
+    options = Common()
+    assert isinstance(_examination(options, {}, silent=False), judging.Examination)
+    options.socket = "/nowhere"
+    assert not isinstance(_examination(options, {}, silent=False), judging.Examination)
 
 
 @pytest.mark.slow
-def test_a_bridge_that_says_nothing_is_told_from_a_robot_that_is_there(broker: Broker) -> None:
+def test_a_silent_bridge_is_told_from_an_online_robot(broker: Broker) -> None:
     is_there(broker, "anna")
     began = time.monotonic()
     found = doctor(broker)
     assert time.monotonic() - began < 20
     assert list(found) == WELL
-    assert found["name"]["state"] == "ok"
-    assert (found["bridge"]["state"], found["bridge"]["next"]) == (
-        "failed", "see what the bridge's log says, on anna: journalctl -u talk-bridge",
-    )  # fmt: skip
+    assert (found["name"]["state"], found["bridge"]["state"]) == ("ok", "failed")
+    assert found["bridge"]["next"] == "see what the bridge's log says, on anna: journalctl -u talk-bridge"
 
 
 def test_a_robot_that_is_offline_or_has_no_server_is_not_asked(broker: Broker) -> None:
@@ -141,8 +131,8 @@ def test_a_robot_that_is_offline_or_has_no_server_is_not_asked(broker: Broker) -
         assert found["name"]["message"].endswith(words)
 
 
-def test_a_name_that_nobody_has_comes_with_those_that_are_near() -> None:
-    """Asked both at once: each waits a second for what the broker may keep."""
+def test_an_unknown_name_is_told_with_those_that_come_near() -> None:
+    """Both doctors run at once, as each waits a second for the broker's retained messages."""
     with Broker(users={"olga": "o"}, anonymous=True) as broker, Desk(broker, user="olga") as desk:
         is_there(broker, "anna")
         clients = [desk.start("--json", "--robot", name, "doctor") for name in ("Ana", "zebra")]
@@ -150,13 +140,13 @@ def test_a_name_that_nobody_has_comes_with_those_that_are_near() -> None:
     assert near["name"]["message"] == "the broker knows no robot 'Ana'; it knows anna"
     assert near["name"]["next"] == "talk --robot anna doctor"
     assert far["name"]["next"] == "on the robot: talk bridge --name zebra"
-    assert near["anonymous"]["state"] == "warning"  # it lets users in, and anybody besides
+    assert near["anonymous"]["state"] == "warning"  # it lets its users in, and anybody else
 
 
 # Rights
 
 
-def test_an_operator_may_ask_and_a_login_without_the_lines_of_one_is_told_what_it_may_not(
+def test_an_operator_may_ask_and_another_login_is_told_its_missing_rights(
     scripted: Talk, secure_broker: Broker, make_bridge: MakeBridge
 ) -> None:
     make_bridge(scripted, secure_broker, "anna", user="anna", observer=OPERATORS[0])
@@ -171,7 +161,7 @@ def test_an_operator_may_ask_and_a_login_without_the_lines_of_one_is_told_what_i
     assert list(found) == ["broker", "certificate", *WELL[1:-1]]
 
 
-def test_a_robot_itself_finds_out_whether_its_bridge_may_speak(secure_broker: Broker) -> None:
+def test_a_robot_itself_learns_whether_its_bridge_may_speak(secure_broker: Broker) -> None:
     with Listener(secure_broker, "talk/#", user="olga") as listener:
         with Desk(secure_broker, user="anna") as desk:
             done = desk.run("--robot", "anna", "doctor")
@@ -183,7 +173,7 @@ def test_a_robot_itself_finds_out_whether_its_bridge_may_speak(secure_broker: Br
         assert not [each for each in listener.messages if each.retain and not each.topic.endswith("/presence")]
 
 
-def test_what_a_robot_may_not_write_and_does_not_hear_is_named() -> None:
+def test_topics_that_a_robot_may_not_write_or_read_are_named() -> None:
     acl = "pattern read talk/robot/%u/presence\npattern write talk/robot/%u/echo\npattern write talk/reply/+/+/%u\n"
     with Broker(users={"anna": "a"}, acl=acl) as broker:
         found = doctor(broker, user="anna")
@@ -192,7 +182,7 @@ def test_what_a_robot_may_not_write_and_does_not_hear_is_named() -> None:
     assert found["rights"]["next"].endswith("talk bridge --print-acl")
 
 
-# The way there, and who is let in
+# The way to the broker, and the login
 
 
 @pytest.mark.parametrize(
@@ -205,31 +195,29 @@ def test_what_a_robot_may_not_write_and_does_not_hear_is_named() -> None:
         ({"TALK_BROKER": "mqtt://no-such.invalid"}, ":1883: no such host", "spell the host in TALK_BROKER rightly"),
     ],
 )
-def test_variables_that_name_no_broker_are_told(broker: Broker, changed: dict[str, str], words: str, step: str) -> None:
-    found = doctor(broker, env=changed)
-    assert list(found) == ["broker"]
-    assert found["broker"]["state"] == "failed"
-    assert words in found["broker"]["message"]
-    assert found["broker"]["next"].startswith(step)
+def test_variables_that_name_no_broker_are_told(changed: dict[str, str], words: str, step: str) -> None:
+    (found,) = judging.Examination("anna", {"TALK_BROKER": f"mqtt://{HOST}", **changed}).findings()
+    assert (found.check, found.state) == ("broker", "failed")
+    assert words in found.message
+    assert str(found.next).startswith(step)
 
 
-def test_where_nobody_listens_the_connection_is_refused(broker: Broker) -> None:
+def test_a_refused_connection_is_named() -> None:
     with Port() as port:
-        found = doctor(broker, env={"TALK_BROKER": f"mqtt://{HOST}:{port.number}"})
-    assert list(found) == ["broker"]
-    assert found["broker"]["message"] == f"mqtt://{HOST}:{port.number}: connection refused"
-    assert f"'listener {port.number}'" in found["broker"]["next"]
+        (found,) = judging.Examination("anna", {"TALK_BROKER": f"mqtt://{HOST}:{port.number}"}).findings()
+    assert (found.check, found.message) == ("broker", f"mqtt://{HOST}:{port.number}: connection refused")
+    assert f"'listener {port.number}'" in str(found.next)
 
 
 @pytest.mark.slow
-def test_what_listens_and_says_nothing_is_no_broker(broker: Broker) -> None:
+def test_a_silent_port_is_no_broker() -> None:
     with socket.create_server((HOST, 0)) as mute:
-        found = doctor(broker, env={"TALK_BROKER": f"mqtt://{HOST}:{mute.getsockname()[1]}"})
-    assert list(found) == ["broker", "login"]
-    assert found["login"]["message"].endswith("does not answer: nothing in 5 s")
+        found = list(judging.Examination("anna", {"TALK_BROKER": f"mqtt://{HOST}:{mute.getsockname()[1]}"}).findings())
+    assert [each.check for each in found] == ["broker", "login"]
+    assert found[-1].message.endswith("does not answer: nothing in 5 s")
 
 
-def test_a_certificate_that_is_not_to_be_trusted_ends_it(secure_broker: Broker, broker: Broker) -> None:
+def test_an_untrusted_certificate_ends_the_examination(secure_broker: Broker, broker: Broker) -> None:
     found = doctor(secure_broker, user="olga", env={"TALK_MQTT_CA": stranger().file})
     assert list(found) == ["broker", "certificate"]
     assert "unable to get local issuer certificate" in found["certificate"]["message"]
@@ -239,37 +227,31 @@ def test_a_certificate_that_is_not_to_be_trusted_ends_it(secure_broker: Broker, 
     assert "certificate has expired" in found["certificate"]["message"]
     assert "set this machine's clock" in found["certificate"]["next"]
     url = broker.url.replace("mqtt:", "mqtts:")
-    assert (
-        "name the port that has TLS"
-        in doctor(secure_broker, user="olga", env={"TALK_BROKER": url})["certificate"]["next"]
-    )
+    found = doctor(secure_broker, user="olga", env={"TALK_BROKER": url})
+    assert "name the port that has TLS" in found["certificate"]["next"]
 
 
-def test_a_login_that_is_refused_says_as_whom_and_what_to_set(secure_broker: Broker) -> None:
+def test_a_refused_login_is_told_with_the_variables_to_set(secure_broker: Broker) -> None:
     found = doctor(secure_broker, user="olga", password="wrong")
-    assert last(found)["check"] == "login"
+    assert [*found][-1] == "login"
     assert "does not let 'olga' in" in found["login"]["message"]
     assert found["login"]["next"].startswith("log in as somebody whom it knows: TALK_MQTT_USER")
+    url = secure_broker.url.replace("mqtts:", "mqtt:")
+    found = doctor(secure_broker, env={"TALK_BROKER": url, "TALK_MQTT_CA": ""})
+    assert [*found][-1] == "login"
+    where = f"where port {secure_broker.port} is for TLS: TALK_BROKER={secure_broker.url}"
+    assert found["login"]["next"].endswith(where)
 
 
-def test_a_certificate_is_a_login_and_without_one_nobody_is_let_in() -> None:
+def test_a_certificate_is_a_login_and_a_client_without_one_is_not_let_in() -> None:
     with Broker(certificates=True) as broker:
         is_there(broker, "anna", cert="anna", online=False)
         found = doctor(broker, cert="olga", env={"TALK_MQTT_USER": "olga"})
         assert found["login"]["message"] == "as 'olga', with a certificate"
         assert found["anonymous"]["state"] == "ok"
         found = doctor(broker)
-        assert last(found)["check"] == "login"
+        assert [*found][-1] == "login"
         assert "TALK_MQTT_CERT and TALK_MQTT_KEY name " in found["login"]["next"]
-
-
-def test_a_port_that_is_for_tls_is_told(secure_broker: Broker) -> None:
-    url = secure_broker.url.replace("mqtts:", "mqtt:")
-    found = doctor(secure_broker, env={"TALK_BROKER": url, "TALK_MQTT_CA": ""})
-    assert last(found)["check"] == "login"
-    assert found["login"]["next"].endswith(
-        f"where port {secure_broker.port} is for TLS: TALK_BROKER={secure_broker.url}"
-    )
 
 
 def test_an_interrupt_ends_it_while_it_waits() -> None:
@@ -292,30 +274,42 @@ def test_a_name_that_no_robot_can_have_is_a_usage_error() -> None:
         judging.Examination("a/b", {})
 
 
-@pytest.mark.parametrize(("days", "state"), [(13, "warning"), (15, "ok")])
-def test_a_certificate_is_renewed_two_weeks_before_its_end(days: int, state: str) -> None:
-    (found,) = judging.judge_certificate(TLS, Way(until=1e9 + days * 86400), 1e9, near=False)
-    assert found.state == state
-    assert "the system's CAs" in found.message
+PLAIN = Named("broker.example", 1883, tls=False)
 
 
-def test_another_host_s_certificate_is_a_matter_of_the_name() -> None:
-    way = Way(untrusted="Hostname mismatch", fault=62)
-    (found,) = judging.judge_certificate(TLS, way, 1e9, near=False)
-    assert (found.state, found.next and found.next[:26]) == ("failed", "name the host in TALK_BROK")
+@pytest.mark.parametrize(
+    ("broker", "way", "near", "state", "words", "step"),
+    [
+        (TLS, Way(until=1e9 + 13 * 86400), False, "warning", "the system's CAs", "renew the certificate"),
+        (TLS, Way(until=1e9 + 15 * 86400), False, "ok", "the system's CAs", "None"),
+        (TLS, Way(untrusted="Hostname mismatch", fault=62), False, "failed", "mismatch", "name the host in TALK_BROK"),
+        (PLAIN, Way(), False, "warning", "none: ", "give the broker a certificate"),
+        (PLAIN, Way(), True, None, "", ""),
+    ],
+)
+def test_a_certificate_is_judged_by_its_end_its_name_and_the_distance(
+    broker: Named, way: Way, near: bool, state: str | None, words: str, step: str
+) -> None:
+    found = judging.judge_certificate(broker, way, 1e9, near=near)
+    assert [each.state for each in found] == ([] if state is None else [state])
+    for each in found:
+        assert words in each.message
+        assert str(each.next).startswith(step)
 
 
-def test_without_tls_another_machine_s_broker_is_warned_of() -> None:
-    plain = Named("broker.example", 1883, tls=False)
-    assert [each.state for each in judging.judge_certificate(plain, Way(), 1e9, near=False)] == ["warning"]
-    assert judging.judge_certificate(plain, Way(), 1e9, near=True) == []
-
-
-def test_a_broker_that_hangs_up_on_what_is_not_allowed_is_told_from_one_that_refuses() -> None:
+def test_a_broker_that_hangs_up_on_a_forbidden_topic_is_told_from_one_that_refuses_it() -> None:
     found = judging.judge_rights("olga", Allowed(None, (), ("talk/reply/olga/1/_",), "the broker went away"))
     assert (found.state, found.message) == ("failed", "what 'olga' may do can't be found out: the broker went away")
 
 
-def test_an_engine_that_is_not_ready_is_a_warning() -> None:
-    server: dict[str, object] = {"version": __version__, "engine": "failed", "pending": 0}
-    assert judging.judge_bridge("anna", server, 0.001).state == "warning"
+@pytest.mark.parametrize(
+    ("change", "state", "step"),
+    [
+        ({}, "ok", None),
+        ({"engine": "failed"}, "warning", "on anna: talk doctor"),
+        ({"paused": True}, "warning", "talk --robot anna resume"),
+    ],
+)
+def test_the_server_s_own_words_are_judged(change: dict[str, object], state: str, step: str | None) -> None:
+    found = judging.judge_bridge("anna", SERVER | change, 0.001)
+    assert (found.state, found.next) == (state, step)
