@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import espeakng_loader
@@ -26,8 +27,7 @@ from tests.faults.test_users import NOBODY, impostor
 from tests.support.surroundings import clean_environment, short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
+    from collections.abc import Iterator
 
     from talkcli.doctor.report import Finding
     from tests.conftest import MakeTalk
@@ -49,126 +49,86 @@ PW_NODES = """
 
 @pytest.fixture
 def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A directory for all sockets of a user who names none."""
+    """Return a directory in which all usual places of a socket are, but for the system's."""
     with short_directory() as path:
         os.makedirs(f"{path}/run/talk", 0o700)
-        monkeypatch.delenv("TALK_SOCKET", raising=False)
         monkeypatch.setenv("TMPDIR", path)
         monkeypatch.setenv("XDG_RUNTIME_DIR", f"{path}/run")
         yield path
 
 
-def no_server() -> Finding:
-    """Return what is found instead of a server."""
-    client, found = server.connect(None, None)
+def no_server(named: str | None = None) -> Finding:
+    """Return what is found instead of a server, with this TALK_SOCKET."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TALK_SOCKET", named or "")
+        client, found = server.connect(None, None)
     assert client is None
     finding = server.judge_places(found)
     assert finding.state == FAILED
     return finding
 
 
-def leave_socket(path: str) -> None:
+@pytest.mark.usefixtures("nobody_serves")
+def test_each_usual_place_is_named_with_what_is_there(home: str) -> None:
+    path = f"{home}/run/talk/talk.sock"
+
+    def check(words: str, step: str) -> None:
+        found = no_server()
+        others = ("/run/talk/talk.sock: not there", f"{home}/runtime-{os.getuid()}/talk/talk.sock: not there")
+        assert [each for each in (f"{path}: {words}", *others) if each not in found.message] == []
+        assert found.next == step
+
+    check("not there", "talk serve")
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(path)
+    check("nobody answers: left over from a server", "talk serve (it takes the place of what was left over)")
+    os.unlink(path)
+    write(Path(path), "")
+    check("a file, and no socket", f"remove {path}, and: talk serve")
 
 
-def leave_file(path: str) -> None:
-    with open(path, "w"):
-        pass
-
-
-@pytest.mark.usefixtures("nobody_serves")
-@pytest.mark.parametrize(
-    ("put", "words", "step"),
-    [
-        (lambda _: None, "not there", "talk serve"),
-        (
-            leave_socket,
-            "nobody answers: left over from a server that ended",
-            "talk serve (it takes the place of what was left over)",
-        ),
-        (leave_file, "a file, and no socket", "remove {path}, and: talk serve"),
-    ],
-)
-def test_each_usual_place_is_named_with_what_is_there(
-    home: str, put: Callable[[str], None], words: str, step: str
-) -> None:
-    path = f"{home}/run/talk/talk.sock"
-    put(path)
-    found = no_server()
-    for each in (f"{path}: {words}", "/run/talk/talk.sock: not", f"{home}/runtime-{os.getuid()}/talk/talk.sock: not"):
-        assert each in found.message
-    assert found.next == step.format(path=path)
-
-
-@pytest.mark.parametrize(
-    ("name", "words", "step"),
-    [
-        ("run", "run: a directory, and", "name the socket in it: TALK_SOCKET={home}/run/talk.sock"),
-        ("file", "file: a file, and no", "unset TALK_SOCKET, or name a socket"),
-    ],
-)
-def test_a_named_place_that_is_no_socket_is_told(
-    home: str, monkeypatch: pytest.MonkeyPatch, name: str, words: str, step: str
-) -> None:
-    leave_file(f"{home}/file")
-    monkeypatch.setenv("TALK_SOCKET", f"{home}/{name}")
-    found = no_server()
-    assert words in found.message
-    assert found.next == step.format(home=home)
+def test_a_named_place_that_is_no_socket_is_told(home: str) -> None:
+    found = no_server(f"{home}/run")
+    assert f"{home}/run: a directory, and" in found.message
+    assert found.next == f"name the socket in it: TALK_SOCKET={home}/run/talk.sock"
+    write(Path(home, "file"), "")
+    found = no_server(f"{home}/file")
+    assert f"{home}/file: a file, and no" in found.message
+    assert found.next == "unset TALK_SOCKET, or name a socket"
 
 
 @pytest.mark.parametrize(
     ("greeting", "words", "step"),
     [
-        (b"220 mail ready\n", "is no talk server", "restart the server on"),
-        (b'{"talk": 2, "version": "9"}\n', "upgrade", "install the same talk on both sides"),
-        (b'{"talk": 1, "error": "permission_denied"}\n', "refuses", "--socket-mode 0660"),
+        ("220 mail ready", "is no talk server", "restart the server on"),
+        ('{"talk": 2, "version": "9"}', "upgrade", "install the same talk on both sides"),
+        ('{"talk": 1, "error": "permission_denied"}', "refuses", "--socket-mode 0660"),
     ],
 )
-def test_a_process_that_answers_and_takes_no_client_is_named(
-    home: str, monkeypatch: pytest.MonkeyPatch, greeting: bytes, words: str, step: str
-) -> None:
-    monkeypatch.setenv("TALK_SOCKET", f"{home}/s")
-    with FakeServer(f"{home}/s", [greeting], closes=True):
-        found = no_server()
+def test_a_process_that_answers_and_takes_no_client_is_named(home: str, greeting: str, words: str, step: str) -> None:
+    with FakeServer(f"{home}/s", [f"{greeting}\n".encode()], closes=True):
+        found = no_server(f"{home}/s")
     assert words in found.message
     assert step in str(found.next)
 
 
-@pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Give a server half a second to answer."""
+def test_a_server_that_is_stopped_or_full_is_named(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "SocketConnection", partial(SocketConnection, patience=0.5))
-
-
-@pytest.mark.usefixtures("impatient", "home")
-def test_a_server_that_is_stopped_is_named(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
-    talk = make_talk(scripted=True, watched=False)
-    monkeypatch.setenv("TALK_SOCKET", talk.socket)
+    talk = make_talk("--max-clients", "1", scripted=True, watched=False)
+    with talk.connect() as wire:
+        assert wire.request("hello")["ok"]
+        assert "--max-clients" in str(no_server(talk.socket).next)
     talk.freeze()
-    found = no_server()
+    found = no_server(talk.socket)
     talk.thaw()
     assert found.message.endswith(f"{talk.socket}: a process listens that is stopped")
     assert found.next == f"let it go on: kill -CONT {talk.pid}"
 
 
-@pytest.mark.usefixtures("impatient", "home")
-def test_a_full_server_is_named(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
-    talk = make_talk("--max-clients", "1", scripted=True, watched=False)
-    monkeypatch.setenv("TALK_SOCKET", talk.socket)
-    with talk.connect() as wire:
-        assert wire.request("hello")["ok"]
-        assert "--max-clients" in str(no_server().next)
-
-
-def test_a_wrong_variable_is_told_from_the_server_that_runs_elsewhere(
-    home: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_variable_is_told_from_the_server_that_runs_elsewhere(home: str) -> None:
     os.chmod(f"{home}/run", 0o700)
     with serving(environment(home, XDG_RUNTIME_DIR=f"{home}/run")):
-        monkeypatch.setenv("TALK_SOCKET", f"{home}/wrong")
-        found = no_server()
+        found = no_server(f"{home}/wrong")
     assert f"named by TALK_SOCKET: {home}/wrong: not there" in found.message
     assert found.next == f"unset TALK_SOCKET: a server is on {home}/run/talk/talk.sock"
 
@@ -192,47 +152,31 @@ def test_another_user_s_server_is_named_and_told_nothing(home: str) -> None:
 # Engine processes
 
 
-LOADER = "get_library_path = lambda: {!r}\nget_data_path = lambda: '/gone'"
+def unable(directory: Path, named: str | None = None) -> Finding:
+    """Return why an engine process cannot start that finds the modules and libraries of this directory first."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(directory)
+        env = environment(str(directory), LD_LIBRARY_PATH=str(directory))
+        found = voice.judge("2.99", voice.look(voice.Setting(voice=named, env=env)), server=None)[-1]
+    assert found.state == FAILED
+    return found
 
 
-@pytest.mark.parametrize(
-    ("files", "named", "check", "words", "step"),
-    [
-        (
-            {"espeakng_loader.py": "raise ModuleNotFoundError('no wheel', name='espeakng_loader')"},
-            *(None, "libespeak-ng", "libespeak-ng is missing", "apt-get install"),
-        ),
-        (
-            {"espeakng_loader.py": LOADER.format(f"{os.path.dirname(espeakng_loader.__file__)}/libespeak-ng.so")},
-            *(None, "libespeak-ng", "no espeak-ng data", "apt-get install"),
-        ),
-        (
-            {"pyttsx3.py": "import os\nos.kill(os.getpid(), 11)"},
-            *(None, "libespeak-ng", "SIGSEGV", "apt-get install"),
-        ),
-        ({}, "klingon-7", "voices", 'unknown voice "klingon-7"', "talk voices"),
-    ],
-    ids=["no library", "no data", "crash", "no such voice"],
-)
-def test_an_engine_that_cannot_start_says_why(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    files: dict[str, str],
-    named: str | None,
-    check: str,
-    words: str,
-    step: str,
-) -> None:
-    monkeypatch.syspath_prepend(tmp_path)
-    for name, text in files.items():
-        write(tmp_path / name, f"{text}\n")
-    if "espeakng_loader.py" in files:
-        (tmp_path / "libespeak-ng.so.1").write_bytes(b"no library")
-    env = environment(str(tmp_path), LD_LIBRARY_PATH=str(tmp_path))
-    found = voice.judge("2.99", voice.look(voice.Setting(voice=named, env=env)), server=None)[-1]
-    assert (found.check, found.state) == (check, FAILED)
-    assert words in found.message
-    assert step in str(found.next)
+def test_an_engine_that_cannot_start_says_why(tmp_path: Path) -> None:
+    found = unable(tmp_path, "klingon-7")
+    assert (found.check, 'unknown voice "klingon-7"' in found.message) == ("voices", True)
+    (tmp_path / "libespeak-ng.so.1").write_bytes(b"no library")
+    library = os.path.join(os.path.dirname(espeakng_loader.__file__), "libespeak-ng.so")
+    for name, text, words in (
+        ("espeakng_loader", "raise ModuleNotFoundError('', name='espeakng_loader')", "libespeak-ng is missing"),
+        ("espeakng_loader", f"get_library_path = lambda: {library!r}\nget_data_path = str", "no espeak-ng data"),
+        ("pyttsx3", "import os\nos.kill(os.getpid(), 11)", "SIGSEGV"),
+    ):
+        write(tmp_path / f"{name}.py", f"{text}\n")
+        found = unable(tmp_path)
+        assert (found.check, words in found.message) == ("libespeak-ng", True), found
+        assert "apt-get install" in str(found.next)
+        (tmp_path / f"{name}.py").unlink()
 
 
 # Programs
@@ -250,8 +194,7 @@ def test_the_output_of_a_program_is_kept_and_its_complaint_is_one_line(tmp_path:
     killed = sound.asked("killed", env=env_with(tmp_path, killed="kill -ILL $$"))
     assert killed.trouble == "it was killed by SIGILL"
     good, bad = sound.asked("good", env=env), sound.asked("bad", env=env)
-    assert good == sound.Said(None, "out\nC\n")
-    assert bad == sound.Said("first line", "\n")
+    assert (good, bad) == (sound.Said(None, "out\nC\n"), sound.Said("first line", "\n"))
     assert sound.asked("missing", env=env) == sound.Said("missing is not there")
     write(tmp_path / "broken", "#!/no/such/interpreter\n", 0o755)
     assert "No such file" in str(sound.asked("broken", env=env).trouble)
