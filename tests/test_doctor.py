@@ -1,4 +1,4 @@
-"""`talk doctor` beside a running server, and the sentence that it sends as any client would."""
+"""`talk doctor` as a command: beside a running server, and without one, when its own engine process plays."""
 
 from __future__ import annotations
 
@@ -8,29 +8,35 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import click
 import pytest
 
+import talkcli
 from talkcli import Client
-from talkcli.doctor import sentence
+from talkcli.doctor import examine, sentence, sound
+from talkcli.doctor.report import heard
 from talkcli.goals.states import State
-from tests.faults.broken import write
+from tests.conformance.bareserve import TALK, environment, serving
+from tests.conformance.rawsocket import FakeServer
+from tests.faults.broken import python_path, write
+from tests.faults.test_users import NOBODY, as_user
 from tests.support.compare import assert_silent, extent
 from tests.support.processes import Talk, run_talk
 from tests.support.real_voice import REAL_PACKAGE
-from tests.support.surroundings import clean_environment, needs
+from tests.support.surroundings import clean_environment, needs, short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-    from pathlib import Path
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
-    from tests.support.processes import Finished
     from tests.support.sink import Sink
 
 #: Checks that are made only if a neural voice is installed, as in CI.
@@ -54,17 +60,41 @@ def robot(sink: Sink) -> Iterator[Talk]:
         talk.stop()
 
 
-def doctor(talk: Talk, *options: str) -> tuple[Finished, dict[str, dict[str, str]]]:
-    """Return how the doctor ended, and its findings by their checks."""
-    done = talk.run("--json", "doctor", *options, timeout=LIMIT)
-    findings = [json.loads(line) for line in done.out.splitlines()]
+def doctor(
+    env: Mapping[str, str], *options: str, code: int = 4, command: Sequence[str] = ()
+) -> dict[str, dict[str, str]]:
+    """Run the doctor, by another command if one is named, and return its findings by their checks."""
+    words = ["--json", "doctor", *options]
+    if command:
+        done = subprocess.run(
+            [*command, *words], env=dict(env), cwd="/", capture_output=True, text=True, timeout=LIMIT, check=False
+        )
+        ended, out, err = done.returncode, done.stdout, done.stderr
+    else:
+        ended, out, err = run_talk(words, env, LIMIT)
+    assert (ended, err) == (code, ""), out
+    findings = [json.loads(line) for line in out.splitlines()]
     for each in findings:
         assert list(each) == ["check", "state", "message", "next"]
         assert each["state"] in {"ok", "warning", "failed"}
         assert (each["next"] is None) == (each["state"] == "ok"), each
+    assert [findings[each]["check"] for each in (0, -1)] == ["python", "sentence"]
     assert len({each["check"] for each in findings}) == len(findings)
-    assert done.code == (4 if any(each["state"] == "failed" for each in findings) else 0), done.out
-    return done, {each["check"]: each for each in findings}
+    assert code == (4 if any(each["state"] == "failed" for each in findings) else 0), out
+    return {each["check"]: each for each in findings}
+
+
+@pytest.fixture
+def home() -> Iterator[str]:
+    with short_directory() as path:
+        os.chmod(path, 0o755)
+        os.mkdir(f"{path}/run", 0o700)
+        yield path
+
+
+def quick(home: str) -> dict[str, str]:
+    """Return an environment without a server, in which the sentence goes to a file, which takes no time."""
+    return environment(home, TALK_PLAYER=f"file:{home}/said.wav", TALK_SOCKET=f"{home}/s")
 
 
 def logged(talk: Talk) -> list[Message]:
@@ -74,8 +104,8 @@ def logged(talk: Talk) -> list[Message]:
 
 def test_if_all_is_well_its_sentence_is_heard_as_its_own_goal(robot: Talk, sink: Sink) -> None:
     with sink.record() as recording:
-        done, found = doctor(robot)
-    assert (done.code, done.err, list(found)) == (0, "", CHECKS), done.out
+        found = doctor(robot.env, code=0)
+    assert list(found) == CHECKS
     assert "eSpeak NG" in found["libespeak-ng"]["message"]
     assert f"{robot.socket} (TALK_SOCKET, process {robot.pid})" in found["socket"]["message"]
     assert "plays to null" in found["sound server"]["message"]
@@ -111,8 +141,7 @@ def test_silent_waits_for_no_goal_and_leaves_none(robot: Talk) -> None:
     with Client(robot.socket) as client:
         first = client.say(LONG, rate=80)
         second = client.say("and one that waits")
-        done, found = doctor(robot, "--silent")
-        assert (done.code, found["sentence"]["state"]) == (0, "ok"), done.out
+        assert doctor(robot.env, "--silent", code=0)["sentence"]["state"] == "ok"
         status = client.status()
         assert (status.active and status.active.id, [each.id for each in status.pending]) == (first.id, [second.id])
         assert logged(robot) == before
@@ -122,10 +151,10 @@ def test_silent_waits_for_no_goal_and_leaves_none(robot: Talk) -> None:
 def test_a_muted_sink_fails_though_the_sentence_was_played(robot: Talk, sink: Sink) -> None:
     sink.pactl("set-sink-mute", "null", "1")
     try:
-        done, found = doctor(robot, "--silent")
+        found = doctor(robot.env, "--silent")
     finally:
         sink.pactl("set-sink-mute", "null", "0")
-    assert (done.code, found["sentence"]["state"]) == (4, "ok")
+    assert found["sentence"]["state"] == "ok"
     assert (found["loudness"]["state"], found["loudness"]["message"]) == ("failed", "the default sink is muted")
 
 
@@ -139,11 +168,10 @@ def test_the_sound_behind_a_forwarded_socket_is_not_looked_for_here(robot: Talk,
             assert forwarder.poll() is None
             time.sleep(0.01)  # it tells nobody
         with sink.record() as recording:
-            done, found = doctor(robot, "--socket", forwarded)
+            found = doctor(robot.env, "--socket", forwarded, code=0)
     finally:
         forwarder.kill()
         forwarder.wait()
-    assert done.code == 0, done.out
     assert "on another machine or in a container: run talk doctor there" in found["session"]["message"]
     assert not found.keys() & {"player", "device", "cards", "group", "sound server", "loudness"}
     assert "through the server, pulse" in found["sentence"]["message"]
@@ -182,8 +210,7 @@ def test_the_player_that_the_server_uses_is_tried_and_not_the_first_installed_on
     assert talk.run("say", "--wait", "one").code == 0
     assert talk.request("status")["server"]["player"] == "pacat"
     write(tmp_path / "aplay", f"#!/bin/sh\ncase $1 in -L) ;; *) touch {mark}; cat > /dev/null;; esac\n", 0o755)
-    done, found = doctor(talk, "--silent")
-    assert done.code == 0, done.out
+    found = doctor(talk.env, "--silent", code=0)
     assert found["player"]["message"].startswith("pacat (the server's)")
     assert found["device"]["message"].startswith("pactl list short sinks")
     assert ", pacat, " in found["sentence"]["message"]
@@ -199,8 +226,8 @@ def test_a_custom_player_that_fails_is_to_be_tried_by_hand(make_talk: MakeTalk) 
     shown = done.out.splitlines()[-1]
     assert "sentence      ABORTED, audio_" in shown
     assert shown.endswith(f"no such card -> {step}")
-    done, found = doctor(talk, "--silent")
-    assert (done.code, found["sentence"]["next"]) == (4, step)
+    found = doctor(talk.env, "--silent")
+    assert found["sentence"]["next"] == step
     assert found["recent goals"]["state"] == "warning"
     assert "the last goal ABORTED, " in found["recent goals"]["message"]
 
@@ -212,9 +239,8 @@ def test_a_sound_server_that_hangs_is_named_and_the_doctor_ends(
     sink = private_sink()
     talk = make_talk(sink=sink, forked=False)
     sink.freeze()
-    done, found = doctor(talk)
+    found = doctor(talk.env)
     sink.thaw()
-    assert done.code == 4
     assert found["sound server"]["state"] == "warning"
     assert "does not answer from the server" in found["sound server"]["message"]
     assert found["sentence"]["state"] == "failed"
@@ -290,3 +316,105 @@ def test_a_signal_cancels_its_sentence(scripted: Talk) -> None:
         while client.status().pending:
             assert time.monotonic() < end
         client.cancel()
+
+
+# Without a server
+
+
+@pytest.mark.usefixtures("nobody_serves")
+def test_its_own_engine_is_heard_and_the_server_is_what_is_missing(home: str, sink: Sink) -> None:
+    with sink.record() as recording:
+        found = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"))
+        recording.wait_until_quiet(0.2)
+    assert extent(recording.samples)
+    assert {each["check"] for each in found.values() if each["state"] == "failed"} == {"socket"}
+    assert found["socket"]["next"] == "unset TALK_SOCKET, or start a server there: talk serve"
+    assert "by an engine of this command's own, pulse" in found["sentence"]["message"]
+    assert "server" not in found
+
+
+@pytest.mark.usefixtures("nobody_serves")
+def test_without_any_sound_the_player_s_own_words_are_told(home: str) -> None:
+    needs("aplay")
+    found = doctor(environment(home, TALK_PLAYER="aplay", ALSA_CONFIG_PATH="/dev/null"))
+    assert found["sentence"]["message"].startswith("ABORTED, audio_device: aplay: audio open error")
+    assert found["sound server"]["state"] == "warning"
+    assert "PULSE_SERVER" in found["sound server"]["message"]
+
+
+def test_without_a_library_the_sentence_fails_as_the_engine_does(home: str, tmp_path: Path) -> None:
+    write(tmp_path / "pyttsx3.py", "raise ModuleNotFoundError('No module named pyttsx3', name='pyttsx3')\n")
+    found = doctor({**quick(home), **python_path(tmp_path)})
+    assert (found["pyttsx3"]["state"], found["sentence"]["state"]) == ("failed", "failed")
+    assert "pip install pyttsx3" in found["pyttsx3"]["next"]
+
+
+def test_a_server_that_goes_away_is_named(home: str) -> None:
+    greeting = b'{"talk": 1, "version": "0.1", "pid": 1, "boot": "abcd"}\n'
+    with FakeServer(f"{home}/s", [greeting], closes=True):
+        found = doctor(quick(home), "--silent")["server"]
+    assert found["state"] == "failed"
+    assert "went away" in found["message"]
+    assert "start it again" in found["next"]
+
+
+@pytest.mark.skipif(
+    os.getuid() != 0 or shutil.which("setpriv") is None, reason="only root can act as other users (and setpriv)"
+)
+def test_a_server_that_does_not_let_this_user_in_is_named(home: str) -> None:
+    needs("/usr/bin/python3")  # theirs: they may be able to read neither this checkout nor its interpreter
+    for package in (talkcli, click):
+        folder = os.path.dirname(str(package.__file__))
+        shutil.copytree(folder, f"{home}/lib/{package.__name__}", ignore=shutil.ignore_patterns("__pycache__"))
+    subprocess.run(["chmod", "-R", "a+rX", f"{home}/lib"], check=True)
+    ours = environment(home, TALK_SOCKET=f"{home}/s")
+    with serving(ours):
+        theirs = {**ours, "PYTHONPATH": f"{home}/lib", "PYTHONDONTWRITEBYTECODE": "1", "TALK_PLAYER": "null"}
+        found = doctor(theirs, command=[*as_user(NOBODY), "/usr/bin/python3", "-m", "talkcli"])
+    assert f"{home}/s: no permission (uid 0)" in found["socket"]["message"]
+    assert "have uid 0 let you in" in found["socket"]["next"]
+
+
+def test_programs_that_hang_delay_it_and_no_more(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("pactl", "aplay", "pw-cli"):
+        write(Path(home, "run", name), "#!/bin/sh\nexec sleep 98\n", 0o755)
+    env = environment(home, TALK_SOCKET=f"{home}/s")
+    env["PATH"] = f"{home}/run:{env['PATH']}"
+    monkeypatch.setattr(sound, "LIMIT", 0.3)
+    monkeypatch.setattr(examine, "LIMIT", 0.6)
+    for name in [each for each in os.environ if each not in env]:
+        monkeypatch.delenv(name)
+    for name, value in env.items():
+        monkeypatch.setenv(name, value)
+    began = time.monotonic()
+    findings = list(examine.Examination(None, silent=False).findings())
+    assert time.monotonic() - began < LIMIT / 2
+    assert not heard(findings)
+    found = {each.check: each.message for each in findings}
+    assert "no answer within 0.3 s" in found["device"]
+    assert "does not answer" in found["sound server"]
+
+
+def test_a_signal_ends_it_and_its_engine(home: str) -> None:
+    env = environment(home, TALK_SOCKET=f"{home}/s", TALK_PLAYER="sleep 97")
+    with subprocess.Popen([*TALK, "doctor"], env=env, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        for line in process.stdout:
+            if "socket" in line.split():
+                break
+        process.terminate()
+        assert process.wait(10) == 128 + 15
+
+
+def test_the_library_stays_out_of_its_own_process(home: str) -> None:
+    code = (
+        "import sys\nfrom talkcli.doctor.examine import Examination\n"
+        "found = [each.check for each in Examination(None, silent=True).findings()]\n"
+        "assert found[-1] == 'sentence'\n"
+        "print([each for each in ('pyttsx3', 'espeakng_loader', 'asyncio') if each in sys.modules], end='')\n"
+        "print('espeak' in open('/proc/self/maps').read() if sys.platform == 'linux' else False)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=quick(home), capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout == "[]False\n"

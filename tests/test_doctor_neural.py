@@ -25,7 +25,7 @@ from tests.engine.test_neural import WITHOUT
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_PACKAGE, REAL_VOICE, real_voice
 from tests.support.surroundings import needs_packages
-from tests.test_doctor_alone import doctor, home
+from tests.test_doctor import doctor, home
 
 if TYPE_CHECKING:
     from talkcli.doctor.report import Finding
@@ -65,8 +65,7 @@ def _found(used: str | None, env: dict[str, str], limit: float = LIMIT) -> dict[
 
 
 def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
-    found = {**alone, "TALK_VOICE": "piper/ti"}
-    checks = doctor(found)
+    checks = doctor({**alone, "TALK_VOICE": "piper/ti"})
     assert checks["neural"]["state"] == "ok"
     assert re.search(r"onnxruntime \d+\.\d+.*, numpy \d+\.\d+", checks["neural"]["message"])
     assert checks["voice files"] == {
