@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.client.connect import Begun, ask, connect, hello, reach, stand_back
-from talkcli.errors import AccessDenied
+from talkcli.cli.interrupts import Interrupts
+from talkcli.client.connect import Begun, ask, connect, hello, reach, ready, stand_back
+from talkcli.errors import EXIT_TIMEOUT, AccessDenied
 from talkcli.frozen import replace
 from talkcli.paths import client_sockets
 from tests.conformance.bareserve import TALK, run
@@ -272,3 +273,41 @@ def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(ear
         with pytest.raises(AccessDenied, match=f"(?s)tried:\n  {first}: the server refuses: not you\n"):
             connect(None, hello(None, urgent=False), begun=begun())
     assert set(heard) == {b'{"request": "hello"}\n'}, "what was asked is for the server that takes it"
+
+
+# Signals while a client waits
+
+
+def to_another_thread(number: signal.Signals) -> None:
+    """Have the kernel give a signal to a thread that is not the main one, which stays where it is."""
+    thread = threading.Thread(target=lambda: signal.pthread_kill(threading.get_ident(), number))
+    thread.start()
+    thread.join()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM])
+def test_a_signal_that_another_thread_is_given_ends_the_waiting(number: signal.Signals) -> None:
+    began = time.monotonic()
+    with Interrupts(60) as interrupts:
+        sender = threading.Timer(0.1, to_another_thread, [number])
+        sender.start()
+        ready({}, 10, interrupts.watched)
+    sender.join()
+    assert interrupts.exit_code == (EXIT_TIMEOUT if number == signal.SIGALRM else 128 + number)
+    assert time.monotonic() - began < 5
+    assert signal.set_wakeup_fd(-1) == -1  # nothing is left behind
+
+
+def test_of_what_is_cleared_only_a_first_signal_ends_anything() -> None:
+    with Interrupts() as interrupts:
+        signal.raise_signal(signal.SIGHUP)
+        interrupts.clear()
+        signal.raise_signal(signal.SIGHUP)
+        assert ready({}, 0.05, interrupts.watched) == set()
+    assert interrupts.number == signal.SIGHUP
+    with Interrupts() as interrupts:
+        interrupts.clear()
+        signal.raise_signal(signal.SIGTERM)
+        ready({}, 10, interrupts.watched)
+        pytest.fail("it was not interrupted")
+    assert interrupts.number == signal.SIGTERM

@@ -6,7 +6,10 @@ import signal
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from talkcli.terminal.text import MORE, Sentence, printable, width
 from tests.conformance.bareserve import TALK
 from tests.support.screen import Screen, Terminal
 
@@ -160,21 +163,14 @@ def test_a_failure_leaves_the_words_that_were_heard_and_its_reason(in_terminal: 
     assert last == ""
 
 
-@pytest.mark.parametrize("extra", [{"NO_COLOR": "1"}, {"TERM": "dumb"}])
 def test_a_terminal_without_colour_gets_one_line_per_event(
-    scripted: Talk, in_terminal: Callable[..., Terminal], extra: dict[str, str]
+    scripted: Talk, in_terminal: Callable[..., Terminal]
 ) -> None:
-    terminal = in_terminal("say", "-wf", "length=0.2", "low", **extra)
+    terminal = in_terminal("say", "-wf", "length=0.2", "low", NO_COLOR="1")
     assert terminal.finish() == 0
     goal_id = scripted.watcher.goals()[0]
-    assert terminal.screen.lines == [
-        f"{goal_id} PENDING",
-        f"{goal_id} ACTIVE",
-        f"{goal_id} word 1 0-10 0.000 length=0.2",
-        f"{goal_id} word 2 11-14 0.100 low",
-        f"{goal_id} SUCCEEDED",
-        "",
-    ]
+    events = ["PENDING", "ACTIVE", "word 1 0-10 0.000 length=0.2", "word 2 11-14 0.100 low", "SUCCEEDED"]
+    assert terminal.screen.lines == [*(f"{goal_id} {each}" for each in events), ""]
     assert b"\x1b" not in terminal.raw
 
 
@@ -227,3 +223,69 @@ def test_lines_that_are_typed_light_up_one_after_the_other(
 def test_the_doctor_is_named_when_a_goal_was_aborted_unless_its_text_has_no_words(scripted: Talk) -> None:
     for text, told in (("fail=audio_lost", True), ("fail=nothing_to_say", False), ("length=0", False)):
         assert scripted.run("say", "--wait", "--", text).err.endswith("; see 'talk doctor'\n") == told
+
+
+# How a sentence is cut to the terminal
+
+
+LONG = "the quick brown fox jumps over the lazy dog"
+#: Characters whose widths are hard to tell: wide, combining, joined or escaped.
+ODD = st.text(st.sampled_from("ab .日本é\u0301👩\u200d💻❤\ufe0f🇩🇪\n\x1b\\\u202eﷺ"), max_size=80)
+
+
+def word(text: str, view: str) -> tuple[int, int]:
+    start = text.index(view)
+    return start, start + len(view)
+
+
+def test_a_sentence_that_fits_is_shown_whole() -> None:
+    assert Sentence("battery low").view(8, 11, 11) == ("battery ", "low", "")
+    assert Sentence("battery low").view(0, 7, 80) == ("", "battery", " low")
+    assert Sentence("").view(0, 0, 80) == ("", "", "")
+
+
+def test_a_long_text_is_cut_around_the_word() -> None:
+    sentence = Sentence(LONG)
+    assert sentence.view(*word(LONG, "the"), 20) == ("", "the", f" quick brown fox{MORE}")
+    assert sentence.view(*word(LONG, "jumps"), 20) == (f"{MORE} fox ", "jumps", f" over th{MORE}")
+    assert sentence.view(*word(LONG, "dog"), 20) == (f"{MORE}s over the lazy ", "dog", "")
+
+
+def test_a_word_wider_than_the_terminal_shows_its_beginning() -> None:
+    heard, lit, ahead = Sentence("a" * 50 + " " + "b" * 50).view(51, 101, 12)
+    assert lit.startswith("bbb")
+    assert ahead == MORE
+    assert width(heard + lit + ahead) <= 12
+
+
+def test_wide_characters_take_two_columns() -> None:
+    assert [width(each) for each in ("a", "日", "ｱ", "Ａ", "👩", "e\u0301", "…")] == [1, 2, 1, 2, 2, 1, 1]
+    assert width("❤\ufe0f") == width("🇩🇪") / 2 == 2  # drawn by some terminals in fewer, by none in more
+    heard, lit, ahead = Sentence("日本語" * 10).view(12, 15, 11)
+    assert width(heard + lit + ahead) <= 11
+    assert lit == "日本語"
+
+
+def test_control_and_bidi_characters_are_shown_escaped_and_still_lit_in_place() -> None:
+    text = "a\x1b[31m \u202ered\nnext"
+    assert Sentence(text).view(*word(text, "next"), 80)[:2] == ("a\\x1b[31m \\u202ered\\n", "next")
+
+
+@given(text=ODD, start=st.integers(-3, 90), length=st.integers(-3, 30), columns=st.integers(-2, 60))
+def test_never_wider_than_the_terminal_and_never_anything_raw(text: str, start: int, length: int, columns: int) -> None:
+    sentence = Sentence(text)
+    assert sentence.whole == printable(text)
+    heard, lit, ahead = sentence.view(start, start + length, columns)
+    shown = heard + lit + ahead
+    assert width(shown) <= max(0, columns)
+    assert shown.isprintable() or all(each.isprintable() or each in "\u0301\ufe0f" for each in shown)
+    if width(sentence.whole) <= columns:
+        assert shown == sentence.whole
+    elif columns >= 15 and 0 <= start < len(text) and length > 0:
+        assert lit
+        assert shown.removeprefix(MORE).removesuffix(MORE) in sentence.whole
+
+
+def test_a_sentence_is_split_after_the_words_that_were_heard() -> None:
+    for heard in (0, 3, 7, 11, 99):
+        assert Sentence("battery low").split(heard) == ("battery low"[:heard], "battery low"[heard:])

@@ -1,4 +1,4 @@
-"""A server that uses no neural voice imports nothing for them, though the extra and voices are installed.
+"""A server and clients that use no extra import nothing for it, and a missing extra is told with its package.
 
 The imports of a process are the cost of its start. A module that is not imported takes no memory and starts no thread.
 """
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import install
 from talkcli.engine.synthesizers.models import NEEDED
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.engine.test_neural import NEURAL_MODULES
@@ -23,11 +24,47 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+# A fleet
+
+
+COMMANDS = (["status"], ["say", "--wait", "hello"], ["--json", "log"], ["doctor", "--help"], ["bridge", "--help"])
+
+
+@pytest.mark.usefixtures("nobody_serves")
+def test_neither_server_nor_clients_import_anything_for_fleets(tmp_path: Path) -> None:
+    with short_directory() as home:
+        os.mkdir(f"{home}/run", 0o700)
+        env = spied(tmp_path, environment(home, XDG_RUNTIME_DIR=f"{home}/run"))  # as a user who names no socket
+        with serving(env):
+            for command in COMMANDS:
+                done = run([*TALK, *command], env)
+                assert done.code == 0, done
+    found = imported(tmp_path)
+    assert len(found) > len(COMMANDS)
+    for names in found.values():
+        assert "talkcli" in names
+        assert not {each for each in names if f"{each}.".startswith(("paho.", "talkcli.fleet."))}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--robot", "anna", "status"], ["say", "--robot", "anna", "hello"], ["--robot", "anna", "doctor"], ["watch"]],
+)
+def test_without_the_extra_a_fleet_tells_what_to_install(words: list[str], tmp_path: Path) -> None:
+    env = spied(tmp_path, environment(str(tmp_path), TALK_ROBOT="anna", TALK_BROKER="mqtt://127.0.0.1"), ["paho"])
+    done = run([*TALK, *words], env)
+    assert (done.code, done.out) == (2, "")
+    assert done.err == f"talk: a fleet needs paho-mqtt: {install.command('paho-mqtt')}\n"
+
+
+# Neural voices
+
+
 #: The modules that only neural voices use; a server needs the others of `NEURAL_MODULES` anyway.
 OWN = {*NEEDED, *(each for each in NEURAL_MODULES if each.startswith("talkcli."))}
 #: kB by which memory differs from one start to the next.
 SLACK = 400
-COMMANDS = (["voices"], ["status"], ["say", "--wait", "hello"])
+ASKED = (["voices"], ["status"], ["say", "--wait", "hello"])
 
 
 @dataclass(frozen=True)
@@ -48,7 +85,7 @@ def measure(directory: Path, *options: str, without: Sequence[str] = ()) -> Cost
         env = environment(home, TALK_SOCKET=f"{home}/s", TALK_VOICES=str(directory / "voices"))
         env = spied(directory, env, without)
         with serving(env, *options) as server:
-            for command in COMMANDS:
+            for command in ASKED:
                 done = run([*TALK, *command], env)
                 assert done.code == 0, done
                 assert command != ["voices"] or "piper/tiny" in done.out

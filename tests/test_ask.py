@@ -1,0 +1,303 @@
+"""The commands that ask the server: `talk status`, `talk set` and `talk cancel`, as people and scripts see them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.terminal.text import width
+from tests.conformance.bareserve import TALK, environment, run
+from tests.golden import surface
+from tests.support.processes import Talk
+from tests.support.surroundings import short_directory
+from tests.support.terminal import Terminal
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.conftest import MakeTalk
+
+LONG = "please step back from the door and from the lift " * 3
+DEFAULTS = {"rate": "200", "volume": "1", "voice": "default", "pitch": "50", "preempt": "no", "ttl": "0"}
+
+
+# talk status
+
+
+@pytest.fixture
+def busy(scripted: Talk) -> Talk:
+    """A server with goals that have ended, one that is being spoken and two that wait."""
+    scripted.run("say", "--wait", "length=0")
+    scripted.run("say", "--wait", "--", f"fail=audio_lost {LONG}")
+    active = scripted.run("say", "--", f"never-ends {LONG}").id
+    scripted.watcher.wait_for_word(active)
+    scripted.run("say", "--priority", "7", "--key", "battery, low", "--ttl", "90", "battery low")
+    scripted.run("say", "--id", "door:open", "--as", "patrol", "the door is open")
+    return scripted
+
+
+def test_it_shows_the_settings_and_all_that_is_known_of_each_goal(busy: Talk) -> None:
+    done = busy.run("status")
+    lines = done.out.splitlines()
+    assert (done.code, done.err) == (0, "")
+    assert [each[:9].rstrip() for each in lines] == ["server", "engine", "settings", "now", "queue", "", "said", ""]
+    assert re.match(r'now      \w{4}-\d+ +ACTIVE     "never-ends please .*"  from \S.*, for \d+\.\d s$', lines[3])
+    assert re.search(r'"battery low"  from \S.*, priority 7, key "battery, low", (1 min )?\d+ s left$', lines[4])
+    assert re.search(r'door:open +PENDING    "the door is open"  from "patrol" \(\S.*, pid \d+\)$', lines[5])
+    assert "SUCCEEDED" in lines[6]
+    assert lines[7].endswith("audio_lost: scripted audio_lost")
+    assert LONG in lines[7]  # in a pipe no text is cut that has fewer than 200 characters
+
+
+@pytest.mark.parametrize("columns", [60, 120])
+def test_it_fits_the_terminal(busy: Talk, columns: int) -> None:
+    with Terminal([*TALK, "status"], {"TERM": "xterm", **busy.env}, columns) as shown:
+        assert shown.finish() == 0
+        lines = shown.lines
+    assert max(map(width, lines)) <= columns
+    words = " ".join(" ".join(lines).split())
+    for each in (f"pid {busy.pid} on {busy.socket}", "256 clients", "driver scripted", "voice default", "audio_l"):
+        assert each in words
+    assert 'from "patrol"' in words
+    assert columns < 120 or "priority" in words  # what does not fit is cut at its end
+    goals = [each for each in lines if "PENDING" in each]
+    assert goals[0].index('"') == goals[1].index('"')
+    assert b"\x1b[1;32mACTIVE" in shown.raw
+
+
+def test_one_goal_is_shown_with_all_that_is_known(busy: Talk) -> None:
+    pending = json.loads(busy.run("--json", "status").out)["pending"][0]
+    lines = dict(each.split(None, 1) for each in busy.run("status", pending["id"]).out.splitlines())
+    assert lines["state"] == "PENDING"
+    assert (lines["priority"], lines["key"], lines["text"]) == ("7", '"battery, low"', '"battery low"')
+    assert re.fullmatch(r"90 s, (1 min \d+ s|\d+\.\d s) left", lines["ttl"])
+    busy.request("say", text="with data", id="d", data={"room": "d'été\x1b"})
+    lines = dict(each.split(None, 1) for each in busy.run("status", "d").out.splitlines())
+    assert lines["data"] == r'{"room": "d' + "'" + r'été\\u001b"}'
+    assert lines["priority"] == "0"
+    assert not {"key", "ttl", "started", "reason"} & lines.keys()
+    number = pending["id"].partition("-")[2]
+    assert f"id       {pending['id']}\n" in busy.run("status", number).out
+
+
+def test_a_foreign_key_is_escaped_and_a_long_text_is_cut_at_200_characters(scripted: Talk) -> None:
+    active = scripted.run("say", "never-ends").id
+    scripted.watcher.wait_for_word(active)
+    goal_id = scripted.request("say", text="x" * 300, key="a\x1b[31m\n\u202eb")["goal"]["id"]
+    for words in (["status"], ["status", goal_id]):
+        shown = scripted.run(*words).out
+        assert r'"a\x1b[31m\n\u202eb"' in shown
+        assert "\x1b" not in shown
+    assert f'"{"x" * 200}…"' in scripted.run("status").out
+    scripted.run("cancel")
+
+
+def test_ids_as_long_as_they_may_be_leave_room_for_the_text(scripted: Talk) -> None:
+    scripted.run("say", "--id", "i" * 64, "--wait", "length=0")
+    for command in ("status", "log"):
+        with Terminal([*TALK, command], {"TERM": "xterm", **scripted.env}, 80) as shown:
+            shown.finish()
+            line = next(each for each in shown.lines if "SUCCEEDED" in each)
+        assert width(line) <= 80
+        assert '"length=0"' in line
+        assert "i" * 64 in scripted.run(command).out
+
+
+@pytest.mark.parametrize("columns", [60, 120])
+def test_one_goal_fits_the_terminal_with_all_of_its_text(scripted: Talk, columns: int) -> None:
+    text = f"length=0 {'ten words of which none may be broken by a line ' * 6}".strip()
+    scripted.run("say", "--id", "long", "--wait", text)
+    with Terminal([*TALK, "status", "long"], {"TERM": "xterm", **scripted.env}, columns) as shown:
+        assert shown.finish() == 0
+        lines = shown.lines
+    assert max(map(width, lines)) <= columns
+    first = next(number for number, each in enumerate(lines) if each.startswith("text "))
+    more = [each for each in lines[first + 1 :] if each.startswith(" ")]
+    assert {each[:9] for each in more} == {" " * 9}
+    assert f'"{text}"' in " ".join(each[9:].rstrip() for each in lines)
+    assert f'text     "{text}"' in scripted.run("status", "long").out.splitlines()
+
+
+# talk set
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Talk]:
+    """A server for all tests that leave its settings as they were, or as they were by `shared`."""
+    with contextlib.closing(Talk(scripted=True)) as talk:
+        assert talk.run("voices").code == 0  # now they are known
+        yield talk
+        talk.stop()
+
+
+@pytest.fixture
+def shared(server: Talk) -> Talk:
+    """The same server, with the settings of the start."""
+    assert server.request("set", rate=200, volume=1.0, voice="default", pitch=50, preempt=False, ttl=0)["ok"]
+    return server
+
+
+def settings(talk: Talk) -> dict[str, str]:
+    """Return what `talk set` prints."""
+    done = talk.run("set")
+    assert (done.code, done.err) == (0, "")
+    return dict(each.split() for each in done.out.splitlines())
+
+
+def test_alone_it_prints_the_settings(shared: Talk) -> None:
+    assert settings(shared) == DEFAULTS
+    done = shared.run("set", "--json")
+    assert json.loads(done.out) == {
+        "rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None,
+    }  # fmt: skip
+    assert done.out.count("\n") == 1
+    done = shared.run("set", "--rate", "200")
+    assert (done.code, done.out, done.err) == (0, "", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value", "shown"),
+    [
+        (["--rate", "80"], "rate", 80, "80"),
+        (["--volume", "0.25"], "volume", 0.25, "0.25"),
+        (["--volume", "0"], "volume", 0.0, "0"),
+        (["--voice", "en"], "voice", "en", "en"),
+        (["--voice", "default"], "voice", None, "default"),
+        (["--pitch", "100"], "pitch", 100, "100"),
+        (["--preempt"], "preempt", True, "yes"),
+        (["--no-preempt"], "preempt", False, "no"),
+        (["--ttl", "2.5"], "ttl", 2.5, "2.5"),
+        (["--ttl", "0"], "ttl", None, "0"),
+    ],
+)
+def test_one_setting_is_changed_and_the_others_stay(
+    shared: Talk, words: list[str], name: str, value: object, shown: str
+) -> None:
+    changed = json.loads(shared.run("--json", "set", *words).out)
+    assert changed[name] == value
+    assert settings(shared) == {**DEFAULTS, name: shown}
+    described = shared.request("status")["server"]
+    assert {each: described[each] for each in changed} == changed
+
+
+def test_the_printed_settings_can_be_given_back(shared: Talk) -> None:
+    shared.run("set", "--rate", "150", "--volume", str(0.1 + 0.2), "--ttl", "1.5", "--pitch", "60", "--voice", "en")
+    assert "volume 0.3, " in shared.log
+    before = settings(shared)
+    words = [word for name, value in before.items() if name != "preempt" for word in (f"--{name}", value)]
+    assert shared.run("set", *words).code == 0
+    assert settings(shared) == before
+
+
+def test_a_wrong_value_changes_nothing(shared: Talk) -> None:
+    for words in (["--rate", "79"], ["--volume", "nan"], ["--ttl", "inf"], ["--voice", ""], ["60"]):
+        done = shared.run("set", "--pitch", "60", *words)
+        assert (done.code, done.out, words[0] in done.err) == (2, "", True)
+    assert settings(shared) == DEFAULTS
+
+
+def test_an_unknown_voice_is_told_with_one_that_comes_near(shared: Talk) -> None:
+    done = shared.run("set", "--rate", "150", "--voice", "scirpted")
+    assert (done.code, done.out) == (2, "")
+    assert "did you mean 'scripted'?" in done.err
+    error = json.loads(shared.run("--json", "set", "--voice", "x\x1b[31my").err)["error"]
+    assert (error["code"], error["exit"]) == ("unknown_voice", 2)
+    assert "\x1b" not in error["message"]
+    assert settings(shared) == DEFAULTS
+
+
+def test_the_variables_of_serve_change_nothing(shared: Talk) -> None:
+    env = {**shared.env, "TALK_RATE": "100", "TALK_VOLUME": "0.1", "TALK_VOICE": "none"}
+    assert run([*TALK, "set", "--pitch", "50"], env).code == 0
+    assert settings(shared) == DEFAULTS
+
+
+def test_changes_hold_for_later_goals(make_talk: MakeTalk) -> None:
+    talk = make_talk("--player", "null")
+    talk.run("set", "--rate", "450", "--ttl", "30")
+    fast = json.loads(talk.run("--json", "say", "--wait", "one two three").out)
+    talk.run("set", "--rate", "200", "--ttl", "0")
+    slow = json.loads(talk.run("--json", "say", "--wait", "one two three").out)
+    assert (fast["ttl"], slow["ttl"]) == (30, None)
+    assert slow["duration"] > fast["duration"] * 1.5
+
+
+def test_preempt_holds_for_later_goals(scripted: Talk) -> None:
+    first = scripted.run("say", "never-ends").id
+    scripted.watcher.wait_for_word(first)
+    scripted.run("set", "--preempt")
+    scripted.run("say", "--wait", "length=0")
+    assert scripted.goal(first)["state"] == "PREEMPTED"
+
+
+def test_serve_starts_with_its_options(make_talk: MakeTalk) -> None:
+    talk = make_talk("--ttl", "0.5", "--rate", "100", "--pitch", "40", "--preempt", "--lead-in", "250", scripted=True)
+    assert settings(talk) == {**DEFAULTS, "ttl": "0.5", "rate": "100", "pitch": "40", "preempt": "yes"}
+    server = json.loads(talk.run("--json", "status").out)["server"]
+    assert (server["ttl"], server["lead_in"]) == (0.5, 250)
+    status = talk.run("status").out
+    assert "ttl 0.5 s" in status
+    assert "lead-in 250 ms" in status
+    talk.run("set", "--no-preempt")
+    active = talk.run("say", "never-ends").id
+    talk.watcher.wait_for_word(active)
+    late = talk.run("say", "too late").id
+    assert talk.watcher.wait_for_terminal(late) == "RECALLED"
+    assert talk.goal(late)["reason"] == "expired"
+    talk.run("cancel")
+
+
+@pytest.mark.parametrize("words", [["--ttl", "nan"], ["--lead-in", "-1"], ["--voice", ""]])
+def test_serve_refuses_wrong_values(words: list[str]) -> None:
+    with short_directory() as home:
+        done = run([*TALK, "serve", *words], environment(home, TALK_SOCKET=f"{home}/s"))
+    assert (done.code, done.out, words[0] in done.err) == (2, "", True)
+
+
+def test_help_of_serve_names_the_devices_that_swallow_a_beginning() -> None:
+    words = " ".join((surface.HERE / "help-serve.txt").read_text("utf-8").split())
+    for each in ("HDMI", "USB", "Bluetooth", "aplay -L", "pactl list short sinks", "[default: 0"):
+        assert each in words
+
+
+# talk cancel --key
+
+
+@pytest.fixture
+def ids(scripted: Talk) -> list[str]:
+    """Return the ids of a goal that is being spoken and of two that wait, with the keys battery, door and battery."""
+    active = scripted.run("say", "--key", "battery", "never-ends").id
+    scripted.watcher.wait_for_word(active)
+    return [active, *(scripted.run("say", "--key", key, "waits").id for key in ("door", "battery"))]
+
+
+def test_a_key_cancels_the_goal_being_spoken_and_those_that_wait(scripted: Talk, ids: list[str]) -> None:
+    for key in ("nothing", "batter", "BATTERY", "-"):
+        done = scripted.run("cancel", "--key", key)
+        assert (done.code, done.out, done.err) == (0, "", "")
+    assert scripted.goal(ids[0])["state"] == "ACTIVE"
+    done = scripted.run("cancel", "--key", "battery")
+    assert (done.code, set(done.out.split()), done.err) == (0, {ids[0], ids[2]}, "")
+    assert scripted.goal(ids[0])["state"] == "PREEMPTED"
+    assert scripted.goal(ids[2])["state"] == "RECALLED"
+    assert scripted.watcher.wait_for_terminal(ids[1]) == "SUCCEEDED"
+
+
+def test_selectors_add_up(scripted: Talk, ids: list[str]) -> None:
+    done = scripted.run("--json", "cancel", "--key", "door", ids[2])
+    assert {json.loads(each)["id"] for each in done.out.splitlines()} == {ids[1], ids[2]}
+    assert scripted.goal(ids[0])["state"] == "ACTIVE"
+    assert scripted.run("cancel", "--key", "nothing", "--current").id == ids[0]
+
+
+def test_a_wrong_selector_cancels_nothing(scripted: Talk, ids: list[str]) -> None:
+    for words in (["--key", ""], ["--before", ""], ["--key="], ["--key", "k" * 65]):
+        done = scripted.run("cancel", *words)
+        assert (done.code, done.out) == (2, "")
+        assert "key" in done.err or "--before" in done.err
+    assert scripted.goal(ids[0])["state"] == "ACTIVE"
+    scripted.run("cancel")
