@@ -181,31 +181,21 @@ def test_a_missing_sound_device_is_told_at_the_start_and_found_when_it_comes(mak
 
 
 @pytest.mark.parametrize(
-    ("options", "env"),
-    [
-        (["--player", "null"], {}),
-        (["--player", "file:said.wav"], {}),
-        (["--player", "cat"], {}),
-        (["-q"], {}),
-        ([], {"PULSE_SERVER": "unix:/there"}),
-        (["--driver", "dummy"], {}),
-    ],
+    ("options", "server"),
+    [("--player null", ""), ("--player file:said.wav", ""), ("--player cat", ""), ("-q", ""), ("", "unix:/there")],
 )
-def test_a_missing_sound_device_is_not_told_if_none_is_needed(
-    make_talk: MakeTalk, options: list[str], env: dict[str, str]
-) -> None:
-    talk = make_talk(*options, env={"PULSE_SERVER": "", **env}, watched=False)
+def test_a_missing_sound_device_is_not_told_if_none_is_needed(make_talk: MakeTalk, options: str, server: str) -> None:
+    talk = make_talk(*options.split(), env={"PULSE_SERVER": server}, watched=False)
     assert "no sound device" not in talk.log
 
 
 def test_a_player_is_told_to_have_no_effect_with_a_driver_that_plays_by_itself(make_talk: MakeTalk) -> None:
-    given = make_talk("--player", "aply", "--lead-in", "100", driver="dummy")
-    assert given.run("say", "--wait", "hello").code == 0
-    assert "driver dummy, which plays by itself: --player and --lead-in have no effect\n" in given.log
-    assert "not found" not in given.log
-    plain = make_talk(driver="dummy")
-    assert plain.run("say", "--wait", "hello").code == 0
-    assert "driver dummy, which plays by itself\n" in plain.log
+    for options, told in (("--player aply --lead-in 100", ": --player and --lead-in have no effect"), ("", "")):
+        talk = make_talk(*options.split(), env={"PULSE_SERVER": ""}, driver="dummy")
+        assert talk.run("say", "--wait", "hello").code == 0
+        assert f"driver dummy, which plays by itself{told}\n" in talk.log
+        assert "not found" not in talk.log
+        assert "no sound device" not in talk.log
 
 
 def test_without_any_player_the_packages_to_install_are_told(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
@@ -224,26 +214,19 @@ def test_a_file_of_another_format_is_refused_and_not_written(tmp_path: pathlib.P
 
 def test_a_mistyped_key_is_told_on_a_terminal_alone(scripted: Talk) -> None:
     scripted.run("say", "--key", "battery", "never-ends")
-    for key, said in (("batery", "talk: no goal has the key 'batery': did you mean 'battery'?\n"), ("door", "")):
-        with Terminal([*TALK, "cancel", "--key", key], scripted.env) as shown:
+    told = "talk: no goal has the key 'batery': did you mean 'battery'?\n"
+    for words, said in (("batery", told), ("door", ""), ("batery -q", ""), ("battery", r"\w{4}-\d+\n")):
+        with Terminal([*TALK, "cancel", "--key", *words.split()], scripted.env) as shown:
             assert shown.finish() == 0
-            assert shown.text == said
-        assert scripted.run("cancel", "--key", key).err == ""  # a script cancels what may be there
-    with Terminal([*TALK, "-q", "cancel", "--key", "batery"], scripted.env) as shown:
-        assert (shown.finish(), shown.text) == (0, "")
-    with Terminal([*TALK, "cancel", "--key", "battery"], scripted.env) as shown:
-        assert shown.finish() == 0
-        assert re.fullmatch(r"\w{4}-\d+\n", shown.text)
+            assert re.fullmatch(said.replace("?", r"\?"), shown.text)
+    assert scripted.run("cancel", "--key", "batery").err == ""  # a script cancels whatever is there
 
 
 def test_a_language_may_be_given_by_its_name(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     assert talk.run("voices", "--language", "German").out == talk.run("voices", "--language", "de_DE").out != ""
-    for given, meant in (("Englsh", "en"), ("en-gbb", "en-gb")):
-        done = talk.run("voices", "--language", given)
-        assert (done.code, done.out) == (1, "")
-        assert done.err == f"talk: no voice speaks '{given}': did you mean '{meant}'?\n"
-        assert talk.run("voices", "--language", meant).out
+    done = talk.run("voices", "--language", "Englsh")
+    assert (done.code, done.out, done.err) == (1, "", "talk: no voice speaks 'Englsh': did you mean 'en'?\n")
     quiet = talk.run("--json", "-q", "voices", "--language", "1234")
     assert (quiet.code, quiet.out) == (1, "")
     assert "'talk voices' lists all" in json.loads(quiet.err)["error"]["message"]
