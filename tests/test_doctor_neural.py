@@ -181,33 +181,10 @@ def test_the_server_s_voice_is_tried_in_its_environment(alone: dict[str, str]) -
 
 
 HERE, SERVED = Session(0, "root"), Session(0, "root", server=7)
-UNKNOWN = Engine(reason="unknown_voice", words="x")
+ESPEAK, UNKNOWN = Engine("espeak"), Engine(reason="unknown_voice", words="x")
 
 
-@pytest.mark.parametrize(
-    ("server", "used", "engine", "env", "tried"),
-    [
-        ({}, None, Engine("espeak"), {}, "nothing"),
-        ({}, "de", Engine("espeak"), {}, "nothing"),
-        ({}, None, Engine("espeak", neural=1), {}, None),
-        ({}, None, Engine("espeak"), {"TALK_VOICES": "/v"}, None),
-        ({"neural_voices": {"piper/a": {}}}, None, Engine("espeak"), {}, None),
-        ({}, "piper/ti", Engine("espeak"), {}, "piper/ti"),
-        ({}, "ti", Engine("espeak", voice="piper/tiny"), {}, "piper/tiny"),
-        ({}, "tiny", UNKNOWN, {"TALK_VOICES": "{home}/v"}, "tiny"),
-        ({}, "none", UNKNOWN, {"TALK_VOICES": "{home}/v"}, None),
-        ({"driver": "dummy"}, "piper/ti", Engine("dummy"), {}, "nothing"),
-    ],
-)
-def test_only_a_voice_that_is_used_is_tried(
-    home: str,
-    monkeypatch: pytest.MonkeyPatch,
-    server: dict[str, object],
-    used: str | None,
-    engine: Engine,
-    env: dict[str, str],
-    tried: str | None,
-) -> None:
+def test_only_a_voice_that_is_used_is_tried(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny_voice.put(Path(home) / "v", "tiny")
     asked: list[str | None] = []
 
@@ -216,16 +193,26 @@ def test_only_a_voice_that_is_used_is_tried(
         return Neural(None)
 
     monkeypatch.setattr(neural, "look", look)
-    examination = examine.Examination(None, silent=True)
-    examination._server = server
-    surroundings = {name: value.format(home=home) for name, value in env.items()}
-    found = list(examination._neural(used, engine, HERE, surroundings, running=bool(server)))
-    if server.get("neural_voices"):
-        assert [each.message for each in found] == ["of the server: piper/a"], "the server's files can't be seen"
-        assert not asked
-        found = list(examination._neural(used, engine, SERVED, surroundings, running=True))
-    assert asked == ([] if tried == "nothing" else [tried])
-    assert bool(found) == bool(asked)
+
+    def tried(used: str | None, engine: Engine, here: Session = HERE, **told: object) -> list[str | None]:
+        env = {"TALK_VOICES": f"{home}/v"} if told.pop("installed", False) else {}
+        examination = examine.Examination(None, silent=True)
+        examination._server = told
+        asked.clear()
+        found = list(examination._neural(used, engine, here, env, running=bool(told)))
+        assert bool(found) == bool(asked) or found[0].message == "of the server: piper/a"
+        return [*asked]
+
+    assert tried(None, ESPEAK) == tried("de", ESPEAK) == []
+    assert tried("piper/ti", Engine("dummy"), driver="dummy") == []
+    assert tried(None, Engine("espeak", neural=1)) == tried(None, ESPEAK, installed=True) == [None]
+    assert tried("piper/ti", ESPEAK) == ["piper/ti"]
+    assert tried("ti", Engine("espeak", voice="piper/tiny")) == ["piper/tiny"]
+    assert tried("tiny", UNKNOWN, installed=True) == ["tiny"]
+    assert tried("none", UNKNOWN, installed=True) == [None]
+    voices = {"piper/a": {"state": "loaded"}}
+    assert tried(None, ESPEAK, neural_voices=voices) == [], "the files of the server can't be seen"
+    assert tried(None, ESPEAK, SERVED, neural_voices=voices) == [None]
 
 
 def test_without_neural_voices_nothing_of_them_is_imported() -> None:
