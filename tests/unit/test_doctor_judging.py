@@ -21,11 +21,12 @@ from talkcli.engine.players.devices import DUMMY
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
-from talkcli.paths import ABSENT, FORBIDDEN, STALE
+from talkcli.paths import ABSENT, FORBIDDEN
 from talkcli.terminal.text import Screen, width
 from tests.faults.broken import write
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from talkcli.client.client import Client
@@ -45,33 +46,30 @@ def of(findings: list[Finding], check: str) -> Finding:
 
 
 def test_a_sentence_is_heard_if_one_was_played_and_nothing_failed() -> None:
-    played = ok("sentence", "played")
-    assert heard([ok("python", "3"), warning("cards", "none", "plug in"), played])
-    assert not heard([failed("socket", "no server", "talk serve"), played])
+    played, group = ok("sentence", "played"), warning("group", "not in audio", "usermod")
+    lost, stuck = failed("socket", "no server", "talk serve"), failed("sentence", "ABORTED", "look at the loudspeaker")
+    assert heard([ok("python", "3"), group, played])
+    assert not heard([lost, played])
     assert not heard([ok("python", "3")]), "nothing was proved"
-
-
-def test_the_one_thing_to_do_is_for_the_first_that_failed() -> None:
-    group = warning("group", "not in audio", "usermod")
-    stuck = failed("sentence", "ABORTED", "look at the loudspeaker")
     assert next_step([ok("python", "3"), group, stuck]) == "look at the loudspeaker"
-    assert next_step([group, failed("socket", "no server", "talk serve"), stuck]) == "talk serve"
-    assert next_step([group, ok("sentence", "played")]) is None
+    assert next_step([group, lost, stuck]) == "talk serve"
+    assert next_step([group, played]) is None
+
+
+def cured(reason: str, words: str, player: str | None = None, behind: str | None = None) -> str:
+    """Return the next step after a sentence that ended so; `behind`: that of the checks before."""
+    played = Played(State.ABORTED, reason, words, player=player)
+    return str(sentence.judge(played, silent=False, behind=behind, device="usb").next)
 
 
 def test_the_next_step_for_a_missing_device_is_that_of_its_check() -> None:
     looked = [warning("cards", "none", "plug in"), warning("group", "not in audio", "usermod"), ok("python", "3")]
     assert behind(looked) == "usermod"
     assert behind(looked[2:]) is None
-
-    def cure(reason: str, words: str) -> str | None:
-        played = Played(State.ABORTED, reason, words)
-        return sentence.judge(played, silent=False, behind="usermod").next
-
-    assert cure("audio_device", "aplay: Permission denied") == "usermod"
-    assert cure("audio_lost", "unplugged") == "usermod"
-    assert "another program" in str(cure("audio_device", "aplay: Device or resource busy"))
-    assert "talk set --voice" in str(cure("nothing_to_say", "nothing"))
+    assert cured("audio_device", "aplay: Permission denied", behind="usermod") == "usermod"
+    assert cured("audio_lost", "unplugged", behind="usermod") == "usermod"
+    assert "another program" in cured("audio_device", "aplay: Device or resource busy", behind="usermod")
+    assert "talk set --voice" in cured("nothing_to_say", "nothing", behind="usermod")
 
 
 def test_a_custom_player_is_to_be_tried_by_hand_unless_it_names_a_cause() -> None:
@@ -79,15 +77,11 @@ def test_a_custom_player_is_to_be_tried_by_hand_unless_it_names_a_cause() -> Non
     missing = warning("player", "it is not there", "name a program that is there")
     assert behind([cards], custom=True) is None
     assert behind([cards, missing], custom=True) == "name a program that is there"
-
-    def cure(reason: str, words: str, player: str) -> str | None:
-        played = Played(State.ABORTED, reason, words, player=player)
-        return sentence.judge(played, silent=False, device="usb").next
-
+    stalled = ("audio_stalled", "it took no sound for 5 s")
     by_hand = "try the player by hand, with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d usb"
-    assert cure("audio_stalled", "it took no sound for 5 s", "sox -r {rate} -d {device}") == by_hand
-    assert cure("audio_stalled", "it took no sound for 5 s", "aplay -r {rate}") == sentence.REMEDIES["audio_stalled"]
-    assert "another program" in str(cure("audio_device", "Device or resource busy", "sox"))
+    assert cured(*stalled, "sox -r {rate} -d {device}") == by_hand
+    assert cured(*stalled, "aplay -r {rate}") == sentence.REMEDIES["audio_stalled"]
+    assert "another program" in cured("audio_device", "Device or resource busy", "sox")
 
 
 BUSY = Played(State.ABORTED, "audio_device", "aplay: audio open error: Device or resource busy")
@@ -102,28 +96,22 @@ def test_a_device_that_is_busy_with_the_server_s_speech_is_well() -> None:
     assert sentence.judge(replace(gone, beside_speech=True), silent=True).state == FAILED
 
 
-def status(active: Goal | None = None, *recent: Goal) -> SimpleNamespace:
-    return SimpleNamespace(active=active, recent=recent)
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "spoke"),
-    [
-        (status(), status(), False),
-        (status(SPOKEN), status(), True),
-        (status(), status(SPOKEN), True),
-        (status(None, SPOKEN), status(None, SPOKEN), False),
-        (status(), status(None, SPOKEN), True),
-        (status(), status(None, replace(SPOKEN, state=State.PREEMPTED)), True),
-        (status(), status(None, replace(SPOKEN, state=State.RECALLED)), False),
-    ],
-)
-def test_whether_the_server_spoke_is_seen_from_its_goals_before_and_after(
-    monkeypatch: pytest.MonkeyPatch, before: object, after: object, spoke: bool
-) -> None:
+def test_whether_the_server_spoke_is_seen_from_its_goals_before_and_after(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sentence, "by_engine", lambda *_: BUSY)
-    client = cast("Client", SimpleNamespace(status=iter([before, after]).__next__))
-    assert sentence.beside(client, Setting(), 1.0) == replace(BUSY, beside_speech=spoke)
+
+    def spoke(before: tuple[Goal | None, Sequence[Goal]], after: tuple[Goal | None, Sequence[Goal]]) -> bool:
+        told = (SimpleNamespace(active=active, recent=recent) for active, recent in (before, after))
+        played = sentence.beside(cast("Client", SimpleNamespace(status=told.__next__)), Setting(), 1.0)
+        assert played == replace(BUSY, beside_speech=played.beside_speech)
+        return played.beside_speech
+
+    assert spoke((SPOKEN, ()), (None, ()))
+    assert spoke((None, ()), (SPOKEN, ()))
+    assert spoke((None, ()), (None, [SPOKEN]))
+    assert spoke((None, ()), (None, [replace(SPOKEN, state=State.PREEMPTED)]))
+    assert not spoke((None, ()), (None, ()))
+    assert not spoke((None, [SPOKEN]), (None, [SPOKEN]))
+    assert not spoke((None, ()), (None, [replace(SPOKEN, state=State.RECALLED)]))
 
 
 STALLED = Played(State.ABORTED, "audio_stalled", "aplay took no sound for 3 s")
@@ -145,21 +133,17 @@ def examined(played: Played, client: Client | None = CLIENT, *, silent: bool = F
         return examination._sentence(client, engine, here, {})
 
 
-@pytest.mark.parametrize(
-    ("found", "step"),
-    [
-        (examined(STALLED), "pactl suspend-sink usb 0"),
-        (examined(STALLED, silent=True), "pactl suspend-sink usb 0"),
-        (examined(STALLED, hangs=True), "restart it"),
-        (examined(replace(STALLED, player="mine"), server={"player": "mine"}), "try the player by hand"),
-        (examined(Played(State.ABORTED, "engine_hung", "silence"), None, hangs=True), "restart it"),
-        (examined(Played(State.ABORTED, "engine_hung", "silence"), None), "run talk doctor again"),
-        (examined(STALLED, silent=True, process=None), "run talk doctor --silent there"),
-    ],
-)
-def test_the_next_step_after_a_sentence_depends_on_what_was_found_before(found: Finding, step: str) -> None:
-    assert found.state == FAILED
-    assert str(found.next).startswith(step)
+HUNG = Played(State.ABORTED, "engine_hung", "silence")
+
+
+def test_the_next_step_after_a_sentence_depends_on_the_checks_before() -> None:
+    assert examined(STALLED).next == examined(STALLED, silent=True).next == "pactl suspend-sink usb 0"
+    assert examined(STALLED, hangs=True).next == "restart it"
+    custom = examined(replace(STALLED, player="mine"), server={"player": "mine"})
+    assert str(custom.next).startswith("try the player by hand")
+    assert examined(HUNG, None, hangs=True).next == "restart it"
+    assert str(examined(HUNG, None).next).startswith("run talk doctor again")
+    assert str(examined(STALLED, silent=True, process=None).next).startswith("run talk doctor --silent there")
 
 
 def test_beside_another_user_s_server_the_sentence_is_to_be_played_by_that_user(
@@ -167,11 +151,9 @@ def test_beside_another_user_s_server_the_sentence_is_to_be_played_by_that_user(
 ) -> None:
     gone = Played(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
     monkeypatch.setattr(machine, "owner", lambda path: 33 if path == "/proc/7" else None)
-    step = str(examined(gone, silent=True, env={}).next)
-    assert step.endswith(": sudo -u '#33' talk doctor --silent")
+    assert str(examined(gone, silent=True, env={}).next).endswith(": sudo -u '#33' talk doctor --silent")
     monkeypatch.setattr(machine, "owner", lambda _: None)  # as if /proc were mounted with hidepid
-    assert examined(gone, silent=True, env={}).next == "restart it"
-    assert examined(gone, silent=True).next == "restart it"
+    assert examined(gone, silent=True, env={}).next == examined(gone, silent=True).next == "restart it"
 
 
 def test_a_player_without_sound_plays_a_sentence_that_is_not_heard() -> None:
@@ -180,42 +162,35 @@ def test_a_player_without_sound_plays_a_sentence_that_is_not_heard() -> None:
     assert "without sound" not in examined(played, server={"player": "aplay"}).message
 
 
-@pytest.mark.parametrize("silent", [False, True])
-def test_without_a_server_an_engine_process_plays_by_the_variables(
-    monkeypatch: pytest.MonkeyPatch, silent: bool
-) -> None:
-    monkeypatch.setenv("TALK_PLAYER", "pacat")
-    monkeypatch.setenv("TALK_VOICE", "de")
-    given: list[object] = []
+def test_without_a_server_an_engine_process_plays_by_the_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[tuple[object, ...]] = []
 
     def by_engine(*arguments: object) -> Played:
-        given.extend(arguments)
-        return Played(State.SUCCEEDED)
+        given.append(arguments)
+        return STALLED
 
     monkeypatch.setattr(sentence, "by_engine", by_engine)
-    assert Examination(None, silent=silent)._sentence(None, ENGINE, Session(0, "root"), {}).state == OK
-    assert given[:3] == [sentence.TEXT, Setting("pacat", None, "de"), 0.0 if silent else 1.0]
+    monkeypatch.setenv("TALK_PLAYER", "pacat")
+    monkeypatch.setenv("TALK_VOICE", "de")
+    for silent in (False, True):
+        Examination(None, silent=silent)._sentence(None, ENGINE, Session(0, "root"), {})
+    setting = Setting("pacat", None, "de")
+    assert [each[:3] for each in given] == [(sentence.TEXT, setting, 1.0), (sentence.TEXT, setting, 0.0)]
 
 
-@pytest.mark.parametrize(
-    ("told", "named", "player", "worked"),
-    [
-        ("aplay", False, None, "aplay"),
-        ("aplay", True, "aplay", None),
-        ("mine -x", False, "mine -x", None),
-        ("file:/tmp/x.wav", True, "null", None),
-        ("null", True, "null", None),
-        (None, False, None, None),
-    ],
-)
-def test_silent_plays_with_the_server_s_settings_and_tries_the_same_players(
-    monkeypatch: pytest.MonkeyPatch, told: str | None, named: bool, player: str | None, worked: str | None
-) -> None:
-    monkeypatch.setattr(machine, "names_a_player", lambda *_: named)
-    examination = Examination(None, silent=True)
-    examination._server = {"player": told, "device": "usb", "voice": "de", "driver": "espeak"}
-    expected = Setting(player, "usb", "de", None, "espeak", worked, {})
-    assert examination._setting_of_server(7, {}) == expected
+def test_silent_plays_with_the_server_s_settings_and_tries_the_same_players(monkeypatch: pytest.MonkeyPatch) -> None:
+    def setting(told: str | None, *, named: bool) -> Setting:
+        monkeypatch.setattr(machine, "names_a_player", lambda *_: named)
+        examination = Examination(None, silent=True)
+        examination._server = {"player": told, "device": "usb", "voice": "de", "driver": "espeak"}
+        return examination._setting_of_server(7, {})
+
+    rest = ("usb", "de", None, "espeak")
+    assert setting("aplay", named=False) == Setting(None, *rest, "aplay", {})
+    assert setting("aplay", named=True) == Setting("aplay", *rest, None, {})
+    assert setting("mine -x", named=False) == Setting("mine -x", *rest, None, {})
+    assert setting("file:/tmp/x.wav", named=True) == setting("null", named=True) == Setting("null", *rest, None, {})
+    assert setting(None, named=False) == Setting(None, *rest, None, {})
 
 
 def test_foreign_text_is_escaped_in_every_finding() -> None:
@@ -267,16 +242,10 @@ PATH = "/run/user/1000/talk/talk.sock"
 @pytest.mark.parametrize(
     ("found", "words", "step"),
     [
-        (Places((Place(PATH, ABSENT),)), "not there", "talk serve"),
-        (Places((Place(PATH, STALE, 1000),)), "left over", "talk serve (it takes the place"),
         (Places((Place(PATH, FORBIDDEN, 7),)), "no permission (uid 7)", "have uid 7 let you in"),
-        (Places((Place(PATH, server.FOREIGN, 7),)), "another user's server (uid 7)", f"talk --socket {PATH} doctor"),
-        (Places((Place(PATH, ABSENT),), "TALK_SOCKET"), "named by TALK_SOCKET", "unset TALK_SOCKET, or"),
         (Places((Place(PATH, ABSENT),), "--socket"), "named by --socket", "leave --socket out, or"),
-        (Places((Place("/x", ABSENT),), "TALK_SOCKET", elsewhere=PATH), "/x", f"a server is on {PATH}"),
         (Places((Place(PATH, server.MUTE),), None, "it does not answer"), "it does not answer", "restart"),
         (Places((Place(PATH, server.MUTE),), None, "busy", "busy"), "busy", "--max-clients"),
-        (Places((Place(PATH, server.STOPPED, 0, 7),), None, "it does not answer"), "is stopped", "kill -CONT 7"),
         (Places((Place(PATH, ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
     ],
 )
