@@ -107,26 +107,19 @@ def test_the_scripts_that_are_checked_in_are_those_that_the_command_prints(
 # Offers
 
 
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
+def test_much_is_offered_without_a_server(tmp_path: pathlib.Path) -> None:
+    env = environment(str(tmp_path), TALK_SOCKET=f"{tmp_path}/none")
+    for line, expected in (
         ("talk sta", {"status"}),
         ("talk say --pre", {"--preempt"}),
         ("talk serve --vo", {"--volume", "--voice", "--voice-memory"}),
         ("talk serve --player ", {"pulse", "aplay", "pacat", "pw-cat", "null"}),
         ("talk serve --player=p", {"--player=pulse", "--player=pacat", "--player=pw-cat"}),
-        ("talk --socket /etc/pa", {"file"}),
-        ("talk say -o x", {"file"}),
+        *((each, {"file"}) for each in ("talk --socket /etc/pa", "talk say -o x")),
         ("talk completion ", set(FILES)),
-        ("talk say ", set()),
-        ("talk nonsense --x", set()),
-        ("talk cancel --nonsense", set()),
-        ('talk cancel "', set()),
-    ],
-)
-def test_much_is_offered_without_a_server(tmp_path: pathlib.Path, line: str, expected: set[str]) -> None:
-    env = environment(str(tmp_path), TALK_SOCKET=f"{tmp_path}/none")
-    assert {value for value, _ in offered(line, env)} == expected
+        *((each, set()) for each in ("talk say ", "talk nonsense --x", "talk cancel --nonsense", 'talk cancel "')),
+    ):
+        assert {value for value, _ in offered(line, env)} == expected, line
 
 
 def test_every_command_and_option_is_offered_with_its_help(tmp_path: pathlib.Path) -> None:

@@ -265,23 +265,21 @@ def test_programs_that_fail_or_hang_say_why_no_device_or_server_is_found(
 
 
 def test_a_sound_server_is_found_by_its_own_program_or_by_its_socket(tmp_path: Path) -> None:
-    info = "printf 'Server Name: pulseaudio\\nDefault Sink: usb\\n'"
-    (tmp_path / "one").mkdir()
-    found = sound.sound_server(env_with(tmp_path / "one", pactl=info), STRANGER)
+    for each in ("pulse", "wire", "run/pulse"):
+        (tmp_path / each).mkdir(parents=True)
+    env = env_with(tmp_path / "pulse", pactl="printf 'Server Name: pulseaudio\\nDefault Sink: usb\\n'")
+    found = sound.sound_server(env, STRANGER)
     assert (found.name, found.sink) == ("pulseaudio", "usb")
-    (tmp_path / "two").mkdir()
-    env = env_with(tmp_path / "two", pactl="echo Connection refused >&2; exit 1", pw_cli="exit 0")
-    assert "PipeWire" in str(sound.sound_server(env, STRANGER).name)
-    assert not sound.sound_server(env, STRANGER).pulse
-    (tmp_path / "run" / "pulse").mkdir(parents=True)
+    env = env_with(tmp_path / "pulse", pactl="echo Connection refused >&2; exit 1", pw_cli="exit 0")
+    found = sound.sound_server(env, STRANGER)
+    assert ("PipeWire" in str(found.name), found.pulse) == (True, False)
     native = tmp_path / "run" / "pulse" / "native"
     native.touch()
     alone = {"PATH": "/nowhere", "XDG_RUNTIME_DIR": str(tmp_path / "run")}
     found = sound.sound_server(alone, STRANGER)
     assert (found.name, found.trouble, found.sockets) == (None, None, (str(native),))
     native.unlink()
-    (tmp_path / "three").mkdir()
-    wire = {**alone, **env_with(tmp_path / "three", pw_cli="exit 0")}
+    wire = {**alone, **env_with(tmp_path / "wire", pw_cli="exit 0")}
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(native))
         refused = sound.sound_server(wire, STRANGER)
@@ -311,22 +309,20 @@ def test_the_volume_is_read_from_the_mixer_in_charge(tmp_path: Path) -> None:
 # System files
 
 
-def test_a_card_may_be_opened_by_its_owner_its_group_or_by_its_mode(tmp_path: Path) -> None:
+def test_a_card_may_be_opened_by_root_by_its_group_or_by_its_mode(tmp_path: Path) -> None:
     kernel, nodes = tmp_path / "asound", tmp_path / "snd"
     kernel.mkdir()
     nodes.mkdir()
-    text = " 0 [Device         ]: USB-Audio - USB Audio Device\n                      C-Media at usb-1\n"
-    write(kernel / "cards", text)
+    write(kernel / "cards", " 0 [Device         ]: USB-Audio - USB Audio Device\n              C-Media at usb-1\n")
     for name, mode in (("pcmC0D0p", 0o660), ("pcmC0D0c", 0o660), ("pcmC1D0p", 0o666)):
         write(nodes / name, "", mode)
     found = machine.cards(STRANGER, str(kernel), str(nodes))
     assert found.names == ("USB Audio Device",)
     assert found.nodes == (f"{nodes}/pcmC0D0p", f"{nodes}/pcmC1D0p")
     assert found.forbidden == (f"{nodes}/pcmC0D0p",), "others may open the second one, by its mode"
-    group = os.stat(nodes / "pcmC0D0p").st_gid
-    member = Session(4141, "member", gids=(group,))
-    assert machine.cards(member, str(kernel), str(nodes)).forbidden == ()
-    assert machine.cards(Session(0, "root"), str(kernel), str(nodes)).forbidden == ()
+    member = Session(4141, "member", gids=(os.stat(nodes / "pcmC0D0p").st_gid,))
+    for each in (member, Session(0, "root")):
+        assert machine.cards(each, str(kernel), str(nodes)).forbidden == ()
     assert machine.cards(STRANGER, str(tmp_path / "gone"), str(tmp_path / "gone")) == Cards(kernel=False, group="audio")
 
 
