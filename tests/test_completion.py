@@ -94,9 +94,7 @@ def busy(make_talk: MakeTalk) -> tuple[Talk, list[str]]:
 
 
 @pytest.mark.parametrize(("shell", "name"), FILES.items())
-def test_the_scripts_that_are_checked_in_are_those_that_the_command_prints(
-    tmp_path: pathlib.Path, shell: str, name: str
-) -> None:
+def test_the_command_prints_the_scripts_that_are_checked_in(tmp_path: pathlib.Path, shell: str, name: str) -> None:
     assert sorted(os.listdir(CHECKED_IN)) == sorted(FILES.values())
     done = run([*TALK, "completion", shell], environment(str(tmp_path)))
     assert (done.code, done.err) == (0, "")

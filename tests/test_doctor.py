@@ -165,9 +165,7 @@ def test_the_sound_behind_a_forwarded_socket_is_not_looked_for_here(robot: Talk,
     assert extent(recording.samples)
 
 
-def test_silent_plays_zeros_by_the_server_s_player_to_its_device_in_its_environment(
-    make_talk: MakeTalk, sink: Sink, tmp_path: Path
-) -> None:
+def test_silent_plays_zeros_as_the_server_would_play(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
     script = f"""#!/bin/sh
 printf '%s ' "$@" "$PULSE_SERVER" >> {tmp_path}/called
 tee -a {tmp_path}/played | aplay -q -t raw -f S16_LE -c 1 -r "$1"
@@ -199,9 +197,7 @@ def test_a_custom_player_that_fails_is_to_be_tried_by_hand(make_talk: MakeTalk) 
 
 
 @pytest.mark.slow
-def test_a_sound_server_that_hangs_is_named_and_the_doctor_ends(
-    make_talk: MakeTalk, private_sink: Callable[[], Sink]
-) -> None:
+def test_a_sound_server_that_hangs_is_named(make_talk: MakeTalk, private_sink: Callable[[], Sink]) -> None:
     sink = private_sink()
     talk = make_talk(sink=sink, forked=False)
     sink.freeze()

@@ -253,9 +253,7 @@ def test_devices_are_named_as_their_player_names_them(tmp_path: Path) -> None:
     assert sound.suspended(env) == ("usb",)
 
 
-def test_programs_that_fail_or_hang_say_why_no_device_or_server_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_programs_that_fail_or_hang_say_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sound, "LIMIT", 0.3)
     env = env_with(tmp_path, aplay="exec /bin/sleep 98", pactl="echo Connection refused >&2; exit 1")
     troubles = [each.trouble for player in ("aplay", "pacat", "pw-cat") if (each := sound.devices(env, player, None))]

@@ -297,9 +297,7 @@ def test_an_engine_that_dies_costs_one_goal_and_loads_its_voice_again(env: dict[
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", TINY)
 
 
-def test_a_voice_that_kills_the_engine_twice_is_left_alone_until_it_is_set_again(
-    env: dict[str, str], hold: Path
-) -> None:
+def test_a_voice_that_kills_the_engine_twice_is_left_alone(env: dict[str, str], hold: Path) -> None:
     why = "the engine process ended while it was being loaded"
     with _robot(env, "--voice", TINY) as robot:
         for _ in range(2):
@@ -467,9 +465,7 @@ def test_with_another_driver_a_neural_voice_is_refused(env: dict[str, str]) -> N
         assert (done.code, words in done.err) == (2, True), done
 
 
-def test_without_the_extra_they_are_listed_and_refused_with_what_to_install(
-    env: dict[str, str], tmp_path: Path
-) -> None:
+def test_without_the_extra_they_are_listed_and_refused(env: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "site" / "sitecustomize.py").write_text(WITHOUT.format(names=["onnxruntime"]))
     bare = {**env, "PYTHONPATH": str(tmp_path / "site")}
     words = f"onnxruntime is missing: {install.neural()}"
@@ -525,9 +521,7 @@ _REPORTS = re.compile(
 
 
 @pytest.mark.parametrize("seconds", [0, pytest.param(30, marks=pytest.mark.slow)])
-def test_a_neural_sentence_makes_no_connection_and_writes_no_file(
-    env: dict[str, str], tmp_path: Path, seconds: int
-) -> None:
+def test_a_neural_sentence_is_reported_to_nobody(env: dict[str, str], tmp_path: Path, seconds: int) -> None:
     """Even if the user has turned on onnxruntime's telemetry, which asks for its host 9 seconds after the import."""
     needs("strace")
     trace = tmp_path / "trace"

@@ -194,9 +194,7 @@ SLOW = f"{ENDLESS} slow-stop=0.2"
         (["-q", "say", "-w"], {"terminal": True, "errors": True}),
     ],
 )
-def test_a_reader_that_goes_away_while_it_waits_cancels_the_goal(
-    scripted: Talk, words: list[str], way: dict[str, bool]
-) -> None:
+def test_a_reader_that_goes_away_cancels_the_goal(scripted: Talk, words: list[str], way: dict[str, bool]) -> None:
     reader = Reader(scripted, *words, ENDLESS, **way)
     goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
     assert reader.leave() == CLOSED
@@ -218,9 +216,7 @@ def test_a_reader_that_goes_away_while_its_goal_is_in_the_queue_recalls_it(scrip
     ("words", "way"),
     [("say -wf", {}), ("--json say -wf", {"terminal": True}), ("--json say -w", {"errors": True})],
 )
-def test_a_signal_that_ends_the_reader_too_is_what_counts(
-    scripted: Talk, words: str, way: dict[str, bool], first: str
-) -> None:
+def test_a_signal_counts_more_than_the_reader(scripted: Talk, words: str, way: dict[str, bool], first: str) -> None:
     number = signal.SIGINT if first == "reader" else signal.SIGHUP
     reader = Reader(scripted, *words.split(), SLOW, **way)
     goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
@@ -243,9 +239,7 @@ def test_a_signal_that_ends_the_reader_too_is_what_counts(
     ("words", "first"),
     [("say -w", signal.SIGINT), ("say -wf", signal.SIGHUP), ("say -w --lines", signal.SIGHUP)],
 )
-def test_a_terminal_that_is_closed_sends_sighup_more_than_once(
-    scripted: Talk, words: str, first: signal.Signals
-) -> None:
+def test_a_closed_terminal_sends_sighup_more_than_once(scripted: Talk, words: str, first: signal.Signals) -> None:
     lines = "--lines" in words
     client = scripted.start(*words.split(), *([] if lines else [SLOW]), stdin=subprocess.PIPE)
     if lines:

@@ -116,7 +116,7 @@ def assert_sent_as_by_the_library(arguments: list[str]) -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(LINES, ENVIRONMENTS)
-def test_any_line_is_read_as_by_click_and_sent_as_by_the_library(
+def test_lines_are_read_as_by_click_and_sent_as_by_the_library(
     arguments: list[str], environment: Mapping[str, str]
 ) -> None:
     with named(environment):
@@ -127,9 +127,7 @@ def test_any_line_is_read_as_by_click_and_sent_as_by_the_library(
 @pytest.mark.slow
 @settings(max_examples=5000, deadline=None)
 @given(LINES, ENVIRONMENTS)
-def test_thousands_of_lines_are_read_as_by_click_and_sent_as_by_the_library(
-    arguments: list[str], environment: Mapping[str, str]
-) -> None:
+def test_thousands_of_lines_are_read_and_sent_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
     with named(environment):
         assert_read_alike(arguments)
         assert_sent_as_by_the_library(arguments)

@@ -55,9 +55,7 @@ def serving(env: dict[str, str], *, session: bool = False) -> Forked:
     ("words", "code", "out", "err"),
     [(["--version"], 0, "talk ", ""), (["sya"], 2, "", "did you mean"), (["status"], 3, "", "talk serve")],
 )
-def test_it_ends_and_prints_as_a_started_one_does(
-    env: dict[str, str], words: list[str], code: int, out: str, err: str
-) -> None:
+def test_it_ends_as_a_started_one_does(env: dict[str, str], words: list[str], code: int, out: str, err: str) -> None:
     found = ended(words, env)
     assert (found[0], found[1].startswith(out), err in found[2]) == (code, True, True), found
     assert "Traceback" not in found[2]
@@ -72,14 +70,6 @@ def test_a_signal_is_not_lost_however_early_it_comes(env: dict[str, str]) -> Non
         reading.send_signal(signal.SIGINT)
         assert reading.wait(LIMIT) in (130, -signal.SIGINT)
         reading.communicate(timeout=LIMIT)
-
-
-def test_its_streams_may_be_files(env: dict[str, str], tmp_path: pathlib.Path) -> None:
-    with open(tmp_path / "both", "wb") as both, Forked(["status"], env, stdout=both.fileno(), stderr=subprocess.STDOUT):
-        pass
-    assert "talk serve" in (tmp_path / "both").read_text("utf-8")
-    nowhere = Forked(["status"], env)
-    assert (nowhere.stdin, nowhere.stdout, nowhere.stderr, nowhere.wait(LIMIT)) == (None, None, None, 3)
 
 
 def test_a_signal_that_kills_it_is_a_negative_code(env: dict[str, str]) -> None:
@@ -145,9 +135,7 @@ def test_it_is_killed_with_the_process_that_forks(env: dict[str, str]) -> None:
     [{"PYTHONPATH": "/elsewhere"}, {"PYTHONUTF8": "0"}, {"LD_PRELOAD": "lib.so"}, {"LC_ALL": "C"}, {"LANG": "C"}],
     ids=lambda each: next(iter(each)),
 )
-def test_a_process_whose_interpreter_libraries_or_locale_differ_is_not_forked(
-    env: dict[str, str], extra: dict[str, str]
-) -> None:
+def test_another_interpreter_library_or_locale_is_not_forked(env: dict[str, str], extra: dict[str, str]) -> None:
     assert forks(env)
     assert forks({**env, "TALK_PLAYER": "null", "HOME": "/elsewhere"})
     assert not forks({**env, **extra})

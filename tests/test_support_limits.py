@@ -48,9 +48,7 @@ def test_a_late_result_beside_a_late_control_is_not_measured(control: MakeContro
 @pytest.mark.parametrize(
     ("beside", "seconds", "limit"), [(0.01, 0.11, 0.1), (0.019, 0.11, 0.1), (0.03, 0.35, 0.1), (0.03, 0.091, 0.02)]
 )
-def test_a_late_result_that_the_control_does_not_explain_fails(
-    control: MakeControl, beside: float, seconds: float, limit: float
-) -> None:
+def test_an_unexplained_late_result_fails(control: MakeControl, beside: float, seconds: float, limit: float) -> None:
     with pytest.raises(AssertionError, match="it took"), limits(control(beside)):
         assert_within(seconds, limit, "it")
     assert take_unmeasured() == []

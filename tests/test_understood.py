@@ -55,9 +55,7 @@ def say(talk: Talk, sentence: str, voice: str = REAL_VOICE) -> None:
     assert (done.code, talk.goal(done.id)["voice"]) == (0, voice), done
 
 
-def test_ten_sentences_that_a_neural_voice_writes_into_a_file_are_understood(
-    make_talk: MakeTalk, tmp_path: Path
-) -> None:
+def test_ten_sentences_of_a_neural_voice_are_understood(make_talk: MakeTalk, tmp_path: Path) -> None:
     real_voice()
     needs_packages(PACKAGE)
     path = tmp_path / "speech.wav"
@@ -74,9 +72,7 @@ def test_ten_sentences_that_a_neural_voice_writes_into_a_file_are_understood(
 
 
 @pytest.mark.slow  # each sentence takes as long as it is, with either voice: a minute and a half
-def test_speech_is_understood_and_a_neural_voice_no_worse_than_espeak(
-    make_talk: MakeTalk, sink: Sink, tmp_path: Path
-) -> None:
+def test_a_neural_voice_is_understood_no_worse_than_espeak(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
     real_voice()
     needs_packages(PACKAGE)
     env = {"XDG_CACHE_HOME": str(tmp_path / "cache")}

@@ -146,9 +146,7 @@ def test_an_unknown_name_is_told_with_those_that_come_near() -> None:
 # Rights
 
 
-def test_an_operator_may_ask_and_another_login_is_told_its_missing_rights(
-    scripted: Talk, secure_broker: Broker, make_bridge: MakeBridge
-) -> None:
+def test_a_login_is_told_its_missing_rights(scripted: Talk, secure_broker: Broker, make_bridge: MakeBridge) -> None:
     make_bridge(scripted, secure_broker, "anna", user="anna", observer=OPERATORS[0])
     found = doctor(secure_broker, user=OPERATORS[0], code=0)
     assert [each["state"] for each in found.values()] == ["ok", "warning", *["ok"] * 5]

@@ -146,7 +146,7 @@ def test_the_next_step_after_a_sentence_depends_on_the_checks_before() -> None:
     assert str(examined(STALLED, silent=True, process=None).next).startswith("run talk doctor --silent there")
 
 
-def test_beside_another_user_s_server_the_sentence_is_to_be_played_by_that_user(
+def test_another_user_s_server_is_to_be_examined_by_that_user(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     gone = Played(State.ABORTED, "audio_device", "aplay: audio open error: No such device")
@@ -278,9 +278,7 @@ def test_an_obstacle_before_the_server_s_place_is_a_warning() -> None:
         ({"volume": 0.1 + 0.2, "ttl": 1.23456789012}, "settings", OK, None),
     ],
 )
-def test_a_server_is_judged_by_its_own_description(
-    change: dict[str, object], check: str, state: str, step: str | None
-) -> None:
+def test_a_server_is_judged_by_its_words(change: dict[str, object], check: str, state: str, step: str | None) -> None:
     found = of(server.judge({**SERVER, **change}, [], 0.0), check)
     assert found.state == state
     assert (step in str(found.next)) if step else found.next is None
