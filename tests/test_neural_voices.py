@@ -151,75 +151,62 @@ def test_a_goal_waits_for_its_voice_and_so_do_those_behind_it(env: dict[str, str
     assert "voice piper/tiny loaded in " in robot.server.log
 
 
-def test_the_server_is_ready_before_its_voice_is_loaded(env: dict[str, str], hold: Path) -> None:
+def test_the_server_is_ready_before_its_voice_and_goals_stop_waiting_if_it_is_changed(
+    env: dict[str, str], hold: Path
+) -> None:
     with _robot(env, "--voice", "piper/ti") as robot:
         assert "loaded" not in robot.server.log
         robot.until(lambda: robot.neural()["state"] == "loading")
-        goal = robot.say("hello", None)
+        goal = robot.say("hello", None, voice_only=True)
         assert robot.state(goal) == "PENDING"
         assert robot.client.status().server["voice"] == TINY
+        robot.client.set(voice="en-us")
+        assert robot.heard(goal) == ("SUCCEEDED", INSTEAD)
+        robot.client.set(voice="piper/ti")
+        goal = robot.say("hello", None)
         hold.unlink()
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
 
 
-def test_espeak_speaks_instead_if_a_goal_cannot_wait(env: dict[str, str], hold: Path) -> None:
-    assert hold.exists()
+def test_espeak_speaks_instead_if_a_goal_cannot_wait_and_does_not_insist(env: dict[str, str], hold: Path) -> None:
     with _robot(env) as robot:
         for urgent in ({"preempt": True}, {"flush": True}, {"priority": 1}, {"ttl": 0.2}):
             goal = robot.say("hello", **urgent)
             assert robot.heard(goal) == ("SUCCEEDED", INSTEAD)
             assert f"{goal.id} is spoken by {INSTEAD}: piper/tiny is not loaded" in robot.server.log
         assert f"voice    {INSTEAD}" in run([*TALK, "status", goal.id], env).out
-
-
-def test_a_goal_that_insists_waits_for_the_voice_or_expires(env: dict[str, str], hold: Path) -> None:
-    with _robot(env) as robot:
-        late, urgent = robot.say(voice_only=True, ttl=0.5), robot.say("x", voice_only=True, priority=1)
+        late, insists = robot.say(voice_only=True, ttl=0.5), robot.say("x", voice_only=True, priority=1)
         assert late.wait(LIMIT).reason == "expired"
-        assert robot.state(urgent) == "PENDING"
+        assert robot.state(insists) == "PENDING"
         hold.unlink()
-        assert robot.heard(urgent) == ("SUCCEEDED", TINY)
+        assert robot.heard(insists) == ("SUCCEEDED", TINY)
 
 
-def test_a_voice_is_loaded_during_the_speech(env: dict[str, str], hold: Path, tmp_path: Path) -> None:
+def test_the_first_voice_is_loaded_in_silence_and_others_during_the_speech(env: dict[str, str], tmp_path: Path) -> None:
+    """The libraries of the first one stop the whole process for a moment, which would be heard."""
     tiny_voice.put(tmp_path / "voices", "second")
-    hold.unlink()
-    with _robot(env, "--voice", "piper/second") as robot:
-        robot.loads("piper/second")
-        hold.touch()
+    with _robot(env) as robot:
+        active = robot.say(LONG, None)
+        robot.until(lambda: robot.state(active) == "ACTIVE")
+        goal = robot.say(voice="piper/second")
+        assert robot.neural("piper/second")["state"] == "waiting"
+        robot.client.cancel([active.id])
+        assert robot.heard(goal) == ("SUCCEEDED", "piper/second")
+        log = robot.server.log
+        assert log.index(f"{active.id} PREEMPTED") < log.index("voice piper/second loaded")
+
+        (tmp_path / "hold").touch()
         active = robot.say(LONG, None, feedback=True)
         robot.until(lambda: robot.state(active) == "ACTIVE")
         goal = robot.say()
         robot.until(lambda: robot.neural()["state"] == "loading")
         words = active.feedback()
         assert [next(words).word for _ in range(5)] == ["this", "goes", "on", "and", "on"]
-        hold.unlink()
-        robot.loads()
+        (tmp_path / "hold").unlink()
+        robot.until(lambda: robot.neural()["state"] == "loaded")
         assert robot.state(active) == "ACTIVE"
         robot.client.cancel([active.id])
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
-
-
-def test_the_first_voice_is_loaded_while_nothing_is_heard(env: dict[str, str]) -> None:
-    """Its libraries stop the whole process for a moment, which would be heard."""
-    with _robot(env) as robot:
-        active = robot.say(LONG, None)
-        robot.until(lambda: robot.state(active) == "ACTIVE")
-        goal = robot.say()
-        assert robot.neural()["state"] == "waiting"
-        robot.client.cancel([active.id])
-        assert robot.heard(goal) == ("SUCCEEDED", TINY)
-    ended, loaded = (robot.server.log.index(each) for each in (f"{active.id} PREEMPTED", "voice piper/tiny loaded"))
-    assert ended < loaded
-
-
-def test_goals_stop_waiting_when_the_server_s_voice_is_changed(env: dict[str, str], hold: Path) -> None:
-    assert hold.exists()
-    with _robot(env, "--voice", TINY) as robot:
-        goal = robot.say("hello", None, voice_only=True)
-        robot.until(lambda: robot.neural()["state"] == "loading")
-        robot.client.set(voice="en-us")
-        assert robot.heard(goal) == ("SUCCEEDED", INSTEAD)
 
 
 # -- a voice that can't be loaded
@@ -278,9 +265,8 @@ def test_a_pitch_is_refused_with_a_voice_that_has_none(env: dict[str, str]) -> N
         refused = robot.say(pitch=70).goal
         assert (refused.reason, refused.state.name) == ("bad_option", "REJECTED")
         assert "has no pitch but its own" in str(refused.message)
-        assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", TINY), "the server's pitch is for other voices"
-        assert robot.heard(robot.say("hello", None, pitch=70)) == ("SUCCEEDED", TINY)
-        assert robot.heard(robot.say("hello", None, voice_only=True)) == ("SUCCEEDED", TINY)
+        for options in ({}, {"pitch": 70}, {"voice_only": True}):  # the server's pitch is for other voices
+            assert robot.heard(robot.say("hello", None, **options)) == ("SUCCEEDED", TINY)
 
 
 # -- an engine that dies, hangs or cannot start
