@@ -62,7 +62,7 @@ def test_it_fits_the_terminal(busy: Talk, columns: int) -> None:
     for each in (f"pid {busy.pid} on {busy.socket}", "256 clients", "driver scripted", "voice default", "audio_l"):
         assert each in words
     assert 'from "patrol"' in words
-    assert columns < 120 or "priority" in words  # what does not fit is cut at its end
+    assert columns < 120 or "priority" in words  # a line that does not fit is cut at its end
     goals = [each for each in lines if "PENDING" in each]
     assert goals[0].index('"') == goals[1].index('"')
     assert b"\x1b[1;32mACTIVE" in shown.raw
@@ -123,7 +123,7 @@ def test_one_goal_fits_the_terminal_with_all_of_its_text(scripted: Talk, columns
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Talk]:
-    """A server for all tests that leave its settings as they were, or as they were by `shared`."""
+    """A server for all tests that change only settings, which `shared` restores."""
     with contextlib.closing(Talk(scripted=True)) as talk:
         assert talk.run("voices").code == 0  # now they are known
         yield talk
@@ -138,7 +138,7 @@ def shared(server: Talk) -> Talk:
 
 
 def settings(talk: Talk) -> dict[str, str]:
-    """Return what `talk set` prints."""
+    """Return the settings that `talk set` prints."""
     done = talk.run("set")
     assert (done.code, done.err) == (0, "")
     return dict(each.split() for each in done.out.splitlines())

@@ -34,7 +34,7 @@ RAW = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028\u2029\u202a-\u2
 
 
 def alone(*words: str, **extra: str) -> Any:
-    """Run `talk` where there is no server."""
+    """Run `talk` without a server."""
     with short_directory() as home:
         return run([*TALK, *words], environment(home, **{"TALK_SOCKET": f"{home}/s", **extra}))
 
@@ -231,7 +231,7 @@ def test_json_on_a_terminal_is_escaped_and_means_the_same(scripted: Talk, comman
     assert not RAW.search(line), repr(line)
     assert all(each in line for each in (r"\u009b31m \u007f \ue000 \udb40\udc01", "Grüße 日本 👩", r"\u202epatrol"))
     assert text in _strings(json.loads(line))
-    if command != ["watch"]:  # a program gets what was said, as ever
+    if command != ["watch"]:  # a program gets the text unchanged
         assert json.loads(scripted.run(*words).out)
         assert "\x9b31m \x7f" in scripted.run(*words).out
 

@@ -35,8 +35,8 @@ CHECKED_IN = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file
 KEY = 'low battery, now: it\'s $5 "x" *\\ a;b|c&'
 #: The file of each shell's script.
 FILES = {"bash": "talk.bash", "zsh": "_talk", "fish": "talk.fish"}
-#: Each shell, how it is kept from its start files, told to complete, and to write its command line to the file OUT when
-#: ^G is pressed.
+#: For each shell: options against its start files, and commands that load the script and bind ^G to writing the command
+#: line to the file OUT.
 SHELLS = {
     "bash": (
         ["--noprofile", "--norc"],
@@ -54,12 +54,12 @@ SHELLS = {
         "bind \\cg 'commandline > OUT'; function fish_prompt; echo 'rea''dy> '; end\n",
     ),
 }
-#: What loads completion in bash where it is installed; it takes `talk` for an older program.
+#: The loader of completions in bash, if it is installed; it takes `talk` for an older program.
 BASH_COMPLETION = "/usr/share/bash-completion/bash_completion"
 
 
 def offered(line: str, env: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Return the values that are offered at the end of a line, with their help; nothing else may be said."""
+    """Return the values that are offered at the end of a line, with their help; no errors may be written."""
     asked = {"_TALK_COMPLETE": "fish_complete", "COMP_WORDS": line, "COMP_CWORD": ""}
     done = run(TALK, {**env, **asked})
     assert (done.code in {0, 1}, done.err) == (True, ""), done
@@ -209,7 +209,7 @@ class Shell:
     """An interactive shell that completes `talk`, in a terminal."""
 
     def __init__(self, name: str, talk: Talk, stack: contextlib.ExitStack, lines: str | None = None) -> None:
-        """`lines`: sh's commands that make its start files, which then load the script; None: it has none."""
+        """`lines`: commands of sh that make start files, which load the script; None for no start files."""
         needs(name)
         directory = talk.directory
         bare, load, setup = SHELLS[name]
@@ -233,7 +233,7 @@ class Shell:
         self.terminal.wait_for("ready> ", 20)
 
     def complete(self, line: str) -> str:
-        """Type a line and TAB, and return the command line that this makes; it is empty again then."""
+        """Type a line and TAB, return the command line that this makes, and clear it."""
         self.terminal.type(line.encode() + b"\t\x07")
         written = b""
         while not written.endswith(b"\n"):
@@ -277,7 +277,7 @@ def test_shells_complete_and_quote_ids_keys_and_options(busy: tuple[Talk, list[s
 
 @pytest.mark.parametrize("name", SHELLS)
 def test_start_files_of_the_readme_load_it(busy: tuple[Talk, list[str]], name: str) -> None:
-    """bash's loads bash-completion first, as it does on most machines."""
+    """The start file of bash loads bash-completion first, as on most machines."""
     talk, _ = busy
     if name == "bash" and not os.path.exists(BASH_COMPLETION):
         needs("bash-completion")

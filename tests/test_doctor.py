@@ -153,7 +153,7 @@ def test_the_sound_behind_a_forwarded_socket_is_not_looked_for_here(robot: Talk,
     try:
         while not os.path.exists(forwarded):
             assert forwarder.poll() is None
-            time.sleep(0.01)  # it tells nobody
+            time.sleep(0.01)  # socat doesn't tell when it listens
         with sink.record() as recording:
             found = doctor(robot.env, "--socket", forwarded, code=0)
     finally:
@@ -276,7 +276,7 @@ def test_a_signal_cancels_its_sentence(scripted: Talk) -> None:
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_its_own_engine_is_heard_and_the_server_is_what_is_missing(home: str, sink: Sink) -> None:
+def test_its_own_engine_is_heard_and_the_server_is_missing(home: str, sink: Sink) -> None:
     with sink.record() as recording:
         found = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"))
         recording.wait_until_quiet(0.2)

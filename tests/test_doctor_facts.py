@@ -49,7 +49,7 @@ PW_NODES = """
 
 @pytest.fixture
 def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Return a directory in which all usual places of a socket are, but for the system's."""
+    """Return a directory with all usual places of a socket, except the system's."""
     with short_directory() as path:
         os.makedirs(f"{path}/run/talk", 0o700)
         monkeypatch.setenv("TMPDIR", path)
@@ -58,7 +58,7 @@ def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def no_server(named: str | None = None) -> Finding:
-    """Return what is found instead of a server, with this TALK_SOCKET."""
+    """Return the finding about the missing server, with this TALK_SOCKET."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TALK_SOCKET", named or "")
         client, found = server.connect(None, None)
@@ -69,7 +69,7 @@ def no_server(named: str | None = None) -> Finding:
 
 
 @pytest.mark.usefixtures("nobody_serves")
-def test_each_usual_place_is_named_with_what_is_there(home: str) -> None:
+def test_each_usual_place_is_described(home: str) -> None:
     path = f"{home}/run/talk/talk.sock"
 
     def check(words: str, step: str) -> None:
@@ -330,7 +330,7 @@ def test_a_server_of_the_same_user_is_examined_in_its_own_environment(tmp_path: 
     with subprocess.Popen(["sh", "-c", "sleep 98; :", "--player", "x"], env=env, start_new_session=True) as process:
         try:
             end = time.monotonic() + 5
-            while machine._environment(process.pid) != env:  # it is another program's until it has begun
+            while machine._environment(process.pid) != env:  # the process has ours until its program has started
                 assert time.monotonic() < end
             found, seen = machine.surroundings(process.pid)
             assert seen == env

@@ -58,7 +58,7 @@ def _environment(home: str, tmp_path: Path, code: str) -> dict[str, str]:
 
 
 def _found(used: str | None, env: dict[str, str], limit: float = LIMIT) -> dict[str, Finding]:
-    """Look at the voices of this environment, and return what is found, by its checks."""
+    """Return the findings about the voices of this environment, by their checks."""
     return {each.check: each for each in neural.judge(neural.look(used, env, limit), server=False)}
 
 
@@ -74,7 +74,7 @@ def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
     assert list(checks)[3:8] == ["voices", "neural", "voice files", "neural voice", "session"]
 
 
-def test_wrong_files_are_named_one_after_the_other_with_what_to_do(alone: dict[str, str], home: str) -> None:
+def test_wrong_files_are_named_one_after_the_other_with_the_next_step(alone: dict[str, str], home: str) -> None:
     place = Path(home) / "v"
     for name in ("a", "b", "c"):
         tiny_voice.put(place, name)
@@ -103,7 +103,7 @@ def test_wrong_files_are_named_one_after_the_other_with_what_to_do(alone: dict[s
     ],
     ids=["garbage", "another's json"],
 )
-def test_a_voice_that_cannot_speak_says_why_and_what_to_do(
+def test_a_voice_that_cannot_speak_says_why(
     alone: dict[str, str], home: str, model: bytes | None, speakers: int, words: str, step: str
 ) -> None:
     tiny_voice.put(Path(home) / "v", "bad", model or tiny_voice.model(speakers=speakers))

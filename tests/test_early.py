@@ -236,7 +236,7 @@ def test_a_server_whose_backlog_is_full_is_not_passed_over_for_the_next_place() 
             found = reach(None)
             assert (found.socket, found.full, found.failures[-1][0]) == (None, True, first)
         listening.setblocking(False)
-        with pytest.raises(BlockingIOError):  # nobody came to the second
+        with pytest.raises(BlockingIOError):  # no client came to the second place
             listening.accept()
 
 
@@ -245,7 +245,7 @@ def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(ear
     heard: list[bytes] = []
 
     def serve(listening: socket.socket, greeting: bytes) -> None:
-        with contextlib.suppress(OSError):  # it is closed, and nobody else came
+        with contextlib.suppress(OSError):  # until it is closed
             while True:
                 connected, _ = listening.accept()
                 with connected:
@@ -279,14 +279,14 @@ def test_a_server_that_refuses_this_client_is_passed_over_for_the_next_place(ear
 
 
 def to_another_thread(number: signal.Signals) -> None:
-    """Have the kernel give a signal to a thread that is not the main one, which stays where it is."""
+    """Have the kernel give a signal to another thread than the main one, which keeps waiting."""
     thread = threading.Thread(target=lambda: signal.pthread_kill(threading.get_ident(), number))
     thread.start()
     thread.join()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM])
-def test_a_signal_that_another_thread_is_given_ends_the_waiting(number: signal.Signals) -> None:
+def test_a_signal_to_another_thread_ends_the_waiting(number: signal.Signals) -> None:
     began = time.monotonic()
     with Interrupts(60) as interrupts:
         sender = threading.Timer(0.1, to_another_thread, [number])
@@ -298,7 +298,7 @@ def test_a_signal_that_another_thread_is_given_ends_the_waiting(number: signal.S
     assert signal.set_wakeup_fd(-1) == -1  # nothing is left behind
 
 
-def test_of_what_is_cleared_only_a_first_signal_ends_anything() -> None:
+def test_after_clear_only_a_first_signal_ends_the_waiting() -> None:
     with Interrupts() as interrupts:
         signal.raise_signal(signal.SIGHUP)
         interrupts.clear()

@@ -35,7 +35,7 @@ HEADINGS = ["Usage:", "Examples:", "Options:", "Options of every command:", "Exi
 
 
 def alone(*words: str, **extra: str) -> tuple[int, str, str]:
-    """Run `talk` where there is no server, in 80 columns; return its exit code and what it wrote."""
+    """Run `talk` without a server, in 80 columns; return its exit code, output and errors."""
     with short_directory() as home:
         done = run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", **{"COLUMNS": "80", **extra}))
     return done.code, done.out, done.err
@@ -109,7 +109,7 @@ def test_help_of_each_command_has_a_purpose_examples_options_and_exit_codes(name
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)
-def test_every_option_says_what_it_is_for(name: str) -> None:
+def test_every_option_is_explained(name: str) -> None:
     for each in command(name).params:
         if isinstance(each, click.Option):
             assert each.help, each.name

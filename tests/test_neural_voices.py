@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from tests.conformance.bareserve import BareServe
 
 TINY, BROKEN = "piper/tiny", "piper/broken"
-#: The voice of libespeak-ng that speaks in the place of these, whose language is en-us.
+#: The voice of libespeak-ng that speaks instead of these, whose language is en-us.
 INSTEAD = "gmw/en-US"
 LONG = "this goes on and on " * 30
-#: Runs first in each Python process: no model is loaded as long as a file is there, and each may take more memory.
+#: Runs first in each Python process: no model is loaded while the file HOLD exists, and each may take more memory.
 SITE = """
 import importlib.abc, importlib.util, os, sys, time
 class Held(importlib.abc.MetaPathFinder):

@@ -161,16 +161,16 @@ def test_lines_are_spoken_though_the_disk_is_full(scripted: Talk, words: str) ->
 
 
 class Reader:
-    """Reads what a client writes, until it goes away."""
+    """A reader of a client's output that goes away."""
 
     def __init__(self, talk: Talk, *words: str, errors: bool = False, terminal: bool = False) -> None:
-        """`errors`: it has standard error, too; `terminal`: it is one, and not the client's own."""
+        """`errors`: it reads standard error, too; `terminal`: it is a terminal, but not the client's own."""
         self.descriptor, theirs = os.openpty() if terminal else os.pipe()
         self.client = Forked(
             words, talk.env, stdout=theirs, stderr=theirs if errors else subprocess.PIPE, start_new_session=True
         )
         os.close(theirs)
-        _wait_until_caught(self.client, signal.SIGHUP)  # which comes after its first look at its output
+        _wait_until_caught(self.client, signal.SIGHUP)  # after that the client has looked at its output once
 
     def leave(self) -> int:
         """Go away, and return the client's exit code."""
@@ -216,7 +216,9 @@ def test_a_reader_that_goes_away_while_its_goal_is_in_the_queue_recalls_it(scrip
     ("words", "way"),
     [("say -wf", {}), ("--json say -wf", {"terminal": True}), ("--json say -w", {"errors": True})],
 )
-def test_a_signal_counts_more_than_the_reader(scripted: Talk, words: str, way: dict[str, bool], first: str) -> None:
+def test_a_signal_counts_more_than_a_reader_that_goes_away(
+    scripted: Talk, words: str, way: dict[str, bool], first: str
+) -> None:
     number = signal.SIGINT if first == "reader" else signal.SIGHUP
     reader = Reader(scripted, *words.split(), SLOW, **way)
     goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
@@ -227,7 +229,7 @@ def test_a_signal_counts_more_than_the_reader(scripted: Talk, words: str, way: d
         reader.client.send_signal(signal.SIGCONT)
     else:
         reader.client.send_signal(number)
-        scripted.watcher.wait_for(goal, "PREEMPTING")  # which is what the client had to ask for
+        scripted.watcher.wait_for(goal, "PREEMPTING")  # the client has to ask for this
         os.close(reader.descriptor)
     err = reader.client.communicate(timeout=10)[1]
     assert reader.client.returncode == 128 + number
@@ -256,13 +258,13 @@ def test_a_closed_terminal_sends_sighup_more_than_once(scripted: Talk, words: st
 
 @pytest.mark.parametrize("shared", [True, False], ids=["with its input", "alone"])
 def test_a_reader_that_goes_away_while_the_text_is_read_has_nothing_spoken(scripted: Talk, shared: bool) -> None:
-    ours, theirs = socket.socketpair()  # what sshd gives a command
+    ours, theirs = socket.socketpair()  # as sshd gives a command
     reader, output = (-1, theirs.fileno()) if shared else os.pipe()
     words = ["say", "-w", "-"]
     client = Forked(words, scripted.env, stdin=theirs.fileno(), stdout=output, stderr=subprocess.PIPE)
     theirs.close()
     ours.send(b"half of a sen")
-    while fcntl.ioctl(ours, termios.TIOCOUTQ, b"    ") != b"\0\0\0\0":  # until it was read, of which nothing tells
+    while fcntl.ioctl(ours, termios.TIOCOUTQ, b"    ") != b"\0\0\0\0":  # until it was read, as no event tells
         time.sleep(0.002)
     if shared:
         ours.close()
@@ -317,7 +319,7 @@ def test_the_reader_of_a_wait_ends_it_and_cancels_nothing(scripted: Talk, words:
     assert scripted.goal(goal)["state"] in {"PENDING", "ACTIVE"}
 
 
-def test_sighup_cancels_what_say_owns_and_nohup_keeps_it_away(scripted: Talk) -> None:
+def test_sighup_cancels_the_goal_of_say_unless_nohup_keeps_it_away(scripted: Talk) -> None:
     for words, code, state in ((["say", "-w"], 129, "PREEMPTED"), (["wait"], 129, "ACTIVE")):
         goal = scripted.run("say", ENDLESS).id if words == ["wait"] else None
         client = scripted.start(*words, goal or ENDLESS)
@@ -344,7 +346,7 @@ def test_sighup_cancels_what_say_owns_and_nohup_keeps_it_away(scripted: Talk) ->
 
 
 def _wait_until_caught(client: Process, number: int) -> None:
-    """Wait until a process catches a signal, of which nothing tells."""
+    """Wait until a process catches a signal, as no event tells."""
     while True:
         assert client.poll() is None, "it has ended"
         with open(f"/proc/{client.pid}/status", encoding="utf-8") as status:

@@ -93,7 +93,7 @@ def test_speech_is_awaited_held_cancelled_and_examined(make_talk: MakeTalk, plat
 
 
 def test_a_player_is_awaited_killed_and_told_to_have_failed(make_talk: MakeTalk) -> None:
-    """By talk's own driver: a program that plays nothing for a while longer than it is fed, and one that fails."""
+    """With talk's own driver: one program plays silence for longer than it is fed, and another one fails."""
     env = {"PYTHONPATH": PATH, "TALK_TEST_PLATFORM": "linux"}
     talk = make_talk("--player", "sh -c 'cat >/dev/null; sleep 0.4'", "--rate", "450", env=env)
     assert talk.run("say", "--wait", "hi").code == 0

@@ -175,7 +175,7 @@ def test_a_stopped_or_held_sentence_is_recognised_though_it_ran_dry_before(low: 
 
 
 def test_quiet_samples_beside_a_pause_belong_to_the_sentence() -> None:
-    """A sentence with zeros of its own, between sounds that are hardly any, is held there; and it ran dry before."""
+    """A sentence is held at its own zeros, which stand between faint sounds, and it ran dry before."""
     (sentence,) = render([Sentence("two three four five six seven eight nine ten", rate=450)])
     sounds = np.flatnonzero(sentence)
     places = [int(sounds[each]) for each in np.flatnonzero(np.diff(sounds) > 200)]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="talk is forked on Linux alone")
 
-#: Seconds for what takes milliseconds.
+#: Seconds in which anything ends that takes milliseconds.
 LIMIT = 20.0
 
 
@@ -82,7 +82,7 @@ def test_a_signal_that_kills_it_is_a_negative_code(env: dict[str, str]) -> None:
         process.send_signal(number)
         assert process.wait(LIMIT) == -number
         assert process.poll() == process.returncode == -number
-        process.send_signal(number)  # it is gone, and nobody else is hit
+        process.send_signal(number)  # the process is gone, and no other process gets the signal
 
 
 def test_sigint_and_sigterm_give_a_shell_s_exit_codes(env: dict[str, str]) -> None:

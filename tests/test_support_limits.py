@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def control() -> Iterator[MakeControl]:
-    """Makes a control that takes 10 ms before the test, and so many seconds in it."""
+    """Makes controls that take 10 ms before the limited block, and so many seconds in it."""
 
     def make(beside: float) -> Callable[[], float]:
         times = iter([0.01] * 5)

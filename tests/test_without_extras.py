@@ -62,7 +62,7 @@ def test_without_the_extra_a_fleet_tells_what_to_install(words: list[str], tmp_p
 
 #: The modules that only neural voices use; a server needs the others of `NEURAL_MODULES` anyway.
 OWN = {*NEEDED, *(each for each in NEURAL_MODULES if each.startswith("talkcli."))}
-#: kB by which memory differs from one start to the next.
+#: Differences of memory between two starts, in kB.
 SLACK = 400
 ASKED = (["voices"], ["status"], ["say", "--wait", "hello"])
 

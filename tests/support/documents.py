@@ -19,7 +19,7 @@ class Document:
         self.text = self.path.read_text(encoding="utf-8")
 
     def section(self, title: str) -> str:
-        """Return what stands under a heading, what is under its own headings included."""
+        """Return the text under a heading, with its own subsections."""
         found = re.search(rf"^(##+) {re.escape(title)}\n(.*?)(?=^## |^\1 |\Z)", self.text, re.MULTILINE | re.DOTALL)
         assert found, f"{self.name} has no section {title!r}"
         return found[2]
@@ -42,7 +42,7 @@ class Document:
         return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
-#: What a user reads, and what stands beside what it describes.
+#: The document for users, and those beside the code that they describe.
 README = Document("README.md")
 COMMAND_LINE = Document("talkcli/cli/README.md")
 WIRE = Document("talkcli/protocol/README.md")
@@ -69,7 +69,7 @@ def tables(text: str) -> list[list[Row]]:
 
 
 def words(cell: str) -> list[str]:
-    """Return what stands in a cell as code."""
+    """Return the code in a cell."""
     return re.findall(r"`([^`]+)`", cell)
 
 

@@ -18,20 +18,20 @@ _PATIENCE = 30.0
 
 
 def serve_with(make_talk: MakeTalk, voice: str, *options: str, sink: Sink | None, env: dict[str, str]) -> Talk:
-    """Start a server that speaks with this voice, and return it when that is loaded."""
+    """Start a server that speaks with this voice, and return it when the voice is loaded."""
     talk = make_talk("--voice", voice, *options, sink=sink, env=env)
     await_loaded(talk.socket, voice)
     return talk
 
 
 def await_loaded(socket: str, voice: str) -> None:
-    """Wait until a server, which was told to speak with this voice, has it loaded; AssertionError if it fails."""
+    """Wait until a server has loaded its voice; AssertionError if it fails."""
     end = time.monotonic() + _PATIENCE
     with Wire(socket) as wire:
         while (told := _told(wire, voice))["state"] != "loaded":
             assert told["state"] != "failed", f"{voice} was not loaded: {told['why']}"
             assert time.monotonic() < end, f"{voice} is not loaded within {_PATIENCE:g} s"
-            time.sleep(0.01)  # that it is loaded is no event on the wire
+            time.sleep(0.01)  # no event on the wire tells that it is loaded
 
 
 def _told(wire: Wire, voice: str) -> Message:

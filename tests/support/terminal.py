@@ -1,4 +1,4 @@
-"""A program in a terminal, read as lines: for what is written from top to bottom, and for shells, which draw."""
+"""A program in a terminal, read as lines, for output from top to bottom and for shells, which draw."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _COLOURING = re.compile("\x1b\\[[0-9;]*m")
 
 
 class Terminal(screen.Terminal):
-    """As `screen.Terminal`, with what was written as text; what isn't drawn there is no error before `finish`."""
+    """A `screen.Terminal` whose output is read as text; output that can't be drawn is no error before `finish`."""
 
     def __enter__(self) -> Terminal:
         return self
@@ -28,7 +28,7 @@ class Terminal(screen.Terminal):
 
     @property
     def text(self) -> str:
-        """What was written so far, without colours."""
+        """The output so far, without colours."""
         return _COLOURING.sub("", self.raw.decode(errors="ignore")).replace("\r\n", "\n")
 
     @property
@@ -37,7 +37,7 @@ class Terminal(screen.Terminal):
         return self.text.split("\n")[:-1]
 
     def wait_for(self, pattern: str, timeout: float = PATIENCE) -> re.Match[str]:
-        """Wait until what was written has this pattern."""
+        """Wait until the output has this pattern."""
         end = time.monotonic() + timeout
         with self._changed:
             while True:

@@ -120,7 +120,7 @@ WARNED = [warning("sound server", "it hangs", "restart it")]
 
 
 def examined(played: Played, client: Client | None = CLIENT, *, silent: bool = False, **facts: object) -> Finding:
-    """Return what is found of a sentence that was played so; `facts`: those of an `Examination`."""
+    """Return the finding about a sentence that was played so; `facts`: attributes of the `Examination`."""
     examination = Examination(None, silent=silent)
     for name, value in {"process": 7, "found": WARNED, **facts}.items():
         setattr(examination, f"_{name}", value)
@@ -249,7 +249,7 @@ PATH = "/run/user/1000/talk/talk.sock"
         (Places((Place(PATH, ABSENT),), others=("/run/user/7/s",)), "not there", "talk --socket /run/user/7/s"),
     ],
 )
-def test_without_a_server_each_place_is_named_with_what_is_there(found: Places, words: str, step: str) -> None:
+def test_without_a_server_each_place_is_described(found: Places, words: str, step: str) -> None:
     judgement = server.judge_places(found)
     assert judgement.state == FAILED
     assert words in judgement.message
@@ -308,7 +308,7 @@ def test_after_a_text_without_words_the_next_step_is_to_send_words() -> None:
     assert "choose a voice" in str(of(server.judge(SERVER, [foreign], 0.0), "recent goals").next)
 
 
-def test_the_sentence_says_how_it_ended_and_what_to_do() -> None:
+def test_the_end_of_the_sentence_is_told_with_the_next_step() -> None:
     played = Played(State.SUCCEEDED, duration=1.7, player="aplay", served=True)
     found = sentence.judge(played, silent=False)
     assert found.state == OK
@@ -348,7 +348,7 @@ FOUND = [
 
 
 @pytest.mark.parametrize("columns", [40, 80, 120])
-def test_on_a_terminal_nothing_is_wider_than_it_is(columns: int) -> None:
+def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
     screen = Screen(columns, colour=True)
     for finding in FOUND:
         lines = report.lines(finding, screen)
@@ -404,19 +404,19 @@ def test_a_robot_with_a_card_and_nothing_else_is_well() -> None:
     assert found[0].message == "aplay is used; then pacat"
 
 
-def test_a_sound_server_that_answers_is_played_to_without_a_program() -> None:
+def test_a_sound_server_that_answers_needs_no_program() -> None:
     assert judged("player", server=PULSE).message == "pulse is used, by the sound server; then aplay, pacat"
     alone = judged("player", Players((), None), server=PULSE)
     assert (alone.state, alone.message) == (OK, "pulse is used, by the sound server")
     assert judged("player", Players((), "pulse"), server=PULSE, running=True).message == "pulse (the server's)"
     assert judged("player", server=WIRE).message == "aplay is used; then pacat"
-    # What an engine process has chosen counts more than what the sound server says.
+    # The choice of an engine process counts more than the sound server's answer.
     chosen = replace(PLAYERS, first="aplay")
     assert judged("player", chosen, server=PULSE).message == "aplay is used; then pacat"
     assert judged("player", replace(PLAYERS, first="pulse"), server=WIRE).message.startswith("pulse is used")
 
 
-def test_a_sound_server_with_a_dummy_alone_is_heard_by_nobody() -> None:
+def test_a_sound_server_with_only_a_dummy_output_is_not_heard() -> None:
     found = judged("sound server", server=replace(PULSE, sink=DUMMY))
     assert (found.state, found.next) == (
         WARNING, "plug in a loudspeaker, and look whether it is there: pactl list short sinks"
@@ -430,7 +430,7 @@ def test_no_player_names_the_package() -> None:
     assert judged("player", Players((), None), running=True).state == WARNING
 
 
-def test_a_player_that_is_set_and_not_there_is_named() -> None:
+def test_a_chosen_player_that_is_missing_is_named() -> None:
     found = judged("player", Players(("aplay",), "pw-cat", runs=False))
     assert (found.state, found.next) == (FAILED, "sudo apt-get install -y pipewire-bin")
     found = judged("player", Players(("aplay",), "/opt/play", runs=False))
@@ -446,7 +446,7 @@ def test_a_player_without_sound_is_not_heard(player: str) -> None:
     assert sound.judge_silent("aplay", running=True) == []
 
 
-def test_a_device_is_looked_for_among_those_that_the_player_lists() -> None:
+def test_a_device_is_looked_up_in_the_player_s_list() -> None:
     assert judged("device", devices=replace(DEVICES, wanted="default")).state == OK
     assert judged("device", devices=replace(DEVICES, wanted="plughw:1,0")).state == OK
     found = judged("device", devices=replace(DEVICES, wanted="robot_speaker"))
@@ -457,14 +457,14 @@ def test_a_device_is_looked_for_among_those_that_the_player_lists() -> None:
     assert "no answer" in judged("device", devices=Devices("aplay -L", trouble="no answer")).message
 
 
-def test_devices_that_no_program_can_list_are_a_fault_only_if_one_is_named() -> None:
+def test_devices_that_cannot_be_listed_are_a_fault_only_if_one_is_named() -> None:
     unlisted = Devices("pactl list short sinks", package="pulseaudio-utils")
     assert judged("device", devices=unlisted).state == OK
     found = judged("device", devices=replace(unlisted, wanted="usb"))
     assert (found.state, found.next) == (WARNING, "sudo apt-get install -y pulseaudio-utils")
 
 
-def test_a_step_that_takes_pactl_says_where_it_comes_from(tmp_path: Path) -> None:
+def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
     muted = failed("loudness", "muted", "pactl set-sink-mute @DEFAULT_SINK@ 0")
     without = {"PATH": str(tmp_path)}
     step = f"{muted.next} (for pactl: sudo apt-get install -y pulseaudio-utils)"
@@ -475,7 +475,7 @@ def test_a_step_that_takes_pactl_says_where_it_comes_from(tmp_path: Path) -> Non
     assert sound.installing(muted, without) == muted
 
 
-def test_no_device_is_named_with_what_to_plug_in_or_to_hand_in() -> None:
+def test_a_missing_device_is_to_be_plugged_in_or_given_to_the_container() -> None:
     found = judged("cards", cards=NO_CARDS)
     assert (found.state, "plug in" in str(found.next)) == (WARNING, True)
     found = judged("cards", cards=NO_CARDS, session=replace(PI, kinds=("a container",)))
@@ -505,7 +505,7 @@ def test_no_permission_for_the_device_names_the_group_and_the_user() -> None:
         ({}, "systemctl --user restart"),
     ],
 )
-def test_why_a_sound_server_is_out_of_reach_depends_on_where_this_runs(change: dict[str, object], step: str) -> None:
+def test_the_step_to_a_sound_server_depends_on_the_session(change: dict[str, object], step: str) -> None:
     server = replace(NO_SERVER, sockets=("/run/user/1000/pulse/native",))
     found = judged("sound server", server=server, session=replace(PI, **change))
     assert found.state == WARNING
@@ -524,7 +524,7 @@ def test_a_sound_server_that_hangs_or_is_named_wrongly_or_cannot_be_asked() -> N
     assert service.state == WARNING
 
 
-def test_without_a_runtime_directory_the_session_says_what_to_set() -> None:
+def test_a_missing_runtime_directory_is_told_with_the_variable_to_set() -> None:
     found = machine.judge_session(replace(PI, runtime=None, runtime_owner=None, usual_runtime="/run/user/1000"))
     assert (found.state, found.next) == (WARNING, "export XDG_RUNTIME_DIR=/run/user/1000")
     assert "cron, sudo" in found.message
@@ -535,7 +535,7 @@ def test_without_a_runtime_directory_the_session_says_what_to_set() -> None:
     assert "uid 33's" in machine.judge_session(replace(PI, runtime_owner=33)).message
 
 
-def test_what_is_muted_is_not_heard() -> None:
+def test_a_muted_output_is_not_heard() -> None:
     def level(name: str, text: str) -> Level:
         return sound.level_of(name, text, f"unmute {name}", f"{name} 70%")
 
@@ -556,6 +556,6 @@ def test_what_is_muted_is_not_heard() -> None:
     assert sound.judge_levels((), default=True) == []
 
 
-def test_a_player_is_a_user_s_own_where_its_program_is_another() -> None:
+def test_a_player_with_an_unknown_program_is_custom() -> None:
     assert all(map(sound.is_custom, ("sleep 100", "/opt/bin/play -x", "false")))
     assert not any(map(sound.is_custom, ("/usr/bin/aplay -q", "pacat", "null", "file:a.wav", "'", "", None)))

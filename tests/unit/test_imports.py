@@ -24,9 +24,9 @@ PACKAGE = Path(talkcli.__file__).parent
 
 #: The layers: each may import itself and those before it.
 LAYERS = ["ground", "goals", "protocol", "terminal", "daemon", "client", "engine", "server", "fleet", "doctor", "cli"]
-#: The files of the ground, which lie flat and import nothing of the others but each other.
+#: The modules of the ground, which import only each other.
 GROUND = {"errors", "frozen", "install", "paths", "peers"}
-#: What lies flat besides: the package's face and its command, which hand on what others have.
+#: The package itself and its command, which only pass on the work of others.
 FACE = {"", "__main__"}
 #: What is pure besides all of `goals`, `protocol` and `terminal`.
 PURE = [
@@ -39,7 +39,7 @@ IMPURE = {
     *("asyncio", "threading", "_thread", "socket", "_socket", "select", "selectors", "signal", "time", "datetime"),
     *("random", "secrets", "click", "pyttsx3", "platformdirs", "os", "io", "pathlib", "subprocess", "multiprocessing"),
 }
-#: What stands at the top of the project; beside it only files and folders whose names begin with a dot.
+#: The files and folders at the top of the project whose names do not begin with a dot.
 TOP = {"pyproject.toml", "talkcli", "tests", "completions", "README.md", "LICENSE"}
 #: Who may name these: a module, or the first part of its name.
 ONLY = {
@@ -91,7 +91,7 @@ def pure() -> list[str]:
 
 
 def absolute(module: str, node: ast.ImportFrom) -> str:
-    """Return the full name of what an import is from."""
+    """Return the full name of the module that an import is from."""
     if not node.level:
         return node.module or ""
     is_package = (PACKAGE / module.replace(".", "/") / "__init__.py").exists()
@@ -136,7 +136,7 @@ def outside(module: str) -> set[str]:
 
 
 def inside(module: str) -> list[tuple[str, Import]]:
-    """Return the modules of the package that this one imports, with their names within it."""
+    """Return the modules of the package that a module imports, by their names within it."""
     return [
         (each.name.removeprefix("talkcli").removeprefix("."), each)
         for each in imports(module)
@@ -162,7 +162,7 @@ def test_no_module_imports_a_layer_above_it_not_even_for_types() -> None:
         assert not above, f"talkcli.{module} is of a layer below {above}"
 
 
-def test_the_top_of_the_project_holds_what_it_should() -> None:
+def test_the_top_of_the_project_is_as_listed() -> None:
     needs("git")
     listed = subprocess.run(["git", "ls-files"], cwd=PACKAGE.parent, capture_output=True, text=True, check=False)
     if listed.returncode:
@@ -207,7 +207,7 @@ def test_a_module_that_shows_times_knows_the_time_zone_and_asks_no_clock() -> No
         for each in calls:
             name = ast.unparse(each.func).removeprefix("time.")
             assert arguments.get(name) == len(each.args), f"talkcli.{module}:{each.lineno} asks a clock"
-        # It is used in no other way, and nothing of it under another name.
+        # The module `time` is used in no other way, and under no other name.
         assert not any(isinstance(each, ast.ImportFrom) and each.module == "time" for each in nodes)
         assert len(calls) == sum(isinstance(each, ast.Name) and each.id == "time" for each in nodes) > 0
 
@@ -246,9 +246,9 @@ def test_server_doctor_and_fleet_are_imported_only_if_they_are_asked_for() -> No
                 assert each.function or each.typing or module in OF_THE_FLEET, where
 
 
-#: Who else may end the process on the spot: the server, on its second signal, in the handler.
+#: Other modules that may end the process on the spot, as the server does on its second signal.
 ENDING = {"server.run": {"os._exit"}, "engine.main": {"os._exit"}}
-#: Who else may write to standard error: the log of what runs for months, and the engine process, whose server reads it.
+#: Other modules that may write to standard error: the log, and the engine process, whose server reads it.
 COMPLAINING = {"daemon.log", "engine.main", "engine.session"}
 
 
@@ -290,7 +290,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, [], "")
 
 
-#: The doctor's modules that judge; each gathers what it judges, too, but for the last.
+#: The doctor's modules that judge; all but the last gather facts, too.
 JUDGING = ["machine", "voice", "neural", "sound", "server", "sentence", "broker", "report"]
 #: Modules that the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
@@ -301,7 +301,7 @@ FOR_JUDGING = {
 
 @cache
 def sources_of_names(module: str) -> dict[str, str]:
-    """Return the names that a module imports at its top, and where each is from: one of the package, or a library."""
+    """Return the names that a module imports at its top, with the module that each is from."""
     found: dict[str, str] = {}
     for node in sources()[module].body:
         if isinstance(node, ast.Import):
@@ -320,7 +320,7 @@ def not_its_own(function: ast.FunctionDef) -> set[str]:
 
 
 def test_the_doctor_judges_without_looking() -> None:
-    """Facts are gathered beside it, so this follows each judgement through all that it calls."""
+    """The same modules gather facts, so this follows each judgement through all that it calls."""
     functions = {
         (module, node.name): node
         for module, tree in sources().items()
@@ -349,14 +349,14 @@ def test_the_doctor_judges_without_looking() -> None:
 
 
 def test_contributing_names_every_file_that_an_option_goes_through() -> None:
-    """By the option that it takes as its example: --ttl."""
+    """The option --ttl is its example."""
     text = (PACKAGE.parent / ".github" / "CONTRIBUTING.md").read_text("utf-8")
     steps = text.partition("**An option of `say`**")[2].partition("\n\nWire, checks")[0]
     named = {module_name(PACKAGE / each) for each in re.findall(r"talkcli/([\w/]+\.py)", steps)}
     having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
     # On a broker it is a message's expiry, too; no other option is known there.
     having -= {module for module in having if part(module) == "fleet"}
-    assert named - having == {"engine.protocol"}  # which is not told
-    # Examples and help of commands; a sentence that the doctor says, as any client does; and what waits to be queued.
+    assert named - having == {"engine.protocol"}  # it takes no expiry
+    # Examples and help of commands; the sentence of the doctor, as of any client; and requests that wait for the queue.
     assert having - named == {"cli.commands", "doctor.sentence", "cli.stdin", "server.requests"}
     assert len(having) <= 9
