@@ -230,18 +230,10 @@ def test_json_on_a_terminal_is_escaped_and_means_the_same(scripted: Talk, comman
         line = shown.raw.decode().split("\r\n")[0]
     assert not RAW.search(line), repr(line)
     assert all(each in line for each in (r"\u009b31m \u007f \ue000 \udb40\udc01", "Grüße 日本 👩", r"\u202epatrol"))
-    assert text in _strings(json.loads(line))
+    assert json.dumps(text)[1:-1] in json.dumps(json.loads(line))
     if command != ["watch"]:  # a program gets the text unchanged
         assert json.loads(scripted.run(*words).out)
         assert "\x9b31m \x7f" in scripted.run(*words).out
-
-
-def _strings(found: Any) -> set[str]:
-    """Return all strings in an object of JSON."""
-    if isinstance(found, str):
-        return {found}
-    parts = found.values() if isinstance(found, dict) else found if isinstance(found, list) else ()
-    return {each for part in parts for each in _strings(part)}
 
 
 def test_colour_is_for_terminals_alone(scripted: Talk) -> None:

@@ -21,6 +21,7 @@ from tests.conformance.bareserve import TALK, environment, run
 from tests.golden import surface
 from tests.support.surroundings import short_directory
 from tests.support.terminal import Terminal
+from tests.test_command_line import alone
 
 if TYPE_CHECKING:
     import pathlib
@@ -32,13 +33,6 @@ if TYPE_CHECKING:
 FAST = ("--rate", "450")
 
 HEADINGS = ["Usage:", "Examples:", "Options:", "Options of every command:", "Exit codes:"]
-
-
-def alone(*words: str, **extra: str) -> tuple[int, str, str]:
-    """Run `talk` without a server, in 80 columns; return its exit code, output and errors."""
-    with short_directory() as home:
-        done = run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", **{"COLUMNS": "80", **extra}))
-    return done.code, done.out, done.err
 
 
 def command(name: str) -> ClickCommand:
@@ -60,8 +54,9 @@ def as_it_was(name: str) -> str:
 
 
 def test_talk_alone_fits_a_small_terminal_and_shows_every_command() -> None:
-    code, out, err = alone()
-    assert (code, err, too_wide(out)) == (0, "", [])
+    done = alone(COLUMNS="80")
+    out = done.out
+    assert (done.code, done.err, too_wide(out)) == (0, "", [])
     assert len(out.splitlines()) < 24  # the prompt comes below it
     assert re.findall(r"(?m)^  ([a-z]+)  +[A-Z]", out) == [*commands.COMMANDS]
     for words in ("talk serve &", "talk say ", "talk doctor", "talk --help", "talk COMMAND --help"):
@@ -81,10 +76,10 @@ def test_help_of_talk_has_all_exit_codes() -> None:
 
 @pytest.mark.parametrize("words", [["-h"], ["say", "-h"]])
 def test_help_has_a_short_option_and_uses_the_width_of_the_terminal(words: list[str]) -> None:
-    assert alone(*words) == (0, as_it_was(words[0] if words[1:] else "talk"), "")
-    code, out, err = alone(*words, COLUMNS="120")
-    assert (code, err, too_wide(out, 120)) == (0, "", [])
-    assert too_wide(out)
+    assert alone(*words, COLUMNS="80").out == as_it_was(words[0] if words[1:] else "talk")
+    done = alone(*words, COLUMNS="120")
+    assert (done.code, done.err, too_wide(done.out, 120)) == (0, "", [])
+    assert too_wide(done.out)
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)
@@ -158,7 +153,9 @@ def test_a_command_in_a_message_is_not_broken() -> None:
 
 
 def test_a_variable_with_a_wrong_value_is_named() -> None:
-    assert alone("serve", TALK_RATE="fast")[2].startswith("talk: --rate (env var: 'TALK_RATE'): 'fast' is not a whole ")
+    assert alone("serve", TALK_RATE="fast").err.startswith(
+        "talk: --rate (env var: 'TALK_RATE'): 'fast' is not a whole "
+    )
 
 
 def test_a_missing_player_is_told_at_the_start(make_talk: MakeTalk) -> None:
@@ -206,9 +203,8 @@ def test_without_any_player_the_packages_to_install_are_told(make_talk: MakeTalk
 
 
 def test_a_file_of_another_format_is_refused_and_not_written(tmp_path: pathlib.Path) -> None:
-    code, _, err = alone("say", "-o", str(tmp_path / "hello.MP3"), "hello")
-    assert code == 2
-    assert "--output writes WAV, not .MP3: name it .wav" in err
+    done = alone("say", "-o", str(tmp_path / "hello.MP3"), "hello")
+    assert (done.code, "--output writes WAV, not .MP3: name it .wav" in done.err) == (2, True)
     assert not list(tmp_path.iterdir())
 
 

@@ -72,13 +72,6 @@ def test_reader_that_has_enough_ends_it_with_141(scripted: Talk) -> None:
     assert code in {"0", str(CLOSED)}  # the rest may have been written before the reader was gone
 
 
-def test_watch_ends_when_its_reader_does(scripted: Talk) -> None:
-    talks = "while talk say -q --wait length=0; do true; done & "
-    done = bash(scripted, talks + "talk watch | head -n 1; echo ${PIPESTATUS[0]}; kill $!; wait 2> /dev/null")
-    assert done.stdout.splitlines()[-1] == str(CLOSED)
-    assert done.stderr == ""
-
-
 @pytest.mark.parametrize("closed", [">&-", "1</dev/null"])
 def test_an_output_that_was_closed_from_the_start_is_141(scripted: Talk, closed: str) -> None:
     done = bash(scripted, f"(talk status; echo $? >&2) {closed}")
