@@ -210,24 +210,6 @@ def test_the_variables_of_serve_change_nothing(shared: Talk) -> None:
     assert settings(shared) == DEFAULTS
 
 
-def test_changes_hold_for_later_goals(make_talk: MakeTalk) -> None:
-    talk = make_talk("--player", "null")
-    talk.run("set", "--rate", "450", "--ttl", "30")
-    fast = json.loads(talk.run("--json", "say", "--wait", "one two three").out)
-    talk.run("set", "--rate", "200", "--ttl", "0")
-    slow = json.loads(talk.run("--json", "say", "--wait", "one two three").out)
-    assert (fast["ttl"], slow["ttl"]) == (30, None)
-    assert slow["duration"] > fast["duration"] * 1.5
-
-
-def test_preempt_holds_for_later_goals(scripted: Talk) -> None:
-    first = scripted.run("say", "never-ends").id
-    scripted.watcher.wait_for_word(first)
-    scripted.run("set", "--preempt")
-    scripted.run("say", "--wait", "length=0")
-    assert scripted.goal(first)["state"] == "PREEMPTED"
-
-
 def test_serve_starts_with_its_options(make_talk: MakeTalk) -> None:
     talk = make_talk("--ttl", "0.5", "--rate", "100", "--pitch", "40", "--preempt", "--lead-in", "250", scripted=True)
     assert settings(talk) == {**DEFAULTS, "ttl": "0.5", "rate": "100", "pitch": "40", "preempt": "yes"}
@@ -236,13 +218,6 @@ def test_serve_starts_with_its_options(make_talk: MakeTalk) -> None:
     status = talk.run("status").out
     assert "ttl 0.5 s" in status
     assert "lead-in 250 ms" in status
-    talk.run("set", "--no-preempt")
-    active = talk.run("say", "never-ends").id
-    talk.watcher.wait_for_word(active)
-    late = talk.run("say", "too late").id
-    assert talk.watcher.wait_for_terminal(late) == "RECALLED"
-    assert talk.goal(late)["reason"] == "expired"
-    talk.run("cancel")
 
 
 def test_help_of_serve_names_the_devices_that_swallow_a_beginning() -> None:
