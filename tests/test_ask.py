@@ -11,7 +11,6 @@ import pytest
 
 from talkcli.terminal.text import width
 from tests.conformance.bareserve import TALK, run
-from tests.golden import surface
 from tests.support.processes import Talk
 from tests.support.terminal import Terminal
 
@@ -220,46 +219,28 @@ def test_serve_starts_with_its_options(make_talk: MakeTalk) -> None:
     assert "lead-in 250 ms" in status
 
 
-def test_help_of_serve_names_the_devices_that_swallow_a_beginning() -> None:
-    words = " ".join((surface.HERE / "help-serve.txt").read_text("utf-8").split())
-    for each in ("HDMI", "USB", "Bluetooth", "aplay -L", "pactl list short sinks", "[default: 0"):
-        assert each in words
+# talk cancel
 
 
-# talk cancel --key
-
-
-@pytest.fixture
-def ids(scripted: Talk) -> list[str]:
-    """Return the ids of a goal that is being spoken and of two that wait, with the keys battery, door and battery."""
+def test_cancel_stops_the_goals_that_any_selector_selects_and_no_other(scripted: Talk) -> None:
     active = scripted.run("say", "--key", "battery", "never-ends").id
     scripted.watcher.wait_for_word(active)
-    return [active, *(scripted.run("say", "--key", key, "waits").id for key in ("door", "battery"))]
-
-
-def test_a_key_cancels_the_goal_being_spoken_and_those_that_wait(scripted: Talk, ids: list[str]) -> None:
+    keys = ("door", "battery", "lift", "hall")
+    door, battery, lift, hall = (scripted.run("say", "--key", each, "waits").id for each in keys)
     for key in ("nothing", "batter", "BATTERY", "-"):
         done = scripted.run("cancel", "--key", key)
         assert (done.code, done.out, done.err) == (0, "", "")
-    assert scripted.goal(ids[0])["state"] == "ACTIVE"
-    done = scripted.run("cancel", "--key", "battery")
-    assert (done.code, set(done.out.split()), done.err) == (0, {ids[0], ids[2]}, "")
-    assert scripted.goal(ids[0])["state"] == "PREEMPTED"
-    assert scripted.goal(ids[2])["state"] == "RECALLED"
-    assert scripted.watcher.wait_for_terminal(ids[1]) == "SUCCEEDED"
-
-
-def test_selectors_add_up(scripted: Talk, ids: list[str]) -> None:
-    done = scripted.run("--json", "cancel", "--key", "door", ids[2])
-    assert {json.loads(each)["id"] for each in done.out.splitlines()} == {ids[1], ids[2]}
-    assert scripted.goal(ids[0])["state"] == "ACTIVE"
-    assert scripted.run("cancel", "--key", "nothing", "--current").id == ids[0]
-
-
-def test_a_wrong_selector_cancels_nothing(scripted: Talk, ids: list[str]) -> None:
     for words in (["--key", ""], ["--before", ""], ["--key="], ["--key", "k" * 65]):
         done = scripted.run("cancel", *words)
         assert (done.code, done.out) == (2, "")
         assert "key" in done.err or "--before" in done.err
-    assert scripted.goal(ids[0])["state"] == "ACTIVE"
-    scripted.run("cancel")
+    done = scripted.run("--json", "cancel", "--key", "door", lift)
+    assert {json.loads(each)["id"] for each in done.out.splitlines()} == {door, lift}
+    assert scripted.goal(active)["state"] == "ACTIVE"
+    done = scripted.run("cancel", "--key", "battery")
+    assert (done.code, set(done.out.split()), done.err) == (0, {active, battery}, "")
+    assert (scripted.goal(active)["state"], scripted.goal(battery)["state"]) == ("PREEMPTED", "RECALLED")
+    assert scripted.watcher.wait_for_terminal(hall) == "SUCCEEDED"
+    active = scripted.run("say", "never-ends").id
+    scripted.watcher.wait_for_word(active)
+    assert scripted.run("cancel", "--key", "nothing", "--current").id == active
