@@ -70,6 +70,8 @@ def test_the_next_step_for_a_missing_device_is_that_of_its_check() -> None:
     assert cured("audio_lost", "unplugged", behind="usermod") == "usermod"
     assert "another program" in cured("audio_device", "aplay: Device or resource busy", behind="usermod")
     assert "talk set --voice" in cured("nothing_to_say", "nothing", behind="usermod")
+    assert cured("audio_device", "aplay: No such device") == sentence.REMEDIES["audio_device"]
+    assert "usermod" in cured("audio_device", "aplay: Operation not permitted")
 
 
 def test_a_custom_player_is_to_be_tried_by_hand_unless_it_names_a_cause() -> None:
