@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import random
@@ -129,30 +128,6 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_in_a_second_is_spoken_wh
         assert_told_in_order(talk)
         talk.stop()
         assert_within(seconds, 1.0, "taking a thousand goals")
-
-
-def test_row_26_a_burst_from_several_clients_ends_with_one_goal_spoken(scripted: Talk) -> None:
-    """Whoever came last: it is the one that no other ended."""
-    with contextlib.ExitStack() as stack:
-        wires = [stack.enter_context(scripted.connect()) for _ in range(CLIENTS)]
-
-        def burst(wire: Wire) -> None:
-            for number in range(BURST // CLIENTS):
-                assert wire.request("say", text=f"length=0.3 number {number}", preempt=True)["ok"]
-
-        threads = [threading.Thread(target=burst, args=(wire,)) for wire in wires]
-        for each in threads:
-            each.start()
-        for each in threads:
-            each.join()
-    last = f"{wires[0].greeting['boot']}-{BURST}"
-    assert scripted.watcher.wait_for_terminal(last) == "SUCCEEDED"
-    goals = scripted.watcher.goals()
-    assert (len(goals), goals[-1]) == (BURST, last)
-    assert set(ends(scripted, *goals)) == {1}
-    states = last_states(scripted)
-    assert {states[each] for each in goals[:-1]} <= {"PREEMPTED", "RECALLED"}
-    assert_told_in_order(scripted)
 
 
 def last_states(talk: Talk) -> dict[str, str]:

@@ -59,10 +59,8 @@ def test_row_47_in_a_full_queue_the_newest_of_the_lowest_priority_gives_way(make
     high = submit(talk, "length=0 urgent", priority=5)
     assert high["state"] == "PENDING"
     assert_recalled(talk, third, "displaced", by=high["id"])
-    low = talk.run("--json", "say", "--wait", "--", "length=0 not now")
-    assert (low.code, "Talk rejected: " in low.err) == (5, True)
-    rejected = submit(talk, "length=0 nor now")
-    assert_rejected(rejected, "queue_full", "--max-queue")
+    low = talk.run("say", "--wait", "--", "length=0 not now")
+    assert (low.code, "Talk rejected: " in low.err, "--max-queue" in low.err) == (5, True, True)
     assert pending(talk) == [high["id"], first, second]
     assert talk.request("cancel", ids=[active])["ok"]
     assert states(talk, second)[-1] == "SUCCEEDED"
@@ -87,45 +85,6 @@ def test_row_47_a_goal_that_brings_preempt_displaces_the_newest_that_does_not(ma
     assert_told_in_order(talk)
 
 
-def test_row_47_a_goal_of_the_same_or_a_lower_priority_displaces_nothing(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "2", scripted=True)
-    begin(talk)
-    waiting = queue(talk, 3, 3)
-    for priority in (3, 2, -1):
-        assert_rejected(submit(talk, "length=0 more", priority=priority), "queue_full")
-    assert pending(talk) == waiting
-    assert talk.request("cancel")["count"] == 3
-
-
-def test_row_47_room_is_counted_after_flush_and_key(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "2", scripted=True)
-    active = begin(talk)
-    keyed = submit(talk, "length=0 old", key="battery")["id"]
-    other = submit(talk, "length=0 other")["id"]
-    newer = submit(talk, "length=0 new", key="battery")["id"]
-    assert_recalled(talk, keyed, "replaced", by=newer)
-    assert pending(talk) == [newer, other]
-    last = submit(talk, "length=0 last", flush=True)["id"]
-    for each in (newer, other):
-        assert_recalled(talk, each, "preempted", by=last)
-    assert states(talk, last)[-1] == "SUCCEEDED"
-    assert states(talk, active)[-1] == "PREEMPTED"
-    assert_told_in_order(talk)
-
-
-def test_row_47_a_goal_that_is_rejected_has_done_nothing(make_talk: MakeTalk) -> None:
-    """Not even where it preempts: the one that is ACTIVE has room for itself alone."""
-    talk = make_talk("--max-queue", "1", scripted=True)
-    active = begin(talk)
-    waiting = queue(talk, 1)
-    assert_rejected(submit(talk, "length=0 not now", preempt=True), "queue_full")
-    assert_rejected(submit(talk, "", flush=True), "invalid_text")
-    assert_rejected(submit(talk, "length=0", flush=True, rate=1), "bad_option", "rate")
-    assert talk.watcher.states(active) == ["PENDING", "ACTIVE"]
-    assert pending(talk) == waiting
-    assert talk.request("cancel")["count"] == 2
-
-
 # -- a sender that waits for room
 
 
@@ -138,6 +97,7 @@ def test_a_patient_goal_is_answered_when_there_is_room(make_talk: MakeTalk) -> N
         # Answered in between, over the same connection: the server goes on with it.
         wire.send({"seq": 2, "request": "status", "id": active})
         assert wire.receive()["seq"] == 2
+        assert_rejected(submit(talk, "length=0", patient=True, voice="klingon"), "unknown_voice")
         assert talk.request("cancel", ids=[first])["count"] == 1
         reply = wire.receive()
         assert (reply["seq"], reply["goal"]["state"]) == (1, "PENDING")
@@ -165,16 +125,6 @@ def test_patient_goals_keep_the_order_in_which_they_were_sent(make_talk: MakeTal
     assert [each["text"] for each in results] == [f"length=0 line {number}" for number in range(5)]
     assert spoken(talk) == [active, waiting, *(each["id"] for each in results)]
     assert_told_in_order(talk)
-
-
-def test_a_patient_goal_that_is_refused_for_another_reason_does_not_wait(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "1", scripted=True)
-    begin(talk)
-    queue(talk, 0)
-    assert_rejected(submit(talk, "", patient=True), "invalid_text")
-    assert_rejected(submit(talk, "length=0", patient=True, volume=2), "bad_option")
-    assert_rejected(submit(talk, "length=0", patient=True, voice="nobody's"), "unknown_voice")
-    assert talk.request("cancel")["count"] == 2
 
 
 def test_a_goal_that_comes_later_does_not_take_the_room_of_one_that_waits(make_talk: MakeTalk) -> None:
@@ -315,29 +265,23 @@ def waits(wire: Wire, text: str, **fields: object) -> None:
     [
         ({}, ["one", "two", "three"]),
         ({"ids": ["two", "seven"]}, ["two"]),
-        ({"key": "door"}, ["one", "two"]),
         ({"before": "two"}, ["one", "two"]),
         ({"before": "early"}, []),
-        ({"current": True}, []),
-        ({"ids": []}, []),
     ],
     ids=str,
 )
-def test_cancel_ends_the_goals_that_wait_for_room_and_are_selected(
+def test_a_cancel_ends_the_selected_goals_that_wait_for_room(
     make_talk: MakeTalk, selection: dict[str, Any], chosen: list[str]
 ) -> None:
-    """One whose room comes with the cancel itself is not spoken after it, whoever sent it."""
     talk = make_talk("--max-queue", "1", scripted=True)
     active = begin(talk, id="early")
     (queued,) = queue(talk, 0)
-    with contextlib.ExitStack() as stack:
-        one, two, three, canceling = (stack.enter_context(talk.connect()) for _ in range(4))
+    with talk.connect() as one, talk.connect() as two, talk.connect() as three, talk.connect() as canceling:
         wires = {"one": one, "two": two, "three": three}
-        waits(one, "one", key="door")
-        waits(two, "two", id="two", key="door")
-        waits(three, "three")
+        for name, wire in wires.items():
+            waits(wire, name, **({"id": "two"} if name == "two" else {}))
         reply = canceling.request("cancel", **selection)
-        assert reply["ok"] == ("seven" not in selection.get("ids", ()))
+        assert reply["ok"] == ("ids" not in selection)
         ended = [each["canceled"]["text"].split()[-1] for each in canceling.items if "canceled" in each]
         assert [each for each in ended if each in wires] == chosen
         assert not [each for each in canceling.items if "ended" in each]
@@ -346,7 +290,7 @@ def test_cancel_ends_the_goals_that_wait_for_room_and_are_selected(
             assert (goal["state"], goal["reason"], goal["started_at"]) == ("RECALLED", "canceled", None)
             assert goal["by"]["client"]["pid"] == os.getpid()
             assert states(talk, goal["id"]) == ["PENDING", "RECALLED"]
-        if "two" in chosen:  # as of any goal that has ended, whoever sends it again is told how
+        if "two" in chosen:  # the same goal sent again is told how the first one ended
             assert submit(talk, "length=0 two", id="two")["state"] == "RECALLED"
         talk.request("cancel", ids=[active, queued])
         for name in wires.keys() - chosen:
@@ -354,89 +298,16 @@ def test_cancel_ends_the_goals_that_wait_for_room_and_are_selected(
     assert_told_in_order(talk)
 
 
-def test_goals_that_wait_for_room_are_told_of_the_server_s_end(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "1", scripted=True)
-    begin(talk)
-    queue(talk, 0)
-    with talk.connect() as wire:
-        waits(wire, "patient")
-        talk.stop()
-        assert_rejected(wire.receive()["goal"], "shutdown")
-
-
-def test_an_id_that_was_cancelled_before_its_goal_came_does_not_wait_for_room(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "1", scripted=True)
-    begin(talk)
-    queue(talk, 0)
-    assert talk.request("cancel", ids=["door"])["error"]["code"] == "unknown_goal"
-    assert submit(talk, "length=0 the door", id="door", patient=True)["id"] == "door"
-    assert states(talk, "door") == ["PENDING", "RECALLED"]
-    assert talk.request("cancel")["count"] == 2
-
-
-# -- flush
-
-
-def test_flush_ends_what_is_spoken_and_all_that_waits_up_to_its_priority(scripted: Talk) -> None:
-    active = begin(scripted, priority=1)
-    zero, one, five, one_more = queue(scripted, 0, 1, 5, 1)
-    newcomer = submit(scripted, "length=0 attention", flush=True, priority=1)["id"]
-    for each in (zero, one, one_more):
-        assert_recalled(scripted, each, "preempted", by=newcomer)
-    assert states(scripted, newcomer)[-1] == "SUCCEEDED"
-    assert states(scripted, active) == ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
-    assert scripted.goal(active)["by"] == {"goal": newcomer}
-    assert spoken(scripted) == [active, five, newcomer]
-    assert_told_in_order(scripted)
-
-
-def test_flush_leaves_an_active_goal_of_a_higher_priority(scripted: Talk) -> None:
-    active = begin(scripted, priority=2)
-    (waiting,) = queue(scripted, 0)
-    newcomer = submit(scripted, "length=0 attention", flush=True, priority=1)["id"]
-    assert_recalled(scripted, waiting, "preempted", by=newcomer)
-    assert scripted.watcher.states(active) == ["PENDING", "ACTIVE"]
-    assert scripted.request("cancel", current=True)["count"] == 1
-    assert states(scripted, newcomer)[-1] == "SUCCEEDED"
-
-
-def test_preempting_goals_that_wait_are_recalled_by_the_next_one_and_the_others_stay(scripted: Talk) -> None:
-    active = begin(scripted, "length=20 slow-stop=0.1 words=1")
-    plain, high = queue(scripted, 0, 5)
-    first = submit(scripted, "length=0 first", preempt=True)["id"]
-    second = submit(scripted, "length=0 second", preempt=True)["id"]
-    assert_recalled(scripted, first, "preempted", by=second)
-    assert states(scripted, plain)[-1] == "SUCCEEDED"
-    assert spoken(scripted) == [active, high, second, plain]
-    assert scripted.goal(active)["by"] == {"goal": first}  # the first stop gives the reason, later ones join it
-    assert_told_in_order(scripted)
-
-
 # -- settings and voices
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("rate", 79), ("rate", 451), ("volume", 1.01), ("volume", -0.1), ("pitch", 101), ("ttl", -1), ("throttle", -1)],
-)
-def test_options_out_of_range_are_rejected_and_interrupt_nothing(scripted: Talk, field: str, value: float) -> None:
-    active = begin(scripted)
-    rejected = submit(scripted, "length=0", flush=True, **{field: value})
-    assert_rejected(rejected, "bad_option", field)
-    assert scripted.goal(active)["state"] == "ACTIVE"
-    assert scripted.request("cancel")["count"] == 1
 
 
 def test_an_unknown_voice_is_rejected_with_near_matches(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     assert_rejected(submit(talk, "hello", voice="en-uss"), "unknown_voice", "en-uss", "did you mean", "'en-us'")
     assert_rejected(submit(talk, "hello", voice="klingonisch"), "unknown_voice", "klingonisch", "talk voices")
-    refused = talk.request("set", voice="en-uss")
-    assert (refused["ok"], refused["error"]["code"]) == (False, "unknown_voice")
-    assert "'en-us'" in refused["error"]["message"]
+    refused = talk.request("set", voice="en-uss")["error"]
+    assert (refused["code"], "'en-us'" in refused["message"]) == ("unknown_voice", True)
     assert talk.request("set")["settings"]["voice"] is None
-    goal = submit(talk, "hello", voice="en-us", rate=450)
-    assert states(talk, goal["id"])[-1] == "SUCCEEDED"
 
 
 def test_settings_are_changed_all_together_or_not_at_all(scripted: Talk) -> None:

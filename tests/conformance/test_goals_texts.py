@@ -54,15 +54,14 @@ def assert_rejected(done: Finished, reason: str) -> None:
     assert "Talk rejected: " in done.err
 
 
-@pytest.mark.parametrize("preempt", [False, True])
-def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_wire(scripted: Talk, preempt: bool) -> None:
+def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_wire(scripted: Talk) -> None:
     bystanders = Bystanders(scripted)
     cases = [(name, text, "invalid_text") for name, text in INVALID.items()]
     cases += [(name, text, "text_too_long") for name, text in TOO_LONG.items()]
     with Raw(scripted.socket) as raw:
         raw.receive_lines(1)
         for number, (name, text, reason) in enumerate(cases):
-            request = {"seq": number, "request": "say", "text": text, "wait": True, "preempt": preempt}
+            request = {"seq": number, "request": "say", "text": text, "wait": True, "preempt": True}
             raw.send(json.dumps(request).encode() + b"\n")
             reply, state, result = raw.receive_lines(1 + 3 * (number + 1))[-3:]
             assert reply["seq"] == number
@@ -160,11 +159,6 @@ def test_row_13_100_kilobytes_on_the_wire_are_refused_and_do_nothing(scripted: T
     assert (reply["ok"], reply["error"]["code"]) == (False, "line_too_long")
     bystanders.assert_untouched()
     bystanders.assert_only_these_were_active()
-
-
-def test_row_13_a_format_that_is_not_known_is_rejected(scripted: Talk) -> None:
-    goal = scripted.request("say", text="<speak>hello</speak>", format="ssml")["goal"]
-    assert (goal["state"], goal["reason"]) == ("REJECTED", "bad_option")
 
 
 def test_whole_texts_are_spoken_as_they_are(scripted: Talk) -> None:
