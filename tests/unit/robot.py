@@ -1,36 +1,61 @@
-"""A scheduler for tests: its effects written down, its time moved by the test alone."""
+"""A scheduler for tests: a script goes in, and one line comes out that tells what became of each goal.
+
+The steps of a script are parted by semicolons. A goal is a single letter, which is its text, with its options; every
+other step is a verb:
+
+    a 5 preempt key=k ttl=1     send a goal of priority 5 that preempts; "queue" is preempt=False
+    heard a; completed a; failed a; stopped a; deaf a   report this of a goal, as the engine does
+    cancel; cancel a b; cancel current before=c key=k
+    wait 1; pass 1              let a second pass, with or without a look at the clock
+    pause; resume; shutdown; lost; ready; missing; room 2 (the places in the queue); set ttl=5 preempt=yes
+    expect joe; begin joe; end joe      load the voice piper/joe
+
+In the outcome, "a ACTIVE; c b PENDING; d e RECALLED replaced by c", pending goals have their order in the queue.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import INITIAL, Cancel, Say
 from talkcli.goals.scheduler import Cancelled, Changed, Effect, Now, Scheduler, Submitted
+from talkcli.goals.states import State
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from talkcli.goals.record import Record
-    from talkcli.goals.states import State
 
 ARM = Sender(pid=7, uid=1000, command="talk", name="arm")
 DOOR = Sender(pid=8, uid=1000, command="talk", name="door")
+#: How the message of each end begins.
+MESSAGES = {
+    State.SUCCEEDED: "Talk completed successfully",
+    State.ABORTED: "Talk aborted: ",
+    State.REJECTED: "Talk rejected: ",
+    State.RECALLED: "Talk recalled: ",
+    State.PREEMPTED: "Talk preempted",
+}
+WORDS = {"yes": True, "no": False}
 
 
 @dataclass
 class Robot:
     """A scheduler whose effects are written down, at a time that only the test moves."""
 
-    preempt: bool = False
     max_queue: int = 100
-    ttl: float = 0.0
     seconds: float = 100.0
+    #: the effects in their order, as "a PENDING", "a Start"
     seen: list[str] = field(default_factory=list)
+    goals: dict[str, Record] = field(default_factory=dict)
+    #: the attached ones, as "b is a"
+    attached: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        settings = replace(INITIAL, preempt=self.preempt, ttl=self.ttl)
-        self.scheduler = Scheduler("4k7f", max_queue=self.max_queue, settings=settings)
+        self.scheduler = Scheduler("4k7f", max_queue=self.max_queue, settings=INITIAL)
 
     @property
     def now(self) -> Now:
@@ -39,11 +64,20 @@ class Robot:
     def see(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
             what = effect.state.name if isinstance(effect, Changed) else effect.order.value
-            self.seen.append(f"{effect.record.number} {what}")
+            self.seen.append(f"{self.name_of(effect.record)} {what}")
         return effects
 
-    def submits(self, say: Say, fault: tuple[str, str] | None = None) -> Submitted:
-        done = self.scheduler.submit(say, ARM, self.now, fault)
+    def name_of(self, record: Record) -> str:
+        return next((name for name, each in self.goals.items() if each is record), str(record.number))
+
+    # -- one step each
+
+    def submits(self, say: Say, name: str = "", **known: Any) -> Submitted:
+        done = self.scheduler.submit(say, ARM, self.now, **known)
+        if name and done.attached:
+            self.attached.append(f"{name} is {self.name_of(done.record)}")
+        elif name:
+            self.goals[name] = done.record
         self.see(done.effects)
         return done
 
@@ -53,22 +87,14 @@ class Robot:
     def says(self, text: str = "door open", *, preempt: bool | None = None, priority: int = 0) -> Record:
         return self.asks(Say(text, preempt=preempt, priority=priority))
 
-    def lacks_room(self, say: Say, fault: tuple[str, str] | None = None) -> bool:
-        return self.scheduler.lacks_room(say, self.now, fault)
-
-    def cancels(self, *ids: str, current: bool = False, before: str | None = None, key: str | None = None) -> Cancelled:
-        done = self.scheduler.cancel(Cancel(ids or None, current, before, key), DOOR, self.now)
+    def cancels(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancelled:
+        done = self.scheduler.cancel(Cancel(ids or None, **selection), DOOR, self.now, waiting)
         self.see(done.effects)
         return done
 
-    def pauses(self) -> None:
-        self.see(self.scheduler.pause())
-
-    def resumes(self) -> None:
-        self.see(self.scheduler.resume(self.now))
-
-    def shuts_down(self) -> None:
-        self.see(self.scheduler.shutdown(self.now))
+    def waits(self, seconds: float) -> None:
+        self.seconds += seconds
+        self.see(self.scheduler.tick(self.now))
 
     def tells(self, event: str, goal_id: str) -> None:
         """Let the engine tell this of a goal."""
@@ -79,29 +105,116 @@ class Robot:
                 self.see(self.scheduler.completed(goal_id, 1.5, self.now))
             case "failed":
                 self.see(self.scheduler.failed(goal_id, "audio_lost", "device is gone", 1.5, self.now))
+            case "deaf":
+                self.see(self.scheduler.failed(goal_id, "not_silent", "it does not end", None, self.now))
             case "stopped":
                 self.see(self.scheduler.stopped(goal_id, self.now))
+            case _:
+                raise ValueError(event)
 
-    def speaks_the_rest(self) -> list[str]:
-        """Let the engine speak to the end all that is active or waits; return the texts from the next one on."""
-        spoken = []
-        while self.scheduler.active:
-            self.tells("completed", self.scheduler.active.id)
-            if self.scheduler.active:
-                spoken.append(str(self.scheduler.active.text))
-        return spoken
+    # -- scripts
 
-    def waits(self, seconds: float) -> None:
-        self.seconds += seconds
-        self.see(self.scheduler.tick(self.now))
+    def play(self, script: str) -> Robot:
+        for step in script.split(";"):
+            verb, *words = step.split()
+            if len(verb) == 1:
+                given = options(words)
+                known = {each: given.pop(each) for each in ("waited", "fault", "canceled") if each in given}
+                if "fault" in known:
+                    known["fault"] = known["fault"], "it can't be had"
+                if "canceled" in known:
+                    known["canceled"] = By(client=DOOR)
+                self.submits(Say(**{"text": verb, **given}), verb, **known)
+            elif verb == "cancel":
+                given = options(words)
+                ids = [self._id(each) for each in words if given.get(each) and each != "current"]
+                selection: dict[str, Any] = {each: self._id(given[each]) for each in ("before", "key") if each in given}
+                self.cancels(*ids, current="current" in given, **selection)
+            else:
+                self._do(verb, words)
+        return self
 
-    def waiting(self) -> list[int]:
-        return [each.number for each in self.scheduler.pending()]
+    def _do(self, verb: str, words: list[str]) -> None:
+        scheduler, word = self.scheduler, words[0] if words else ""
+        effects: Callable[[], list[Effect] | None] = {
+            "pause": scheduler.pause,
+            "resume": lambda: scheduler.resume(self.now),
+            "shutdown": lambda: scheduler.shutdown(self.now),
+            "lost": scheduler.engine_lost,
+            "ready": lambda: scheduler.engine_ready(self.now),
+            "missing": lambda: scheduler.engine_missing("no memory", self.now),
+            "expect": lambda: scheduler.loading.wait_for(f"piper/{word}"),
+            "begin": lambda: scheduler.loading.begin(f"piper/{word}", self.seconds),
+            "end": lambda: scheduler.loading.end(f"piper/{word}"),
+            "wait": lambda: self.waits(float(word)),
+            "pass": lambda: setattr(self, "seconds", self.seconds + float(word)),
+            "room": lambda: setattr(scheduler, "max_queue", int(word)),
+            "set": lambda: setattr(scheduler, "settings", replace(scheduler.settings, **options(words))),
+        }.get(verb, lambda: self.tells(verb, self._id(word)))
+        self.see(effects() or [])
+        if verb == "end":
+            self.waits(0)
+
+    def _id(self, name: str) -> str:
+        return self.goals[name].id if name in self.goals else name
+
+    def outcome(self) -> str:
+        """Return what became of the goals, and check that each of them and what was told of it agree."""
+        pending = list(self.scheduler.pending())
+        ended = [each for each in self.goals.values() if each not in pending]
+        groups: dict[str, list[str]] = {}
+        for record in [*sorted(ended, key=lambda each: each is not self.scheduler.active), *pending]:
+            groups.setdefault(self._ending(record), []).append(self.name_of(record))
+        found = [f"{' '.join(names)} {ending}" for ending, names in groups.items()]
+        order = sorted(
+            found, key=lambda each: ("ACTIVE" not in each and "PREEMPTING" not in each, "PENDING" not in each)
+        )
+        return "; ".join([*order, *self.attached])
+
+    def _ending(self, record: Record) -> str:
+        goal = record.snapshot()
+        told = [each.split()[1] for each in self.seen if each.startswith(f"{self.name_of(record)} ")]
+        states = [each for each in told if each.isupper()]
+        assert states[-1] == goal.state.name, f"it is {goal.state.name}, and was told to be {states}"
+        assert (goal.started_at is not None) == ("ACTIVE" in states)
+        assert (goal.ended_at is not None) == goal.state.terminal
+        assert str(goal.message).startswith(MESSAGES[goal.state]) if goal.state.terminal else goal.message is None
+        words = [goal.state.name, *(["paused"] if goal.paused else []), *([goal.reason] if goal.reason else [])]
+        if goal.by and goal.by.goal:
+            words += ["by", self.name_of(next(each for each in self.goals.values() if each.id == goal.by.goal))]
+        elif goal.by and goal.by.client:
+            words += ["by", str(goal.by.client.name)]
+        return " ".join(words)
+
+
+def play(script: str) -> Robot:
+    return Robot().play(script)
+
+
+def options(words: list[str]) -> dict[str, Any]:
+    """Return the options of a step: a number is a priority, a word alone is a flag."""
+    found: dict[str, Any] = {}
+    for word in words:
+        name, is_value, value = word.partition("=")
+        if is_value:
+            found[name] = WORDS.get(value, number(value))
+        elif name == "queue":
+            found["preempt"] = False
+        elif isinstance(number(name), int):
+            found["priority"] = number(name)
+        else:
+            found[name] = True
+    return found
+
+
+def number(word: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(word)
+        except ValueError:
+            pass
+    return word
 
 
 def ending(record: Record) -> tuple[State, str | None, By | None]:
     return record.state, record.reason, record.by
-
-
-def numbers(records: list[Record]) -> list[int]:
-    return sorted(each.number for each in records)

@@ -1,273 +1,274 @@
-"""The scheduler by examples: order, preempt, admission, cancel, shutdown, and what a goal's end says of it."""
+"""What the scheduler answers and tells: messages, news, times, the answer to a cancel, and what is remembered."""
 
 from __future__ import annotations
 
 import pytest
 
-from talkcli.goals.goal import By
-from talkcli.goals.options import Say
-from talkcli.goals.scheduler import Cancelled, Changed, Now
+from talkcli.goals import history
+from talkcli.goals.goal import By, Output
+from talkcli.goals.history import EARLY_CANCEL, MAX_EARLY_CANCELS, MAX_SAID
+from talkcli.goals.options import Cancel, Say
+from talkcli.goals.scheduler import SILENCE_LIMIT, Cancelled, Now
 from talkcli.goals.states import State
-from tests.unit.robot import ARM, DOOR, Robot, ending, numbers
+from tests.unit.robot import ARM, DOOR, Robot, play
+
+#: The message of the last goal of each script.
+MESSAGES = {
+    "a; completed a": "Talk completed successfully",
+    "a; failed a": "Talk aborted: device is gone",
+    "lost; a; missing": "Talk aborted: no memory",
+    "a; cancel a; wait 2": "Talk aborted: silence could not be confirmed within 1.9 s",
+    "a; cancel a; stopped a": "Talk preempted",
+    "a; b; cancel b": "Talk recalled: canceled before it was spoken",
+    "a canceled": "Talk recalled: canceled before it was spoken",
+    "cancel mine; a id=mine": "Talk recalled: canceled before it arrived",
+    "a; b; shutdown": "Talk recalled: the server was stopped",
+    "a; b ttl=1; wait 1": "Talk recalled: its time to live of 1 s was over before it was spoken",
+    "a; b ttl=1 waited=1": "Talk recalled: its time to live of 1 s was over before it was spoken",
+    "shutdown; a": "Talk rejected: the server is being stopped",
+    "a text=": "Talk rejected: the text is empty",
+    "a fault=unknown_voice": "Talk rejected: it can't be had",
+    "room 1; a; b; c": "Talk rejected: 1 goals are waiting already (`talk serve --max-queue`)",
+    "a id=mine; b id=mine": "Talk rejected: the id mine is that of another text already",
+    "a; b text=a throttle=60": "Talk rejected: the same is being said",
+    "a; b; c text=b throttle=60": "Talk rejected: the same is waiting already",
+    "a; completed a; b text=a throttle=2.5": "Talk rejected: the same was said less than 2.5 s ago",
+}
+
+#: What is told of each script, in its order; of the first, everything.
+NEWS = {
+    "a; b; completed a": "a PENDING, a ACTIVE, a Start, b PENDING, a SUCCEEDED, b ACTIVE, b Start",
+    "a; b preempt; c preempt": "b PENDING, a PREEMPTING, a Stop, c PENDING, b RECALLED",
+    "a; b; c key=k; d flush key=k": "d PENDING, c RECALLED, b RECALLED, a PREEMPTING, a Stop",
+    "pause; a; b flush; resume": "a PENDING, b PENDING, a RECALLED, b ACTIVE, b Start",
+    "room 1; a; b; c 5": "c PENDING, b RECALLED",
+    "a; pause; pause; resume; resume; completed a": "a Start, a Hold, a Resume, a SUCCEEDED",
+    "a; cancel a; pause; resume": "a Start, a PREEMPTING, a Stop",
+    "a; pause; cancel a; resume": "a Hold, a PREEMPTING, a Stop",
+    "a; b; cancel": "b PENDING, b RECALLED, a PREEMPTING, a Stop",
+    "a; b; shutdown; shutdown": "b PENDING, b RECALLED, a PREEMPTING, a Stop",
+    "a; b; cancel a; wait 2": "a Stop, a GiveUp, a ABORTED, b ACTIVE, b Start",
+    "a; b ttl=2; c ttl=1; wait 3": "c PENDING, c RECALLED, b RECALLED",
+    "lost; a; missing": "a PENDING, a ACTIVE, a ABORTED",
+    "cancel mine; a id=mine": "a PENDING, a RECALLED",
+}
+
+#: When the scheduler has something to do next, in monotonic seconds; a script begins at 100.
+DEADLINES = {
+    "a; b": None,
+    "a ttl=1": None,
+    "a; b ttl=1": 101,
+    "a; b ttl=9; c ttl=2; d ttl=4": 102,
+    "a; b ttl=9; c ttl=2; d ttl=4; cancel c": 104,
+    "a; b ttl=9; c ttl=2; d ttl=4; cancel c; wait 4": 109,
+    "a; b ttl=5; cancel a": 100 + SILENCE_LIMIT,
+    "a; b ttl=1; cancel a": 101,
+    "a; cancel a; pass 1; cancel a": 100 + SILENCE_LIMIT,
+    "a; cancel a; wait 2": None,
+    "a ttl=1; lost": 101,
+    "a ttl=1; heard a; lost": None,
+    "lost; a; b ttl=3": 103,
+    "a; b key=k ttl=1; c key=k ttl=9": 109,
+}
 
 
-def test_goals_are_spoken_first_in_first_out() -> None:
+@pytest.mark.parametrize("script", MESSAGES)
+def test_each_end_has_its_words(script: str) -> None:
+    assert [*play(script).goals.values()][-1].message == MESSAGES[script]
+
+
+@pytest.mark.parametrize("script", NEWS)
+def test_what_happens_is_told_in_its_order(script: str) -> None:
+    news = NEWS[script].split(", ")
+    assert play(script).seen[-len(news) :] == news
+
+
+@pytest.mark.parametrize("script", DEADLINES)
+def test_the_deadline_is_the_first_that_is_due(script: str) -> None:
+    assert play(script).scheduler.deadline() == DEADLINES[script]
+
+
+def test_silence_is_given_up_within_the_two_seconds_in_which_a_cancel_is_answered() -> None:
+    assert 1.5 < SILENCE_LIMIT < 2
+
+
+# What a goal shows
+
+
+def test_a_goal_that_succeeded_shows_how_it_was_spoken() -> None:
     robot = Robot()
-    goals = [robot.says(text) for text in ("a", "b", "c")]
-    for goal in goals:
-        robot.tells("completed", goal.id)
-    assert robot.seen == [
-        *("1 PENDING", "1 ACTIVE", "1 Start", "2 PENDING", "3 PENDING"),
-        *("1 SUCCEEDED", "2 ACTIVE", "2 Start", "2 SUCCEEDED", "3 ACTIVE", "3 Start", "3 SUCCEEDED"),
-    ]
+    record = robot.submits(Say("door", data={"page": 3}, priority=-7), "a").record
+    goal = robot.play("pass 3; completed a").goals["a"].snapshot()
+    assert goal == record.snapshot()
+    assert (goal.id, goal.state, goal.client, goal.priority) == ("4k7f-1", State.SUCCEEDED, ARM, -7)
+    assert (goal.data, goal.key, goal.voice, goal.output, goal.paused) == ({"page": 3}, None, None, None, False)
+    assert (goal.reason, goal.by, goal.duration, goal.spoken, goal.format) == (None, None, 1.5, "door", "text")
+    assert (goal.queued_at, goal.started_at, goal.ended_at) == (1.7e9 + 100, 1.7e9 + 100, 1.7e9 + 103)
 
 
-def test_a_goal_that_succeeded_says_so() -> None:
-    robot = Robot()
-    goal = robot.says("door open")
-    robot.seconds += 3
-    robot.tells("completed", goal.id)
-    told = goal.snapshot()
-    assert (told.state, told.message, told.reason) == (State.SUCCEEDED, "Talk completed successfully", None)
-    assert (told.by, told.client, told.duration, told.spoken) == (None, ARM, 1.5, "door open")
-    assert told.queued_at == told.started_at == 1.7e9 + 100
-    assert told.ended_at == 1.7e9 + 103
-
-
-@pytest.mark.parametrize(("gaps", "words"), [(1, "1 gap of 2.0 s in all"), (3, "3 gaps of 2.0 s in all")])
-def test_a_goal_with_gaps_succeeded_and_says_so(gaps: int, words: str) -> None:
-    robot = Robot()
-    goal = robot.says("door open")
-    robot.see(robot.scheduler.completed(goal.id, 1.5, robot.now, gaps, 2.04))
-    told = goal.snapshot()
-    message = f"Talk completed successfully, but with {words}: this machine is too slow for the voice"
-    assert (told.state, told.message) == (State.SUCCEEDED, message)
-
-
-def test_a_goal_that_failed_says_why_and_how_far_it_came_and_the_next_one_starts() -> None:
-    robot = Robot()
-    goal = robot.says("door open")
-    robot.says()
-    robot.tells("heard", goal.id)
-    robot.tells("failed", goal.id)
-    told = goal.snapshot()
-    assert (told.state, told.reason, told.message) == (State.ABORTED, "audio_lost", "Talk aborted: device is gone")
-    assert (told.spoken, told.by) == ("door", None)
-    assert robot.seen[-3:] == ["1 ABORTED", "2 ACTIVE", "2 Start"]
-
-
-def test_what_was_heard_only_moves_forward() -> None:
-    robot = Robot()
-    goal = robot.says("door open")
-    assert goal.snapshot().spoken == ""
-    for end, spoken in ((4, "door"), (2, "door"), (0, "door"), (9, "door open"), (4, "door open")):
-        assert robot.scheduler.heard(goal.id, end) is goal
-        assert goal.snapshot().spoken == spoken
-
-
-def test_a_goal_that_waits_has_nothing_spoken_and_no_end() -> None:
-    robot = Robot()
-    robot.says()
-    told = robot.says().snapshot()
-    assert (told.spoken, told.started_at, told.ended_at, told.message, told.reason) == (None, None, None, None, None)
-
-
-def test_data_and_format_travel_with_the_goal() -> None:
-    record = Robot().scheduler.submit(Say("hi", data={"page": 3}), ARM, Now(0, 0)).record
-    assert (record.snapshot().data, record.snapshot().format) == ({"page": 3}, "text")
-
-
-# Preempt
-
-
-def test_preempt_stops_the_active_goal_and_goes_first_when_it_is_silent() -> None:
-    robot = Robot()
-    first = robot.says()
-    robot.says()
-    robot.says()
-    newcomer = robot.says(preempt=True)
-    assert robot.waiting() == [4, 2, 3]
-    robot.tells("stopped", first.id)
-    assert ending(first) == (State.PREEMPTED, "preempted", By(goal=newcomer.id))
-    assert newcomer.state is State.ACTIVE
-    assert robot.waiting() == [2, 3]
-
-
-def test_the_newest_of_those_that_preempt_wins_and_the_rest_of_the_queue_stays() -> None:
-    robot = Robot()
-    robot.says()
-    robot.says()
-    older = robot.says(preempt=True)
-    newer = robot.says(preempt=True)
-    assert ending(older) == (State.RECALLED, "preempted", By(goal=newer.id))
-    assert str(older.message).startswith("Talk recalled: ")
-    assert robot.waiting() == [4, 2]
-    assert robot.seen[-2:] == ["4 PENDING", "3 RECALLED"]
-
-
-def test_preempt_with_nothing_spoken_starts_at_once() -> None:
-    robot = Robot()
-    robot.says(preempt=True)
-    assert robot.seen == ["1 PENDING", "1 ACTIVE", "1 Start"]
-
-
-def test_preempt_may_be_the_servers_default_and_a_goal_may_opt_out() -> None:
-    robot = Robot(preempt=True)
-    robot.says(preempt=False)
-    robot.says(preempt=False)
-    assert robot.seen[-1] == "2 PENDING"
-    robot.says()
-    assert robot.waiting() == [3, 2]
-    robot.says(preempt=False)
-    assert robot.waiting() == [3, 2, 4]
-
-
-def test_of_a_thousand_preempting_goals_the_last_is_spoken_whole() -> None:
-    robot = Robot()
-    goals = [robot.says(f"goal {number}", preempt=True) for number in range(1_000)]
-    robot.tells("stopped", goals[0].id)
-    robot.tells("completed", goals[-1].id)
-    assert [each.state for each in goals] == [State.PREEMPTED, *[State.RECALLED] * 998, State.SUCCEEDED]
-    ends = [each for each in robot.seen if each.split()[1] in {"PREEMPTED", "RECALLED", "SUCCEEDED"}]
-    assert len(ends) == len(set(ends)) == 1_000
-    assert robot.scheduler.unfinished() == []
-
-
-# Admission
+def test_what_was_heard_only_moves_forward_and_stays_after_a_failure() -> None:
+    robot = play("a text=door_open; b")
+    assert robot.goals["a"].snapshot().spoken == ""
+    assert robot.goals["b"].snapshot().spoken is None
+    for end, spoken in ((4, "door"), (2, "door"), (0, "door"), (9, "door_open"), (4, "door_open")):
+        assert robot.scheduler.heard("4k7f-1", end) is robot.goals["a"]
+        assert robot.goals["a"].snapshot().spoken == spoken
+    goal = play("a text=door_open; heard a; failed a").goals["a"].snapshot()
+    assert (goal.spoken, goal.duration) == ("door", 1.5)
 
 
 @pytest.mark.parametrize(
-    ("say", "reason"),
+    ("gaps", "muted", "words"),
     [
-        (Say("", preempt=True), "invalid_text"),
-        (Say("\u200b", preempt=True), "invalid_text"),
-        (Say("a\0", preempt=True), "invalid_text"),
-        (Say("\ud800", preempt=True), "invalid_text"),
-        (Say("a" * 100_000, preempt=True), "text_too_long"),
-        (Say("hi", preempt=True, format="ssml"), "bad_option"),
+        (0, False, ""),
+        (1, False, ", but with 1 gap of 2.0 s in all: this machine is too slow for the voice"),
+        (3, False, ", but with 3 gaps of 2.0 s in all: this machine is too slow for the voice"),
+        (0, True, ", but the output was muted: card"),
     ],
 )
-def test_a_rejected_goal_has_its_reason_and_interrupts_nothing(say: Say, reason: str) -> None:
-    robot = Robot()
-    active, pending = robot.says(), robot.says(preempt=False)
-    before = active.snapshot(), pending.snapshot(), robot.waiting()
-    done = robot.submits(say)
-    record = done.record
-    assert done.effects == [Changed(record, State.REJECTED)]
-    assert (record.reason, record.started_at, record.ended_at) == (reason, None, robot.now.wall)
-    assert str(record.message).startswith("Talk rejected: ")
-    assert (active.snapshot(), pending.snapshot(), robot.waiting()) == before
-    assert robot.scheduler.find(record.id) is record
+def test_a_goal_that_was_not_heard_well_says_so(gaps: int, muted: bool, words: str) -> None:
+    robot = play("a")
+    output = Output("pulse", "card", 0.5, muted)
+    robot.scheduler.goes_to("4k7f-1", output)
+    robot.see(robot.scheduler.completed("4k7f-1", 1.5, robot.now, gaps, 2.04))
+    goal = robot.goals["a"].snapshot()
+    assert (goal.state, goal.output, goal.message) == (State.SUCCEEDED, output, f"Talk completed successfully{words}")
 
 
-def test_a_full_queue_rejects_the_newcomer() -> None:
-    robot = Robot(max_queue=2)
-    goals = [robot.says() for _ in range(4)]
-    assert ending(goals[3]) == (State.REJECTED, "queue_full", None)
-    assert robot.waiting() == [2, 3]
-    assert goals[0].state is State.ACTIVE
+def test_a_goal_as_it_was_accepted_shows_nothing_that_came_later() -> None:
+    robot = play("pause; a; resume; pause")
+    robot.scheduler.spoken_by("4k7f-1", "gmw/en-US")
+    robot.play("cancel; stopped a")
+    goal = robot.goals["a"].snapshot(State.PENDING)
+    late = (goal.voice, goal.reason, goal.by, goal.message, goal.spoken, goal.started_at, goal.ended_at, goal.output)
+    assert late == (None,) * 8
+    assert (goal.state, goal.paused, goal.queued_at) == (State.PENDING, False, 1.7e9 + 100)
+    assert (robot.goals["a"].snapshot().voice, robot.goals["a"].holds) == ("gmw/en-US", 1)
 
 
-def test_room_is_counted_after_those_that_give_way() -> None:
-    robot = Robot(max_queue=1)
-    robot.says()
-    older = robot.says(preempt=True)
-    newer = robot.says(preempt=True)
-    assert (older.state, newer.state) == (State.RECALLED, State.PENDING)
-    assert robot.says(preempt=False).reason == "queue_full"
-    assert newer.state is State.PENDING
+@pytest.mark.parametrize(
+    ("script", "ttl"),
+    [("a", None), ("a ttl=0", None), ("a ttl=2.5", 2.5), ("set ttl=5; a", 5), ("set ttl=5; a ttl=0", None)],
+)
+def test_a_goal_shows_the_time_to_live_that_holds(script: str, ttl: float | None) -> None:
+    assert play(script).goals["a"].snapshot().ttl == ttl
 
 
-def test_no_id_is_used_twice_and_each_is_the_boots() -> None:
-    robot = Robot(max_queue=1)
-    ids = [robot.says(text).id for text in ("a", "b", "c", "", "d")]
-    assert len(set(ids)) == 5
-    assert all(each.startswith("4k7f-") for each in ids)
+def test_each_goal_has_an_id_of_its_own_and_attaching_uses_none_up() -> None:
+    robot = play("room 1; a; b text=; c; d; e id=mine; f text=a; g id=other text=; h")
+    ids = ["4k7f-1", "4k7f-2", "4k7f-3", "4k7f-4", "4k7f-5", "4k7f-6", "4k7f-7", "4k7f-8"]
+    assert [each.id for each in robot.goals.values()] == ids
+    assert play("a id=mine; b id=mine text=a; c").goals["c"].id == "4k7f-2"
 
 
-# Cancel
-
-
-def test_cancel_without_a_selector_ends_everything() -> None:
-    robot = Robot()
-    goals = [robot.says() for _ in range(4)]
-    done = robot.cancels()
-    assert (numbers(done.recalled), done.stopping) == ([2, 3, 4], goals[0])
-    for goal in goals[1:]:
-        assert ending(goal) == (State.RECALLED, "canceled", By(client=DOOR))
-        assert str(goal.message).startswith("Talk recalled: ")
-    robot.tells("stopped", goals[0].id)
-    assert robot.scheduler.unfinished() == []
-    assert sum(each.endswith(("RECALLED", "PREEMPTED")) for each in robot.seen) == 4
-
-
-def test_cancel_with_nothing_to_cancel_does_nothing() -> None:
-    robot = Robot()
-    assert robot.cancels() == Cancelled()
-    assert robot.cancels(current=True) == Cancelled()
-
-
-def test_cancel_of_one_of_three_pending_keeps_the_order_of_the_rest() -> None:
-    robot = Robot()
-    goals = [robot.says() for _ in range(4)]
-    assert numbers(robot.cancels(goals[2].id).recalled) == [3]
-    assert robot.waiting() == [2, 4]
-    assert goals[0].state is State.ACTIVE
-
-
-def test_cancel_before_an_id_ends_that_goal_and_all_accepted_before_it() -> None:
-    robot = Robot()
-    goals = [robot.says() for _ in range(9)]
-    newest = robot.says(preempt=True)
-    done = robot.cancels(before=goals[6].id)
-    assert numbers(done.recalled) == [2, 3, 4, 5, 6, 7]
-    assert done.stopping is goals[0]
-    assert robot.waiting() == [newest.number, 8, 9]
-
-
-def test_cancel_of_ended_and_unknown_ids_says_so_and_does_the_rest() -> None:
-    robot = Robot()
-    ended = robot.says()
-    robot.tells("completed", ended.id)
-    before = ended.snapshot()
-    robot.says()
-    pending = robot.says()
-    done = robot.cancels(ended.id, "4k7f-99", pending.id, pending.id, before="mine")
-    assert (done.ended, sorted(done.unknown), done.recalled, done.stopping) == (
-        [ended], ["4k7f-99", "mine"], [pending], None
-    )  # fmt: skip
-    assert ended.snapshot() == before
-
-
-def test_selectors_of_a_cancel_add_up() -> None:
-    robot = Robot()
-    goals = [robot.says() for _ in range(5)]
-    done = robot.cancels(goals[4].id, current=True, before=goals[1].id)
-    assert (numbers(done.recalled), done.stopping) == ([2, 5], goals[0])
-    assert robot.waiting() == [3, 4]
-
-
-# The end
-
-
-def test_shutdown_ends_everything_for_its_own_reason_and_takes_no_goal_any_more() -> None:
-    robot = Robot()
-    goals = [robot.says() for _ in range(4)]
-    robot.shuts_down()
-    robot.shuts_down()
-    assert [ending(each) for each in goals[1:]] == [(State.RECALLED, "shutdown", None)] * 3
-    late = robot.says()
-    assert ending(late) == (State.REJECTED, "shutdown", None)
-    robot.tells("stopped", goals[0].id)
-    assert ending(goals[0]) == (State.PREEMPTED, "shutdown", None)
-    assert robot.seen.count("1 Stop") == 1
-    assert robot.scheduler.unfinished() == []
-
-
-def test_results_are_found_after_the_end() -> None:
-    robot = Robot()
-    goals = [robot.says() for _ in range(3)]
-    robot.cancels()
-    robot.tells("stopped", goals[0].id)
-    assert [robot.scheduler.find(each.id) for each in goals] == list(goals)
+def test_a_result_is_found_after_the_end() -> None:
+    robot = play("a; b; c; cancel; stopped a")
+    assert [robot.scheduler.find(each.id) for each in robot.goals.values()] == [*robot.goals.values()]
     assert robot.scheduler.find("4k7f-4") is None
+    robot = play("a id=mine; completed a")
+    robot.goals["a"].drop_text()
+    assert robot.play("b text=a id=mine; c id=mine").outcome() == "a SUCCEEDED; c REJECTED id_conflict; b is a"
+
+
+def test_time_on_the_wall_does_not_matter() -> None:
+    robot = play("a; b ttl=1; completed a; c; d ttl=1")
+    assert robot.scheduler.tick(Now(robot.seconds + 0.5, 9e9)) == []
+    assert robot.scheduler.submit(Say("a", throttle=60), ARM, Now(159, 9e9)).record.reason == "throttled"
+
+
+# The answer to a cancel
+
+
+def test_a_cancel_tells_what_it_ended_and_what_it_did_not_find() -> None:
+    robot = play("a; completed a; b; c; d")
+    a, b, c, _ = robot.goals.values()
+    done = robot.cancels(a.id, "4k7f-99", c.id, c.id, current=True, before="mine")
+    assert (done.ended, done.unknown, done.recalled, done.stopping) == ([a], ["4k7f-99", "mine"], [c], b)
+    assert len(done.effects) == 3
+    assert (c.by, b.by) == (By(client=DOOR), By(client=DOOR))
+    again = robot.cancels(b.id)
+    assert (again.stopping, again.effects) == (b, [])
+    assert Robot().cancels() == Robot().cancels(current=True) == Robot().cancels(key="k") == Cancelled()
+
+
+def test_an_id_that_waits_for_room_is_known_to_a_cancel() -> None:
+    robot = play("a; b")
+    assert robot.cancels("mine", waiting=("mine",)) == Cancelled()
+    done = robot.cancels(before="mine", waiting=("mine",))
+    assert (done.unknown, done.recalled, done.stopping) == ([], [robot.goals["b"]], robot.goals["a"])
+    assert robot.play("c id=mine").goals["c"].state is State.PENDING
+
+
+@pytest.mark.parametrize(
+    ("selection", "chosen"),
+    [
+        (Cancel(), [0, 1, 2, 3]),
+        (Cancel(ids=()), []),
+        (Cancel(ids=("b", "7", "c")), [1, 2]),
+        (Cancel(key="k"), [0, 1]),
+        (Cancel(current=True), []),
+        (Cancel(before="b"), [0, 1]),
+        (Cancel(before="nobody's"), []),
+        (Cancel(ids=("c",), before="b", current=True), [0, 1, 2]),
+    ],
+    ids=str,
+)
+def test_a_cancel_selects_among_goals_that_wait_for_room(selection: Cancel, chosen: list[int]) -> None:
+    waiting = [Say("1", key="k"), Say("2", id="b", key="k"), Say("3", id="c"), Say("4")]
+    assert selection.of_waiting(waiting) == chosen
+
+
+# Room
+
+
+def test_a_goal_lacks_room_if_nothing_else_is_wrong_with_it() -> None:
+    robot = play("room 1; a")
+    assert not robot.scheduler.lacks_room(Say("x"), robot.now)
+    robot.play("b id=mine key=face")
+    cases = {
+        True: [Say("x"), Say("x", preempt=True, priority=-1), Say("x", key="other")],
+        False: [
+            *(Say("x", priority=1), Say("x", flush=True), Say("x", preempt=True), Say("x", key="face")),
+            *(Say(""), Say("x", rate=1), Say("b", id="mine"), Say("z", id="mine")),
+        ],
+    }
+    for lacks, says in cases.items():
+        for say in says:
+            assert robot.scheduler.lacks_room(say, robot.now) is lacks, say
+    assert not robot.scheduler.lacks_room(Say("x"), robot.now, ("unknown_voice", "no such voice"))
+    robot.play("cancel early")
+    assert not robot.scheduler.lacks_room(Say("x", id="early"), robot.now), "it is RECALLED at once"
+    robot.play("cancel mine")
+    assert not robot.scheduler.lacks_room(Say("x"), robot.now)
+
+
+def test_a_goal_that_waits_for_room_goes_on_if_it_has_it_or_never_will() -> None:
+    robot = play("room 1; a; b id=mine")
+    assert not robot.scheduler.has_room(Say("x"))
+    assert robot.scheduler.has_room(Say("x", priority=1))
+    assert robot.scheduler.has_room(Say("x", id="mine"))
+    assert robot.play("shutdown").scheduler.has_room(Say("x"))
+
+
+# What is remembered
+
+
+def test_as_many_keys_and_texts_are_remembered_as_may_be_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert MAX_SAID == 10_000
+    monkeypatch.setattr(history, "MAX_SAID", 3)
+    robot = Robot()
+    for name in ("a", "b", "c", "a", "d"):
+        robot.tells("completed", robot.asks(Say(f"text {name}", key=f"key {name}")).id)
+    for name in ("a", "c", "d"):
+        assert robot.asks(Say("x", key=f"key {name}", throttle=60)).reason == "throttled"
+        assert robot.asks(Say(f"text {name}", throttle=60)).reason == "throttled"
+    assert robot.asks(Say("x", key="key b", throttle=60)).state is State.ACTIVE
+    assert robot.asks(Say("text b", throttle=60)).state is State.PENDING
+
+
+def test_a_thousand_early_cancels_are_remembered_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert (EARLY_CANCEL, MAX_EARLY_CANCELS) == (60, 1_000)
+    monkeypatch.setattr(history, "MAX_EARLY_CANCELS", 3)
+    robot = play("cancel one two three; cancel one four; cancel 4k7f-8 9z9z-7 17 -x")
+    robot.play("a id=one; b id=three; c id=four; d id=two")
+    assert robot.outcome() == "d ACTIVE; a b c RECALLED canceled by door"

@@ -1,186 +1,80 @@
-"""Voices that are being loaded, by examples: who waits for one, for how long, and who does not."""
+"""How long a goal waits for its voice to be loaded: one row for each rule, in the language of `tests.unit.robot`."""
 
 from __future__ import annotations
 
 import pytest
 
-from talkcli.frozen import replace
-from talkcli.goals.options import Say
-from talkcli.goals.states import State
-from tests.unit.robot import Robot, ending
+from tests.unit.robot import play
 
-JOE = "piper/joe"
+JOE, AMY = "voice=piper/joe", "voice=piper/amy"
 
+RULES = {
+    "a goal waits for its voice, and so do those behind it": (f"begin joe; a {JOE}; b", "a b PENDING"),
+    "a speaker is of its voice": (f"begin joe; a {JOE}#3; b; wait 9.9; end amy", "a b PENDING"),
+    "it begins once the voice is loaded": (f"begin joe; a {JOE}#3; b; end joe", "a ACTIVE; b PENDING"),
+    "another voice is not waited for": (f"begin joe; a {AMY}", "a ACTIVE"),
+    "a goal without a voice waits for the server's": (f"begin joe; set {JOE}; a; b voice=en", "a b PENDING"),
+    "a goal with a voice does not": (f"begin joe; set {JOE}; a voice=en; b", "a ACTIVE; b PENDING"),
+    "the server's may change": (f"begin joe; set {JOE}; a; set voice=en; wait 0", "a ACTIVE"),
+    "it waits ten seconds from when loading began": (f"begin joe; wait 4; a {JOE}; wait 5.9", "a PENDING"),
+    "and no longer": (f"begin joe; wait 4; a {JOE}; wait 6", "a ACTIVE"),
+    "if loading has not begun, from its turn": (
+        f"a; expect joe; b {JOE}; wait 60; completed a; wait 9.9",
+        "b PENDING; a SUCCEEDED",
+    ),
+    "or no longer than that": (f"a; expect joe; b {JOE}; wait 60; completed a; wait 10", "b ACTIVE; a SUCCEEDED"),
+    "a turn may come by a cancel": (
+        f"begin joe; expect amy; a {JOE}; b {AMY}; wait 3; cancel a; wait 0; wait 10",
+        "b ACTIVE; a RECALLED canceled by door",
+    ),
+    "a goal that preempts does not wait": (f"begin joe; a {JOE}; b {JOE} preempt", "b ACTIVE; a PENDING"),
+    "nor does one that flushes": (f"begin joe; a {JOE}; b {JOE} flush", "b ACTIVE; a RECALLED preempted by b"),
+    "nor one of a higher priority": (f"begin joe; a {JOE}; b {JOE} 1", "b ACTIVE; a PENDING"),
+    "one of a lower priority does": (f"begin joe; a {JOE} -1", "a PENDING"),
+    "a goal waits while more than half a second of its time is left": (
+        f"begin joe; a {JOE} ttl=2; wait 1.4",
+        "a PENDING",
+    ),
+    "then it begins": (f"begin joe; a {JOE} ttl=2; wait 1.5", "a ACTIVE"),
+    "or at once": (f"begin joe; a {JOE} ttl=0.5", "a ACTIVE"),
+    "a goal that insists waits until the voice is loaded": (f"begin joe; a {JOE} voice_only; wait 60", "a PENDING"),
+    "though it preempts": (f"begin joe; a {JOE} voice_only preempt; wait 60", "a PENDING"),
+    "though its priority is high": (f"begin joe; a {JOE} voice_only 5; wait 60; end joe", "a ACTIVE"),
+    "and expires like any other": (f"begin joe; a {JOE} voice_only ttl=3; b; wait 3", "b ACTIVE; a RECALLED expired"),
+    "a goal behind one that was cancelled begins": (
+        f"begin joe; a {JOE}; b; cancel a; wait 0",
+        "b ACTIVE; a RECALLED canceled by door",
+    ),
+    "a loaded voice starts none beside the active goal": (f"a; begin joe; b {JOE}; end joe", "a ACTIVE; b PENDING"),
+    "nor while speech is paused": (f"begin joe; a {JOE}; pause; end joe", "a PENDING"),
+    "an engine that is lost loads nothing": (f"begin joe; a {JOE}; lost; wait 20; ready", "a ACTIVE"),
+}
 
-def loads(robot: Robot, voice: str = JOE) -> None:
-    robot.scheduler.loading.begin(voice, robot.seconds)
-
-
-def has_loaded(robot: Robot, voice: str = JOE) -> None:
-    robot.scheduler.loading.end(voice)
-    robot.waits(0)
-
-
-@pytest.mark.parametrize("voice", [JOE, f"{JOE}#3"])
-def test_a_goal_waits_for_its_voice_and_those_behind_it_wait_too(voice: str) -> None:
-    robot = Robot()
-    loads(robot)
-    first, second = robot.asks(Say("battery low", voice=voice)), robot.says()
-    assert (first.state, second.state) == (State.PENDING, State.PENDING)
-    robot.waits(9.9)
-    has_loaded(robot, "piper/another")
-    assert first.state.name == "PENDING"
-    has_loaded(robot)
-    assert robot.seen == ["1 PENDING", "2 PENDING", "1 ACTIVE", "1 Start"]
-    assert robot.speaks_the_rest() == ["door open"]
-
-
-def test_a_goal_without_a_voice_waits_for_the_servers() -> None:
-    robot = Robot()
-    loads(robot)
-    robot.scheduler.settings = replace(robot.scheduler.settings, voice=JOE)
-    mine, other = robot.says(), robot.asks(Say("turn left", voice="en"))
-    assert (mine.state, other.state) == (State.PENDING, State.PENDING)
-    robot.scheduler.settings = replace(robot.scheduler.settings, voice=None)
-    assert robot.scheduler.deadline() == 0
-    robot.waits(0)
-    assert mine.state is State.ACTIVE
-
-
-def test_a_goal_waits_ten_seconds_from_when_its_voice_was_begun_with() -> None:
-    robot = Robot()
-    loads(robot)
-    robot.waits(4)
-    goal = robot.asks(Say("battery low", voice=JOE))
-    assert robot.scheduler.deadline() == 110
-    robot.waits(5.9)
-    assert goal.state.name == "PENDING"
-    robot.waits(0.1)
-    assert goal.state is State.ACTIVE
-
-
-def test_for_a_voice_that_is_not_begun_with_a_goal_waits_ten_seconds_from_its_turn() -> None:
-    robot = Robot()
-    first = robot.says()
-    robot.scheduler.loading.wait_for(JOE)
-    goal = robot.asks(Say("battery low", voice=JOE))
-    robot.waits(60)
-    robot.tells("completed", first.id)
-    assert robot.scheduler.deadline() == 170
-    robot.waits(4)
-    loads(robot)
-    assert robot.scheduler.deadline() == 174, "it will be there soon"
-    robot.waits(9.9)
-    assert goal.state.name == "PENDING"
-    robot.waits(0.1)
-    assert goal.state is State.ACTIVE
+DEADLINES = {
+    f"begin joe; wait 4; a {JOE}": 110,
+    f"begin joe; wait 4; expect joe; a {JOE}": 110,
+    f"a; expect joe; b {JOE}; wait 60": None,
+    f"a; expect joe; b {JOE}; wait 60; completed a": 170,
+    f"a; expect joe; b {JOE}; wait 60; completed a; wait 4; begin joe": 174,
+    f"begin joe; expect amy; a {JOE}; b {AMY}; wait 3; cancel a": 0,
+    f"begin joe; expect amy; a {JOE}; b {AMY}; wait 3; cancel a; wait 0": 113,
+    f"begin joe; a {JOE} ttl=2": 101.5,
+    f"begin joe; a {JOE} ttl=99": 110,
+    f"begin joe; a {JOE} voice_only": None,
+    f"begin joe; a {JOE} voice_only ttl=3": 103,
+    f"begin joe; a {JOE}; end joe": None,
+    f"a; begin joe; b {JOE}": None,
+    f"begin joe; a {JOE}; pause": None,
+    f"begin joe; a {JOE}; lost": None,
+    f"begin joe; set {JOE}; a; set voice=en": 0,
+}
 
 
-def test_a_goal_whose_turn_it_is_by_a_cancel_waits_from_then_on() -> None:
-    robot = Robot()
-    loads(robot)
-    robot.scheduler.loading.wait_for("piper/amy")
-    first, second = robot.asks(Say("x", voice=JOE)), robot.asks(Say("y", voice="piper/amy"))
-    robot.waits(3)
-    robot.cancels(first.id)
-    assert robot.scheduler.deadline() == 0, "it is to be looked at"
-    robot.waits(0)
-    assert robot.scheduler.deadline() == 113
-    robot.waits(10)
-    assert second.state is State.ACTIVE
+@pytest.mark.parametrize(("script", "outcome"), RULES.values(), ids=RULES.keys())
+def test_a_rule_holds(script: str, outcome: str) -> None:
+    assert play(script).outcome() == outcome
 
 
-@pytest.mark.parametrize("urgent", [{"preempt": True}, {"flush": True}, {"priority": 1}])
-def test_who_is_urgent_waits_for_no_voice(urgent: dict[str, object]) -> None:
-    robot = Robot()
-    loads(robot)
-    waiting = robot.asks(Say("battery low", voice=JOE))
-    goal = robot.asks(Say("stop", voice=JOE, **urgent))  # type: ignore[arg-type]
-    assert goal.state is State.ACTIVE
-    assert waiting.state is (State.RECALLED if "flush" in urgent else State.PENDING)
-
-
-def test_a_lower_priority_is_not_urgent() -> None:
-    robot = Robot()
-    loads(robot)
-    assert robot.asks(Say("battery low", voice=JOE, priority=-1)).state is State.PENDING
-
-
-def test_a_goal_begins_while_half_a_second_of_its_time_is_left() -> None:
-    robot = Robot()
-    loads(robot)
-    goal = robot.asks(Say("battery low", voice=JOE, ttl=2))
-    assert robot.scheduler.deadline() == 101.5
-    robot.waits(1.5)
-    assert goal.state is State.ACTIVE
-    robot = Robot()
-    loads(robot)
-    assert robot.asks(Say("battery low", voice=JOE, ttl=0.5)).state is State.ACTIVE
-
-
-@pytest.mark.parametrize("urgent", [{}, {"preempt": True}, {"priority": 5}])
-def test_who_insists_on_a_voice_waits_until_it_is_there(urgent: dict[str, object]) -> None:
-    robot = Robot()
-    loads(robot)
-    goal = robot.asks(Say("battery low", voice=JOE, voice_only=True, **urgent))  # type: ignore[arg-type]
-    assert robot.scheduler.deadline() is None
-    robot.waits(60)
-    assert goal.state.name == "PENDING"
-    has_loaded(robot)
-    assert goal.state is State.ACTIVE
-
-
-def test_who_insists_on_a_voice_expires_as_any() -> None:
-    robot = Robot()
-    loads(robot)
-    goal, behind = robot.asks(Say("battery low", voice=JOE, voice_only=True, ttl=3)), robot.says()
-    assert robot.scheduler.deadline() == 103
-    robot.waits(3)
-    assert ending(goal) == (State.RECALLED, "expired", None)
-    assert behind.state is State.ACTIVE
-
-
-def test_what_waited_behind_a_goal_that_was_cancelled_begins() -> None:
-    robot = Robot()
-    loads(robot)
-    goal, behind = robot.asks(Say("battery low", voice=JOE)), robot.says()
-    robot.cancels(goal.id)
-    robot.waits(0)
-    assert behind.state is State.ACTIVE
-
-
-def test_nothing_begins_for_a_voice_while_speech_is_paused_or_another_goal_is_spoken() -> None:
-    robot = Robot()
-    first = robot.says()
-    loads(robot)
-    goal = robot.asks(Say("battery low", voice=JOE))
-    assert robot.scheduler.deadline() is None
-    has_loaded(robot)
-    assert goal.state.name == "PENDING"
-    robot.pauses()
-    robot.tells("completed", first.id)
-    assert robot.scheduler.deadline() is None
-    robot.resumes()
-    assert goal.state is State.ACTIVE
-
-
-def test_an_engine_that_is_lost_loads_nothing_any_more() -> None:
-    robot = Robot()
-    loads(robot)
-    goal = robot.asks(Say("battery low", voice=JOE))
-    robot.scheduler.engine_lost()
-    robot.waits(20)
-    assert goal.state.name == "PENDING"
-    robot.see(robot.scheduler.engine_ready(robot.now))
-    assert goal.state is State.ACTIVE
-
-
-def test_a_goal_tells_by_which_voice_it_is_heard_from_then_on() -> None:
-    robot = Robot()
-    goal = robot.asks(Say("battery low", voice=JOE))
-    assert goal.snapshot().voice is None
-    robot.scheduler.spoken_by(goal.id, "gmw/en-US")
-    assert goal.snapshot().voice == "gmw/en-US"
-    assert goal.snapshot(State.PENDING).voice is None
-    robot.tells("completed", goal.id)
-    assert goal.snapshot().to_json()["voice"] == "gmw/en-US"
+@pytest.mark.parametrize("script", DEADLINES)
+def test_the_deadline_is_the_end_of_the_wait(script: str) -> None:
+    assert play(script).scheduler.deadline() == DEADLINES[script]
