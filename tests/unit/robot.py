@@ -136,13 +136,13 @@ class Robot:
 
     def _do(self, verb: str, words: list[str]) -> None:
         scheduler, word = self.scheduler, words[0] if words else ""
-        effects: Callable[[], list[Effect] | None] = {
-            "pause": scheduler.pause,
-            "resume": lambda: scheduler.resume(self.now),
-            "shutdown": lambda: scheduler.shutdown(self.now),
+        step: Callable[[], object] = {
+            "pause": lambda: self.see(scheduler.pause()),
+            "resume": lambda: self.see(scheduler.resume(self.now)),
+            "shutdown": lambda: self.see(scheduler.shutdown(self.now)),
             "lost": scheduler.engine_lost,
-            "ready": lambda: scheduler.engine_ready(self.now),
-            "missing": lambda: scheduler.engine_missing("no memory", self.now),
+            "ready": lambda: self.see(scheduler.engine_ready(self.now)),
+            "missing": lambda: self.see(scheduler.engine_missing("no memory", self.now)),
             "expect": lambda: scheduler.loading.wait_for(f"piper/{word}"),
             "begin": lambda: scheduler.loading.begin(f"piper/{word}", self.seconds),
             "end": lambda: scheduler.loading.end(f"piper/{word}"),
@@ -151,7 +151,7 @@ class Robot:
             "room": lambda: setattr(scheduler, "max_queue", int(word)),
             "set": lambda: setattr(scheduler, "settings", replace(scheduler.settings, **options(words))),
         }.get(verb, lambda: self.tells(verb, self._id(word)))
-        self.see(effects() or [])
+        step()
         if verb == "end":
             self.waits(0)
 

@@ -56,14 +56,6 @@ def test_the_log_has_all_that_ended_in_the_order_of_their_ends_the_newest_first(
     assert list(History().log(5)) == []
 
 
-def test_the_log_forgets_what_the_history_forgets() -> None:
-    history = History()
-    for number in range(2_500):
-        history.add(ended(number, State.REJECTED if number % 2 else State.SUCCEEDED))
-    kept = [each.number for each in history.log(10_000)]
-    assert kept == sorted([*range(500, 2_500, 2), *range(2_101, 2_500, 2)], reverse=True)
-
-
 def test_an_id_that_was_forgotten_may_come_again() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "MAX_SPOKEN", 2)
@@ -71,10 +63,6 @@ def test_an_id_that_was_forgotten_may_come_again() -> None:
         for number in (1, 2, 3, 1):
             history.add(ended(number))
         assert [each.number for each in history.log(5)] == [1, 3]
-
-
-def test_an_unknown_id_is_not_found() -> None:
-    assert History().find("4k7f-1") is None
 
 
 def test_texts_take_eight_mebibytes_and_the_oldest_goes_first_but_its_result_stays() -> None:
@@ -99,13 +87,6 @@ def test_bytes_count_not_characters() -> None:
     history.add(second)
     assert first.text is None
     assert second.text is not None
-
-
-def test_a_text_that_is_no_utf8_is_counted_too() -> None:
-    history = History()
-    record = ended(1, State.REJECTED, "\ud800")
-    history.add(record)
-    assert history.find(record.id) is record
 
 
 def test_a_text_without_words_spoken_is_forgotten_with_them() -> None:

@@ -16,7 +16,6 @@ KEYS = [
     "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "priority", "key", "ttl", "data",
     "client", "paused", "queued_at", "started_at", "ended_at", "duration", "voice", "output",
 ]  # fmt: skip
-SENDER_KEYS = ["pid", "uid", "command", "parent", "name"]
 
 numbers = st.integers(-(10**18), 10**18)
 seconds = st.none() | st.floats(-1e15, 1e15)
@@ -56,13 +55,16 @@ goals = st.builds(
 )
 
 
-@given(goals)
-def test_a_goal_has_all_its_keys_and_no_other(goal: Goal) -> None:
+@given(goals, st.dictionaries(st.text().filter(lambda key: key not in KEYS), values, max_size=3))
+def test_a_goal_has_all_its_keys_and_is_read_back_whatever_else_comes(goal: Goal, extra: dict[str, object]) -> None:
     message = goal.to_json()
     assert list(message) == KEYS
-    assert message["state"] == goal.state.name
-    assert message["status"] == goal.state.value
-    assert type(message["status"]) is int
+    assert (message["state"], message["status"], type(message["status"])) == (goal.state.name, goal.state.value, int)
+    read = {**extra, **json.loads(json.dumps(message)), **extra}
+    for name in ("by", "client", "output"):
+        if isinstance(read[name], dict):
+            read[name]["group"] = "robots"
+    assert Goal.from_json(read) == goal
 
 
 def test_what_is_not_known_of_a_goal_is_null() -> None:
@@ -72,11 +74,6 @@ def test_what_is_not_known_of_a_goal_is_null() -> None:
     }  # fmt: skip
 
 
-@given(goals)
-def test_a_goal_goes_there_and_back(goal: Goal) -> None:
-    assert Goal.from_json(json.loads(json.dumps(goal.to_json()))) == goal
-
-
 def test_an_output_that_lacks_something_is_none() -> None:
     message = Goal("4k7f-1", State.ACTIVE, output=Output("pulse", "card", 0.5, True)).to_json()
     assert Goal.from_json(message).output == Output("pulse", "card", 0.5, True)
@@ -84,34 +81,6 @@ def test_an_output_that_lacks_something_is_none() -> None:
         whole = message["output"]
         assert isinstance(whole, dict)
         assert Goal.from_json({**message, "output": {**whole, name: None}}).output is None
-
-
-def test_a_goal_without_a_client_has_none_there_and_back() -> None:
-    assert Goal.from_json(Goal("4k7f-1", State.REJECTED).to_json()).client is None
-
-
-@given(goals, st.dictionaries(st.text().filter(lambda key: key not in KEYS), values, max_size=3))
-def test_fields_that_a_client_does_not_know_are_ignored(goal: Goal, extra: dict[str, object]) -> None:
-    assert Goal.from_json({**extra, **goal.to_json(), **extra}) == goal
-
-
-@given(goals)
-def test_fields_within_sender_and_by_that_a_client_does_not_know_are_ignored(goal: Goal) -> None:
-    message = goal.to_json()
-    for name in ("by", "client", "output"):
-        within = message[name]
-        if isinstance(within, dict):
-            message[name] = {**within, "group": "robots"}
-    assert Goal.from_json(message) == goal
-
-
-@given(values | st.dictionaries(st.sampled_from(KEYS), values))
-def test_any_json_value_is_a_goal_or_a_value_error(value: object) -> None:
-    try:
-        goal = Goal.from_json(value)
-    except ValueError:
-        return
-    assert list(goal.to_json()) == KEYS
 
 
 @given(goals, st.sampled_from(KEYS), values)
@@ -145,12 +114,6 @@ def test_a_goal_with_one_wrong_field_is_a_goal_or_a_value_error(goal: Goal, name
 def test_what_has_no_id_and_no_state_that_is_known_is_no_goal(value: object) -> None:
     with pytest.raises(ValueError, match="goal"):
         Goal.from_json(value)
-
-
-@given(senders)
-def test_a_sender_has_all_its_keys_and_goes_there_and_back(sender: Sender) -> None:
-    assert list(sender.to_json()) == SENDER_KEYS
-    assert Sender.from_json(sender.to_json()) == sender
 
 
 @given(values)

@@ -99,15 +99,3 @@ def test_whatever_comes_and_goes_the_queue_is_as_the_list(
             assert queue.with_key(key) == next((each for each in told if each.key == key is not None), None)
         for text in ("text 0", "text 1", "text 2", "text 3"):
             assert queue.with_text(text) == next((each for each in told if each.text == text), None)
-
-
-def test_goals_that_left_before_their_time_do_not_pile_up() -> None:
-    queue = Queue()
-    longest = 0
-    for number in range(5_000):
-        record = goal(number)
-        record.expires_at = 1e9 + number
-        queue.add(record)
-        queue.remove(record)
-        longest = max(longest, len(queue._expiries))
-    assert longest < 200

@@ -79,21 +79,7 @@ requests: st.SearchStrategy[Request] = st.one_of(
     st.just(Resume()),
 )
 SETTINGS = {"rate", "volume", "voice", "pitch", "preempt", "ttl"}
-FIELDS = {
-    "hello": {"name", "urgent"},
-    "say": {"text", "wait", "feedback", "patient", "flush", "priority", "key", "throttle", "id", "data", "format"}
-    | SETTINGS,
-    "wait": {"ids", "feedback"},
-    "cancel": {"ids", "current", "before", "key"},
-    "status": {"id"},
-    "voices": set(),
-    "watch": set(),
-    "log": {"count"},
-    "set": SETTINGS,
-    "pause": set(),
-    "resume": set(),
-}
-ALL_FIELDS = sorted(set().union(*FIELDS.values()))
+ALL_FIELDS = sorted({option.name for kind in KINDS.values() for option in kind.options})
 
 
 def refusal(message: JsonObject) -> BadRequest:
@@ -103,15 +89,13 @@ def refusal(message: JsonObject) -> BadRequest:
     return refused.value
 
 
-@given(requests)
-def test_a_request_goes_over_the_wire_and_is_the_same(request: Request) -> None:
-    assert read_request(decode(encode(write_request(request)))) == request
-
-
 @given(requests, integers)
-def test_a_request_s_line_is_what_json_makes_of_it(request: Request, number: int | None) -> None:
+def test_a_request_goes_over_the_wire_and_is_the_same(request: Request, number: int | None) -> None:
     message: JsonObject = {"seq": number, **write_request(request)}
-    assert request_line(message) == encode(message)
+    line = request_line(message)
+    assert line == encode(message)
+    assert decode(line).pop("seq") == number
+    assert read_request(decode(encode(write_request(request)))) == request
 
 
 @pytest.mark.parametrize("text", ["\ud800", "Grüße \udc80", '"\\\b\n\x00\x7f\u2028🤖'])
@@ -134,15 +118,6 @@ def test_fields_at_their_defaults_are_not_written(request_: Request) -> None:
     assert written == {"request": request_.kind} | ({"text": "hi"} if isinstance(request_, Say) else {})
 
 
-def test_cancel_and_status_without_fields_are_what_they_are_in_every_protocol() -> None:
-    assert write_request(Cancel()) == {"request": "cancel"}
-    assert write_request(Status()) == {"request": "status"}
-    cancel = read_request({"request": "cancel"})
-    assert isinstance(cancel, Cancel)
-    assert cancel.everything
-    assert read_request({"request": "status"}) == Status()
-
-
 @pytest.mark.parametrize(
     "selection",
     [
@@ -155,7 +130,7 @@ def test_cancel_and_status_without_fields_are_what_they_are_in_every_protocol() 
     ],
 )
 def test_a_cancel_that_selects_is_not_of_everything(selection: Cancel) -> None:
-    assert not selection.everything
+    assert (selection.everything, Cancel().everything) == (False, True)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -169,8 +144,7 @@ def test_a_field_that_is_not_known_is_refused_and_named(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_request_knows_its_own_fields_and_no_others(kind: str) -> None:
-    assert KINDS.keys() == FIELDS.keys()
-    for name in set(ALL_FIELDS) - FIELDS[kind]:
+    for name in set(ALL_FIELDS) - {option.name for option in KINDS[kind].options}:
         message: JsonObject = {"request": kind, name: None}
         assert refusal({**message, "text": "hi"} if kind == "say" else message).code == "unknown_field"
 
@@ -272,11 +246,11 @@ def test_null_is_the_default_where_there_may_be_nothing() -> None:
     assert read_request({"request": "hello", "name": None}) == Hello()
 
 
-@pytest.mark.parametrize("depth", range(900, 1_050))
-def test_data_at_any_depth_of_nesting_is_taken_or_refused(depth: int) -> None:
-    line = b'{"request": "say", "text": "hi", "data": {"a": ' + b"[" * depth + b"]" * depth + b"}}"
-    with pytest.raises(BadRequest):
-        read_request(decode(line))
+def test_data_at_any_depth_of_nesting_is_taken_or_refused() -> None:
+    for depth in range(900, 1_050):
+        line = b'{"request": "say", "text": "hi", "data": {"a": ' + b"[" * depth + b"]" * depth + b"}}"
+        with pytest.raises(BadRequest):
+            read_request(decode(line))
 
 
 @given(

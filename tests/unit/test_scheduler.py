@@ -122,7 +122,7 @@ def test_what_was_heard_only_moves_forward_and_stays_after_a_failure() -> None:
     [
         (0, False, ""),
         (1, False, ", but with 1 gap of 2.0 s in all: this machine is too slow for the voice"),
-        (3, False, ", but with 3 gaps of 2.0 s in all: this machine is too slow for the voice"),
+        (2, False, ", but with 2 gaps of 2.0 s in all: this machine is too slow for the voice"),
         (0, True, ", but the output was muted: card"),
     ],
 )

@@ -344,6 +344,7 @@ ID = {
     "attaching goes on after shutdown": ("a id=mine; shutdown; b text=a id=mine", "a PREEMPTING shutdown; b is a"),
     "another text is a conflict": ("a id=mine; b id=mine flush", "a ACTIVE; b REJECTED id_conflict"),
     "after its end, too, another text": ("a id=mine; completed a; b id=mine", "a SUCCEEDED; b REJECTED id_conflict"),
+    "an id of the server's attaches to nothing": ("a; b text=a id=4k7f-1", "a ACTIVE; b REJECTED bad_option"),
     "a rejected goal does not use its id up": (
         "a id=mine text=; b id=mine",
         "b ACTIVE; a REJECTED invalid_text",
@@ -414,6 +415,7 @@ ENGINE = {
         "a ABORTED engine_failed",
     ),
     "and none while speech is paused": ("lost; a; pause; missing", "a PENDING"),
+    "and none that waits for its voice": ("begin joe; a voice=piper/joe; missing", "a PENDING"),
     "and none once it is there": ("a; b; missing", "a ACTIVE; b PENDING"),
 }
 

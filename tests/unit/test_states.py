@@ -41,13 +41,6 @@ ALLOWED = {
     ("ACTIVE", "LOST"),
     ("PREEMPTING", "LOST"),
 }
-PAIRS = list(itertools.product(NUMBERS, repeat=2))
-
-
-def record_in(state: State) -> Record:
-    record = Record("4k7f-1", 1, Say("door open"), Sender(), 1.0)
-    record.state = state
-    return record
 
 
 def test_names_and_numbers_are_actionlibs() -> None:
@@ -61,24 +54,20 @@ def test_a_state_prints_as_its_name_and_is_a_number_in_json(name: str, number: i
     assert (f"{state:d}", json.dumps(state)) == (f"{number}", f"{number}")
 
 
-@pytest.mark.parametrize(("state", "target"), [each for each in PAIRS if each in ALLOWED])
-def test_transition_of_the_table_is_made(state: str, target: str) -> None:
-    assert follow(State[state], State[target]) is State[target]
-    record = record_in(State[state])
-    record.become(State[target])
-    assert record.state is State[target]
-
-
-@pytest.mark.parametrize(("state", "target"), [each for each in PAIRS if each not in ALLOWED])
-def test_any_other_transition_is_refused_and_changes_nothing(state: str, target: str) -> None:
-    with pytest.raises(IllegalTransition, match=rf"{state}.*{target}") as refused:
-        follow(State[state], State[target])
-    assert refused.value.code == "illegal_transition"
-    record = record_in(State[state])
+@pytest.mark.parametrize(("state", "target"), [*itertools.product(NUMBERS, repeat=2)])
+def test_a_transition_of_the_table_is_made_and_any_other_is_refused(state: str, target: str) -> None:
+    record = Record("4k7f-1", 1, Say("door open"), Sender(), 1.0)
+    record.state = State[state]
     before = record.snapshot()
-    with pytest.raises(IllegalTransition):
+    if (state, target) in ALLOWED:
+        assert follow(State[state], State[target]) is State[target]
         record.become(State[target])
-    assert record.snapshot() == before
+        assert record.state is State[target]
+    else:
+        with pytest.raises(IllegalTransition, match=rf"{state}.*{target}") as refused:
+            record.become(State[target])
+        assert refused.value.code == "illegal_transition"
+        assert record.snapshot() == before
 
 
 def test_a_goal_has_ended_where_nothing_may_follow() -> None:
