@@ -15,8 +15,11 @@ In the outcome, "a ACTIVE; c b PENDING; d e RECALLED replaced by c", pending goa
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+import pytest
 
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Sender
@@ -189,6 +192,19 @@ class Robot:
 
 def play(script: str) -> Robot:
     return Robot().play(script)
+
+
+def rules(table: str) -> list[Any]:
+    """Return the rows of a table as parameters. A row is a rule and below it, indented, "script -> outcome"."""
+    blocks = re.findall(r"^(#|\w)(.*)\n((?:    .*\n)*)", table, re.MULTILINE)
+    title, found = "", []
+    for first, rest, example in blocks:
+        if first == "#":
+            title = f"{rest.strip()}: "
+        else:
+            script, outcome = " ".join(example.split()).split(" -> ")
+            found.append(pytest.param(script, outcome, id=f"{title}{first}{rest}"))
+    return found
 
 
 def options(words: list[str]) -> dict[str, Any]:

@@ -1,76 +1,91 @@
-"""How long a goal waits for its voice to be loaded: one row for each rule, in the language of `tests.unit.robot`."""
+"""How long a goal waits for its voice to be loaded: each rule with a script, in the language of `tests.unit.robot`."""
 
 from __future__ import annotations
 
 import pytest
 
-from tests.unit.robot import play
+from tests.unit.robot import play, rules
 
-JOE, AMY = "voice=piper/joe", "voice=piper/amy"
+RULES = """
+a goal waits for its voice, and so do those behind it
+    begin joe; a voice=piper/joe; b  ->  a b PENDING
+a speaker is of its voice
+    begin joe; a voice=piper/joe#3; b; wait 9.9; end amy  ->  a b PENDING
+it begins once the voice is loaded
+    begin joe; a voice=piper/joe#3; b; end joe  ->  a ACTIVE; b PENDING
+another voice is not waited for
+    begin joe; a voice=piper/amy  ->  a ACTIVE
+a goal without a voice waits for the server's
+    begin joe; set voice=piper/joe; a; b voice=en  ->  a b PENDING
+a goal with a voice does not
+    begin joe; set voice=piper/joe; a voice=en; b  ->  a ACTIVE; b PENDING
+the server's may change
+    begin joe; set voice=piper/joe; a; set voice=en; wait 0  ->  a ACTIVE
+it waits ten seconds from when loading began
+    begin joe; wait 4; a voice=piper/joe; wait 5.9  ->  a PENDING
+and no longer
+    begin joe; wait 4; a voice=piper/joe; wait 6  ->  a ACTIVE
+if loading has not begun, from its turn
+    a; expect joe; b voice=piper/joe; wait 60; completed a; wait 9.9  ->  b PENDING; a SUCCEEDED
+or no longer than that
+    a; expect joe; b voice=piper/joe; wait 60; completed a; wait 10  ->  b ACTIVE; a SUCCEEDED
+a turn may come by a cancel
+    begin joe; expect amy; a voice=piper/joe; b voice=piper/amy; wait 3; cancel a; wait 0; wait 10
+        ->  b ACTIVE; a RECALLED canceled by door
+a goal that preempts does not wait
+    begin joe; a voice=piper/joe; b voice=piper/joe preempt  ->  b ACTIVE; a PENDING
+nor does one that flushes
+    begin joe; a voice=piper/joe; b voice=piper/joe flush  ->  b ACTIVE; a RECALLED preempted by b
+nor one of a higher priority
+    begin joe; a voice=piper/joe; b voice=piper/joe 1  ->  b ACTIVE; a PENDING
+one of a lower priority does
+    begin joe; a voice=piper/joe -1  ->  a PENDING
+a goal waits while more than half a second of its time is left
+    begin joe; a voice=piper/joe ttl=2; wait 1.4  ->  a PENDING
+then it begins
+    begin joe; a voice=piper/joe ttl=2; wait 1.5  ->  a ACTIVE
+or at once
+    begin joe; a voice=piper/joe ttl=0.5  ->  a ACTIVE
+a goal that insists waits until the voice is loaded
+    begin joe; a voice=piper/joe voice_only; wait 60  ->  a PENDING
+though it preempts
+    begin joe; a voice=piper/joe voice_only preempt; wait 60  ->  a PENDING
+though its priority is high
+    begin joe; a voice=piper/joe voice_only 5; wait 60; end joe  ->  a ACTIVE
+and expires like any other
+    begin joe; a voice=piper/joe voice_only ttl=3; b; wait 3  ->  b ACTIVE; a RECALLED expired
+a goal behind one that was cancelled begins
+    begin joe; a voice=piper/joe; b; cancel a; wait 0  ->  b ACTIVE; a RECALLED canceled by door
+a loaded voice starts none beside the active goal
+    a; begin joe; b voice=piper/joe; end joe  ->  a ACTIVE; b PENDING
+nor while speech is paused
+    begin joe; a voice=piper/joe; pause; end joe  ->  a PENDING
+an engine that is lost loads nothing
+    begin joe; a voice=piper/joe; lost; wait 20; ready  ->  a ACTIVE
+"""
 
-RULES = {
-    "a goal waits for its voice, and so do those behind it": (f"begin joe; a {JOE}; b", "a b PENDING"),
-    "a speaker is of its voice": (f"begin joe; a {JOE}#3; b; wait 9.9; end amy", "a b PENDING"),
-    "it begins once the voice is loaded": (f"begin joe; a {JOE}#3; b; end joe", "a ACTIVE; b PENDING"),
-    "another voice is not waited for": (f"begin joe; a {AMY}", "a ACTIVE"),
-    "a goal without a voice waits for the server's": (f"begin joe; set {JOE}; a; b voice=en", "a b PENDING"),
-    "a goal with a voice does not": (f"begin joe; set {JOE}; a voice=en; b", "a ACTIVE; b PENDING"),
-    "the server's may change": (f"begin joe; set {JOE}; a; set voice=en; wait 0", "a ACTIVE"),
-    "it waits ten seconds from when loading began": (f"begin joe; wait 4; a {JOE}; wait 5.9", "a PENDING"),
-    "and no longer": (f"begin joe; wait 4; a {JOE}; wait 6", "a ACTIVE"),
-    "if loading has not begun, from its turn": (
-        f"a; expect joe; b {JOE}; wait 60; completed a; wait 9.9",
-        "b PENDING; a SUCCEEDED",
-    ),
-    "or no longer than that": (f"a; expect joe; b {JOE}; wait 60; completed a; wait 10", "b ACTIVE; a SUCCEEDED"),
-    "a turn may come by a cancel": (
-        f"begin joe; expect amy; a {JOE}; b {AMY}; wait 3; cancel a; wait 0; wait 10",
-        "b ACTIVE; a RECALLED canceled by door",
-    ),
-    "a goal that preempts does not wait": (f"begin joe; a {JOE}; b {JOE} preempt", "b ACTIVE; a PENDING"),
-    "nor does one that flushes": (f"begin joe; a {JOE}; b {JOE} flush", "b ACTIVE; a RECALLED preempted by b"),
-    "nor one of a higher priority": (f"begin joe; a {JOE}; b {JOE} 1", "b ACTIVE; a PENDING"),
-    "one of a lower priority does": (f"begin joe; a {JOE} -1", "a PENDING"),
-    "a goal waits while more than half a second of its time is left": (
-        f"begin joe; a {JOE} ttl=2; wait 1.4",
-        "a PENDING",
-    ),
-    "then it begins": (f"begin joe; a {JOE} ttl=2; wait 1.5", "a ACTIVE"),
-    "or at once": (f"begin joe; a {JOE} ttl=0.5", "a ACTIVE"),
-    "a goal that insists waits until the voice is loaded": (f"begin joe; a {JOE} voice_only; wait 60", "a PENDING"),
-    "though it preempts": (f"begin joe; a {JOE} voice_only preempt; wait 60", "a PENDING"),
-    "though its priority is high": (f"begin joe; a {JOE} voice_only 5; wait 60; end joe", "a ACTIVE"),
-    "and expires like any other": (f"begin joe; a {JOE} voice_only ttl=3; b; wait 3", "b ACTIVE; a RECALLED expired"),
-    "a goal behind one that was cancelled begins": (
-        f"begin joe; a {JOE}; b; cancel a; wait 0",
-        "b ACTIVE; a RECALLED canceled by door",
-    ),
-    "a loaded voice starts none beside the active goal": (f"a; begin joe; b {JOE}; end joe", "a ACTIVE; b PENDING"),
-    "nor while speech is paused": (f"begin joe; a {JOE}; pause; end joe", "a PENDING"),
-    "an engine that is lost loads nothing": (f"begin joe; a {JOE}; lost; wait 20; ready", "a ACTIVE"),
-}
-
+#: When the goal whose turn it is waits no longer, in monotonic seconds; a script begins at 100.
 DEADLINES = {
-    f"begin joe; wait 4; a {JOE}": 110,
-    f"begin joe; wait 4; expect joe; a {JOE}": 110,
-    f"a; expect joe; b {JOE}; wait 60": None,
-    f"a; expect joe; b {JOE}; wait 60; completed a": 170,
-    f"a; expect joe; b {JOE}; wait 60; completed a; wait 4; begin joe": 174,
-    f"begin joe; expect amy; a {JOE}; b {AMY}; wait 3; cancel a": 0,
-    f"begin joe; expect amy; a {JOE}; b {AMY}; wait 3; cancel a; wait 0": 113,
-    f"begin joe; a {JOE} ttl=2": 101.5,
-    f"begin joe; a {JOE} ttl=99": 110,
-    f"begin joe; a {JOE} voice_only": None,
-    f"begin joe; a {JOE} voice_only ttl=3": 103,
-    f"begin joe; a {JOE}; end joe": None,
-    f"a; begin joe; b {JOE}": None,
-    f"begin joe; a {JOE}; pause": None,
-    f"begin joe; a {JOE}; lost": None,
-    f"begin joe; set {JOE}; a; set voice=en": 0,
+    "begin joe; wait 4; a voice=piper/joe": 110,
+    "begin joe; wait 4; expect joe; a voice=piper/joe": 110,
+    "a; expect joe; b voice=piper/joe; wait 60": None,
+    "a; expect joe; b voice=piper/joe; wait 60; completed a": 170,
+    "a; expect joe; b voice=piper/joe; wait 60; completed a; wait 4; begin joe": 174,
+    "begin joe; expect amy; a voice=piper/joe; b voice=piper/amy; wait 3; cancel a": 0,
+    "begin joe; expect amy; a voice=piper/joe; b voice=piper/amy; wait 3; cancel a; wait 0": 113,
+    "begin joe; a voice=piper/joe ttl=2": 101.5,
+    "begin joe; a voice=piper/joe ttl=99": 110,
+    "begin joe; a voice=piper/joe voice_only": None,
+    "begin joe; a voice=piper/joe voice_only ttl=3": 103,
+    "begin joe; a voice=piper/joe; end joe": None,
+    "a; begin joe; b voice=piper/joe": None,
+    "begin joe; a voice=piper/joe; pause": None,
+    "begin joe; a voice=piper/joe; lost": None,
+    "begin joe; set voice=piper/joe; a; set voice=en": 0,
 }
 
 
-@pytest.mark.parametrize(("script", "outcome"), RULES.values(), ids=RULES.keys())
+@pytest.mark.parametrize(("script", "outcome"), rules(RULES))
 def test_a_rule_holds(script: str, outcome: str) -> None:
     assert play(script).outcome() == outcome
 
