@@ -25,19 +25,6 @@ import os, sys
 sys.path.insert(0, {root!r})
 from talkcli.engine import protocol
 
-buffer = b""
-
-def commands():
-    global buffer
-    while True:
-        while b"\\n" not in buffer:
-            data = os.read(0, 65536)
-            if not data:
-                sys.exit()
-            buffer += data
-        line, _, buffer = buffer.partition(b"\\n")
-        yield protocol.decode(line, protocol.COMMANDS)
-
 def send(event):
     os.write(0, protocol.encode(event))
 
@@ -60,7 +47,8 @@ def does(word, said):
     elif name == "stop?":
         assert isinstance(next(arriving), protocol.Stop)
 
-arriving = (each for each in commands() if not isinstance(each, protocol.Followed))
+commands = (protocol.decode(line.rstrip(b"\\n"), protocol.COMMANDS) for line in open(0, "rb", closefd=False))
+arriving = (each for each in commands if not isinstance(each, protocol.Followed))
 for command in arriving:
     if isinstance(command, protocol.Configure):
         send(protocol.Ready("scripted", None, None))

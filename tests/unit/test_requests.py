@@ -17,13 +17,9 @@ from talkcli.protocol.requests import (
     KINDS,
     Hello,
     Log,
-    Pause,
     Request,
-    Resume,
     Status,
-    Voices,
     Wait,
-    Watch,
     read_request,
 )
 
@@ -39,45 +35,31 @@ values = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
     max_leaves=8,
 )
+integers = st.integers(-(10**18), 10**18)
 goal_ids = st.text(min_size=1, max_size=MAX_ID)
-id_lists = st.lists(goal_ids, max_size=4).map(tuple)
-data = st.none() | st.dictionaries(st.text(max_size=5), st.none() | st.booleans() | st.text(max_size=5), max_size=3)
-integers = st.none() | st.integers(-(10**18), 10**18)
-numbers = st.none() | st.integers(-(10**18), 10**18) | st.floats(allow_nan=False, allow_infinity=False)
-words = st.none() | st.text(max_size=5)
-flags = st.none() | st.booleans()
-requests: st.SearchStrategy[Request] = st.one_of(
-    st.builds(Hello, name=st.none() | st.text(min_size=1, max_size=MAX_NAME), urgent=st.booleans()),
-    st.builds(
-        Say,
-        text=st.text(),
-        wait=st.booleans(),
-        feedback=st.booleans(),
-        patient=st.booleans(),
-        preempt=flags,
-        flush=st.booleans(),
-        priority=st.integers(-(10**18), 10**18),
-        ttl=numbers,
-        key=words,
-        throttle=numbers,
-        id=words,
-        rate=integers,
-        volume=numbers,
-        voice=words,
-        pitch=integers,
-        data=data,
-        format=st.text(max_size=8),
-    ),
-    st.builds(Wait, ids=st.none() | id_lists, feedback=st.booleans()),
-    st.builds(Cancel, ids=st.none() | id_lists, current=st.booleans(), before=st.none() | goal_ids, key=words),
-    st.builds(Status, id=st.none() | goal_ids),
-    st.just(Voices()),
-    st.just(Watch()),
-    st.builds(Log, count=st.integers(1, MAX_LOG)),
-    st.builds(Set, rate=integers, volume=numbers, voice=words, pitch=integers, preempt=flags, ttl=numbers),
-    st.just(Pause()),
-    st.just(Resume()),
-)
+#: Values of each kind of option.
+OF_KIND: dict[str, st.SearchStrategy[object]] = {
+    "boolean": st.booleans(),
+    "string": st.text(max_size=8),
+    "integer": integers,
+    "number": integers | st.floats(allow_nan=False, allow_infinity=False),
+    "object": st.dictionaries(st.text(max_size=5), st.none() | st.booleans() | st.text(max_size=5), max_size=3),
+    "id": goal_ids,
+    "list": st.lists(goal_ids, max_size=4).map(tuple),
+}
+
+
+def requests_of(kind: type[Request]) -> st.SearchStrategy[Request]:
+    fields = {each.name: OF_KIND[each.kind.name] for each in kind.options}
+    optional = {each.name: st.none() | fields[each.name] for each in kind.options if each.default is None}
+    within = {
+        Hello: {"name": st.none() | st.text(min_size=1, max_size=MAX_NAME)},
+        Log: {"count": st.integers(1, MAX_LOG)},
+    }
+    return st.builds(kind, **{**fields, **optional, **within.get(kind, {})})
+
+
+requests = st.one_of(*map(requests_of, KINDS.values()))
 SETTINGS = {"rate", "volume", "voice", "pitch", "preempt", "ttl"}
 ALL_FIELDS = sorted({option.name for kind in KINDS.values() for option in kind.options})
 
@@ -89,7 +71,7 @@ def refusal(message: JsonObject) -> BadRequest:
     return refused.value
 
 
-@given(requests, integers)
+@given(requests, st.none() | integers)
 def test_a_request_goes_over_the_wire_and_is_the_same(request: Request, number: int | None) -> None:
     message: JsonObject = {"seq": number, **write_request(request)}
     line = request_line(message)
