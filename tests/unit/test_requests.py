@@ -52,11 +52,8 @@ OF_KIND: dict[str, st.SearchStrategy[object]] = {
 def requests_of(kind: type[Request]) -> st.SearchStrategy[Request]:
     fields = {each.name: OF_KIND[each.kind.name] for each in kind.options}
     optional = {each.name: st.none() | fields[each.name] for each in kind.options if each.default is None}
-    within = {
-        Hello: {"name": st.none() | st.text(min_size=1, max_size=MAX_NAME)},
-        Log: {"count": st.integers(1, MAX_LOG)},
-    }
-    return st.builds(kind, **{**fields, **optional, **within.get(kind, {})})
+    limited = {"name": st.none() | st.text(min_size=1, max_size=MAX_NAME), "count": st.integers(1, MAX_LOG)}
+    return st.builds(kind, **{**fields, **optional, **{name: limited[name] for name in fields if name in limited}})
 
 
 requests = st.one_of(*map(requests_of, KINDS.values()))

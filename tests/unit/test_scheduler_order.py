@@ -187,6 +187,8 @@ shutdown ends a held goal, too
 
 # full queue
 
+a queue without places rejects every goal
+    room 0; a preempt; b  ->  a b REJECTED queue_full
 the newcomer is rejected
     room 2; a; b; c; d  ->  a ACTIVE; b c PENDING; d REJECTED queue_full
 the newest of the lowest priority gives way to a higher one

@@ -2,15 +2,111 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from talkcli.server.voices import DEATHS, RETRY_AFTER, RETRY_AT_LAST, Readiness, Voices
+from tests.unit.robot import rules
 
-A, B, C, D = (f"piper/{each}" for each in "abcd")
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+#: A goal asks for a voice ("want a"), the server asks which is next while goals need some ("next a b", "next : b" with
+#: b as its own), and the engine tells what it has loaded ("loaded a", "failed a", "load a" for all of it), what it has
+#: dropped ("unloaded a"), how many bytes it has grown to by a voice, or by none ("grown a 40"), and its death ("lost").
+#: "excess a : b c" asks which are dropped if a speaks and goals need b and c. "memory 2" are the bytes allowed; a voice
+#: takes one, until it is known better. The outcome: the last answer, the voices that were dropped, and all states.
+RULES = """
+# what is next
+
+one voice is loaded at a time, in the order of the goals
+    want b a; next a b  ->  a; b waiting, a loading
+the next one waits for it
+    want b a; next a b; next a b  ->  nothing; b waiting, a loading
+then it is loaded
+    want b a; next a b; loaded a; next a b  ->  b; b loading, a loaded
+and then there is none
+    want b a; next a b; loaded a; next a b; loaded b; next a b  ->  nothing; b loaded, a loaded
+a voice that no goal needs any more is forgotten
+    want a; next  ->  nothing; none
+and not loaded later
+    want a; next; next a  ->  nothing; none
+unless a goal asks for it again
+    want a; next; want a; next a  ->  a; a loading
+the voice asked for least makes room
+    load a b; want a c; next c  ->  c, b dropped; a loaded, c loading
+none is dropped that is needed before
+    load a b; want c; next a b c  ->  nothing; a loaded, b loaded, c waiting
+one that is needed later is dropped
+    load a b; want c; next b c  ->  c, a dropped; b loaded, c loading
+and is to be loaded again
+    memory 1; load a; want b; next b a; loaded b  ->  b, a dropped; b loaded, a waiting
+but not before it is needed
+    memory 1; load a; want b; next b a; loaded b; next b a  ->  nothing; b loaded, a waiting
+then it makes room in its turn
+    memory 1; load a; want b; next b a; loaded b; next a  ->  a, b dropped; a loading
+a voice larger than the limit is loaded alone
+    memory 0; want a; next a  ->  a; a loading
+nothing is dropped for the server's own while no goal needs it
+    memory 1; load a; want b; next : b  ->  nothing; a loaded, b waiting
+it is once a goal needs it
+    memory 1; load a; want b; next b : b  ->  b, a dropped; b loading
+the server's own is loaded if nothing is in its way
+    memory 0; want a; next : a  ->  a; a loading
+a voice that the engine loads of itself stops no other
+    want a; next a; loaded d  ->  a; a loading, d loaded
+
+# what voices take
+
+what is larger than allowed is dropped, the voice that is not needed first
+    memory 100; load a b c; grown a 40; grown b 80; grown c 125; excess c : c  ->  a dropped; b loaded, c loaded
+nothing is dropped before that
+    memory 100; load a b c; grown a 40; grown b 80; excess b : b  ->  nothing; a loaded, b loaded, c loaded
+what was dropped no longer counts, before the engine has told what it got back
+    memory 100; load a b c; grown a 40; grown b 80; grown c 125; excess c : c; excess c : c
+        ->  nothing; b loaded, c loaded
+nor after that
+    memory 100; load a b; grown a 60; grown b 120; excess b : b; grown - 60; excess b : b  ->  nothing; b loaded
+what a voice took is remembered
+    memory 100; load a b; grown a 60; grown b 110; excess b : b; grown - 50; want a; next a
+        ->  a, b dropped; a loading
+what the engine did not get back counts, too
+    memory 100; load a b; grown a 30; grown b 60; unloaded a; grown - 99; want c; next b c  ->  c; b loaded, c loading
+and leaves no room for a voice
+    memory 100; load a b; grown a 30; grown b 60; unloaded a; grown - 100; want c; next b c
+        ->  nothing; b loaded, c waiting
+a lost engine has grown by nothing
+    memory 100; load a b; grown a 99; lost; want d c; next d c; loaded d; next d c  ->  c; d loaded, c loading
+the voice that speaks is kept
+    memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess a :  ->  b c dropped; a loaded
+without one, the last is kept
+    memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess - :  ->  a b dropped; c loaded
+the voice that is needed last is dropped first
+    memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess a : c b
+        ->  b c dropped; a loaded, b waiting, c waiting
+a voice that is not needed goes before
+    memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess c : c a  ->  b a dropped; c loaded, a waiting
+
+# an engine that is lost
+
+nothing is loaded any more
+    load a b; lost  ->  b; none
+a voice that was being loaded is to be loaded again
+    want b; next b; lost  ->  b; b waiting
+at the second death it has failed
+    want b; next b; lost; want b; next b; lost  ->  b; b failed
+a third one is not its fault
+    want b; next b; lost; want b; next b; lost; lost; want b; next b  ->  nothing; b failed
+a death is forgotten once it is loaded
+    want a; next a; lost; load a; lost; want a; next a; lost  ->  a; a waiting
+"""
 
 
 class Asked(Voices):
-    """Voices of one megabyte each, of which two may be kept."""
+    """Voices whose files have one byte each."""
+
+    answer = "nothing"
 
     def __init__(self, memory: int = 2) -> None:
         super().__init__(memory)
@@ -19,229 +115,87 @@ class Asked(Voices):
     def _size(_: str) -> int:
         return 1
 
-    def wants(self, *voices: str, now: float = 0.0) -> None:
-        for each in voices:
-            self.want(each, now)
+    def play(self, script: str, now: float = 0.0) -> Asked:
+        for step in script.split("; "):
+            verb, *words = step.split()
+            self._do(verb, words, now)
+        return self
 
-    def loads(self, *voices: str) -> None:
-        for each in voices:
-            self.wants(each)
-            assert self.next([each]) == (each, ())
-            self.loaded(each, None, 0.0)
+    def _do(self, verb: str, words: list[str], now: float) -> None:
+        place = words.index(":") if ":" in words else len(words)
+        before, after = (["" if each == "-" else each for each in part] for part in (words[:place], words[place + 1 :]))
+        steps: dict[str, Callable[[], object]] = {
+            "memory": lambda: setattr(self, "_memory", int(words[0])),
+            "want": lambda: [self.want(each, now) for each in words],
+            "next": lambda: self._tell(*(self.next(before, *after) or ("", ()))),
+            "load": lambda: [self.play(f"want {each}; next {each}; loaded {each}") for each in words],
+            "loaded": lambda: self.loaded(words[0], None, now),
+            "failed": lambda: self.loaded(words[0], "no json", now),
+            "unloaded": lambda: self.unloaded(words[0], []),
+            "grown": lambda: self.grown(before[0], int(words[1])),
+            "excess": lambda: self._tell("", self.excess(before[0], after)),
+            "lost": lambda: self.engine_lost(now),
+        }
+        steps[verb]()
 
-    def states(self) -> dict[str, str]:
-        return {voice: each.state.value for voice, each in self.neural.items()}
+    def _tell(self, voice: str, dropped: tuple[str, ...]) -> None:
+        told = [voice, f"{' '.join(dropped)} dropped" if dropped else ""]
+        self.answer = ", ".join(filter(None, told)) or "nothing"
 
-
-def test_one_voice_is_loaded_at_a_time_in_the_order_of_the_goals() -> None:
-    voices = Asked()
-    voices.wants(B, A)
-    assert voices.next([A, B]) == (A, ())
-    assert voices.next([A, B]) is None
-    assert voices.states() == {B: "waiting", A: "loading"}
-    voices.loaded(A, None, 1.0)
-    assert voices.next([A, B]) == (B, ())
-    voices.loaded(B, None, 2.0)
-    assert (voices.lacking, voices.next([A, B])) == (False, None)
-    assert voices.to_json() == {each: {"state": "loaded", "why": None} for each in (B, A)}
-
-
-def test_what_nobody_needs_any_more_is_not_loaded() -> None:
-    voices = Asked()
-    voices.wants(A)
-    assert voices.next([]) is None
-    assert voices.next([A]) is None
-    voices.wants(A)
-    assert voices.next([A]) == (A, ())
+    def outcome(self) -> str:
+        states = ", ".join(f"{voice} {each.state.value}" for voice, each in self.neural.items())
+        return f"{self.answer}; {states or 'none'}"
 
 
-def test_the_one_asked_for_least_makes_room() -> None:
-    voices = Asked()
-    voices.loads(A, B)
-    voices.wants(A, C)
-    assert voices.next([C]) == (C, (B,))
-    assert voices.states() == {A: "loaded", C: "loading"}
-
-
-def test_no_voice_is_dropped_that_is_needed_before() -> None:
-    voices = Asked()
-    voices.loads(A, B)
-    voices.wants(C)
-    assert voices.next([A, B, C]) is None
-    assert voices.next([B, C]) == (C, (A,))
-
-
-def test_one_that_is_dropped_and_needed_later_is_to_be_loaded_again() -> None:
-    voices = Asked(1)
-    voices.loads(A)
-    voices.wants(B)
-    assert voices.next([B, A]) == (B, (A,))
-    voices.loaded(B, None, 0.0)
-    assert voices.states() == {B: "loaded", A: "waiting"}
-    assert voices.next([B, A]) is None
-    assert voices.next([A]) == (A, (B,))
-
-
-def test_what_is_larger_than_the_limit_is_loaded_alone() -> None:
-    voices = Asked(0)
-    voices.wants(A)
-    assert voices.next([A]) == (A, ())
-
-
-def test_what_voices_take_counts_as_the_engine_measures_it() -> None:
-    voices = Asked(100)
-    voices.loads(A, B, C)
-    voices.grown(A, 40)
-    voices.grown(B, 80)
-    assert voices.excess(B, [B]) == ()
-    voices.grown(C, 125)
-    assert voices.excess(C, [C]) == (A,)
-    assert voices.states() == {B: "loaded", C: "loaded"}
-    assert voices.excess(C, [C]) == (), "the engine has not told yet what it got back"
-    voices.grown("", 85)
-    assert voices.excess(C, [C]) == ()
-    voices.wants(A)
-    assert voices.next([A]) == (A, (B,)), "what it took is remembered"
-    voices.grown(A, 86)
-    voices.loaded(A, None, 0.0)
-    voices.engine_lost(0.0)
-    voices.wants(D, B)
-    assert voices.next([D, B]) == (D, ())
-
-
-def test_what_the_engine_did_not_get_back_counts_too() -> None:
-    voices = Asked(100)
-    voices.loads(A, B)
-    voices.grown(A, 30)
-    voices.grown(B, 60)
-    voices.unloaded(A, [])
-    voices.grown("", 58)
-    voices.wants(C)
-    voices.neural[C].size = 50
-    assert voices.next([B, C]) is None, "28 + 30 + 50"
-
-
-@pytest.mark.parametrize(
-    ("first", "needed", "dropped", "states"),
-    [
-        ("", [], (A, B), {C: "loaded"}),
-        (A, [], (B, C), {A: "loaded"}),
-        (A, [C, B], (B, C), {A: "loaded", B: "waiting", C: "waiting"}),
-        (C, [C, A], (B, A), {C: "loaded", A: "waiting"}),
-    ],
-)
-def test_the_voice_that_is_needed_last_is_dropped_first(
-    first: str, needed: list[str], dropped: tuple[str, ...], states: dict[str, str]
-) -> None:
-    voices = Asked(50)
-    voices.loads(A, B, C)
-    for number, each in enumerate((A, B, C), 1):
-        voices.grown(each, 60 * number)
-    assert voices.excess(first, needed) == dropped
-    assert voices.states() == states
+@pytest.mark.parametrize(("script", "outcome"), rules(RULES))
+def test_a_rule_holds(script: str, outcome: str) -> None:
+    assert Asked().play(script).outcome() == outcome
 
 
 def test_a_voice_that_is_too_large_alone_stays_and_that_is_told_once() -> None:
-    voices = Asked(100_000_000)
-    voices.loads(A)
-    voices.grown(A, 99_000_000)
+    voices = Asked(100_000_000).play("load a; grown a 99000000")
     assert voices.too_large() is None
-    voices.grown(A, 120_000_000)
-    assert voices.excess(A, [A]) == ()
+    voices.play("grown a 120000000; excess a : a")
     why = "it takes 120 MB, more than --voice-memory 100"
-    assert voices.too_large() == f"voice {A}: {why}"
-    assert voices.too_large() is None
-    assert voices.to_json() == {A: {"state": "loaded", "why": why}}
-    alone = Asked(0)
-    alone.loads(A)
-    assert alone.too_large() is None, "who allows 0 wants one at a time"
+    assert (voices.answer, voices.too_large(), voices.too_large()) == ("nothing", f"voice a: {why}", None)
+    assert voices.to_json() == {"a": {"state": "loaded", "why": why}}
+    assert Asked(0).play("load a").too_large() is None, "a limit of 0 means one voice at a time"
 
 
-def test_one_that_fails_is_tried_again_where_it_is_asked_for_later_and_later() -> None:
+def test_a_voice_that_fails_is_tried_again_later_and_later() -> None:
     voices = Asked()
     now, waited = 100.0, []
     for _ in range(14):
-        voices.wants(A, now=now)
-        assert voices.next([A]) == (A, ())
-        voices.loaded(A, "no json", now)
-        assert voices.to_json() == {A: {"state": "failed", "why": "no json"}}
-        again = voices.neural[A].again_at
-        voices.wants(A, now=again - 0.001)
-        assert voices.next([A]) is None
+        voices.play("want a; next a; failed a", now)
+        assert (voices.answer, voices.failure("a")) == ("a", "no json")
+        again = voices.neural["a"].again_at
+        assert voices.play("want a; next a", again - 0.001).outcome() == "nothing; a failed"
         waited.append(again - now)
         now = again
     assert waited[:3] == pytest.approx([RETRY_AFTER, 2 * RETRY_AFTER, 4 * RETRY_AFTER])
     assert waited[-1] == pytest.approx(RETRY_AT_LAST)
-    voices.forgive(A)
-    assert voices.want(A, now) is Readiness.WAITING
+    voices.forgive("a")
+    assert voices.want("a", now) is Readiness.WAITING
 
 
-def test_while_it_is_tried_again_it_has_failed() -> None:
-    voices = Asked()
-    voices.wants(A)
-    voices.next([A])
-    voices.loaded(A, "no json", 0.0)
-    assert voices.want(A, RETRY_AFTER) is Readiness.FAILED
-    assert voices.next([A]) == (A, ())
-    assert voices.want(A, 1000.0) is Readiness.FAILED
+def test_a_voice_has_failed_while_it_is_tried_again() -> None:
+    voices = Asked().play("want a; next a; failed a")
+    assert voices.play("want a; next a", RETRY_AFTER).outcome() == "a; a failed"
+    assert voices.want("a", 1000.0) is Readiness.FAILED
     assert not voices.lacking
-    voices.loaded(A, None, 1000.0)
-    assert voices.to_json() == {A: {"state": "loaded", "why": None}}
+    assert voices.play("loaded a").to_json() == {"a": {"state": "loaded", "why": None}}
 
 
-def test_an_engine_that_is_lost_has_nothing_loaded_and_what_it_loaded_is_suspected() -> None:
-    voices = Asked()
-    voices.loads(A)
-    for death in range(1, DEATHS + 1):
-        voices.wants(B)
-        assert voices.next([B]) == (B, ())
-        voices.engine_lost(0.0)
-        assert voices.states() == {B: "waiting" if death < DEATHS else "failed"}
-    assert voices.to_json()[B] == {"state": "failed", "why": "the engine process ended while it was being loaded"}
-    voices.engine_lost(0.0)
-    assert voices.states() == {B: "failed"}, "it was not what was being loaded"
-
-
-def test_one_death_is_forgotten_once_it_is_loaded() -> None:
-    voices = Asked()
-    for _ in range(3):
-        voices.wants(A)
-        voices.next([A])
-        voices.engine_lost(0.0)
-        voices.loads(A)
-        voices.engine_lost(0.0)
-    assert voices.states() == {}
-
-
-def test_what_the_engine_loads_of_itself_is_known_and_stops_no_other() -> None:
-    voices = Asked()
-    voices.wants(A)
-    voices.next([A])
-    voices.loaded(D, None, 0.0)
-    assert voices.states() == {A: "loading", D: "loaded"}
-    assert not voices.lacking
-
-
-def test_nothing_is_dropped_for_the_server_s_own_while_no_goal_needs_it() -> None:
-    voices = Asked(1)
-    voices.loads(A)
-    voices.wants(B)
-    assert voices.next([], B) is None
-    assert voices.next([B], B) == (B, (A,))
-    alone = Asked(0)
-    alone.wants(A)
-    assert alone.next([], A) == (A, ())
-
-
-def test_what_was_asked_for_by_a_goal_that_was_refused_keeps_nobody_looking() -> None:
-    voices = Asked()
-    voices.wants(A)
-    assert voices.next([], B) is None
-    assert (voices.lacking, voices.states()) == (False, {})
-    voices.wants(A)
-    voices.next([A])
-    voices.loaded(A, "no json", 0.0)
-    voices.wants(A, now=RETRY_AFTER)
+def test_a_voice_that_no_goal_needs_any_more_keeps_nobody_looking() -> None:
+    voices = Asked().play("want a; next : b")
+    assert (voices.lacking, voices.outcome()) == (False, "nothing; none")
+    voices.play("want a; next a; failed a").play("want a", RETRY_AFTER)
     assert voices.lacking
-    assert voices.next([]) is None
-    assert (voices.lacking, voices.states()) == (False, {A: "failed"})
+    assert (voices.play("next").outcome(), voices.lacking) == ("nothing; a failed", False)
+
+
+def test_an_engine_that_dies_twice_has_its_cause() -> None:
+    assert DEATHS == 2
+    voices = Asked().play("want a; next a; lost; want a; next a")
+    assert (voices.engine_lost(0.0), voices.engine_lost(0.0)) == ("a", None)
+    assert voices.failure("a") == "the engine process ended while it was being loaded"
