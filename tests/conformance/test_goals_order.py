@@ -37,6 +37,19 @@ def queue(talk: Talk, *priorities: int, text: str = "length=0 waits") -> list[st
     return [str(submit(talk, f"{text} {number}", priority=each)["id"]) for number, each in enumerate(priorities)]
 
 
+def fill(make_talk: MakeTalk) -> tuple[Talk, str, str]:
+    """Return a server without room, its active goal and the only pending one."""
+    talk = make_talk("--max-queue", "1", scripted=True)
+    active = begin(talk)
+    return talk, active, queue(talk, 0)[0]
+
+
+def waits(wire: Wire, text: str, **fields: object) -> None:
+    """Send a goal that waits for room, and return when the server has taken it."""
+    wire.send({"request": "say", "text": f"length=0 {text}", "patient": True, "wait": True, **fields})
+    assert wire.request("hello")["ok"]
+
+
 def pending(talk: Talk) -> list[str]:
     """Return the ids of the goals that wait, in their order."""
     with talk.connect() as wire:
@@ -111,14 +124,10 @@ def test_a_patient_goal_is_answered_when_there_is_room(make_talk: MakeTalk) -> N
 
 
 def test_patient_goals_keep_the_order_in_which_they_were_sent(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "1", scripted=True)
-    active = begin(talk)
-    (waiting,) = queue(talk, 0)
+    talk, active, waiting = fill(make_talk)
     with talk.connect() as wire:
         for number in range(5):
-            wire.send(
-                {"seq": number, "request": "say", "text": f"length=0 line {number}", "patient": True, "wait": True}
-            )
+            waits(wire, f"line {number}")
         assert talk.request("cancel", ids=[active])["ok"]
         results = [wire.receive_event("result")["goal"] for _ in range(5)]
     assert [each["state"] for each in results] == ["SUCCEEDED"] * 5
@@ -128,9 +137,7 @@ def test_patient_goals_keep_the_order_in_which_they_were_sent(make_talk: MakeTal
 
 
 def test_a_goal_that_comes_later_does_not_take_the_room_of_one_that_waits(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "1", scripted=True)
-    begin(talk)
-    (waiting,) = queue(talk, 0)
+    talk, _, waiting = fill(make_talk)
     with talk.connect() as wire:
         wire.send({"seq": 1, "request": "say", "text": "length=0 patient", "patient": True})
         cancel = {"seq": 2, "request": "cancel", "ids": [waiting]}
@@ -147,9 +154,7 @@ def test_a_goal_that_comes_later_does_not_take_the_room_of_one_that_waits(make_t
 
 
 def test_a_thousand_goals_of_one_connection_wait_for_room_and_no_more(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "1", scripted=True)
-    begin(talk)
-    queue(talk, 0)
+    talk, _, _ = fill(make_talk)
     lines = [
         json.dumps({"seq": number, "request": "say", "text": f"length=0 line {number}", "patient": True, "wait": True})
         for number in range(5_001, 6_003)
@@ -182,9 +187,7 @@ def test_a_thousand_goals_of_one_connection_wait_for_room_and_no_more(make_talk:
 
 def test_all_hear_of_a_cancel_that_ends_more_than_may_wait_for_them(make_talk: MakeTalk) -> None:
     count = 800
-    talk = make_talk("--max-queue", "1", scripted=True)
-    begin(talk)
-    queue(talk, 0)
+    talk, _, _ = fill(make_talk)
     text = "length=0 " + "w" * 9_900  # 20 kB are told of each, four times what may wait in all
     with contextlib.ExitStack() as stack:
         sender, one, other = (stack.enter_context(talk.connect()) for _ in range(3))
@@ -206,9 +209,7 @@ def test_all_hear_of_a_cancel_that_ends_more_than_may_wait_for_them(make_talk: M
 
 def test_all_hear_of_the_server_s_end_where_it_is_more_than_may_wait_for_them(make_talk: MakeTalk) -> None:
     count = 150
-    talk = make_talk("--max-queue", "1", scripted=True)
-    begin(talk)
-    queue(talk, 0)
+    talk, _, _ = fill(make_talk)
     with talk.connect() as wire, ThreadPoolExecutor() as pool:
         for _ in range(count):
             waits(wire, "🤖" * 9_900)
@@ -252,12 +253,6 @@ def test_room_is_looked_for_only_when_the_queue_has_changed(make_talk: MakeTalk,
 
 
 # -- a cancel ends what waits for room, too
-
-
-def waits(wire: Wire, text: str, **fields: object) -> None:
-    """Send a goal that waits for room, and return when the server has taken it."""
-    wire.send({"request": "say", "text": f"length=0 {text}", "patient": True, "wait": True, **fields})
-    assert wire.request("hello")["ok"]
 
 
 @pytest.mark.parametrize(
@@ -317,32 +312,25 @@ def test_settings_are_changed_all_together_or_not_at_all(scripted: Talk) -> None
 # -- feedback
 
 
-def test_words_reach_the_one_who_waits_before_the_result(scripted: Talk) -> None:
+def test_words_reach_those_who_asked_for_them_before_the_result(scripted: Talk) -> None:
     text = "length=0.2 one two three"
     with scripted.connect() as sender, scripted.connect() as waiter, scripted.connect() as deaf:
+        other = sender.request("say", text="length=0 not followed", wait=True)["goal"]["id"]
         goal = sender.request("say", text=text, feedback=True)["goal"]["id"]
         for wire, feedback in ((waiter, True), (deaf, False)):
             assert wire.request("wait", ids=[goal], feedback=feedback)["ok"]
+        assert _until_result(sender)[-1]["goal"]["id"] == other
         told = {name: _until_result(each) for name, each in (("s", sender), ("w", waiter), ("d", deaf))}
     words = scripted.watcher.words(goal)
     assert [each["word"] for each in words] == text.split()
     assert [each for each in told["s"] if each["event"] == "word"] == words
-    assert _shapes(told["s"]) == ["PENDING", "ACTIVE", *["word"] * 4, "SUCCEEDED", "result"]
+    assert _shapes(told["s"]) == ["ACTIVE", *["word"] * 4, "SUCCEEDED", "result"]
     # It may have come a word late, and hears all the words from then on.
     heard = [each for each in told["w"] if each["event"] == "word"]
     assert heard == words[len(words) - len(heard) :]
     assert len(heard) >= 2
     assert _shapes(told["w"])[-3:] == ["word", "SUCCEEDED", "result"]
     assert "word" not in _shapes(told["d"])
-
-
-def test_words_are_of_the_goal_that_is_followed_alone(scripted: Talk) -> None:
-    with scripted.connect() as wire:
-        first = wire.request("say", text="length=0 one", wait=True)["goal"]["id"]
-        second = wire.request("say", text="length=0 two", feedback=True)["goal"]["id"]
-        told = [*_until_result(wire), *_until_result(wire)]
-    assert {each["id"] for each in told if each["event"] == "word"} == {second}
-    assert [each["goal"]["id"] for each in told if each["event"] == "result"] == [first, second]
 
 
 def _until_result(wire: Wire) -> list[Message]:

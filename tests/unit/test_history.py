@@ -36,24 +36,14 @@ def test_many_goals_that_end_alike_drive_out_no_other(state: State, limit: int) 
     assert kept == [*others, *alike[-limit:]]
 
 
-def test_latest_are_the_newest_first_without_rejected_ones() -> None:
+def test_the_newest_end_comes_first_and_latest_leaves_rejected_ones_out() -> None:
     history = History()
     states = [State.ABORTED, State.REJECTED, State.RECALLED, State.SUCCEEDED, State.REJECTED, State.RECALLED]
-    for number, state in enumerate(states):
+    for number, state in zip((9, 1, 4, 0, 3, 5), states, strict=True):
         history.add(ended(number, state))
-    assert [each.number for each in history.latest(2)] == [5, 3]
-    assert [each.number for each in history.latest(10)] == [5, 3, 2, 0]
-    assert list(history.latest(0)) == []
-
-
-def test_the_log_has_all_that_ended_in_the_order_of_their_ends_the_newest_first() -> None:
-    history = History()
-    for number in (5, 1, 4, 0, 3):
-        history.add(ended(number, State.REJECTED if number % 2 else State.RECALLED))
-    assert [each.number for each in history.log(10)] == [3, 0, 4, 1, 5]
-    assert [each.number for each in history.log(2)] == [3, 0]
-    assert list(history.log(0)) == []
-    assert list(History().log(5)) == []
+    for count in (0, 2, 10):
+        assert [each.number for each in history.log(count)] == [5, 3, 0, 4, 1, 9][:count]
+        assert [each.number for each in history.latest(count)] == [5, 0, 4, 9][:count]
 
 
 def test_an_id_that_was_forgotten_may_come_again() -> None:
@@ -81,12 +71,10 @@ def test_texts_take_eight_mebibytes_and_the_oldest_goes_first_but_its_result_sta
 
 def test_bytes_count_not_characters() -> None:
     history = History()
-    first = ended(1, text="🤖" * (1024 * 1024))
-    second = ended(2, text="a" * (4 * 1024 * 1024 + 1))
+    first, second = ended(1, text="🤖" * (1024 * 1024)), ended(2, text="a" * (4 * 1024 * 1024 + 1))
     history.add(first)
     history.add(second)
-    assert first.text is None
-    assert second.text is not None
+    assert (first.text, second.text is None) == (None, False)
 
 
 def test_a_text_without_words_spoken_is_forgotten_with_them() -> None:

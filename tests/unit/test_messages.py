@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from talkcli.goals.goal import By, Goal, Output, Sender
 from talkcli.goals.states import State
+from tests.unit.test_lines import values
 
 #: A goal always has all of these, null where unknown.
 KEYS = [
@@ -20,11 +21,6 @@ KEYS = [
 numbers = st.integers(-(10**18), 10**18)
 seconds = st.none() | st.floats(-1e15, 1e15)
 strings = st.none() | st.text()
-values = st.recursive(
-    st.none() | st.booleans() | numbers | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
-    max_leaves=10,
-)
 senders = st.builds(
     Sender, pid=st.none() | numbers, uid=st.none() | numbers, command=strings, parent=strings, name=strings
 )

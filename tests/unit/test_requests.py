@@ -22,19 +22,11 @@ from talkcli.protocol.requests import (
     Wait,
     read_request,
 )
+from tests.unit.test_lines import values
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
-values = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(10**18), 10**18)
-    | st.floats(allow_nan=False, allow_infinity=False)
-    | st.text(),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
-    max_leaves=8,
-)
 integers = st.integers(-(10**18), 10**18)
 goal_ids = st.text(min_size=1, max_size=MAX_ID)
 #: Values of each kind of option.

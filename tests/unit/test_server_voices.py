@@ -63,6 +63,12 @@ what is larger than allowed is dropped, the voice that is not needed first
     memory 100; load a b c; grown a 40; grown b 80; grown c 125; excess c : c  ->  a dropped; b loaded, c loaded
 nothing is dropped before that
     memory 100; load a b c; grown a 40; grown b 80; excess b : b  ->  nothing; a loaded, b loaded, c loaded
+what a voice takes may grow
+    memory 100; load a b c; grown a 40; grown a 60; grown b 100; grown c 130; excess c : c
+        ->  a dropped; b loaded, c loaded
+what is measured while a voice is loaded replaces the size of its file
+    memory 100; want a; next a; grown a 50; loaded a; want b; next b; grown b 100; loaded b; excess b : b
+        ->  nothing; a loaded, b loaded
 what was dropped no longer counts, before the engine has told what it got back
     memory 100; load a b c; grown a 40; grown b 80; grown c 125; excess c : c; excess c : c
         ->  nothing; b loaded, c loaded

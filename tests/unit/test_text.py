@@ -26,24 +26,8 @@ INVALID = {
     "private use": "\ue000",
 }
 SPOKEN = [
-    "door open",
-    "5",
-    "-5",
-    "?",
-    "%",
-    "é",
-    "日",
-    "🤖",
-    "👩\u200d🚀",
-    " a ",
-    "\u200ba",
-    "a\x01b",
-    "e\u0301",
-    "مرحبا",
-    "<speak>hi</speak>",
-    "[[h@'loU]]",
-    '$(reboot); `id` "quoted"\nnext line',
-    "\x1b[31mred",
+    *("door open", "5", "-5", "?", "%", "é", "日", "🤖", "👩\u200d🚀", " a ", "\u200ba", "a\x01b", "e\u0301", "مرحبا"),
+    *("<speak>hi</speak>", "[[h@'loU]]", '$(reboot); `id` "quoted"\nnext line', "\x1b[31mred"),
 ]
 
 

@@ -97,29 +97,25 @@ def test_a_log_without_a_terminal_is_whole(goals: list[Goal]) -> None:
         assert why_forms(goal)[0].rstrip() in line
 
 
-@given(GOALS, WIDTHS, st.booleans())
-def test_a_transcript_fits(goal: Goal, room: int, full: bool) -> None:
-    transcript = Transcript(full=full, words=True)
-    pending = replace(goal, state=State.PENDING)
+@given(st.lists(GOALS, max_size=4), GOALS, WIDTHS, st.booleans())
+def test_a_transcript_and_a_status_fit(goals: list[Goal], goal: Goal, room: int, full: bool) -> None:
+    now = replace(goal, state=State.ACTIVE, started_at=NOON, paused=True, key="k" * 64, priority=10**6)
+    waiting = tuple(replace(each, state=State.PENDING, ttl=5.0, queued_at=NOON) for each in goals)
+    status = ServerStatus(SERVER, now, waiting, tuple(goals))
     events: list[Event] = [
-        Snapshot(ServerStatus(SERVER, replace(GOAL, state=State.ACTIVE), (pending,), ())),
+        Snapshot(status),
         StateChanged(goal.id, State.ACTIVE, NOON),
         PausedChanged(True, goal.id, By(client=goal.client), NOON),
         StateChanged(goal.id, State.PREEMPTING, NOON),
         StateChanged(goal.id, goal.state, NOON, goal=goal),
     ]
-    for event in events:
-        lines = transcript.lines(event, Screen(room), NOON)
+    transcript = Transcript(full=full, words=True)
+    for lines in (
+        status_lines(status, Screen(room), NOON),
+        *(transcript.lines(each, Screen(room), NOON) for each in events),
+    ):
         assert all(width(each) <= room and plain(each) for each in lines), lines
     assert lines
-
-
-@given(st.lists(GOALS, max_size=4), GOALS, WIDTHS)
-def test_a_status_fits(goals: list[Goal], active: Goal, room: int) -> None:
-    now = replace(active, state=State.ACTIVE, started_at=NOON, paused=True, key="k" * 64, priority=10**6)
-    waiting = tuple(replace(each, state=State.PENDING, ttl=5.0, queued_at=NOON) for each in goals)
-    lines = status_lines(ServerStatus(SERVER, now, waiting, tuple(goals)), Screen(room), NOON)
-    assert all(width(each) <= room and plain(each) for each in lines), lines
 
 
 def test_dates_are_shown_of_another_day_alone() -> None:
