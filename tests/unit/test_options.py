@@ -197,6 +197,18 @@ def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_ther
     assert told(changed)[2:] == ["voice de", "pitch 50", "goals preempt", "ttl 2.5 s"]
 
 
+def test_a_setting_is_typed_and_helped_as_its_command_wants_it() -> None:
+    rows = {each.name: each for each in SETTINGS}
+    preempt, rate = rows["preempt"], rows["rate"]
+    assert preempt.setting
+    at_start, to_set = preempt.at_start(), preempt.to_set()
+    assert (at_start.flags, at_start.help, at_start.default) == ("--preempt", preempt.setting.at_start, False)
+    assert (to_set.flags, to_set.help, to_set.default) == ("--preempt/--no-preempt", preempt.setting.to_set, None)
+    at_start, to_set = rate.at_start(), rate.to_set()
+    assert (at_start.flags, at_start.help, at_start.default, at_start.env) == ("--rate", rate.help, 200, "TALK_RATE")
+    assert (to_set.flags, to_set.help, to_set.default, to_set.env) == ("--rate", rate.help, None, "")
+
+
 def test_the_engine_is_told_the_goal_s_own_value_else_the_server_s() -> None:
     settings = replace(INITIAL, voice="de", rate=150)
     general = {"rate": 150, "volume": 1.0, "voice": "de", "pitch": 50, "lead_in": None, "audible": None}

@@ -110,12 +110,10 @@ def test_a_transcript_and_a_status_fit(goals: list[Goal], goal: Goal, room: int,
         StateChanged(goal.id, goal.state, NOON, goal=goal),
     ]
     transcript = Transcript(full=full, words=True)
-    for lines in (
-        status_lines(status, Screen(room), NOON),
-        *(transcript.lines(each, Screen(room), NOON) for each in events),
-    ):
+    told = [transcript.lines(each, Screen(room), NOON) for each in events]
+    for lines in (status_lines(status, Screen(room), NOON), *told):
         assert all(width(each) <= room and plain(each) for each in lines), lines
-    assert lines
+    assert told[-1]
 
 
 def test_dates_are_shown_of_another_day_alone() -> None:
