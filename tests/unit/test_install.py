@@ -21,56 +21,39 @@ PIPX = Environment(
 OPT = Environment("/opt/talk/bin/python3", needs_sudo=True)
 
 
+#: In the commands, PY stands for the environment's own Python.
 @pytest.mark.parametrize(
-    ("environment", "command"),
+    ("environment", "again", "command"),
     [
-        (VENV, "/home/pi/talk/.venv/bin/python -m pip install numpy"),
-        (replace(VENV, python="/home/pi/my robot/bin/python"), "'/home/pi/my robot/bin/python' -m pip install numpy"),
-        (
-            replace(VENV, has_pip=False),
-            "/home/pi/talk/.venv/bin/python -m ensurepip && /home/pi/talk/.venv/bin/python -m pip install numpy",
-        ),
-        (
-            replace(VENV, has_pip=False, made_by_uv=True),
-            "uv pip install --python /home/pi/talk/.venv/bin/python numpy",
-        ),
-        (replace(VENV, made_by_uv=True), "/home/pi/talk/.venv/bin/python -m pip install numpy"),
-        (OPT, "sudo /opt/talk/bin/python3 -m pip install numpy"),
-        (
-            replace(OPT, has_pip=False),
-            "sudo /opt/talk/bin/python3 -m ensurepip && sudo /opt/talk/bin/python3 -m pip install numpy",
-        ),
-        (PIPX, "pipx inject talkcli numpy"),
-        (replace(PIPX, pipx="/home/pi/.local/pipx/venvs/talkcli-2"), "pipx inject talkcli-2 numpy"),
+        (VENV, False, "PY -m pip install numpy"),
+        (replace(VENV, python="/home/pi/my robot/bin/python"), False, "PY -m pip install numpy"),
+        (replace(VENV, has_pip=False), False, "PY -m ensurepip && PY -m pip install numpy"),
+        (replace(VENV, has_pip=False, made_by_uv=True), False, "uv pip install --python PY numpy"),
+        (replace(VENV, made_by_uv=True), False, "PY -m pip install numpy"),
+        (OPT, False, "sudo PY -m pip install numpy"),
+        (replace(OPT, has_pip=False), False, "sudo PY -m ensurepip && sudo PY -m pip install numpy"),
+        (PIPX, False, "pipx inject talkcli numpy"),
+        (replace(PIPX, pipx="/home/pi/.local/pipx/venvs/talkcli-2"), False, "pipx inject talkcli-2 numpy"),
         (
             replace(PIPX, pipx="/opt/pipx/venvs/talkcli", needs_sudo=True),
+            False,
             "sudo PIPX_HOME=/opt/pipx pipx inject talkcli numpy",
         ),
-        (SYSTEM, "/usr/bin/python3 -m pip install --break-system-packages numpy"),
-        (replace(SYSTEM, externally_managed=False), "/usr/bin/python3 -m pip install numpy"),
+        (SYSTEM, False, "PY -m pip install --break-system-packages numpy"),
+        (replace(SYSTEM, externally_managed=False), False, "PY -m pip install numpy"),
         (
             replace(SYSTEM, has_pip=False, needs_sudo=True),
-            "sudo apt-get install -y python3-pip && sudo /usr/bin/python3 -m pip install --break-system-packages numpy",
+            False,
+            "sudo apt-get install -y python3-pip && sudo PY -m pip install --break-system-packages numpy",
         ),
+        (VENV, True, "PY -m pip install --force-reinstall numpy"),
+        (PIPX, True, "pipx inject --force talkcli numpy"),
+        (replace(VENV, has_pip=False, made_by_uv=True), True, "uv pip install --reinstall --python PY numpy"),
     ],
 )
-def test_the_command_fits_the_environment(environment: Environment, command: str) -> None:
-    assert command_for(environment, ["numpy"]) == command
-
-
-@pytest.mark.parametrize(
-    ("environment", "command"),
-    [
-        (VENV, "/home/pi/talk/.venv/bin/python -m pip install --force-reinstall numpy"),
-        (PIPX, "pipx inject --force talkcli numpy"),
-        (
-            replace(VENV, has_pip=False, made_by_uv=True),
-            "uv pip install --reinstall --python /home/pi/talk/.venv/bin/python numpy",
-        ),
-    ],
-)
-def test_a_package_is_installed_again(environment: Environment, command: str) -> None:
-    assert command_for(environment, ["numpy"], again=True) == command
+def test_the_command_fits_the_environment(environment: Environment, again: bool, command: str) -> None:
+    wanted = command.replace("PY ", f"{shlex.quote(environment.python)} ")
+    assert command_for(environment, ["numpy"], again=again) == wanted
 
 
 def test_the_command_names_the_python_that_runs() -> None:

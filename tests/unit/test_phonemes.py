@@ -49,26 +49,39 @@ def _words(text: str, speller: Spelt | None = None) -> list[tuple[str, str]]:
     return found
 
 
-def test_a_piece_is_a_sentence_with_its_stops() -> None:
-    assert _shown("one, two. three? four") == ["one, two.", "three?", "four"]
-    assert [each.ends for each in pieces(Spelt(), "one. two")] == [True, True]
+@pytest.mark.parametrize(
+    ("text", "said", "shown"),
+    [
+        ("one, two. three? four", {}, ["one, two.", "three?", "four"]),
+        # the stops of other scripts are those that voices know
+        *(
+            (f"one{sign}", {f"one{sign}": "one"}, [f"one{mark}"])
+            for sign, mark in zip("。？，…؟;", ".?,.?;", strict=True)
+        ),
+        # a dot that belongs to its word ends nothing but the text
+        ("one mr. two. mr.", {}, ["one mr two.", "mr."]),
+        # accents are sounds of their own, and marks of languages are none
+        ("x", {"x": "(en)\xf5(de)"}, ["o\u0303"]),
+        *((text, {}, []) for text in ("", " ", "...", "!")),
+    ],
+)
+def test_a_piece_is_a_sentence_with_its_stops(text: str, said: dict[str, str], shown: list[str]) -> None:
+    assert _shown(text, Spelt(said=said)) == shown
+    assert all(each.ends for each in pieces(Spelt(said=said), text))
 
 
-@pytest.mark.parametrize(("sign", "mark"), [("。", "."), ("？", "?"), ("，", ","), ("…", "."), ("؟", "?"), (";", ";")])
-def test_other_scripts_stops_are_those_that_voices_know(sign: str, mark: str) -> None:
-    assert _shown(f"one{sign}", Spelt(said={f"one{sign}": "one"})) == [f"one{mark}"]
-
-
-def test_a_dot_that_belongs_to_its_word_ends_nothing_but_the_text() -> None:
-    assert _shown("one mr. two. mr.") == ["one mr two.", "mr."]
-
-
-def test_words_begin_where_they_stand_in_the_text() -> None:
-    assert _words("one, two. three") == [("one", "one"), ("two", "two"), ("three", "thr")]
-
-
-def test_words_that_are_spoken_as_one_begin_inside_of_it() -> None:
-    assert _words("go in the red", Spelt("in the")) == [("go", "go "), ("in", "int"), ("the", "the"), ("red", "red")]
+@pytest.mark.parametrize(
+    ("text", "speller", "words"),
+    [
+        ("one, two. three", Spelt(), [("one", "one"), ("two", "two"), ("three", "thr")]),
+        # words that are spoken as one begin inside of it
+        ("go in the red", Spelt("in the"), [("go", "go "), ("in", "int"), ("the", "the"), ("red", "red")]),
+        # a word that is spoken as several begins with the first
+        ("go 20 by", Spelt(said={"20": "twen ty"}), [("go", "go "), ("20", "twe"), ("by", "by")]),
+    ],
+)
+def test_words_begin_where_they_stand_in_the_text(text: str, speller: Spelt, words: list[tuple[str, str]]) -> None:
+    assert _words(text, speller) == words
 
 
 def test_a_word_that_is_spelled_begins_once_and_those_behind_it_where_they_are() -> None:
@@ -103,20 +116,6 @@ def test_sounds_without_number_are_laid_side_by_side_soon_in_order() -> None:
     found = _words("1 a a a", Spelt(said=said))
     assert_within(time.monotonic() - began, 0.3, "10,000 sounds")
     assert [word for word, _ in found] == ["1", "a", "a", "a"]
-
-
-def test_a_word_that_is_spoken_as_several_begins_with_the_first() -> None:
-    said = {"20": "twen ty"}
-    assert _words("go 20 by", Spelt(said=said)) == [("go", "go "), ("20", "twe"), ("by", "by")]
-
-
-def test_accents_are_sounds_of_their_own_and_marks_of_languages_are_none() -> None:
-    assert _shown("x", Spelt(said={"x": "(en)\xf5(de)"})) == ["o\u0303"]
-
-
-@pytest.mark.parametrize("text", ["", " ", "...", "!"])
-def test_where_nothing_has_a_sound_there_is_no_piece(text: str) -> None:
-    assert list(pieces(Spelt(), text)) == []
 
 
 def test_a_long_sentence_is_parted_at_a_comma_and_without_a_pause() -> None:
