@@ -101,8 +101,8 @@ def test_bytes_that_are_no_utf8_are_left_out_and_named(scripted: Talk) -> None:
     text = "length=0 Grüße:\n日本\nGr\ufffd\ufffde \ufffd\ufffd\ufffd!"
     note = "talk: line 3, column 3: the byte 0xfc is not UTF-8, and is not spoken (the first of 5)\n"
     for options, told in ((["--json"], note), (["--json", "-q"], "")):
-        for words, typed in ((["--", data], b""), (["-"], data)):
-            line = [*TALK, *options, "say", "--wait", *words]
+        for words, typed in (([b"--", data], b""), ([b"-"], data)):
+            line: list[str | bytes] = [*TALK, *options, "say", "--wait", *words]
             done = subprocess.run(line, input=typed, env=scripted.env, capture_output=True, timeout=20, check=False)
             goal = json.loads(done.stdout)
             assert (done.returncode, goal["state"], goal["text"]) == (0, "SUCCEEDED", text)

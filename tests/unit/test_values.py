@@ -81,7 +81,7 @@ def test_the_first_values_of_a_class_are_made_as_all_others_are(
     for number in range(before):
         assert make(number) == make(x=number, y=2)
     for each in (Model, make):
-        with pytest.raises(TypeError, match="__init__.*argument"):
+        with pytest.raises(TypeError, match=r"__init__.*argument"):
             each(*given, **named)
     assert fields(make(1, name="a")) == fields(make(x=1, name="a")) == {"x": 1, "y": 2, "name": "a"}
 
