@@ -110,7 +110,7 @@ def test_bytes_that_are_no_utf8_are_left_out_and_named(scripted: Talk) -> None:
 
 
 def test_bytes_that_are_no_utf8_are_silent_and_no_words(talk: Talk) -> None:
-    line = [*TALK, "say", "--feedback", "--", b"battery \xff low, it\xffs \xff", "now"]
+    line: list[str | bytes] = [*TALK, "say", "--feedback", "--", b"battery \xff low, it\xffs \xff", "now"]
     done = subprocess.run(line, env=talk.env, capture_output=True, text=True, timeout=20, check=False)
     said = [each.split()[-1] for each in done.stdout.splitlines() if " word " in each]
     assert (done.returncode, said) == (0, ["battery", "low", "it", "s", "now"])
