@@ -30,17 +30,6 @@ def test_row_21_a_cancel_that_comes_before_its_goal_recalls_it(scripted: Talk) -
     assert_told_in_order(scripted)
 
 
-def test_row_22_two_commands_with_one_id_end_alike_and_another_text_is_refused(scripted: Talk) -> None:
-    same = ["say", "--wait", "--id", "front-door.1", "--", TEXT]
-    clients = [scripted.start(*same) for _ in range(2)]
-    done = [scripted.finish(each) for each in clients]
-    assert [(each.code, each.id) for each in done] == [(0, "front-door.1")] * 2
-    assert states(scripted, "front-door.1") == ["PENDING", "ACTIVE", "SUCCEEDED"]
-    conflict = scripted.run("say", "--wait", "--id", "front-door.1", "--", "length=0 another text")
-    assert (conflict.code, conflict.out) == (5, "")
-    assert "front-door.1" in conflict.err
-
-
 def test_row_22_the_same_id_twice_is_spoken_once_and_both_see_the_result(scripted: Talk) -> None:
     with scripted.connect() as one, scripted.connect() as two:
         first = one.request("say", text=TEXT, id="front-door.1", wait=True)
@@ -66,11 +55,13 @@ def test_row_22_a_sender_that_attached_and_leaves_ends_nothing(scripted: Talk) -
         assert one.receive_event("result")["goal"]["state"] == "SUCCEEDED"
 
 
-def test_the_commands_take_the_id_that_ros_gives_a_goal(scripted: Talk) -> None:
+def test_row_22_the_commands_take_the_id_that_ros_gives_a_goal(scripted: Talk) -> None:
     own = "/patrol/goal-1-1712.25"
     done = scripted.run("say", "--wait", "--id", own, "--", SHORT)
     assert (done.code, done.id) == (0, own), done
     assert scripted.request("say", text=SHORT, id=own)["attached"]
+    conflict = scripted.run("say", "--wait", "--id", own, "--", "length=0 another text")
+    assert (conflict.code, conflict.out, own in conflict.err) == (5, "", True)
     assert scripted.run("wait", own).code == 0
     assert scripted.run("cancel", own).code == 0
     assert scripted.run("cancel", f"{own}.later").code == 8

@@ -230,7 +230,3 @@ def number(word: str) -> int | float | str:
         except ValueError:
             pass
     return word
-
-
-def ending(record: Record) -> tuple[State, str | None, By | None]:
-    return record.state, record.reason, record.by

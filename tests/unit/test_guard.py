@@ -41,16 +41,8 @@ def test_letters_with_dots_are_parted_before_they_are_too_many() -> None:
     assert guarded("a." * 85) == "a." * 38 + "a " + "a." * 38 + "a " + "a." * 7
     assert guarded("e.g. " * 60).count("e.g. ") < 60
     assert guarded("http://" + "x." * 100).startswith("http://" + "x." * 38 + "x x.")
-    for text in (
-        "я. " * 60,
-        "A.,B.;" * 60,
-        "a..b.." * 60,
-        "'a'.'b'." * 60,
-        "\u0301.\u0302." * 60,
-        "०.१." * 60,
-        "a.՞b.°" * 60,
-        "Ⓐ.Ⓑ." * 60,
-    ):
+    for motif in ("я. ", "A.,B.;", "a..b..", "'a'.'b'.", "\u0301.\u0302.", "०.१.", "a.՞b.°", "Ⓐ.Ⓑ."):
+        text = motif * 60
         changed = guarded(text)
         assert changed != text
         assert changed.replace(" ", "").replace(".", "") == text.replace(" ", "").replace(".", "")
@@ -86,11 +78,8 @@ def test_an_endless_word_ends_earlier_and_loses_no_letter() -> None:
         assert changed.lower() == text.lower()
         parts = [each for each in _words(changed) if each]
         assert max(len(each.encode()) for each in parts) <= 160, parts
-    for text in (
-        "अ" * 100,
-        "中" * 100,
-        "1" * 400,
-    ):  # no capitals, or no word: nothing can be done, and nothing was seen
+    # no capitals, or no word: nothing can be done, and nothing was seen
+    for text in ("अ" * 100, "中" * 100, "1" * 400):
         assert guarded(text) == text
     assert guarded("x" + "'s" * 70) == "x" + "'s" * 30 + " s" + "'s" * 30 + " s" + "'s" * 8
 

@@ -25,13 +25,6 @@ it waits ten seconds from when loading began
     begin joe; wait 4; a voice=piper/joe; wait 5.9  ->  a PENDING
 and no longer
     begin joe; wait 4; a voice=piper/joe; wait 6  ->  a ACTIVE
-if loading has not begun, from its turn
-    a; expect joe; b voice=piper/joe; wait 60; completed a; wait 9.9  ->  b PENDING; a SUCCEEDED
-or no longer than that
-    a; expect joe; b voice=piper/joe; wait 60; completed a; wait 10  ->  b ACTIVE; a SUCCEEDED
-a turn may come by a cancel
-    begin joe; expect amy; a voice=piper/joe; b voice=piper/amy; wait 3; cancel a; wait 0; wait 10
-        ->  b ACTIVE; a RECALLED canceled by door
 a goal that preempts does not wait
     begin joe; a voice=piper/joe; b voice=piper/joe preempt  ->  b ACTIVE; a PENDING
 nor does one that flushes
@@ -40,11 +33,7 @@ nor one of a higher priority
     begin joe; a voice=piper/joe; b voice=piper/joe 1  ->  b ACTIVE; a PENDING
 one of a lower priority does
     begin joe; a voice=piper/joe -1  ->  a PENDING
-a goal waits while more than half a second of its time is left
-    begin joe; a voice=piper/joe ttl=2; wait 1.4  ->  a PENDING
-then it begins
-    begin joe; a voice=piper/joe ttl=2; wait 1.5  ->  a ACTIVE
-or at once
+a goal of which half a second is left begins at once
     begin joe; a voice=piper/joe ttl=0.5  ->  a ACTIVE
 a goal that insists waits until the voice is loaded
     begin joe; a voice=piper/joe voice_only; wait 60  ->  a PENDING
