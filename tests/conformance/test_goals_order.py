@@ -223,13 +223,10 @@ COUNTING = """
 import sys
 sys.path.insert(0, {root!r})
 from talkcli.daemon import log
-from talkcli.server import requests
+from talkcli.server.requests import Requests
 from tests.support import scripted_serve
-let_go = requests.Requests._let_go
-def counted(self):
-    log.line("looks for room")
-    let_go(self)
-requests.Requests._let_go = counted
+let_go = Requests._let_go
+Requests._let_go = lambda self: (log.line("looks for room"), let_go(self))
 scripted_serve.main()
 """
 

@@ -4,7 +4,7 @@ The steps of a script are parted by semicolons. A goal is a single letter, which
 other step is a verb:
 
     a 5 preempt key=k ttl=1     send a goal of priority 5 that preempts; "queue" is preempt=False
-    heard a; completed a; failed a; stopped a; deaf a   report this of a goal, as the engine does
+    heard a; completed a; failed a; stopped a; deaf a   report this of a goal, as the engine does; * is the active one
     cancel; cancel a b; cancel current before=c key=k
     wait 1; pass 1              let a second pass, with or without a look at the clock
     pause; resume; shutdown; lost; ready; missing; room 2 (the places in the queue); set ttl=5 preempt=yes
@@ -159,6 +159,8 @@ class Robot:
             self.waits(0)
 
     def _id(self, name: str) -> str:
+        if name == "*" and self.scheduler.active:
+            return self.scheduler.active.id
         return self.goals[name].id if name in self.goals else name
 
     def outcome(self) -> str:

@@ -108,19 +108,6 @@ def read(line: bytes) -> JsonObject:
         return failure(None, refused.code, refused.message)
 
 
-@given(objects, st.integers(0), st.binary(min_size=1, max_size=3))
-def test_mutated_line_is_an_object_or_a_bad_request(message: JsonObject, place: int, noise: bytes) -> None:
-    line = encode(message).rstrip(b"\n")
-    place %= len(line)
-    for mutated in (
-        line[:place] + noise + line[place:],
-        line[:place] + noise + line[place + len(noise) :],
-        line[:place],
-    ):
-        with contextlib.suppress(BadRequest):
-            assert isinstance(decode(mutated), dict)
-
-
 @given(objects)
 def test_what_is_written_is_one_line_and_is_read_back(message: JsonObject) -> None:
     line = encode(message)

@@ -118,9 +118,7 @@ class Checked(Robot):
 
     def tells(self, event: str, goal_id: str) -> None:
         if goal_id == "*":
-            if self.engine is None:
-                return
-            goal_id = self.engine.id
+            return  # nothing is spoken
         if self.engine and goal_id == self.engine.id:
             stopping = self.engine.state is State.PREEMPTING
             super().tells(event if stopping or event not in {"deaf", "stopped"} else "heard", goal_id)
