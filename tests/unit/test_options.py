@@ -29,6 +29,7 @@ from talkcli.goals.options import (
     OPTIONS,
     SETTINGS,
     SHOWN,
+    SOUND,
     Say,
     Set,
     as_shown,
@@ -188,6 +189,7 @@ def test_what_a_goal_shows_and_what_the_engine_is_told_are_what_the_rows_say() -
 
 def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_there_is_not() -> None:
     assert list(annotated(Set)) == [each.name for each in SETTINGS]
+    assert [each.name for each in SOUND] == ["rate", "volume", "voice", "pitch"]
     shown = as_shown(INITIAL)
     assert shown == {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
     assert as_shown(replace(INITIAL, voice=DEFAULT_VOICE, ttl=0.0)) == shown

@@ -70,11 +70,8 @@ def test_replies_carry_the_number_of_their_request() -> None:
     assert ok(None) == {"ok": True}
     assert item(3, voice={}) == {"seq": 3, "voice": {}}
     assert item(None, voice={}) == {"voice": {}}
-    assert failure(3, "unknown_goal", "no") == {
-        "seq": 3,
-        "ok": False,
-        "error": {"code": "unknown_goal", "message": "no"},
-    }
+    error = {"code": "unknown_goal", "message": "no"}
+    assert failure(3, **error) == {"seq": 3, "ok": False, "error": error}
     assert failure(0, "busy", "no")["seq"] == 0
 
 

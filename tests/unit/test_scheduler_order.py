@@ -306,7 +306,7 @@ the first stop gives the reason
 silence is waited for
     a; b; cancel a; wait 1.89  ->  a PREEMPTING canceled by door; b PENDING
 and given up
-    a; b; cancel a; wait 1.91  ->  b ACTIVE; a ABORTED not_silent by door
+    a; b; cancel a; wait 1.9  ->  b ACTIVE; a ABORTED not_silent by door
 and the first stop counts
     a; cancel a; pass 1.5; cancel a; wait 0.5  ->  a ABORTED not_silent by door
 silence that the engine can't reach

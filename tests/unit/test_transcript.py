@@ -22,6 +22,13 @@ NOON = time.mktime((2024, 5, 17, 12, 0, 0, 0, 0, -1))
 GOAL = Goal("4k7f-7", State.PENDING, "battery low", client=PATROL, queued_at=NOON)
 SERVER = {"pid": 1, "socket": "/run/talk/talk.sock", "boot": "4k7f"}
 
+#: Programs, with their options, that start another one.
+STARTERS = [
+    *("timeout -s KILL -k 5 1m", "timeout --signal KILL --kill-after=5 0.5", "nice -n 5", "nice -n5", "ionice -c 3"),
+    *("env -u X", "sudo -u robot -E A=1", "/usr/bin/time -f %e", "stdbuf -oL", "chrt -f 5"),
+    *("taskset -c 0,1", "flock -w 5 /run/lock/x", "xargs -n 1"),
+]
+
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=80)
 NAMES = st.none() | TEXTS
 SENDERS = st.none() | st.builds(
@@ -193,22 +200,10 @@ def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
         ("perl -ne print a", "perl"),
         ("node --require x.js a.js", "a.js"),
         # programs that start another one
+        *((f"{each} ./a", "a") for each in STARTERS),
         ("timeout 60 python3 a.py", "a.py"),
-        ("timeout -s KILL -k 5 1m ./a", "a"),
-        ("timeout --signal KILL --kill-after=5 0.5 ./a", "a"),
-        ("nice -n 5 ./a", "a"),
-        ("nice -n5 ./a", "a"),
-        ("ionice -c 3 ./a", "a"),
         ("env -i A=1 B=2 ./a C=3", "a"),
-        ("env -u X ./a", "a"),
-        ("sudo -u robot -E A=1 ./a", "a"),
         ("sudo -Eu robot -- ./a -x", "a"),
-        ("/usr/bin/time -f %e ./a", "a"),
-        ("stdbuf -oL ./a", "a"),
-        ("chrt -f 5 ./a", "a"),
-        ("taskset -c 0,1 ./a", "a"),
-        ("flock -w 5 /run/lock/x ./a", "a"),
-        ("xargs -n 1 ./a", "a"),
         ("sudo nohup setsid nice timeout 60 bash a.sh", "a.sh"),
         # without a program
         ("timeout 60", "timeout"),
