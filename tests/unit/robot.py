@@ -25,7 +25,6 @@ from talkcli.frozen import replace
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import INITIAL, Cancel, Say
 from talkcli.goals.scheduler import Cancelled, Changed, Effect, Now, Scheduler, Submitted
-from talkcli.goals.states import State
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,14 +33,6 @@ if TYPE_CHECKING:
 
 ARM = Sender(pid=7, uid=1000, command="talk", name="arm")
 DOOR = Sender(pid=8, uid=1000, command="talk", name="door")
-#: How the message of each end begins.
-MESSAGES = {
-    State.SUCCEEDED: "Talk completed successfully",
-    State.ABORTED: "Talk aborted: ",
-    State.REJECTED: "Talk rejected: ",
-    State.RECALLED: "Talk recalled: ",
-    State.PREEMPTED: "Talk preempted",
-}
 WORDS = {"yes": True, "no": False}
 
 
@@ -130,7 +121,7 @@ class Robot:
                 self.submits(Say(**{"text": verb, **given}), verb, **known)
             elif verb == "cancel":
                 given = options(words)
-                ids = [self._id(each) for each in words if given.get(each) and each != "current"]
+                ids = [self._id(each) for each in words if "=" not in each and each != "current"]
                 selection: dict[str, Any] = {each: self._id(given[each]) for each in ("before", "key") if each in given}
                 self.cancels(*ids, current="current" in given, **selection)
             else:
@@ -165,16 +156,11 @@ class Robot:
 
     def outcome(self) -> str:
         """Return what became of the goals, and check that each of them and what was told of it agree."""
-        pending = list(self.scheduler.pending())
-        ended = [each for each in self.goals.values() if each not in pending]
+        unfinished = self.scheduler.unfinished()
         groups: dict[str, list[str]] = {}
-        for record in [*sorted(ended, key=lambda each: each is not self.scheduler.active), *pending]:
+        for record in [*unfinished, *(each for each in self.goals.values() if each not in unfinished)]:
             groups.setdefault(self._ending(record), []).append(self.name_of(record))
-        found = [f"{' '.join(names)} {ending}" for ending, names in groups.items()]
-        order = sorted(
-            found, key=lambda each: ("ACTIVE" not in each and "PREEMPTING" not in each, "PENDING" not in each)
-        )
-        return "; ".join([*order, *self.attached])
+        return "; ".join([*(f"{' '.join(names)} {ending}" for ending, names in groups.items()), *self.attached])
 
     def _ending(self, record: Record) -> str:
         goal = record.snapshot()
@@ -183,7 +169,7 @@ class Robot:
         assert states[-1] == goal.state.name, f"it is {goal.state.name}, and was told to be {states}"
         assert (goal.started_at is not None) == ("ACTIVE" in states)
         assert (goal.ended_at is not None) == goal.state.terminal
-        assert str(goal.message).startswith(MESSAGES[goal.state]) if goal.state.terminal else goal.message is None
+        assert (goal.message is not None) == goal.state.terminal
         words = [goal.state.name, *(["paused"] if goal.paused else []), *([goal.reason] if goal.reason else [])]
         if goal.by and goal.by.goal:
             words += ["by", self.name_of(next(each for each in self.goals.values() if each.id == goal.by.goal))]
