@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.goals.goal import By, Goal, Output, Sender
+from talkcli.goals.goal import seconds as seconds_of
 from talkcli.goals.states import State
 from tests.unit.test_lines import values
 
@@ -68,6 +69,12 @@ def test_what_is_not_known_of_a_goal_is_null() -> None:
     assert message == dict.fromkeys(KEYS) | {
         "id": "4k7f-1", "state": "PENDING", "status": 0, "format": "text", "priority": 0, "paused": False
     }  # fmt: skip
+
+
+def test_a_time_that_no_calendar_can_show_is_unknown() -> None:
+    shown: list[object] = [0, -1e15, 1e15]
+    assert [seconds_of(each) for each in shown] == shown
+    assert {seconds_of(each) for each in (1e15 + 1, -1e15 - 1, float("nan"), True, "1", None)} == {None}
 
 
 def test_an_output_that_lacks_something_is_none() -> None:

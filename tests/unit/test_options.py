@@ -19,7 +19,7 @@ from talkcli.cli.command import MODE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.engine import protocol
 from talkcli.frozen import fields, replace
-from talkcli.goals.option import INTEGER, NUMBER, Option, is_clients_id
+from talkcli.goals.option import INTEGER, NUMBER, SECONDS, Option, is_clients_id
 from talkcli.goals.options import (
     DEFAULT_VOICE,
     FOR_ENGINE,
@@ -44,6 +44,7 @@ from talkcli.server import run
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+ROWS = {each.name: each for each in OPTIONS}
 NO_SECONDS: list[object] = [-1, -0.001, math.nan, math.inf, -math.inf, 10**400, -(10**400)]
 GOOD: list[tuple[str, list[object]]] = [
     ("rate", [80, 200, 450]),
@@ -200,8 +201,7 @@ def test_settings_are_given_whole_at_the_start_and_shown_with_null_for_what_ther
 
 
 def test_a_setting_is_typed_and_helped_as_its_command_wants_it() -> None:
-    rows = {each.name: each for each in SETTINGS}
-    preempt, rate = rows["preempt"], rows["rate"]
+    preempt, rate = ROWS["preempt"], ROWS["rate"]
     assert preempt.setting
     at_start, to_set = preempt.at_start(), preempt.to_set()
     assert (at_start.flags, at_start.help, at_start.default) == ("--preempt", preempt.setting.at_start, False)
@@ -232,6 +232,27 @@ def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
         for name, row in rows.items()
         if not row.setting and name != "print_unit"
     }
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        (Option("x", NUMBER, limits=(0, 1), unit=" m"), 2, "the x 2 is not within 0 to 1 m"),
+        (Option("x", INTEGER, limits=(1, None)), 0, "the x 0 is not from 1 on"),
+        (Option("x", NUMBER, limits=(0, None), above=True), 0, "the x 0 is not above 0"),
+        (Option("x", SECONDS, limits=(0, None)), -1, "the x -1 is no number of seconds from 0 on"),
+        (Option("x", SECONDS, limits=(0, 9)), 10, "the x 10 is not within 0 to 9"),
+        (Option("x", NUMBER), 10, None),
+        (ROWS["priority"], 1_000_001, "the priority 1000001 is not within -1000000 to 1000000"),
+        (ROWS["key"], "", "a key has 1 to 64 characters, this one has 0"),
+        (ROWS["voice"], "", "the voice is empty"),
+        (ROWS["format"], "x" * 99, f"the format '{'x' * 64}' is not known, only 'text'"),
+    ],
+    ids=lambda each: getattr(each, "name", None) or str(each)[:24],
+)
+def test_a_refusal_says_what_a_value_may_be(option: Option, value: object, words: str | None) -> None:
+    assert option.refusal(value) == words
+    assert option.refusal(None) is None
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -157,6 +157,8 @@ the goal that is spoken is held
     a; b; pause; pause  ->  a ACTIVE paused; b PENDING
 it goes on
     a; b; pause; resume; resume  ->  a ACTIVE; b PENDING
+resume without a pause does nothing
+    begin joe; a voice=piper/joe ttl=1; pass 1; resume  ->  a PENDING
 goals are accepted and none starts
     pause; a; b  ->  a b PENDING
 the first one starts at resume

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from talkcli.goals.goal import Sender
+from talkcli.goals.goal import Goal, Sender
 from talkcli.goals.options import Say
 from talkcli.goals.record import Record
 from talkcli.goals.states import EXIT_CODES, TRANSITIONS, IllegalTransition, State, follow
@@ -63,3 +63,6 @@ def test_a_goal_has_ended_where_nothing_may_follow() -> None:
 def test_each_end_has_its_exit_code() -> None:
     codes = {"SUCCEEDED": 0, "ABORTED": 4, "REJECTED": 5, "RECALLED": 6, "PREEMPTED": 7, "LOST": 12}
     assert {each.name: code for each, code in EXIT_CODES.items()} == codes
+    for state in State:
+        assert Goal("4k7f-1", state).exit_code == codes.get(state.name)
+    assert Goal("4k7f-1", State.REJECTED, reason="throttled").exit_code == 0
