@@ -7,16 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.errors import BadRequest, Busy, ProtocolMismatch
-from talkcli.protocol.events import (
-    PROTOCOL,
-    busy_greeting,
-    check_greeting,
-    failure,
-    greeting,
-    item,
-    ok,
-    take_seq,
-)
+from talkcli.protocol.events import PROTOCOL, busy_greeting, check_greeting, failure, greeting, item, ok, take_seq
 from talkcli.protocol.lines import decode, encode
 
 if TYPE_CHECKING:

@@ -13,14 +13,7 @@ from talkcli.goals.option import MAX_DATA, MAX_ID, MAX_IDS, MAX_LOG, MAX_NAME
 from talkcli.goals.options import Cancel, Say
 from talkcli.protocol.events import failure
 from talkcli.protocol.lines import decode, encode, request_line, write_request
-from talkcli.protocol.requests import (
-    KINDS,
-    Log,
-    Request,
-    Status,
-    Wait,
-    read_request,
-)
+from talkcli.protocol.requests import KINDS, Log, Request, Status, Wait, read_request
 from tests.unit.test_lines import values
 
 if TYPE_CHECKING:
