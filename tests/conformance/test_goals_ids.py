@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING
 
-from tests.conformance.told import assert_told_in_order, submit
+from tests.conformance.told import assert_told_in_order
 from tests.conformance.witness import states
 
 if TYPE_CHECKING:
@@ -67,9 +66,3 @@ def test_row_22_the_commands_take_the_id_that_ros_gives_a_goal(scripted: Talk) -
     assert scripted.run("cancel", f"{own}.later").code == 8
     assert scripted.run("say", "--wait", "--id", f"{own}.later", "--", SHORT).code == 6
     assert_told_in_order(scripted)
-
-
-def test_the_number_alone_of_an_id_of_the_server_is_enough(scripted: Talk) -> None:
-    goal = submit(scripted, SHORT)["id"]
-    assert re.fullmatch("[0-9][a-z][0-9][a-z]-1", goal)
-    assert scripted.run("wait", "1").code == 0
