@@ -13,36 +13,36 @@ goals are spoken first in, first out
     a; b; c; completed a  ->  b ACTIVE; c PENDING; a SUCCEEDED
 a higher priority goes first and interrupts nothing
     a; b; c 5; d 1; e 5; f -3  ->  a ACTIVE; c e d b f PENDING
-it is spoken first
+a higher priority is spoken first
     a; b; c 5; completed a  ->  c ACTIVE; b PENDING; a SUCCEEDED
 
 # preempt
 
 a goal that preempts stops the active one and goes first
     a; b; c; d preempt  ->  a PREEMPTING preempted by d; d b c PENDING
-it starts once the active one is silent
+the goal that preempts starts once the active one is silent
     a; b; c; d preempt; stopped a  ->  d ACTIVE; b c PENDING; a PREEMPTED preempted by d
-it starts at once if nothing is spoken
+a goal that preempts starts at once if nothing is spoken
     a preempt  ->  a ACTIVE
-the newest of several wins
+the newest of several goals that preempt wins
     a; b; c preempt; d preempt  ->  a PREEMPTING preempted by c; d b PENDING; c RECALLED preempted by d
-it recalls those of a lower priority
+preempt recalls preempting goals of a lower priority
     a; b -1 preempt; c -1; d preempt  ->  a PREEMPTING preempted by d; d c PENDING; b RECALLED preempted by d
-it recalls none of a higher priority
+preempt recalls no goal of a higher priority
     a 5; b 3 preempt; c 1 preempt  ->  a ACTIVE; b c PENDING
-it does not stop a goal of a higher priority
+preempt does not stop a goal of a higher priority
     a 5; b 4 preempt  ->  a ACTIVE; b PENDING
-it stops a goal of its own priority
+preempt stops a goal of its own priority
     a 5; b 5 preempt  ->  a PREEMPTING preempted by b; b PENDING
-it stops a goal of a lower priority
+preempt stops a goal of a lower priority
     a 5; b 6 preempt  ->  a PREEMPTING preempted by b; b PENDING
-it goes first among its own priority alone
+a goal that preempts goes first among its own priority alone
     a 5; b 1; c 3; d 3 preempt; e 1 preempt  ->  a ACTIVE; d c e b PENDING
-a pending goal of a higher priority goes before it
+a pending goal of a higher priority goes before one that preempts
     a; b 2; c preempt; stopped a  ->  b ACTIVE; c PENDING; a PREEMPTED preempted by c
-preempt is the server's if the goal brings none
+the server's setting holds for a goal that says nothing of preempt
     set preempt=yes; a queue; b queue; c; d queue  ->  a PREEMPTING preempted by c; c b d PENDING
-a goal keeps what held when it was accepted
+a goal keeps the setting with which it was accepted
     set preempt=yes; a; b; set preempt=no; c; d preempt
         ->  a PREEMPTING preempted by b; d c PENDING; b RECALLED preempted by d
 
@@ -50,47 +50,47 @@ a goal keeps what held when it was accepted
 
 flush recalls all goals up to its priority
     a; b; c -1; d queue; e 1; f flush  ->  a PREEMPTING preempted by f; e f PENDING; b c d RECALLED preempted by f
-it does not stop a goal of a higher priority
+flush does not stop a goal of a higher priority
     a 1; b; c flush  ->  a ACTIVE; c PENDING; b RECALLED preempted by c
-it counts as preempting for the next one
+a goal that flushes counts as preempting for the next one
     a; b flush; c preempt  ->  a PREEMPTING preempted by b; c PENDING; b RECALLED preempted by c
-it holds whatever the server's setting
+flush preempts whatever the server's setting is
     set preempt=no; a; b flush  ->  a PREEMPTING preempted by b; b PENDING
 
 # key
 
 a goal takes the place of the pending one with its key
     a; b key=k; c; d key=k; e key=k  ->  a ACTIVE; e c PENDING; b RECALLED replaced by d; d RECALLED replaced by e
-it replaces none that is spoken
+a key does not replace the goal that is spoken
     a key=k; b key=k  ->  a ACTIVE; b PENDING
-it replaces none of another key or of none
+a key does not replace a goal with another key or none
     a; b key=k; c key=d; d; e key=k  ->  a ACTIVE; e c d PENDING; b RECALLED replaced by e
-with a lower priority it is queued by that
+a goal of a lower priority does not take the place
     a; b key=k; c; d -1 key=k  ->  a ACTIVE; c d PENDING; b RECALLED replaced by d
-with a higher priority it is queued by that
+a goal of a higher priority does not take the place
     a; b key=k; c; d 1 key=k  ->  a ACTIVE; d c PENDING; b RECALLED replaced by d
-it replaces a goal of a higher priority, too
+a goal replaces one of a higher priority, too
     a; b 9 key=k; c; d key=k  ->  a ACTIVE; c d PENDING; b RECALLED replaced by d
-with preempt it goes first
+a goal with a key that preempts goes first
     a; b; c key=k; d preempt key=k  ->  a PREEMPTING preempted by d; d b PENDING; c RECALLED replaced by d
-a goal that would be preempted, too, is replaced
+a goal that is both replaced and preempted counts as replaced
     a; b key=k preempt; c key=k preempt  ->  a PREEMPTING preempted by b; c PENDING; b RECALLED replaced by c
-a goal that would be flushed, too, is replaced
+a goal that is both replaced and flushed counts as replaced
     a; b key=k; c key=k flush  ->  a PREEMPTING preempted by c; c PENDING; b RECALLED replaced by c
-in the place of a preempting goal it does not count as preempting
+a goal in the place of a preempting one does not count as preempting
     a; b key=k preempt; c key=k; d preempt  ->  a PREEMPTING preempted by b; d c PENDING; b RECALLED replaced by c
 
 # throttle
 
 a key is throttled while it is spoken
     a key=k; pass 99; b key=k throttle=60  ->  a ACTIVE; b REJECTED throttled by a
-and for the time after it began
+a key is throttled for the time since the first goal began
     a key=k; pass 9; completed a; pass 50.9; b key=k throttle=60  ->  a SUCCEEDED; b REJECTED throttled by a
-and no longer
+a key is not throttled after that time
     a key=k; completed a; pass 60; b key=k throttle=60  ->  b ACTIVE; a SUCCEEDED
 a text is throttled while it is spoken
     a; pass 99; b text=a throttle=60  ->  a ACTIVE; b REJECTED throttled by a
-a text is not throttled by another
+a text is not throttled by another text
     a; b throttle=60  ->  a ACTIVE; b PENDING
 a goal without a throttle is not throttled but throttles others
     a; b text=a; completed a; completed b; c text=a throttle=60  ->  a b SUCCEEDED; c REJECTED throttled by b
@@ -98,27 +98,27 @@ a throttle of 0 holds while it is spoken
     a; b text=a throttle=0  ->  a ACTIVE; b REJECTED throttled by a
 a pending goal throttles its text
     a; b; c text=b; d text=b throttle=1  ->  a ACTIVE; b c PENDING; d REJECTED throttled by b
-of several, the first is named
+the first of several pending goals of a text is named
     a; b; c 1 text=b; d text=b throttle=1  ->  a ACTIVE; c b PENDING; d REJECTED throttled by c
-a pending goal of its key is replaced instead
+a pending goal of the same key is replaced and throttles nothing
     a; b key=k; c key=k throttle=60  ->  a ACTIVE; c PENDING; b RECALLED replaced by c
-with a key the text does not matter while it is spoken
+the active goal's text does not throttle a goal with a key
     a key=k; b text=a key=d throttle=60  ->  a ACTIVE; b PENDING
-nor while it waits
+a pending goal's text does not throttle a goal with a key
     a; b; c text=b key=k throttle=60  ->  a ACTIVE; b c PENDING
-nor does it later
+a text said before does not throttle a goal with a key
     a key=k; completed a; b text=a key=d throttle=60  ->  b ACTIVE; a SUCCEEDED
-without a key, a key does not matter
+a goal without a key is throttled by its text, whatever the first goal's key is
     a key=k; completed a; b text=a throttle=60  ->  a SUCCEEDED; b REJECTED throttled by a
 a goal that expired throttles nothing
     a; b key=k ttl=1; wait 1; c key=k throttle=60  ->  a ACTIVE; c PENDING; b RECALLED expired
-nor does one that was aborted
+a goal that was aborted throttles nothing
     a key=k; heard a; failed a; b key=k throttle=60  ->  b ACTIVE; a ABORTED audio_lost
-nor one of which nothing was heard
+a goal of which nothing was heard throttles nothing
     a key=k; cancel a; stopped a; b key=k throttle=60  ->  b ACTIVE; a PREEMPTED canceled by door
 a goal that was heard in part throttles
     a; heard a; cancel a; stopped a; b text=a throttle=60  ->  a PREEMPTED canceled by door; b REJECTED throttled by a
-an aborted one leaves the earlier one remembered
+after an aborted goal the earlier one still throttles
     a; completed a; pass 5; b text=a; failed b; c text=a throttle=60
         ->  a SUCCEEDED; b ABORTED audio_lost; c REJECTED throttled by a
 a throttled goal does nothing to others
@@ -132,57 +132,57 @@ a goal whose time is over is recalled
     a; b ttl=1; wait 1  ->  a ACTIVE; b RECALLED expired
 a goal that has begun may take its time
     a ttl=1; wait 100  ->  a ACTIVE
-it is not started, even if nobody looked at the clock
+an expired goal is not started, even if the clock was not looked at
     a; b ttl=1; c ttl=2; pass 1; completed a  ->  c ACTIVE; a SUCCEEDED; b RECALLED expired
-the time of waiting for room counts, and it interrupts nothing
+a goal that expired while it waited for room interrupts nothing
     room 1; a; b; c ttl=1 preempt waited=1  ->  a ACTIVE; b PENDING; c RECALLED expired
-nor does a goal that flushes
+a goal that expired while it waited for room flushes nothing
     room 1; a; b; c ttl=1 flush waited=1  ->  a ACTIVE; b PENDING; c RECALLED expired
-nor does it replace
+a goal that expired while it waited for room replaces nothing
     set ttl=1; a; b key=k; c key=k waited=1  ->  a ACTIVE; b PENDING; c RECALLED expired
-one that waited for less is queued
+a goal that waited for room for less than its time is queued
     a; b ttl=1 waited=0.5; wait 0.4  ->  a ACTIVE; b PENDING
-and expires when it would have
+the time of waiting for room counts
     a; b ttl=1 waited=0.5; wait 0.5  ->  a ACTIVE; b RECALLED expired
 the server's time holds for goals that bring none
     set ttl=5; a; b; c ttl=0; d ttl=9; wait 5  ->  a ACTIVE; c d PENDING; b RECALLED expired
 a goal keeps the time with which it was accepted
     set ttl=5; a; b; set ttl=1; c; wait 1  ->  a ACTIVE; b PENDING; c RECALLED expired
-it does not start when silence is given up
+an expired goal does not start when silence is given up
     a; b ttl=1; cancel a; wait 2  ->  a ABORTED not_silent by door; b RECALLED expired
 
 # pause
 
 the goal that is spoken is held
     a; b; pause; pause  ->  a ACTIVE paused; b PENDING
-it goes on
+the held goal goes on at resume
     a; b; pause; resume; resume  ->  a ACTIVE; b PENDING
 resume without a pause does nothing
     begin joe; a voice=piper/joe ttl=1; pass 1; resume  ->  a PENDING
-goals are accepted and none starts
+goals are accepted and none starts while speech is paused
     pause; a; b  ->  a b PENDING
-the first one starts at resume
+the first of them starts at resume
     pause; a; b; resume  ->  a ACTIVE; b PENDING
-a full queue rejects
+a full queue rejects while speech is paused
     room 1; pause; a; b  ->  a PENDING; b REJECTED queue_full
-the next one does not start at an end
+the next goal does not start when the held one ends
     a; b; pause; completed a  ->  b PENDING; a SUCCEEDED
-it starts at resume
+the next goal starts at resume
     a; b; pause; completed a; resume  ->  b ACTIVE; a SUCCEEDED
-preempt ends the held goal
+preempt stops the held goal
     a; pause; b preempt  ->  a PREEMPTING preempted by b; b PENDING
-and waits
+a goal that has preempted the held one waits
     a; pause; b preempt; stopped a  ->  b PENDING; a PREEMPTED preempted by b
-and starts at resume
+a goal that has preempted the held one starts at resume
     a; pause; b preempt; stopped a; resume  ->  b ACTIVE; a PREEMPTED preempted by b
 a goal that is being stopped is not held
     a; b; cancel a; pause  ->  a PREEMPTING canceled by door; b PENDING
-resume starts none beside it
+resume starts no goal beside one that is being stopped
     a; b; cancel a; pause; resume  ->  a PREEMPTING canceled by door; b PENDING
-cancel, ttl and the limit of silence go on
+cancel, ttl and the limit of silence hold while speech is paused
     a; b ttl=1; c; pause; wait 1; cancel c; cancel a; wait 2
         ->  a ABORTED not_silent by door; b RECALLED expired; c RECALLED canceled by door
-resume starts none that is too late
+resume starts no expired goal
     pause; a ttl=1; b; pass 1; resume  ->  b ACTIVE; a RECALLED expired
 shutdown ends a held goal, too
     a; b; pause; shutdown; stopped a; resume  ->  a PREEMPTED shutdown; b RECALLED shutdown
@@ -191,7 +191,7 @@ shutdown ends a held goal, too
 
 a queue without places rejects every goal
     room 0; a preempt; b  ->  a b REJECTED queue_full
-the newcomer is rejected
+a full queue rejects the newcomer
     room 2; a; b; c; d  ->  a ACTIVE; b c PENDING; d REJECTED queue_full
 the newest of the lowest priority gives way to a higher one
     room 4; a; b; c 1; d; e 2; f 5  ->  a ACTIVE; f e c b PENDING; d RECALLED displaced by f
@@ -201,22 +201,22 @@ nothing gives way to a lower priority
     room 2; a; b; c 1; d -1 preempt  ->  a ACTIVE; c b PENDING; d REJECTED queue_full
 a goal that brings preempt displaces its own priority
     room 2; a 2; b; c; d preempt  ->  a ACTIVE; d b PENDING; c RECALLED displaced by d
-with a key, too
+a goal with a key that brings preempt displaces its own priority, too
     room 2; a 2; b; c; d preempt key=k  ->  a ACTIVE; d b PENDING; c RECALLED displaced by d
-while speech is paused, too
+a goal that brings preempt displaces its own priority while speech is paused
     room 2; a 2; b; c; pause; d preempt  ->  a ACTIVE paused; d b PENDING; c RECALLED displaced by d
-it displaces of the lowest priority first
+a goal that brings preempt displaces the newest of the lowest priority
     room 4; a 2; b 2; c 1; d 1; e 2; f 2 preempt
         ->  a PREEMPTING preempted by f; f b e c PENDING; d RECALLED displaced by f
-it displaces no higher priority
+a goal that brings preempt displaces no higher priority
     room 2; a 2; b 1; c 1; d preempt  ->  a ACTIVE; b c PENDING; d REJECTED queue_full
-nor does flush
+a goal that flushes displaces no higher priority
     room 2; a; b 1; c 1; d flush  ->  a ACTIVE; b c PENDING; d REJECTED queue_full
 a goal that preempts by the server's setting displaces none
     set preempt=yes; room 2; a queue; b queue; c queue; d  ->  a ACTIVE; b c PENDING; d REJECTED queue_full
-a goal that is first may give way, as it is the newest
+a goal that is first in the queue is displaced if it is the newest
     room 2; a; b; c preempt; d 1  ->  a PREEMPTING preempted by c; d b PENDING; c RECALLED displaced by d
-a goal in the place of another is as new as it is
+a goal in the place of another counts as new
     room 3; a; b key=k; c; d; e key=k; f 1
         ->  a ACTIVE; f c d PENDING; b RECALLED replaced by e; e RECALLED displaced by f
 room is counted after flush
@@ -230,114 +230,114 @@ the active goal makes no room
 
 # cancel
 
-without a selector, everything
+without a selector, cancel ends everything
     a; b; c; d; cancel  ->  a PREEMPTING canceled by door; b c d RECALLED canceled by door
-nothing to cancel
+cancel with nothing to cancel does nothing
     cancel; cancel current; cancel key=k; a  ->  a ACTIVE
-one of three keeps the order of the rest
+cancel of one goal keeps the order of the rest
     a; b; c; d; cancel c  ->  a ACTIVE; b d PENDING; c RECALLED canceled by door
-before a goal, all accepted before it
+cancel before a goal ends it and all accepted before it
     a 2; b; c; d 1; e 1; f preempt; cancel before=d
         ->  a PREEMPTING canceled by door; e f PENDING; b c d RECALLED canceled by door
-selectors add up
+the selectors of a cancel add up
     a; b; c; d; e; cancel e current before=b
         ->  a PREEMPTING canceled by door; c d PENDING; b e RECALLED canceled by door
-a key, spoken and pending
+cancel of a key ends the spoken and the pending goal
     a key=k; b key=d; c key=k; cancel key=k  ->  a PREEMPTING canceled by door; b PENDING; c RECALLED canceled by door
-a key that no goal has
+cancel of a key that no goal has ends nothing
     a key=d; b; cancel b key=k  ->  a ACTIVE; b RECALLED canceled by door
 shutdown ends everything and takes no goal
     a; b; c; shutdown; shutdown; d; stopped a  ->  a PREEMPTED shutdown; b c RECALLED shutdown; d REJECTED shutdown
-one that waited for room stops nothing
+a goal that was cancelled while it waited for room stops nothing
     room 1; a; b; c flush canceled  ->  a ACTIVE; b PENDING; c RECALLED canceled by door
-and is not throttled
+a goal that was cancelled while it waited for room is not throttled
     a; b text=a throttle=60 canceled  ->  a ACTIVE; b RECALLED canceled by door
 
 # id
 
-the same id again attaches
+a goal with a known id attaches to the first
     a id=mine; b text=a id=mine  ->  a ACTIVE; b is a
-after its end, too
+a goal attaches to one that has ended
     a id=mine; completed a; b text=a id=mine  ->  a SUCCEEDED; b is a
 attaching needs no room and does nothing
     room 1; a; b id=mine; c text=b id=mine throttle=60 flush key=x  ->  a ACTIVE; b PENDING; c is b
 attaching goes on after shutdown
     a id=mine; shutdown; b text=a id=mine  ->  a PREEMPTING shutdown; b is a
-another text is a conflict
+another text with the same id is a conflict
     a id=mine; b id=mine flush  ->  a ACTIVE; b REJECTED id_conflict
-after its end, too, another text
+another text is a conflict after the end of the first
     a id=mine; completed a; b id=mine  ->  a SUCCEEDED; b REJECTED id_conflict
-an id of the server's attaches to nothing
+an id of the server's form attaches to nothing
     a; b text=a id=4k7f-1  ->  a ACTIVE; b REJECTED bad_option
 a rejected goal does not use its id up
     a id=mine text=; b id=mine  ->  b ACTIVE; a REJECTED invalid_text
-nor does a throttled one
+a throttled goal does not use its id up
     a; b id=mine text=a throttle=60; c id=mine  ->  a ACTIVE; c PENDING; b REJECTED throttled by a
-cancel before an id
+cancel before an id ends that goal and all accepted before it
     a; b id=mine; c; cancel before=mine  ->  a PREEMPTING canceled by door; c PENDING; b RECALLED canceled by door
 a goal that was cancelled before it arrived is recalled
     cancel mine; a id=mine; b text=a id=mine  ->  a RECALLED canceled by door; b is a
-by before, too
+a goal that was cancelled early by before is recalled
     cancel before=mine; a id=mine  ->  a RECALLED canceled by door
-it needs no room and does nothing
+a goal that was cancelled before it arrived needs no room and does nothing
     room 1; a; b key=k; cancel mine; c id=mine key=k flush  ->  a ACTIVE; b PENDING; c RECALLED canceled by door
-it is rejected all the same and stays cancelled
+a rejected goal leaves its id cancelled
     cancel mine; a id=mine text=; b id=mine  ->  a REJECTED invalid_text; b RECALLED canceled by door
-it is throttled all the same
+a goal that was cancelled before it arrived may be throttled
     a; cancel mine; b id=mine text=a throttle=60  ->  a ACTIVE; b REJECTED throttled by a
-the cancel is remembered for a minute
+an early cancel is remembered for a minute
     cancel mine; pass 59.9; a id=mine  ->  a RECALLED canceled by door
-and no longer
+an early cancel is forgotten after a minute
     cancel mine; pass 60; a id=mine  ->  a ACTIVE
-the cancel of an id of the server's is not remembered
+an early cancel of an id of the server's form is not remembered
     cancel 4k7f-1; a  ->  a ACTIVE
 
 # engine
 
-a goal that was stopped
+a goal that was stopped is preempted
     a; cancel a; stopped a  ->  a PREEMPTED canceled by door
-though the engine died of it
+a goal that was stopped is preempted even if the engine died
     a; cancel a; failed a  ->  a PREEMPTED canceled by door
-a goal that ends before the stop arrives
+a goal that ends before the stop arrives has succeeded
     a; cancel a; completed a  ->  a SUCCEEDED
-a goal that failed
+after a goal that failed the next one starts
     a; b; heard a; failed a  ->  b ACTIVE; a ABORTED audio_lost
 the first stop gives the reason
     a; cancel a; pass 1.5; b preempt; cancel current; shutdown; stopped a
         ->  a PREEMPTED canceled by door; b RECALLED shutdown
-silence is waited for
+the next goal waits for silence
     a; b; cancel a; wait 1.89  ->  a PREEMPTING canceled by door; b PENDING
-and given up
+silence is given up at the limit, and the next goal starts
     a; b; cancel a; wait 1.9  ->  b ACTIVE; a ABORTED not_silent by door
-and the first stop counts
+the limit counts from the first stop
     a; cancel a; pass 1.5; cancel a; wait 0.5  ->  a ABORTED not_silent by door
-silence that the engine can't reach
+if the engine reports that it can't be silent, the goal is aborted
     a; b; cancel a; deaf a  ->  b ACTIVE; a ABORTED not_silent by door
-an undisturbed goal has no limit
+a goal that is not stopped has no limit
     a; wait 1000000  ->  a ACTIVE
-without an engine goals wait
+goals wait while there is no engine
     lost; a ttl=1; b; wait 0.5  ->  a b PENDING
-and their time runs
+goals expire while there is no engine
     lost; a ttl=1; b; wait 1  ->  b PENDING; a RECALLED expired
-they go on with it
+the next goal starts when there is an engine
     lost; a; b; ready  ->  a ACTIVE; b PENDING
-an unheard goal that lost its engine has its time
+a goal that lost its engine before it was heard expires
     a ttl=1; b; wait 2; lost; wait 0  ->  a PREEMPTING expired; b PENDING
-one that was heard is not begun anew
+a goal that lost its engine after it was heard does not expire
     a ttl=1; heard a; lost; wait 20  ->  a ACTIVE
-it may end while there is no engine
+a goal may end while there is no engine
     a; b; lost; failed a  ->  b PENDING; a ABORTED audio_lost
-an engine that does not come costs one goal
+an engine that does not come aborts one goal
     lost; a; b; missing  ->  b PENDING; a ABORTED engine_failed
-each time
+an engine that does not come aborts one goal each time
     lost; a; b; missing; missing  ->  a b ABORTED engine_failed
-though its voice was to be loaded
+an engine that does not come aborts a goal that waits for its voice
     lost; begin joe; a voice=piper/joe; missing  ->  a ABORTED engine_failed
-and none while speech is paused
+an engine that does not come aborts no goal while speech is paused
     lost; a; pause; missing  ->  a PENDING
-and none that waits for its voice
+an engine that has come aborts no goal that waits for its voice
     begin joe; a voice=piper/joe; missing  ->  a PENDING
-and none once it is there
+an engine that has come aborts no goal
     a; b; missing  ->  a ACTIVE; b PENDING
 """
 

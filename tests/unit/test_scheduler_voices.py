@@ -9,45 +9,45 @@ from tests.unit.robot import play, rules
 RULES = """
 a goal waits for its voice, and so do those behind it
     begin joe; a voice=piper/joe; b  ->  a b PENDING
-a speaker is of its voice
+a goal with a speaker waits for the speaker's voice
     begin joe; a voice=piper/joe#3; b; wait 9.9; end amy  ->  a b PENDING
-it begins once the voice is loaded
+a goal begins once its voice is loaded
     begin joe; a voice=piper/joe#3; b; end joe  ->  a ACTIVE; b PENDING
-another voice is not waited for
+a goal does not wait for another voice
     begin joe; a voice=piper/amy  ->  a ACTIVE
 a goal without a voice waits for the server's
     begin joe; set voice=piper/joe; a; b voice=en  ->  a b PENDING
-a goal with a voice does not
+a goal with a voice does not wait for the server's
     begin joe; set voice=piper/joe; a voice=en; b  ->  a ACTIVE; b PENDING
-the server's may change
+a goal without a voice begins if the server's voice changes
     begin joe; set voice=piper/joe; a; set voice=en; wait 0  ->  a ACTIVE
-it waits ten seconds from when loading began
+a goal waits ten seconds from when loading began
     begin joe; wait 4; a voice=piper/joe; wait 5.9  ->  a PENDING
-and no longer
+a goal begins ten seconds after loading began
     begin joe; wait 4; a voice=piper/joe; wait 6  ->  a ACTIVE
 a goal that preempts does not wait
     begin joe; a voice=piper/joe; b voice=piper/joe preempt  ->  b ACTIVE; a PENDING
-nor does one that flushes
+a goal that flushes does not wait
     begin joe; a voice=piper/joe; b voice=piper/joe flush  ->  b ACTIVE; a RECALLED preempted by b
-nor one of a higher priority
+a goal of a higher priority does not wait
     begin joe; a voice=piper/joe; b voice=piper/joe 1  ->  b ACTIVE; a PENDING
-one of a lower priority does
+a goal of a lower priority waits
     begin joe; a voice=piper/joe -1  ->  a PENDING
 a goal of which half a second is left begins at once
     begin joe; a voice=piper/joe ttl=0.5  ->  a ACTIVE
 a goal that insists waits until the voice is loaded
     begin joe; a voice=piper/joe voice_only; wait 60  ->  a PENDING
-though it preempts
+a goal that insists waits even if it preempts
     begin joe; a voice=piper/joe voice_only preempt; wait 60  ->  a PENDING
-though its priority is high
+a goal that insists waits even if its priority is high
     begin joe; a voice=piper/joe voice_only 5; wait 60; end joe  ->  a ACTIVE
-and expires like any other
+a goal that insists expires like any other
     begin joe; a voice=piper/joe voice_only ttl=3; b; wait 3  ->  b ACTIVE; a RECALLED expired
 a goal behind one that was cancelled begins
     begin joe; a voice=piper/joe; b; cancel a; wait 0  ->  b ACTIVE; a RECALLED canceled by door
 a loaded voice starts none beside the active goal
     a; begin joe; b voice=piper/joe; end joe  ->  a ACTIVE; b PENDING
-nor while speech is paused
+a loaded voice starts no goal while speech is paused
     begin joe; a voice=piper/joe; pause; end joe  ->  a PENDING
 an engine that is lost loads nothing
     begin joe; a voice=piper/joe; lost; wait 20; ready  ->  a ACTIVE

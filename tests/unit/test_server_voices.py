@@ -22,35 +22,35 @@ RULES = """
 
 one voice is loaded at a time, in the order of the goals
     want b a; next a b  ->  a; b waiting, a loading
-the next one waits for it
+the next voice waits for the one that is loading
     want b a; next a b; next a b  ->  nothing; b waiting, a loading
-then it is loaded
+the next voice is loaded after it
     want b a; next a b; loaded a; next a b  ->  b; b loading, a loaded
-and then there is none
+no voice is next once all are loaded
     want b a; next a b; loaded a; next a b; loaded b; next a b  ->  nothing; b loaded, a loaded
 a voice that no goal needs any more is forgotten
     want a; next  ->  nothing; none
-and not loaded later
+a forgotten voice is not loaded later
     want a; next; next a  ->  nothing; none
-unless a goal asks for it again
+a forgotten voice is loaded if a goal asks for it again
     want a; next; want a; next a  ->  a; a loading
 the voice asked for least makes room
     load a b; want a c; next c  ->  c, b dropped; a loaded, c loading
-none is dropped that is needed before
+no voice is dropped that is needed before
     load a b; want c; next a b c  ->  nothing; a loaded, b loaded, c waiting
-one that is needed later is dropped
+a voice that is not needed is dropped
     load a b; want c; next b c  ->  c, a dropped; b loaded, c loading
-and is to be loaded again
+a dropped voice that is needed later waits again
     memory 1; load a; want b; next b a; loaded b  ->  b, a dropped; b loaded, a waiting
-but not before it is needed
+a dropped voice is not loaded before it is needed
     memory 1; load a; want b; next b a; loaded b; next b a  ->  nothing; b loaded, a waiting
-then it makes room in its turn
+a dropped voice is loaded once it is needed
     memory 1; load a; want b; next b a; loaded b; next a  ->  a, b dropped; a loading
 a voice larger than the limit is loaded alone
     memory 0; want a; next a  ->  a; a loading
 nothing is dropped for the server's own while no goal needs it
     memory 1; load a; want b; next : b  ->  nothing; a loaded, b waiting
-it is once a goal needs it
+a voice is dropped for the server's own once a goal needs that
     memory 1; load a; want b; next b : b  ->  b, a dropped; b loading
 the server's own is loaded if nothing is in its way
     memory 0; want a; next : a  ->  a; a loading
@@ -61,7 +61,7 @@ a voice that the engine loads of itself stops no other
 
 what is larger than allowed is dropped, the voice that is not needed first
     memory 100; load a b c; grown a 40; grown b 80; grown c 125; excess c : c  ->  a dropped; b loaded, c loaded
-nothing is dropped before that
+nothing is dropped while all fit
     memory 100; load a b c; grown a 40; grown b 80; excess b : b  ->  nothing; a loaded, b loaded, c loaded
 what a voice takes may grow
     memory 100; load a b c; grown a 40; grown a 60; grown b 100; grown c 130; excess c : c
@@ -72,26 +72,26 @@ what is measured while a voice is loaded replaces the size of its file
 what was dropped no longer counts, before the engine has told what it got back
     memory 100; load a b c; grown a 40; grown b 80; grown c 125; excess c : c; excess c : c
         ->  nothing; b loaded, c loaded
-nor after that
+nothing more is dropped after the engine has told what it got back
     memory 100; load a b; grown a 60; grown b 120; excess b : b; grown - 60; excess b : b  ->  nothing; b loaded
 what a voice took is remembered
     memory 100; load a b; grown a 60; grown b 110; excess b : b; grown - 50; want a; next a
         ->  a, b dropped; a loading
 what the engine did not get back counts, too
     memory 100; load a b; grown a 30; grown b 60; unloaded a; grown - 99; want c; next b c  ->  c; b loaded, c loading
-and leaves no room for a voice
+what the engine did not get back leaves no room for a voice
     memory 100; load a b; grown a 30; grown b 60; unloaded a; grown - 100; want c; next b c
         ->  nothing; b loaded, c waiting
 a lost engine has grown by nothing
     memory 100; load a b; grown a 99; lost; want d c; next d c; loaded d; next d c  ->  c; d loaded, c loading
 the voice that speaks is kept
     memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess a :  ->  b c dropped; a loaded
-without one, the last is kept
+without a speaking voice, the last one is kept
     memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess - :  ->  a b dropped; c loaded
 the voice that is needed last is dropped first
     memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess a : c b
         ->  b c dropped; a loaded, b waiting, c waiting
-a voice that is not needed goes before
+a voice that is not needed is dropped before one that is
     memory 50; load a b c; grown a 60; grown b 120; grown c 180; excess c : c a  ->  b a dropped; c loaded, a waiting
 
 # an engine that is lost
@@ -100,11 +100,11 @@ nothing is loaded any more
     load a b; lost  ->  b; none
 a voice that was being loaded is to be loaded again
     want b; next b; lost  ->  b; b waiting
-at the second death it has failed
+a voice has failed at the second death of the engine
     want b; next b; lost; want b; next b; lost  ->  b; b failed
-a third one is not its fault
+a voice that has failed is not blamed for a third death
     want b; next b; lost; want b; next b; lost; lost; want b; next b  ->  nothing; b failed
-a death is forgotten once it is loaded
+a death is forgotten once the voice is loaded
     want a; next a; lost; load a; lost; want a; next a; lost  ->  a; a waiting
 """
 
