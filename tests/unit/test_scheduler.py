@@ -92,14 +92,11 @@ def test_silence_is_given_up_within_the_two_seconds_in_which_a_cancel_is_answere
     assert 1.5 < SILENCE_LIMIT < 2
 
 
-# What a goal shows
-
-
 def test_a_goal_that_succeeded_shows_how_it_was_spoken() -> None:
     robot = Robot()
     record = robot.submits(Say("door", data={"page": 3}, priority=-7), "a").record
     goal = robot.play("pass 3; completed a").goals["a"].snapshot()
-    assert goal == record.snapshot()
+    assert (goal, play("a format=x").goals["a"].snapshot().format) == (record.snapshot(), "x")
     assert (goal.id, goal.state, goal.client, goal.priority) == ("4k7f-1", State.SUCCEEDED, ARM, -7)
     assert (goal.data, goal.key, goal.voice, goal.output, goal.paused) == ({"page": 3}, None, None, None, False)
     assert (goal.reason, goal.by, goal.duration, goal.spoken, goal.format) == (None, None, 1.5, "door", "text")
@@ -179,9 +176,6 @@ def test_time_on_the_wall_does_not_matter() -> None:
     assert robot.scheduler.submit(Say("a", throttle=60), ARM, Now(159, 9e9)).record.reason == "throttled"
 
 
-# The answer to a cancel
-
-
 def test_a_cancel_tells_what_it_ended_and_what_it_did_not_find() -> None:
     robot = play("a; completed a; b; c; d")
     a, b, c, _ = robot.goals.values()
@@ -221,9 +215,6 @@ def test_a_cancel_selects_among_goals_that_wait_for_room(selection: Cancel, chos
     assert selection.of_waiting(waiting) == chosen
 
 
-# Room
-
-
 def test_a_goal_lacks_room_if_nothing_else_is_wrong_with_it() -> None:
     robot = play("room 1; a")
     assert not robot.scheduler.lacks_room(Say("x"), robot.now)
@@ -251,9 +242,6 @@ def test_a_goal_that_waits_for_room_goes_on_if_it_has_it_or_never_will() -> None
     assert robot.scheduler.has_room(Say("x", priority=1))
     assert robot.scheduler.has_room(Say("x", id="mine"))
     assert robot.play("shutdown").scheduler.has_room(Say("x"))
-
-
-# What is remembered
 
 
 def test_as_many_keys_and_texts_are_remembered_as_may_be_and_the_oldest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
