@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 
+from talkcli import Fleet
 from talkcli.fleet import topics
 from talkcli.fleet.policy import ASKABLE
-from tests.fleet.many import RealRobots
+from tests.fleet.many import RealRobots, request
 from tests.fleet.robot import Robot
-from tests.support.bridge import Bridge
+from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
 from tests.support.processes import Talk
+from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -104,10 +107,40 @@ def lasting_robot() -> Iterator[Robot]:
 
 @pytest.fixture(scope="module")
 def pair() -> Iterator[RealRobots]:
-    """Two robots at a broker of their own, wh-1 and wh-2 of the group warehouse, of which all may be asked.
+    """Two robots of the group warehouse, wh-1 and wh-2, that allow all requests, with a broker of their own.
 
-    They are for all tests of a module: each leaves them silent, and with nothing to say.
+    All tests of a module share them: each leaves them silent, and with nothing to say.
     """
     allowed = ("--allow", ",".join(sorted(ASKABLE)))
     with Broker() as broker, RealRobots(broker, ["wh-1", "wh-2"], ["warehouse"], allowed) as result:
         yield result
+
+
+@pytest.fixture
+def desk(pair: RealRobots) -> Iterator[Desk]:
+    """A desk that asks both robots of the pair; what they still have to say is cancelled in the end."""
+    with Desk(pair.broker, env={"TALK_ROBOT": "wh-*"}) as result:
+        yield result
+    request(pair, "resume")
+    request(pair, "cancel")
+
+
+@pytest.fixture
+def fleet(pair: RealRobots, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
+    """The library for the pair; what they still have to say is cancelled in the end."""
+    yield fleet_of(pair.broker, monkeypatch)
+    request(pair, "resume")
+    request(pair, "cancel")
+
+
+def fleet_of(broker: Broker, monkeypatch: pytest.MonkeyPatch, *, grace: float = 0.05, user: str | None = None) -> Fleet:
+    """Return the library for a broker; `grace`: seconds in which the broker may still tell what it keeps."""
+    needs_packages("paho")
+    from talkcli.fleet import desk
+
+    monkeypatch.setattr(desk, "GRACE", grace)  # mosquitto tells at once all that it keeps
+    for each in [name for name in os.environ if name.startswith("TALK_") and not name.startswith("TALK_TEST_")]:
+        monkeypatch.delenv(each)
+    if user:
+        monkeypatch.setenv("TALK_MQTT_USER", user)
+    return Fleet(broker.url)

@@ -1,4 +1,4 @@
-"""Commands to several robots that take a while: interrupted, out of time, unread, and what a terminal shows."""
+"""Commands to several robots that take a while: interrupted, out of time, without a reader, and on a terminal."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from tests.support.terminal import Terminal
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from tests.conftest import MakeTalk
@@ -30,20 +29,12 @@ if TYPE_CHECKING:
     from tests.fleet.robot import Robot
 
 PAIR = ["wh-1", "wh-2"]
-#: Whatever picks both.
+#: A glob and a group that pick both.
 PICKS = ("wh-*", "@warehouse")
 #: Seconds in which it is told that a robot is offline, while others speak.
 AT_ONCE = 1.0
-#: What wipes the count off a terminal's line.
+#: The bytes that clear the count from a terminal's line.
 WIPED = "\r\x1b[2K"
-
-
-@pytest.fixture
-def desk(pair: RealRobots) -> Iterator[Desk]:
-    """Somebody who asks; what is still to be said is cancelled in the end."""
-    with Desk(pair.broker) as result:
-        yield result
-    request(pair, "cancel")
 
 
 def await_state(pair: RealRobots, goal_id: str, state: str) -> None:
@@ -51,13 +42,13 @@ def await_state(pair: RealRobots, goal_id: str, state: str) -> None:
 
 
 def states(pair: RealRobots, goal_id: str) -> list[str]:
-    """Return how this goal stands at each robot."""
+    """Return the state of this goal at each robot."""
     return [each["state"] for each in pair.each(lambda each: each.talk.goal(goal_id))]
 
 
 @pytest.mark.parametrize("to", PICKS)
 def test_ctrl_c_cancels_on_all_that_took_it(pair: RealRobots, desk: Desk, to: str) -> None:
-    """On one it is spoken, on the other it waits behind something else, which goes on."""
+    """One robot speaks the goal; at the other it waits behind another goal, which goes on."""
     before, goal = (f"{each}-{PICKS.index(to)}" for each in ("before", "interrupted"))
     assert pair["wh-2"].talk.request("say", id=before, text=LONG)["ok"]
     waiting = desk.start("--robot", to, "say", "--wait", "--id", goal, "--", LONG)
@@ -74,7 +65,7 @@ def test_ctrl_c_cancels_on_all_that_took_it(pair: RealRobots, desk: Desk, to: st
 
 def test_ctrl_c_takes_nothing_from_a_robot_that_is_done(pair: RealRobots, desk: Desk) -> None:
     assert pair["wh-2"].talk.request("say", text=LONG)["ok"]
-    waiting = desk.start("--robot", "wh-*", "say", "--wait", "--id", "done-on-one", "hello")
+    waiting = desk.start("say", "--wait", "--id", "done-on-one", "hello")
     assert waiting.stdout
     assert waiting.stdout.readline() == "wh-1 done-on-one SUCCEEDED 0\n"
     waiting.send_signal(signal.SIGINT)
@@ -85,29 +76,33 @@ def test_ctrl_c_takes_nothing_from_a_robot_that_is_done(pair: RealRobots, desk: 
 
 
 def test_what_is_not_done_in_time_is_cancelled_with_124(pair: RealRobots, desk: Desk) -> None:
+    """A goal of others that was waited for is left alone; a robot counts as asked if all its goals have ended."""
+    request(pair, "say", id="over", text="length=0")
     request(pair, "say", id="in-front", text=LONG)
-    goals = dict(zip(PICKS, ("late-by-a-glob", "late-by-a-group"), strict=True))
-    words = ["say", "--wait", "--timeout", "0.6"]
-    lines = [["--robot", to, *words, "--id", goal, "hello"] for to, goal in goals.items()]
-    for done, goal in zip(at_once(desk, *lines), goals.values(), strict=True):
+    await_state(pair, "in-front", "ACTIVE")
+    late = ["--timeout", "0.6"]
+    waited, by_glob, by_group = at_once(
+        desk,
+        ["wait", *late, "over", "in-front"],
+        *(["--robot", to, "say", "--wait", *late, "--id", f"late-{PICKS.index(to)}", "hello"] for to in PICKS),
+    )
+    for done, goal in ((by_glob, "late-0"), (by_group, "late-1")):
         assert_told(done, 124, alike(PAIR, goal, "RECALLED", 6), "0 of 2 as asked")
         assert "talk: timed out after 0.6 s\n" in done.err
         assert states(pair, goal) == ["RECALLED"] * 2
+    assert (waited.code, sorted(waited.out.splitlines())) == (124, [f"{name} over SUCCEEDED 0" for name in PAIR])
+    assert waited.err == "talk: timed out after 0.6 s\ntalk: not done: wh-1, wh-2\ntalk: 0 of 2 as asked\n"
     assert states(pair, "in-front") == ["ACTIVE"] * 2
 
 
-def test_who_waits_for_what_others_said_leaves_it_alone(pair: RealRobots, desk: Desk) -> None:
+def test_an_interrupted_wait_leaves_the_goals_of_others_alone(pair: RealRobots, desk: Desk) -> None:
     request(pair, "say", id="others", text=LONG)
     with Listener(pair.broker, "talk/reply/+/+/+") as answers:
-        late = desk.start("--robot", "wh-*", "wait", "--timeout", "0.6", "others")
-        interrupted = desk.start("--robot", "@warehouse", "wait")
-        assert answers.find(lambda _: sum(b'"ok": true' in each.payload for each in answers.messages) == 4, PATIENCE)
-    interrupted.send_signal(signal.SIGINT)
-    done = desk.finish(interrupted)
-    told = "talk: not done: wh-1, wh-2\ntalk: 0 of 2 as asked\n"
-    assert (done.code, done.out, done.err) == (130, "", told)
-    done = desk.finish(late)
-    assert (done.code, done.out, done.err) == (124, "", f"talk: timed out after 0.6 s\n{told}")
+        waiting = desk.start("--robot", "@warehouse", "wait")
+        assert answers.find(lambda _: sum(b'"ok": true' in each.payload for each in answers.messages) == 2, PATIENCE)
+    waiting.send_signal(signal.SIGINT)
+    done = desk.finish(waiting)
+    assert (done.code, done.out, done.err) == (130, "", "talk: not done: wh-1, wh-2\ntalk: 0 of 2 as asked\n")
     assert states(pair, "others") == ["ACTIVE", "ACTIVE"]
 
 
@@ -122,16 +117,12 @@ def test_where_the_reader_of_the_output_goes_away_it_is_cancelled_with_141(pair:
     assert states(pair, "unread") == ["PREEMPTED", "PREEMPTED"]
 
 
-def test_where_nobody_could_ever_read_it_all_is_spoken_all_the_same(pair: RealRobots, desk: Desk) -> None:
-    waiting = desk.start("--robot", "wh-*", "say", "--id", "never-read", "hello")
+def test_a_sentence_is_spoken_although_nobody_reads_the_output(pair: RealRobots, desk: Desk) -> None:
+    waiting = desk.start("say", "--id", "never-read", "hello")
     assert waiting.stdout
     waiting.stdout.close()
-    assert waiting.wait(PATIENCE) in (0, 141)  # by when it looks
-    for name in PAIR:
-        assert pair[name].talk.watcher.wait_for_terminal("never-read") == "SUCCEEDED"
-
-
-# robots that are offline
+    assert waiting.wait(PATIENCE) in (0, 141)  # 141 if it tries to write
+    assert pair.each(lambda each: each.talk.watcher.wait_for_terminal("never-read")) == ["SUCCEEDED"] * 2
 
 
 def test_one_that_is_offline_is_told_at_once_and_never_speaks_it(
@@ -162,42 +153,34 @@ def test_one_that_is_offline_is_told_at_once_and_never_speaks_it(
     assert talk.watcher.texts("PENDING") == ["this alone"]
 
 
-# terminals
+# Terminals
 
 
-@pytest.mark.parametrize("columns", [80, 120])
-def test_a_terminal_counts_the_robots_that_are_done_and_is_left_clean(
-    pair: RealRobots, desk: Desk, columns: int
-) -> None:
-    goal = f"counted-{columns}"
+def test_a_terminal_counts_the_robots_that_are_done_and_is_left_clean(pair: RealRobots, desk: Desk) -> None:
     assert pair["wh-2"].talk.request("say", text=LONG)["ok"]
-    command = [*TALK, "--robot", "@warehouse", "say", "--wait", "--id", goal, "hello"]
-    with Terminal(command, desk.env, columns) as terminal:
+    command = [*TALK, "--robot", "@warehouse", "say", "--wait", "--id", "counted", "hello"]
+    with Terminal(command, desk.env) as terminal:
         terminal.wait_for("\r0 of 2")
-        terminal.wait_for(f"{goal} SUCCEEDED 0\n")
+        terminal.wait_for("counted SUCCEEDED 0\n")
         terminal.wait_until(lambda screen: screen.last == "1 of 2")
         request(pair, "cancel")
         assert terminal.finish() == 6
     written = terminal.raw.decode()
     assert list(dict.fromkeys(re.findall(r"\r(\d of \d)", written))) == ["0 of 2", "1 of 2", "2 of 2"]
     assert terminal.screen.wraps == 0
-    *lines, last = terminal.screen.lines
-    assert lines[:2] == [f"wh-1 {goal} SUCCEEDED 0", f"wh-2 {goal} RECALLED 6"]
-    assert (lines[2].startswith(f"talk: RECALLED: wh-2: {goal}: "), lines[-1], last) == (
-        True,
-        "talk: 1 of 2 as asked",
-        "",
-    )
+    first, second, why, *_, summary, last = terminal.screen.lines
+    assert (first, second) == ("wh-1 counted SUCCEEDED 0", "wh-2 counted RECALLED 6")
+    assert why.startswith("talk: RECALLED: wh-2: counted: ")
+    assert (summary, last) == ("talk: 1 of 2 as asked", "")
 
 
 @pytest.mark.usefixtures("pair")
-def test_only_the_terminal_of_standard_error_counts(desk: Desk, tmp_path: Path) -> None:
-    command = shlex.join([sys.executable, "-m", "talkcli", "--robot", "wh-*", "status"])
+def test_the_count_is_shown_only_if_standard_error_is_a_terminal(desk: Desk, tmp_path: Path) -> None:
+    command = shlex.join([sys.executable, "-m", "talkcli", "status"])
     cases = {
         f"{command} > {tmp_path}/out": True,
         f"{command} 2> {tmp_path}/err": False,
         f"{command} -q": False,
-        f"{command} 2>&1 | cat": False,
     }
     terminals = [(Terminal(["sh", "-c", each], desk.env), counts) for each, counts in cases.items()]
     for terminal, counts in terminals:
@@ -208,8 +191,7 @@ def test_only_the_terminal_of_standard_error_counts(desk: Desk, tmp_path: Path) 
 
 
 def test_ctrl_c_on_a_terminal_leaves_no_count_behind(pair: RealRobots, desk: Desk) -> None:
-    command = [*TALK, "--robot", "@warehouse", "say", "--wait", "--id", "typed", "--", LONG]
-    with Terminal(command, desk.env) as terminal:
+    with Terminal([*TALK, "say", "--wait", "--id", "typed", "--", LONG], desk.env) as terminal:
         await_state(pair, "typed", "ACTIVE")
         terminal.wait_for("\r0 of 2")
         terminal.type(b"\x03")

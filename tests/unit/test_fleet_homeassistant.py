@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from talkcli.fleet import homeassistant, topics
 from talkcli.fleet.policy import ASKABLE
@@ -82,16 +81,9 @@ def test_the_entities_show_the_status(status: dict[str, Any], states: list[str])
     assert attributes == status.get("last", {})
 
 
-@given(st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,58}", fullmatch=True), st.data())
-def test_each_name_has_a_topic_of_its_own(name: str, data: st.DataObject) -> None:
-    alike = st.text("._-d" + name, min_size=1, max_size=59).filter(lambda each: not topics.fault(each))
-    other = data.draw(st.one_of(alike, st.just(name.replace(".", "_d")), st.just(name.replace("_d", "."))))
-    assert TOPIC.fullmatch(topics.device(name))
-    assert topics.fault(other) or (topics.device(name) == topics.device(other)) == (name == other)
-
-
-def test_similar_names_have_different_topics() -> None:
-    names = ["a.b", "a_b", "a-b", "a_db", "a__b", "a._b", "a_.b", "a..b", "a__.b", "a_d.b", "a.db", "a_ddb"]
+def test_each_name_has_a_topic_of_its_own() -> None:
+    names = ["a" + "".join(each) for length in range(5) for each in product("._d", repeat=length)]
     assert len({topics.device(each) for each in names}) == len(names)
+    assert all(TOPIC.fullmatch(topics.device(each)) for each in names)
     for name in ("anna", "A_1", "wh-07"):  # so that an ACL's pattern is enough
         assert topics.device(name) == topics.device("%u").replace("%u", name)
