@@ -1,4 +1,4 @@
-"""`talk fleet`: the table of a fleet's robots, and what happens to them, at a desk; in a pipe, and on a terminal."""
+"""`talk fleet status` and `talk fleet watch` at a desk, in a pipe and on a terminal."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def robots(broker: Broker) -> Iterator[Listener]:
-    """Who publishes for the robots: three, one of which is gone, and one has no server."""
+    """A publisher for three robots, one of which is offline, and one without a server."""
     with Listener(broker) as publisher:
         told.presence(publisher, "wh-2", online=False, groups=["warehouse"])
         told.presence(publisher, "wh-1", groups=["warehouse"])
@@ -53,7 +53,7 @@ def listed(done: Finished) -> list[str]:
 
 
 @pytest.mark.usefixtures("robots")
-def test_a_table_says_how_each_robot_stands(broker: Broker) -> None:
+def test_the_table_and_the_objects_show_each_robot(broker: Broker) -> None:
     done = run(broker, "fleet", "status")
     assert (done.code, done.err) == (0, "")
     assert [each.split() for each in done.out.splitlines()] == [
@@ -62,10 +62,6 @@ def test_a_table_says_how_each_robot_stands(broker: Broker) -> None:
         ["wh-1", "yes", "0.1.0", '"please', "step", 'back"', "2", "SUCCEEDED", "1", "h", "2", "h"],
         ["wh-2", "OFFLINE", "-", "-", "-", "-", "-"],
     ]
-
-
-@pytest.mark.usefixtures("robots")
-def test_for_programs_each_robot_is_an_object(broker: Broker) -> None:
     anna, first, second = (json.loads(each) for each in run(broker, "--json", "fleet", "status").out.splitlines())
     assert (anna["robot"], anna["presence"]["online"], anna["presence"]["server"]) == ("anna", True, None)
     assert anna["status"] is None
@@ -74,33 +70,23 @@ def test_for_programs_each_robot_is_an_object(broker: Broker) -> None:
     assert (second["robot"], second["presence"]["online"]) == ("wh-2", False)
 
 
-def test_of_a_robot_it_is_what_its_bridge_says(robot: Robot) -> None:
+def test_a_robot_is_shown_by_the_words_of_its_bridge(robot: Robot) -> None:
     assert robot.desk("say", "--wait", "--", "battery low").code == 0
     with robot.listen("status") as listener:
         listener.await_message(lambda each: each.topic.endswith("/status") and bool(each.json["last"]))
-    found = json.loads(run(robot.broker, "--json", "fleet", "status").out)
-    assert found["status"]["last"]["text"] == "battery low"
-    assert found["presence"]["server"]["pid"] == robot.talk.pid
-    robot.bridge.kill()
-    with Listener(robot.broker, robot.presence) as listener:
+        found = json.loads(run(robot.broker, "--json", "fleet", "status").out)
+        assert found["status"]["last"]["text"] == "battery low"
+        assert found["presence"]["server"]["pid"] == robot.talk.pid
+        robot.bridge.kill()
         listener.await_message(robot.is_offline)
-    done = run(robot.broker, "fleet", "status")
-    assert "anna   OFFLINE" in done.out
+    assert "anna   OFFLINE" in run(robot.broker, "fleet", "status").out
 
 
-@pytest.mark.parametrize(
-    ("text", "picked"),
-    [
-        ("anna", ["anna"]),
-        ("wh-*", ["wh-1", "wh-2"]),
-        ("@warehouse", ["wh-1", "wh-2"]),
-        ("@all", ["anna", "wh-1", "wh-2"]),
-    ],
-)
 @pytest.mark.usefixtures("robots")
-def test_a_name_a_glob_or_a_group_picks(broker: Broker, text: str, picked: list[str]) -> None:
-    assert listed(run(broker, "--robot", text, "fleet", "status")) == picked
-    assert listed(run(broker, "fleet", "status", TALK_ROBOT=text)) == picked
+def test_a_name_a_glob_or_a_group_picks(broker: Broker) -> None:
+    for text, picked in (("anna", ["anna"]), ("wh-*", ["wh-1", "wh-2"]), ("@warehouse", ["wh-1", "wh-2"])):
+        assert listed(run(broker, "--robot", text, "fleet", "status")) == picked
+    assert listed(run(broker, "fleet", "status", TALK_ROBOT="@all")) == ["anna", "wh-1", "wh-2"]
 
 
 @pytest.mark.parametrize(
@@ -109,38 +95,22 @@ def test_a_name_a_glob_or_a_group_picks(broker: Broker, text: str, picked: list[
         ("bert", "no robot 'bert' is known at"),
         ("x*", "no robot 'x*' is known at"),
         ("@night", "no robot of the group 'night' is known at"),
+        ("", "no robot is known at {broker.url}; on each robot: talk bridge --name NAME"),
     ],
 )
-@pytest.mark.usefixtures("robots")
-def test_where_none_is_meant_it_ends_with_3(broker: Broker, text: str, words: str) -> None:
-    done = run(broker, "fleet", "status", "--robot", text)
+def test_a_pick_of_no_robot_ends_it_with_3(broker: Broker, text: str, words: str) -> None:
+    done = run(broker, "fleet", "status", *(["--robot", text] if text else []))
     assert (done.code, done.out) == (3, "")
-    assert words in done.err
-
-
-def test_where_none_is_known_it_says_what_to_do(broker: Broker) -> None:
-    done = run(broker, "fleet", "status")
-    assert (done.code, done.out) == (3, "")
-    assert f"no robot is known at {broker.url}; on each robot: talk bridge --name NAME" in done.err
+    assert words.format(broker=broker) in done.err
 
 
 @pytest.mark.parametrize("what", ["status", "watch"])
-def test_without_a_broker_it_ends_with_3(broker: Broker, what: str) -> None:
-    with Port() as port, Desk(broker, port=port.number) as somebody:
-        done = somebody.run("fleet", what)
-    assert (done.code, done.out) == (3, "")
-    assert "talk: no broker at mqtt://" in done.err
-
-
-@pytest.mark.parametrize("what", ["status", "watch"])
-@pytest.mark.parametrize(("password", "words"), [(True, "does not let 'otto'"), ("wrong", "let 'otto' in")])
-def test_one_who_may_not_ask_is_told_so_with_10(
-    secure_broker: Broker, what: str, password: str | bool, words: str
-) -> None:
-    with Desk(secure_broker, user="otto", password=password) as somebody:
-        done = somebody.run("fleet", what)
-    assert (done.code, done.out) == (10, "")
-    assert words in done.err
+def test_without_a_broker_or_rights_it_ends_with_3_or_10(secure_broker: Broker, what: str) -> None:
+    done = run(secure_broker, "fleet", what, user="otto")
+    assert (done.code, done.out, "does not let 'otto'" in done.err) == (10, "", True), done
+    with Port() as port:
+        done = run(secure_broker, "fleet", what, TALK_BROKER=f"mqtts://127.0.0.1:{port.number}")
+    assert (done.code, done.out, "talk: no broker at mqtts://" in done.err) == (3, "", True), done
 
 
 @pytest.mark.parametrize(
@@ -152,17 +122,15 @@ def test_one_who_may_not_ask_is_told_so_with_10(
         (["--robot", "a b*", "fleet", "watch"], {}, "the glob 'a b*' matches no robot's name"),
         (["fleet", "status"], {"TALK_ROBOT": "a/b"}, "no robot can be called 'a/b'"),
         (["fleet", "status"], {"TALK_BROKER": ""}, "which broker? TALK_BROKER is not set"),
-        (["--robot", "wh-*", "log"], {}, "'talk log' is of one robot: name it; 'talk fleet status' and"),
     ],
 )
-def test_what_is_wrong_is_named(broker: Broker, words: list[str], env: dict[str, str], said: str) -> None:
+def test_a_usage_error_names_the_mistake(broker: Broker, words: list[str], env: dict[str, str], said: str) -> None:
     done = run(broker, *words, **env)
-    assert (done.code, done.out) == (2, "")
-    assert said in done.err
+    assert (done.code, done.out, said in done.err) == (2, "", True), done
 
 
-def test_all_are_told_of_more_robots_than_a_broker_keeps_messages_back_for_one(broker: Broker) -> None:
-    """mosquitto has 20 on their way to a client and keeps 1,000; more it drops, unless that takes more at once."""
+def test_more_robots_are_shown_than_mosquitto_queues_messages_for_a_client(broker: Broker) -> None:
+    """It sends 20 at once and queues 1,000; it drops others, unless the client asks for more at once."""
     with Listener(broker) as publisher:
         for number in range(600):
             told.presence(publisher, f"wh-{number:03}")
@@ -172,19 +140,18 @@ def test_all_are_told_of_more_robots_than_a_broker_keeps_messages_back_for_one(b
     assert done.out.count("SUCCEEDED") == 600
 
 
-@pytest.mark.parametrize("columns", [80, 120])
-def test_on_a_terminal_it_fits(broker: Broker, robots: Listener, columns: int) -> None:
+def test_on_a_terminal_the_table_fits(broker: Broker, robots: Listener) -> None:
     for number in range(40):
         name = f"robot-{number}-of-the-warehouse"
         told.presence(robots, name, online=number % 7 > 0, server=told.SERVER if number % 5 else None)
         told.status(robots, name, active="a-2", text="请往后退，门即将关闭 " * 9, last="a-1", paused=number % 9 == 0)
-    with Desk(broker) as somebody, Terminal([*TALK, "fleet", "status"], somebody.env, columns) as terminal:
+    with Desk(broker) as somebody, Terminal([*TALK, "fleet", "status"], somebody.env, 80) as terminal:
         assert terminal.finish() == 0
         lines = terminal.screen.lines
     assert terminal.screen.wraps == 0
     assert len([each for each in lines if each]) == 44
     assert "PAUSED" in terminal.text
-    # Names that have no room are cut, but not what tells that a robot is not there.
+    # Names are cut if there is no room, but not the word OFFLINE.
     assert sum("OFFLINE" in each for each in lines) == 7
 
 
@@ -197,7 +164,7 @@ def somebody(broker: Broker) -> Iterator[Desk]:
         yield result
 
 
-def test_each_event_is_a_line_with_its_robot(robot: Robot, somebody: Desk) -> None:
+def test_each_event_has_a_line_with_its_robot(robot: Robot, somebody: Desk) -> None:
     watching = Watching(somebody)
     assert robot.desk("say", "--wait", "--id", "b-1", "--", "battery low").code == 0
     watching.until("SUCCEEDED")
@@ -223,7 +190,7 @@ def test_each_event_is_a_line_with_its_robot(robot: Robot, somebody: Desk) -> No
     assert (watching.end().code, watching.process.stderr and watching.process.stderr.closed) == (130, True)
 
 
-def test_robots_that_come_and_go_and_their_servers_are_lines(broker: Broker, robots: Listener, somebody: Desk) -> None:
+def test_robots_and_servers_that_come_and_go_have_lines(broker: Broker, robots: Listener, somebody: Desk) -> None:
     watching = Watching(somebody)
     assert watching.lines[0].split("  ")[1] == f"3 robots, 1 OFFLINE, 1 without a server; {broker.url}"
     told.presence(robots, "wh-2", session="1")
@@ -244,7 +211,7 @@ def test_robots_that_come_and_go_and_their_servers_are_lines(broker: Broker, rob
     assert watching.end().code == 130
 
 
-def test_for_programs_each_is_an_object_with_its_robot(robots: Listener, somebody: Desk) -> None:
+def test_with_json_each_event_is_an_object_with_its_robot(robots: Listener, somebody: Desk) -> None:
     watching = Watching(somebody, "--json", "--robot", "wh-*")
     told.event(robots, "anna", "c-1", "ACTIVE")
     told.event(robots, "wh-1", "a-2", "SUCCEEDED", "please step back")
@@ -265,9 +232,7 @@ def test_for_programs_each_is_an_object_with_its_robot(robots: Listener, somebod
 
 
 @pytest.mark.usefixtures("robots")
-def test_a_broker_that_goes_and_comes_is_told_on_standard_error_and_what_has_changed(
-    broker: Broker, somebody: Desk
-) -> None:
+def test_a_break_is_told_on_standard_error_and_then_what_has_changed(broker: Broker, somebody: Desk) -> None:
     watching = Watching(somebody)
     quiet = Watching(somebody, "-q")
     broker.kill()
@@ -300,11 +265,10 @@ def test_a_reader_that_goes_away_ends_it_with_141(somebody: Desk) -> None:
     assert watching.process.wait(PATIENCE) == 141
 
 
-@pytest.mark.parametrize("columns", [80, 120])
-def test_on_a_terminal_no_line_is_broken(robots: Listener, somebody: Desk, columns: int) -> None:
+def test_on_a_terminal_no_line_is_broken(robots: Listener, somebody: Desk) -> None:
     long = "a-robot-of-the-warehouse-in-the-north"
     told.presence(robots, long)
-    with Terminal([*TALK, "fleet", "watch"], somebody.env, columns) as terminal:
+    with Terminal([*TALK, "fleet", "watch"], somebody.env, 80) as terminal:
         terminal.wait_for("4 robots")
         told.event(robots, "wh-1", "a-3", "ACTIVE", "please step back " * 9)
         told.event(robots, long, "its-own-id-which-is-long", "ABORTED", "请往后退，门即将关闭 " * 9)
