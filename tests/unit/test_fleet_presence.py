@@ -1,4 +1,4 @@
-"""What is made of a robot's presence, whoever wrote it."""
+"""Presence and status as a reader takes them, whoever wrote them."""
 
 from __future__ import annotations
 
@@ -7,52 +7,59 @@ import json
 import pytest
 
 from talkcli.fleet.presence import Presence, rank
+from talkcli.fleet.status import LastGoal, Status
+from talkcli.goals.states import State
 
 SERVER = {"boot": "7r2z", "pid": 4711, "version": "0.1.0"}
 HERE = {
-    "talk": 1,
-    "version": "0.2.0",
-    "online": True,
-    "session": "9b51",
-    "since": 1767225600.25,
-    "groups": ["all", "warehouse"],
-    "allow": ["say", "cancel"],
-    "server": SERVER,
+    "talk": 1, "version": "0.2.0", "online": True, "session": "9b51", "since": 1767225600.25,
+    "groups": ["all", "warehouse"], "allow": ["say", "cancel"], "server": SERVER,
     "later": "a field that is not known yet",
-}
+}  # fmt: skip
+LAST = {"id": "door-17", "state": "ABORTED", "reason": "player", "text": "the door", "at": 1767225601.5}
+STATUS = {"active": "a-1", "text": "hello", "pending": 3, "paused": True, "last": LAST}
 #: Values that are neither a string nor a number.
 OTHER_VALUES: tuple[object, ...] = (None, True, [], {})
 
 
-def test_what_a_bridge_says_is_taken_up() -> None:
-    found = Presence.read("anna", json.dumps(HERE).encode() + b"\n")
+def presence(said: object) -> Presence | None:
+    return Presence.read("anna", json.dumps(said).encode() + b"\n")
+
+
+def status(said: object) -> Status | None:
+    return Status.read(json.dumps(said).encode() + b"\n")
+
+
+def test_a_presence_is_read_and_told_again() -> None:
+    found = presence(HERE)
     assert found == Presence(
         "anna", True, "9b51", 1767225600.25, ("all", "warehouse"), ("say", "cancel"), SERVER, "0.2.0"
     )
-    known = {name: value for name, value in HERE.items() if name not in ("talk", "later")}
-    assert found is not None
-    assert found.to_json() == known
-
-
-def test_what_the_will_says_is_that_it_is_gone_and_of_which_groups_it_was() -> None:
+    assert found.to_json() == {name: value for name, value in HERE.items() if name not in ("talk", "later")}
     will = {"talk": 1, "online": False, "session": "9b51", "groups": ["all", "night"]}
-    found = Presence.read("anna", json.dumps(will).encode())
-    assert found == Presence("anna", online=False, session="9b51", groups=("all", "night"))
+    assert presence(will) == Presence("anna", online=False, session="9b51", groups=("all", "night"))
+
+
+def test_a_status_is_read_and_told_again() -> None:
+    found = status({**STATUS, "later": "a field that is not known yet"})
+    last = LastGoal("door-17", State.ABORTED, "player", "the door", 1767225601.5)
+    assert found == Status("a-1", "hello", 3, paused=True, last=last)
+    assert found.to_json() == STATUS
 
 
 @pytest.mark.parametrize(
     "payload",
     [
-        *(b"", b"\n", b"[]", b"anna", b'"online"', b"{", b"\xff", b'{"a": 1, "a": 2}'),
+        *(b"", b"\n", b"[]", b"anna", b"3", b'"online"', b"{", b"\xff", b'{"a": 1, "a": 2}'),
         *(b'{"online": true, "since": ' + each + b"}" for each in (b"NaN", b"-Infinity", b"1e999", b"7" * 5000)),
     ],
 )
-def test_what_is_cleared_or_is_no_object_is_no_presence(payload: bytes) -> None:
-    assert Presence.read("anna", payload) is None
+def test_a_payload_that_is_no_object_is_ignored(payload: bytes) -> None:
+    assert (Presence.read("anna", payload), Status.read(payload)) == (None, None)
 
 
 @pytest.mark.parametrize("name", ["", "_", "+", "a b", "a" * 60, "\x1b[2J"])
-def test_a_name_that_no_robot_can_have_is_none(name: str) -> None:
+def test_a_name_that_no_robot_can_have_is_ignored(name: str) -> None:
     assert Presence.read(name, json.dumps(HERE).encode()) is None
 
 
@@ -64,17 +71,22 @@ def test_a_name_that_no_robot_can_have_is_none(name: str) -> None:
         {"groups": [1, None, ["all"]]},
         {"since": 10**19, "session": True, "server": 1e300, "version": 10**19, "allow": {"say": True}},
         {"since": -1e300, "session": ["9b51"], "server": False, "version": None, "allow": [[], {}, 1.5]},
+        {"active": 3, "text": ["hello"], "pending": "many", "paused": "no", "last": "door-17"},
+        {"pending": -1, "last": {"id": 3, "state": "ABORTED"}},
+        {"pending": None, "last": {"id": "a", "state": "SUNG"}},
+        {"last": {"id": "a", "state": ["ABORTED"]}},
         {},
     ],
 )
-def test_what_is_not_of_its_form_is_not_said(wrong: dict[str, object]) -> None:
-    assert Presence.read("anna", json.dumps(wrong).encode()) == Presence("anna", online=False)
+def test_a_malformed_field_counts_as_missing(wrong: dict[str, object]) -> None:
+    assert (presence(wrong), status(wrong)) == (Presence("anna", online=False), Status())
 
 
-def test_of_groups_those_are_taken_that_can_be_read() -> None:
-    found = Presence.read("anna", b'{"online": true, "groups": ["all", 7, "night"]}')
-    assert found is not None
-    assert found.groups == ("all", "night")
+def test_of_a_field_those_values_are_taken_that_can_be_read() -> None:
+    assert presence({"groups": ["all", 7, "night"]}) == Presence("anna", online=False, groups=("all", "night"))
+    untold = {name: value for name, value in LAST.items() if name not in ("text", "reason", "at")}
+    assert status({"active": "a", "last": untold}) == Status("a", last=LastGoal("door-17", State.ABORTED))
+    assert status({"last": {**untold, "at": True}}) == Status(last=LastGoal("door-17", State.ABORTED))
 
 
 @pytest.mark.parametrize(
@@ -90,4 +102,4 @@ def test_of_groups_those_are_taken_that_can_be_read() -> None:
 def test_only_a_presence_with_a_time_and_a_session_is_compared_with_other_bridges(
     changed: dict[str, object], found: tuple[float, str] | None
 ) -> None:
-    assert rank(Presence.read("anna", json.dumps(HERE | changed).encode())) == found
+    assert rank(presence(HERE | changed)) == found
