@@ -1,4 +1,4 @@
-"""Bridge, broker, server or network goes away, and comes back: each is told in time, and each result once."""
+"""A bridge, a broker, a server, a network or a desk that goes away: it is told in time, and each result once."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from tests.support.processes import Finished
     from tests.support.proxy import Way
 
-#: Seconds in which a desk knows that a bridge was killed, and that the network of a robot is gone.
+#: Seconds in which a desk knows that a bridge was killed, and that a robot's network is gone.
 KILLED, CUT_OFF = 1.0, 20.0
-#: Seconds in which all are back once a broker is, and those for which a desk waits for that.
+#: Seconds in which all are back after a broker, and for which a desk waits for a broker.
 BACK, ABSENCE = 15.0, 30.0
 #: Seconds for which the broker keeps that a robot is online.
 EXPIRY = 150
 
 
 def assert_one_result(done: Finished) -> None:
-    """Assert that a `--json say --wait` was told one result, that all was played."""
+    """Assert that a `--json say --wait` was told one result, SUCCEEDED."""
     assert done.code == 0, done
     told = [json.loads(line) for line in done.out.splitlines()]
     assert [each["state"] for each in told] == ["SUCCEEDED"], done
@@ -163,60 +163,42 @@ def test_a_server_that_is_killed_under_a_desk_that_waits_has_lost_the_goal(robot
     """server dead, bridge alive"""
     with Desk(robot.broker) as somebody, Listener(robot.broker, "talk/reply/#") as replies:
         asked = somebody.start("--robot", "anna", "say", "--wait", "--", LONG)
-        replies.await_message(lambda each: "ACTIVE" in each.text)  # else the desk may not know whether it was taken
+        replies.await_message(lambda each: "ACTIVE" in each.text)  # else the desk may not know that it was accepted
         robot.talk.kill()
         done = somebody.finish(asked)
-    assert done.code == 12, done
-    assert "lost" in done.err
+    assert (done.code, "lost" in done.err) == (12, True), done
 
 
 def test_a_robot_that_ends_says_goodbye(robot: Robot) -> None:
     """robot offline"""
     with robot.listen() as listener:
+        online = listener.messages[0]
+        assert online.expiry is not None
+        assert EXPIRY - 20 < online.expiry <= EXPIRY  # a robot may die while the broker is away
         assert robot.bridge.terminate() == 0
         listener.await_message(robot.is_offline)
         with Listener(robot.broker, robot.presence) as later:
             kept = later.await_message(robot.is_offline)
-            assert (kept.retain, kept.expiry) == (True, None)  # so that who is missing is seen
-        listener.publish(robot.presence, b"")  # which comes behind all that the bridge has said
+            assert (kept.retain, kept.expiry) == (True, None)  # so that a missing robot is seen
+        listener.publish(robot.presence, b"")  # which comes after all words of the bridge
         listener.await_message(lambda each: not each.payload)
         assert [each.json["online"] for each in listener.messages if each.payload] == [True, False]
 
 
-def test_that_a_robot_is_online_is_kept_for_a_while_and_not_for_ever(lasting_robot: Robot) -> None:
-    """robot dies while the broker is away"""
-    with lasting_robot.listen() as listener:
-        online = listener.messages[0]
-        assert online.expiry is not None
-        assert EXPIRY - 20 < online.expiry <= EXPIRY
-
-
-def test_a_goal_of_a_desk_that_is_interrupted_is_cancelled_at_the_robot(lasting_robot: Robot) -> None:
+@pytest.mark.parametrize(("how", "code"), [("interrupted", 130), ("unread", 141), ("too-late", 124)])
+def test_a_goal_of_a_desk_that_goes_away_is_cancelled_at_the_robot(lasting_robot: Robot, how: str, code: int) -> None:
     """a desk that goes away"""
+    words = {"unread": ["--feedback"], "too-late": ["--timeout", "0.5"]}.get(how, [])
     with Desk(lasting_robot.broker) as somebody:
-        asked = somebody.start("--robot", "anna", "say", "--wait", "--id", "interrupted", "--", LONG)
-        lasting_robot.talk.watcher.wait_for("interrupted", "ACTIVE")
-        asked.send_signal(signal.SIGINT)
-        assert somebody.finish(asked).code == 130
-        assert lasting_robot.talk.goal("interrupted")["state"] == "PREEMPTED"
-
-
-def test_a_goal_of_a_desk_whose_time_is_over_is_cancelled_at_the_robot(lasting_robot: Robot) -> None:
-    """a desk that goes away"""
-    done = lasting_robot.desk("say", "--wait", "--timeout", "0.5", "--id", "too-late", "--", LONG)
-    assert done.code == 124, done
-    assert lasting_robot.talk.goal("too-late")["state"] == "PREEMPTED"
-
-
-def test_a_goal_of_a_desk_whose_reader_went_away_is_cancelled_at_the_robot(lasting_robot: Robot) -> None:
-    """a desk that goes away"""
-    with Desk(lasting_robot.broker) as somebody:
-        asked = somebody.start("--robot", "anna", "say", "--wait", "--feedback", "--id", "unread", "--", LONG)
-        lasting_robot.talk.watcher.wait_for("unread", "ACTIVE")
+        asked = somebody.start("--robot", "anna", "say", "--wait", *words, "--id", how, "--", LONG)
+        lasting_robot.talk.watcher.wait_for(how, "ACTIVE")
         assert asked.stdout
-        asked.stdout.close()
-        assert asked.wait(10) == 141
-        assert lasting_robot.talk.goal("unread")["state"] == "PREEMPTED"
+        if how == "interrupted":
+            asked.send_signal(signal.SIGINT)
+        elif how == "unread":
+            asked.stdout.close()
+        assert asked.wait(10) == code
+        assert lasting_robot.talk.goal(how)["state"] == "PREEMPTED"
 
 
 def test_a_command_waits_for_a_robot_to_be_online(robot: Robot) -> None:

@@ -1,4 +1,4 @@
-"""How long a robot's askers have their places, and what they may hold: with a real server, and no broker."""
+"""Sessions of a robot's askers: their ends, their places, and their limits. With a real server and no broker."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
-#: Seconds without a line of an asker's after which it is gone.
+#: Seconds without a request after which an asker counts as gone.
 GONE = 90.0
 
 
 @pytest.fixture
 def talk(make_talk: MakeTalk) -> Talk:
-    """A silent server that holds its speech."""
+    """A silent server that is paused."""
     talk = make_talk("--player", "null")
     talk.request("pause")
     return talk
@@ -34,7 +34,7 @@ def talk(make_talk: MakeTalk) -> Talk:
 
 @pytest.fixture
 def pass_time(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Moves on the clock of the event loop that runs."""
+    """Advances the clock of the running event loop."""
     passed = 0.0
 
     def move(seconds: float) -> None:
@@ -49,11 +49,16 @@ def say(number: int, **more: object) -> dict[str, object]:
     return {"seq": number, "request": "say", "text": f"sentence {number}", **more}
 
 
-# Who is gone
+async def await_clients(talk: Talk, most: int) -> None:
+    """Wait until the server has no more clients than this; it tells nobody that one has left."""
+    end = time.monotonic() + 5
+    while talk.request("status")["server"]["clients"] > most:
+        assert time.monotonic() < end, "a connection to the server is kept"
+        await asyncio.sleep(0.01)
 
 
 @pytest.mark.parametrize("waits", ["for room", "for a result", "for events"])
-def test_an_asker_that_says_nothing_is_gone_whatever_it_waits_for(
+def test_an_asker_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
     talk: Talk, pass_time: Callable[[float], None], waits: str
 ) -> None:
     async def run() -> None:
@@ -107,25 +112,19 @@ def test_an_asker_to_whom_nothing_is_owed_is_let_go_without_a_word(
 ) -> None:
     async def run() -> None:
         house = House(talk.socket)
+        before = talk.request("status")["server"]["clients"]
         await house.ask({"seq": 1, "request": "status"})
         told = house.lines()
         pass_time(GONE + 0.1)
-        before = talk.request("status")["server"]["clients"]
         house.askers.beat()
-        end = time.monotonic() + 5
-        while talk.request("status")["server"]["clients"] >= before:
-            assert time.monotonic() < end, "the connection to the server is kept"
-            await asyncio.sleep(0.01)  # the server tells nobody that a client has left
+        await await_clients(talk, before)
         assert house.lines() == told
 
     asyncio.run(run())
 
 
-# Who says goodbye
-
-
-def test_what_was_asked_before_a_goodbye_is_carried_out_but_what_waits_for_room(talk: Talk) -> None:
-    """Be it that there was no connection to the server yet; and one who thinks better of it is told again."""
+def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_for_room(talk: Talk) -> None:
+    """With and without a connection to the server; an asker that comes back after its goodbye is told again."""
 
     async def run() -> None:
         house = House(talk.socket)
@@ -139,23 +138,16 @@ def test_what_was_asked_before_a_goodbye_is_carried_out_but_what_waits_for_room(
         assert (await house.ask({"seq": 4, "request": "hello"}, "s3"))["ok"]
         await house.ask(say(5, id="last"), "s3")
         house.post(b"", "s3")
-        end = time.monotonic() + 5
-        while (status := talk.request("status"))["server"]["clients"] > before:
-            assert time.monotonic() < end, "a connection to the server is kept"
-            await asyncio.sleep(0.01)  # the server tells nobody that a client has left
-        wanted = ["last", "of-s1", "of-s2", "of-s3"]
+        await await_clients(talk, before)
         with talk.connect() as wire:
             wire.request("status")
-            assert sorted(each["pending"]["id"] for each in wire.items) == wanted, status
+            assert sorted(each["pending"]["id"] for each in wire.items) == ["last", "of-s1", "of-s2", "of-s3"]
         assert house.lines("s1") == []
 
     asyncio.run(run())
 
 
-# Who makes place
-
-
-def test_for_a_cancel_the_one_makes_place_that_has_said_nothing_for_longest(
+def test_a_cancel_takes_the_place_of_the_asker_that_is_silent_for_longest(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
     async def run() -> None:
@@ -178,11 +170,8 @@ def test_for_a_cancel_the_one_makes_place_that_has_said_nothing_for_longest(
     asyncio.run(run())
 
 
-# What they may hold
-
-
-def test_those_who_come_and_go_at_a_server_that_hangs_are_not_all_in_its_way() -> None:
-    """What it takes to connect can't be interrupted: it ends when it does, and who has gone before is not connected."""
+def test_askers_that_come_and_go_at_a_server_that_hangs_take_32_threads() -> None:
+    """A thread that connects can't be interrupted; an asker that has gone before its turn is not connected."""
 
     async def run() -> None:
         with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
@@ -210,7 +199,7 @@ def test_those_who_come_and_go_at_a_server_that_hangs_are_not_all_in_its_way() -
     asyncio.run(run())
 
 
-def test_all_together_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Talk) -> None:
+def test_all_askers_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Talk) -> None:
     async def run() -> None:
         house = House(talk.socket)
         for each in range(20):
@@ -234,7 +223,7 @@ def test_all_together_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Tal
     asyncio.run(run())
 
 
-def test_a_goal_that_is_turned_away_is_told_of_without_its_words_where_they_are_too_long(talk: Talk) -> None:
+def test_an_answer_that_is_too_long_for_the_broker_has_no_words_or_is_an_error(talk: Talk) -> None:
     async def run() -> None:
         house = House(talk.socket, room=3_000)
         for each in range(20):
@@ -245,12 +234,6 @@ def test_a_goal_that_is_turned_away_is_told_of_without_its_words_where_they_are_
         assert ended["goal"] == goal
         await house.ask({"seq": 2, "request": "cancel"})
         house.askers.hang_up_all()
-
-    asyncio.run(run())
-
-
-def test_what_is_too_long_without_words_too_is_told_to_be(talk: Talk) -> None:
-    async def run() -> None:
         house = House(talk.socket, room=300)
         reply = await house.ask({"seq": 1, "request": "status"})
         assert (reply["ok"], reply["error"]["code"]) == (False, "too_long")

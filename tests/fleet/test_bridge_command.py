@@ -1,4 +1,4 @@
-"""`talk bridge` as a command: what it refuses, what it prints, what a supervisor is told, and who may do what."""
+"""`talk bridge` as a command: refused options, printed units and rules, and words for a supervisor."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from talkcli.fleet import topics
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.faults.supervisor import Supervisor
 from tests.fleet.asker import Asker
+from tests.support.processes import run_talk
 from tests.support.spied import spied
 from tests.support.surroundings import needs, short_directory
 
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from tests.fleet.conftest import MakeBridge
     from tests.support.broker import Broker
     from tests.support.processes import Talk
-
-BROKER = "mqtt://127.0.0.1:1"
 
 
 @pytest.fixture
@@ -43,64 +42,44 @@ def talk(make_talk: MakeTalk) -> Talk:
 
 
 def bridge(home: str, *words: str, **extra: str) -> tuple[int, str, str]:
-    done = run([*TALK, "bridge", *words], environment(home, **extra))
-    return done.code, done.out, done.err
-
-
-# What it refuses
+    return run_talk(["bridge", *words], environment(home, **extra), 20)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "env", "said"),
     [
-        ([], "--name is missing"),
-        (["--name", "a/b"], "--name: the name 'a/b' can't be in a topic, it must be 1 to 59 of A-Z"),
-        (["--name", "+"], "--name: the name '+' can't be"),
-        (["--name", "anna", "--group", "day,#"], "--group: the name '#' can't be"),
-        (["--name", "anna", "--group", "day,"], "--group: the name '' can't be"),
-        (["--name", "anna", "--allow", "say,cancle"], "--allow: no request is called 'cancle': did you mean 'cancel'?"),
-        (["--name", "anna", "--allow", "xyz"], "--allow: no request is called 'xyz': there are say, wait, cancel"),
-        (["--name", "anna", "--print-unit", "launchd"], "--print-unit: 'launchd' is not one of"),
-        (["--name", "anna"], "which broker? TALK_BROKER is not set"),
-        (["anna"], "'talk bridge' takes options alone: what is 'anna'?"),
+        ("", {}, "--name is missing"),
+        ("--name a/b", {}, "--name: the name 'a/b' can't be in a topic, it must be 1 to 59 of A-Z"),
+        ("--name anna --group day,#", {}, "--group: the name '#' can't be"),
+        ("--name anna --group day,", {}, "--group: the name '' can't be"),
+        ("--name anna --allow say,cancle", {}, "--allow: no request is called 'cancle': did you mean 'cancel'?"),
+        ("--name anna --allow xyz", {}, "--allow: no request is called 'xyz': there are say, wait, cancel"),
+        ("--name anna --print-unit launchd", {}, "--print-unit: 'launchd' is not one of"),
+        ("--name anna", {}, "which broker? TALK_BROKER is not set"),
+        ("anna", {}, "'talk bridge' takes options alone: what is 'anna'?"),
+        ("--name anna", {"TALK_BROKER": "http://broker"}, "TALK_BROKER is no broker's URL"),
+        ("--name anna", {"TALK_BROKER": "mqtts://x:hunter2@broker"}, "holds a user or a password"),
+        ("--name anna", {"TALK_BROKER": "mqtts://b", "TALK_MQTT_CA": "/no"}, "TALK_MQTT_CA: /no: No such file"),
     ],
 )
-def test_what_is_wrong_is_named_with_the_next_step(home: str, words: list[str], said: str) -> None:
-    code, out, err = bridge(home, *words)
-    assert (code, out) == (2, "")
-    assert said in err
-    assert "Traceback" not in err
+def test_a_mistake_is_named_with_the_next_step(home: str, words: str, env: dict[str, str], said: str) -> None:
+    code, out, err = bridge(home, *words.split(), **env)
+    assert (code, out, said in err, "Traceback" in err, "hunter2" in err) == (2, "", True, False, False), err
 
 
-@pytest.mark.parametrize(
-    ("env", "said"),
-    [
-        ({"TALK_BROKER": "http://broker"}, "TALK_BROKER is no broker's URL"),
-        ({"TALK_BROKER": "mqtts://broker", "TALK_MQTT_CA": "/nowhere"}, "TALK_MQTT_CA: /nowhere: No such file"),
-    ],
-)
-def test_settings_that_can_never_work_end_it_at_its_start(home: str, env: dict[str, str], said: str) -> None:
-    code, out, err = bridge(home, "--name", "anna", **env)
-    assert (code, out) == (2, "")
-    assert said in err
-
-
-def test_what_to_install_is_said_and_what_needs_none_of_it_is_printed(home: str, tmp_path: Path) -> None:
-    env = spied(tmp_path, environment(home, TALK_BROKER=BROKER), ["paho"])
+def test_without_paho_it_says_what_to_install_but_prints_all_the_same(home: str, tmp_path: Path) -> None:
+    env = spied(tmp_path, environment(home, TALK_BROKER="mqtt://127.0.0.1:1"), ["paho"])
     done = run([*TALK, "bridge", "--name", "anna"], env)
     assert (done.code, done.out) == (2, "")
     assert done.err == f"talk: a fleet needs paho-mqtt: {install.command('paho-mqtt')}\n"
-    for words in (["--print-acl"], ["--name", "anna", "--print-unit", "user"]):
-        done = run([*TALK, "bridge", *words], env)
-        assert (done.code, done.err) == (0, ""), done
-        assert done.out
-
-
-# What it prints
+    done = run([*TALK, "bridge", "--name", "anna", "--print-unit", "user"], env)
+    assert (done.code, done.err, "[Unit]" in done.out) == (0, "", True), done
 
 
 def test_the_acl_is_printed(home: str) -> None:
     assert bridge(home, "--print-acl") == (0, topics.access() + "\n", "")
+    rules = topics.access(homeassistant=True, name="r2.d2") + "\n"
+    assert bridge(home, "--name", "r2.d2", "--homeassistant", "--print-acl") == (0, rules, "")
 
 
 def printed(home: str, name: str, *options: str) -> str:
@@ -125,7 +104,9 @@ def command_of(unit: str) -> list[str]:
         ("system", "/etc/systemd/system", "/etc/talk/bridge.env"),
     ],
 )
-def test_a_unit_says_where_it_and_its_environment_go(home: str, name: str, folder: str, environment_file: str) -> None:
+def test_a_unit_has_its_place_its_environment_and_its_rights(
+    home: str, name: str, folder: str, environment_file: str
+) -> None:
     unit = printed(home, name)
     head = unit.partition("\n[Unit]\n")[0].splitlines()
     assert head[0].startswith(f"# {folder}/talk-bridge.service: ")
@@ -133,32 +114,22 @@ def test_a_unit_says_where_it_and_its_environment_go(home: str, name: str, folde
     assert any(environment_file.replace("%h", "~") in each for each in head)
     assert any("daemon-reload" in each and "enable --now talk-bridge" in each for each in head)
     assert all(each.startswith("#") and len(each) <= 120 for each in head)
-    assert values(unit, "EnvironmentFile") == [environment_file]
-    assert values(unit, "Type") == ["notify"]
-    assert values(unit, "WatchdogSec") == ["30"]
-    assert values(unit, "Restart") == ["on-failure"]
-    assert values(unit, "RestartPreventExitStatus") == ["2"]  # not 11: the other of its name may go
-    assert (values(unit, "RestartSec"), values(unit, "StartLimitIntervalSec")) == (["10"], ["0"])
-    assert values(unit, "RestrictAddressFamilies") == ["AF_UNIX AF_INET AF_INET6"]
-    assert "\n[Install]\nWantedBy=" in unit
-
-
-def test_the_systems_unit_has_the_network_the_servers_socket_and_little_else(home: str) -> None:
-    unit = printed(home, "system")
-    assert values(unit, "User") == ["talk-bridge"]
-    assert values(unit, "Group") == ["audio"]
+    settings = {
+        "EnvironmentFile": environment_file, "Type": "notify", "WatchdogSec": "30", "Restart": "on-failure",
+        "RestartPreventExitStatus": "2",  # not 11: the other bridge of its name may go
+        "RestartSec": "10", "StartLimitIntervalSec": "0", "RestrictAddressFamilies": "AF_UNIX AF_INET AF_INET6",
+    }  # fmt: skip
+    if name == "system":
+        settings |= {"User": "talk-bridge", "Group": "audio", "PrivateDevices": "yes"}
+        assert "/run/talk/talk.sock" in unit
+    assert {each: values(unit, each) for each in settings} == {each: [value] for each, value in settings.items()}
     assert not values(unit, "PrivateNetwork") + values(unit, "IPAddressDeny") + values(unit, "DeviceAllow")
-    assert values(unit, "PrivateDevices") == ["yes"]
-    assert "/run/talk/talk.sock" in unit
-
-
-@pytest.mark.parametrize("name", ["user", "system"])
-def test_a_units_command_has_the_options_that_were_given(home: str, name: str) -> None:
+    assert "\n[Install]\nWantedBy=" in unit
     flags = ["--no-text", "--homeassistant"]
     command = command_of(printed(home, name, "--group", "a,b", *flags, "--insecure", "--socket", "/run/other"))
     assert os.path.isabs(command[0])
     assert command[-7:] == ["bridge", "--insecure", "--socket=/run/other", "--name=anna", "--group=a,b", *flags]
-    assert command_of(printed(home, name))[-2:] == ["bridge", "--name=anna"]
+    assert command_of(unit)[-2:] == ["bridge", "--name=anna"]
 
 
 @pytest.mark.parametrize("name", ["user", "system"])
@@ -174,10 +145,7 @@ def test_systemd_finds_nothing_wrong(home: str, name: str) -> None:
     assert (done.code, done.err) == (0, ""), done
 
 
-# What a supervisor is told
-
-
-def test_a_supervisor_is_told_how_it_is_whether_a_broker_is_there_or_not(home: str, talk: Talk, broker: Broker) -> None:
+def test_a_supervisor_is_told_the_state_with_and_without_a_broker(home: str, talk: Talk, broker: Broker) -> None:
     broker.kill()
     with Supervisor(f"{home}/n") as supervisor:
         own = {"NOTIFY_SOCKET": supervisor.address, "WATCHDOG_USEC": "1000000"}
@@ -207,7 +175,9 @@ def test_a_supervisor_is_told_how_it_is_whether_a_broker_is_there_or_not(home: s
             assert "Traceback" not in process.stderr.read()
 
 
-def test_it_goes_to_the_socket_that_is_named(home: str, talk: Talk, broker: Broker, make_bridge: MakeBridge) -> None:
+def test_the_bridge_uses_the_socket_that_is_named(
+    home: str, talk: Talk, broker: Broker, make_bridge: MakeBridge
+) -> None:
     with serving(environment(home, TALK_SOCKET=f"{home}/s")):
         make_bridge(talk, broker, "berta", "--socket", f"{home}/s")
         with Asker(broker) as asker:

@@ -1,4 +1,4 @@
-"""The bridge's connection to its server: how it begins, and that nothing is lost or left over on it."""
+"""The bridge's connection to its server, and the threads that wait for it: nothing is lost or left over."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from talkcli import __version__
 from talkcli.errors import Busy, ServerUnavailable
-from talkcli.fleet.local import dial
+from talkcli.fleet.local import apart, dial
 from talkcli.protocol.events import busy_greeting, greeting
 from talkcli.protocol.lines import encode
 from tests.support.surroundings import short_directory
@@ -29,7 +29,7 @@ PATIENCE = 10.0
 
 @pytest.fixture
 def listening() -> Iterator[socket.socket]:
-    """A server's socket, where nobody greets by himself."""
+    """A server's socket; the test greets."""
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
         listening.listen()
@@ -59,6 +59,10 @@ async def greeted(listening: socket.socket) -> AsyncIterator[tuple[Local, socket
         yield await dialing, server
 
 
+def no_more_threads(_: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
 def lines(connected: socket.socket, count: int) -> list[bytes]:
     with connected.makefile("rb") as said:
         return [said.readline() for _ in range(count)]
@@ -66,7 +70,7 @@ def lines(connected: socket.socket, count: int) -> list[bytes]:
 
 @pytest.mark.parametrize("parts", [(GREETING,), (GREETING[:9], GREETING[9:]), (GREETING + b'{"event": 1}\n',)])
 @pytest.mark.parametrize("wait", [0.0, 0.5])
-def test_a_server_that_greets_at_once_or_later_or_in_pieces_is_one(
+def test_a_server_may_greet_at_once_or_later_or_in_pieces(
     listening: socket.socket, parts: tuple[bytes, ...], wait: float
 ) -> None:
     async def work() -> None:
@@ -91,7 +95,7 @@ def test_a_server_that_greets_at_once_or_later_or_in_pieces_is_one(
     run(work)
 
 
-def test_what_the_server_does_not_take_at_once_comes_later_and_in_order(listening: socket.socket) -> None:
+def test_lines_that_the_server_does_not_take_at_once_come_later_and_in_order(listening: socket.socket) -> None:
     sent = [b"%d " % each + b"x" * 60_000 + b"\n" for each in range(50)]
 
     async def work() -> None:
@@ -107,7 +111,7 @@ def test_what_the_server_does_not_take_at_once_comes_later_and_in_order(listenin
 
 
 @pytest.mark.parametrize("who", ["the server", "the bridge"])
-def test_one_who_reads_hears_of_the_end_whoever_ends_it(listening: socket.socket, who: str) -> None:
+def test_a_read_ends_with_the_connection(listening: socket.socket, who: str) -> None:
     async def work() -> None:
         async with greeted(listening) as (local, server):
             reading = asyncio.create_task(local.read())
@@ -122,7 +126,7 @@ def test_one_who_reads_hears_of_the_end_whoever_ends_it(listening: socket.socket
     run(work)
 
 
-def test_others_have_their_turn_while_a_server_has_much_to_say(listening: socket.socket) -> None:
+def test_a_server_that_says_much_does_not_block_the_loop(listening: socket.socket) -> None:
     async def work() -> None:
         async with greeted(listening) as (local, server):
             server.setblocking(False)
@@ -147,8 +151,8 @@ def test_others_have_their_turn_while_a_server_has_much_to_say(listening: socket
     run(work)
 
 
-def test_one_that_can_be_told_nothing_more_has_ended(listening: socket.socket) -> None:
-    """Part of a line may have gone: what came behind that would be another request."""
+def test_a_connection_on_which_a_line_can_not_be_sent_has_ended(listening: socket.socket) -> None:
+    """Part of the line may have been sent: the next line would be another request."""
 
     async def work() -> None:
         async with greeted(listening) as (local, server):
@@ -165,18 +169,15 @@ def test_one_that_can_be_told_nothing_more_has_ended(listening: socket.socket) -
 
 
 @pytest.mark.parametrize("given_up", [False, True])
-def test_where_no_thread_can_be_started_nothing_is_left_over(
+def test_without_threads_nothing_is_left_over(
     listening: socket.socket, monkeypatch: pytest.MonkeyPatch, given_up: bool
 ) -> None:
-    def no_more(_: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
     async def work() -> None:
         slots = asyncio.Semaphore(1)
         dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
         with await accepted(listening) as server:
             with monkeypatch.context() as patched:
-                patched.setattr(threading.Thread, "start", no_more)
+                patched.setattr(threading.Thread, "start", no_more_threads)
                 if given_up:
                     dialing.cancel()
                 with pytest.raises(asyncio.CancelledError if given_up else RuntimeError):
@@ -188,7 +189,7 @@ def test_where_no_thread_can_be_started_nothing_is_left_over(
 
 
 @pytest.mark.parametrize("said", [encode(busy_greeting()), b"220 mail\n", b""])
-def test_one_that_does_not_let_it_in_is_none(
+def test_a_server_that_refuses_the_connection_is_none(
     listening: socket.socket, said: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("talkcli.client.connect.BUSY_LIMIT", 0.3)
@@ -207,7 +208,9 @@ def test_one_that_does_not_let_it_in_is_none(
 
 
 @pytest.mark.parametrize("wait", [0.0, 0.4])
-def test_one_who_gives_up_keeps_the_place_until_the_server_has_greeted(listening: socket.socket, wait: float) -> None:
+def test_a_dial_that_is_cancelled_keeps_its_slot_until_the_server_has_greeted(
+    listening: socket.socket, wait: float
+) -> None:
     async def work() -> None:
         slots = asyncio.Semaphore(1)
         dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
@@ -225,7 +228,9 @@ def test_one_who_gives_up_keeps_the_place_until_the_server_has_greeted(listening
     gc.collect()  # what is left open would be told here
 
 
-def test_no_socket_that_is_left_costs_no_place(listening: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dial_without_a_free_descriptor_gives_its_slot_back(
+    listening: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def none_left(_: str | None) -> None:
         raise OSError("Too many open files")
 
@@ -237,3 +242,54 @@ def test_no_socket_that_is_left_costs_no_place(listening: socket.socket, monkeyp
 
     monkeypatch.setattr("talkcli.fleet.local.reach", none_left)
     run(work)
+
+
+# Work in a thread of its own
+
+
+def test_work_apart_returns_its_result_or_raises_its_error() -> None:
+    def fail() -> None:
+        raise ServerUnavailable("nobody is there")
+
+    async def work() -> None:
+        assert await apart(threading.get_ident) != threading.get_ident()
+        with pytest.raises(ServerUnavailable, match="nobody is there"):
+            await apart(fail)
+
+    run(work)
+
+
+def test_the_result_of_cancelled_work_is_undone_once_its_thread_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    go = threading.Event()
+
+    async def work() -> None:
+        undone, over = asyncio.Event(), asyncio.Event()
+        waiting = apart(lambda: go.wait(5), lambda result: undone.set() if result else None, over.set)
+        await asyncio.sleep(0)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        assert not over.is_set()
+        go.set()
+        await undone.wait()
+        await over.wait()
+        over.clear()
+        monkeypatch.setattr(threading.Thread, "start", no_more_threads)
+        with pytest.raises(RuntimeError, match="can't start new thread"):
+            await apart(threading.get_ident, finished=over.set)
+        assert over.is_set()
+
+    run(work)
+
+
+def test_the_end_of_the_loop_does_not_wait_for_work_whose_result_is_undone_then() -> None:
+    go, undone = threading.Event(), threading.Event()
+
+    async def leave() -> None:
+        work = apart(lambda: go.wait(30), lambda result: undone.set() if result else None)
+        await asyncio.sleep(0)
+        work.cancel()
+
+    asyncio.run(leave())
+    go.set()
+    assert undone.wait(5)

@@ -1,4 +1,4 @@
-"""What comes late is not spoken: a line that stalled, or a robot that was suspended, is found out without clocks."""
+"""Sentences that come late are refused: after a line has stalled, or a robot was suspended."""
 
 from __future__ import annotations
 
@@ -19,23 +19,24 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.fleet.conftest import MakeBridge
     from tests.support.broker import Broker
+    from tests.support.proxy import Way
 
-#: Seconds after the newest echo that came back from which on nothing is spoken that comes.
+#: Seconds after the newest echo that came back for which messages are taken.
 STALE = 6.0
-#: Seconds for which a line stalls whose messages are then too old, and are not, where an echo came just before.
+#: Seconds of a stall after which messages are too old, and after which they are not.
 TOO_LONG, SHORT = STALE + 1.0, STALE / 2
 
 
 @pytest.fixture
 def stalled(make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge) -> Iterator[tuple[Robot, Proxy]]:
-    """A robot behind a network of its own, that has just come up."""
+    """A robot behind a proxy, that has just come online."""
     with Proxy(broker.port) as proxy:
         talk = make_talk(scripted=True)
         yield Robot(talk, broker, make_bridge(talk, broker, "anna", port=proxy.port)), proxy
 
 
 def assert_stale(robot: Robot, stall: Callable[[], object], go_on: Callable[[], object]) -> None:
-    """Stall it for too long, and assert that what is said meanwhile is refused, and what is said after that is not."""
+    """Assert that sentences sent during a long stall are refused, and one sent after it is spoken."""
     with Asker(robot.broker, "olga") as olga, robot.listen("echo") as listener:
         began = time.monotonic()
         stall()
@@ -47,7 +48,7 @@ def assert_stale(robot: Robot, stall: Callable[[], object], go_on: Callable[[], 
         went_on = time.monotonic()
         answer = olga.reply(asked)
         assert answer["error"]["code"] == "stale", answer
-        # With the refusal an echo was sent, unless that was done within a second before; behind it nothing is old.
+        # An echo came with the refusal, or within a second before it; nothing that comes after it is old.
         listener.await_message(lambda each: each.topic.endswith("/echo") and each.arrived > went_on - 1)
         assert robot.desk("say", "--wait", "control").code == 0
     assert robot.spoken == ["control"]
@@ -59,17 +60,22 @@ def test_what_comes_while_a_robot_is_suspended_for_long_is_refused(robot: Robot)
     assert_stale(robot, robot.bridge.stop_process, robot.bridge.go_on)
 
 
-@pytest.mark.slow
-def test_what_comes_while_a_robot_is_suspended_for_a_moment_is_spoken(robot: Robot) -> None:
-    """link stalls, robot suspends, then goes on"""
+def assert_spoken(robot: Robot, stall: Callable[[], object], go_on: Callable[[], object]) -> None:
+    """Assert that a sentence sent during a short stall is spoken."""
     with Desk(robot.broker) as somebody:
-        robot.bridge.stop_process()
+        stall()
         asked = somebody.start("--robot", "anna", "say", "--wait", "in time")
         time.sleep(SHORT)
-        robot.bridge.go_on()
+        go_on()
         done = somebody.finish(asked)
     assert done.code == 0, done
     assert robot.spoken == ["in time"]
+
+
+@pytest.mark.slow
+def test_what_comes_while_a_robot_is_suspended_for_a_moment_is_spoken(robot: Robot) -> None:
+    """link stalls, robot suspends, then goes on"""
+    assert_spoken(robot, robot.bridge.stop_process, robot.bridge.go_on)
 
 
 @pytest.mark.slow
@@ -98,17 +104,10 @@ def test_where_no_echo_comes_back_nothing_is_spoken_that_may_be_old(stalled: tup
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["to_client", "to_broker"])
-def test_what_a_line_has_held_for_a_moment_is_spoken(stalled: tuple[Robot, Proxy], way: str) -> None:
+def test_what_a_line_has_held_for_a_moment_is_spoken(stalled: tuple[Robot, Proxy], way: Way) -> None:
     """link stalls, robot suspends, then goes on"""
     robot, proxy = stalled
-    with Desk(robot.broker) as somebody:
-        proxy.hold("to_client" if way == "to_client" else "to_broker")
-        asked = somebody.start("--robot", "anna", "say", "--wait", "in time")
-        time.sleep(SHORT)
-        proxy.release()
-        done = somebody.finish(asked)
-    assert done.code == 0, done
-    assert robot.spoken == ["in time"]
+    assert_spoken(robot, lambda: proxy.hold(way), proxy.release)
 
 
 def test_how_long_the_broker_keeps_a_sentence_counts_in_the_queue_of_the_robot_too(robot: Robot) -> None:
