@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import functools
 import os
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 import pytest
 
@@ -19,33 +21,25 @@ from tests.support.processes import Talk
 from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Coroutine, Iterator
 
+    #: Starts a bridge for a test, and returns it, online unless that is False: `make_bridge(talk, broker, "anna")`.
+    MakeBridge = Callable[..., Bridge]
 
-#: Who may log in at a secure broker, each with a password of its own: two robots, an operator, and one who may nothing.
+_P = ParamSpec("_P")
+
+#: Logins at a secure broker, each with a password of its own: robots, an operator, and one without rights.
 ROBOTS, OPERATORS, OTHERS = ("anna", "bert"), ("olga",), ("otto",)
 
 
-class MakeBridge(Protocol):
-    """Starts a bridge for a test: `make_bridge(talk, broker, "anna", "--allow", "say")`; see `Bridge`."""
+def in_loop(test: Callable[_P, Coroutine[Any, Any, None]]) -> Callable[_P, None]:
+    """Run a test that is a coroutine."""
 
-    def __call__(
-        self,
-        talk: Talk,
-        broker: Broker,
-        name: str,
-        *options: str,
-        groups: Sequence[str] = (),
-        user: str | None = None,
-        password: str | bool = True,
-        cert: str | None = None,
-        observer: str | None = None,
-        port: int | None = None,
-        env: Mapping[str, str] | None = None,
-        online: bool = True,
-    ) -> Bridge:
-        """Return the bridge, online or at least started."""
-        ...
+    @functools.wraps(test)
+    def run(*args: _P.args, **named: _P.kwargs) -> None:
+        asyncio.run(test(*args, **named))
+
+    return run
 
 
 @pytest.fixture

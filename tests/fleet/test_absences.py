@@ -46,7 +46,6 @@ def assert_one_result(done: Finished) -> None:
 def test_a_bridge_that_is_killed_is_offline_within_a_second_and_the_next_tells_the_result(
     robot: Robot, text: str, over: bool
 ) -> None:
-    """bridge killed"""
     with robot.listen() as listener, Desk(robot.broker) as somebody:
         asked = somebody.start("--robot", "anna", "--json", "say", "--wait", "--id", "mine", "--", text)
         robot.talk.watcher.wait_for("mine", "ACTIVE")
@@ -67,7 +66,6 @@ def test_a_bridge_that_is_killed_is_offline_within_a_second_and_the_next_tells_t
 def test_a_robot_whose_network_is_gone_is_offline_within_20_seconds(
     make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
 ) -> None:
-    """network gone"""
     with Proxy(broker.port) as proxy:
         talk = make_talk(scripted=True)
         robot = Robot(talk, broker, make_bridge(talk, broker, "anna", port=proxy.port))
@@ -83,7 +81,6 @@ def test_a_robot_whose_network_is_gone_is_offline_within_20_seconds(
 
 
 def test_a_broker_that_is_killed_in_mid_sentence_costs_no_result(robot: Robot) -> None:
-    """broker killed in mid-sentence"""
     with Desk(robot.broker) as somebody:
         asked = somebody.start("--robot", "anna", "--json", "say", "--wait", "--id", "mine", "--", "length=0.5 long")
         robot.talk.watcher.wait_for("mine", "ACTIVE")
@@ -102,7 +99,6 @@ def test_a_broker_that_is_killed_in_mid_sentence_costs_no_result(robot: Robot) -
 
 @pytest.mark.parametrize("way", ["to_client", "to_broker"])
 def test_a_goal_whose_acceptance_was_lost_on_the_way_is_asked_for_and_spoken_once(robot: Robot, way: Way) -> None:
-    """broker killed in mid-sentence"""
     with Proxy(robot.broker.port) as proxy, desk_of(robot, proxy.port) as client:
         proxy.hold(way)
         said: list[str] = []
@@ -129,7 +125,6 @@ def desk_of(robot: Robot, port: int) -> Client:
 
 @pytest.mark.slow
 def test_a_broker_that_does_not_come_back_is_given_up_after_half_a_minute(robot: Robot) -> None:
-    """broker killed in mid-sentence"""
     with Desk(robot.broker) as somebody:
         asked = somebody.start("--robot", "anna", "say", "--wait", "--", "length=4 long")
         robot.talk.watcher.wait_for(None, "ACTIVE")
@@ -144,7 +139,6 @@ def test_a_broker_that_does_not_come_back_is_given_up_after_half_a_minute(robot:
 
 
 def test_a_server_that_is_killed_is_told_at_once_and_so_is_the_next(robot: Robot) -> None:
-    """server dead, bridge alive"""
     with robot.listen() as listener:
         killed = time.monotonic()
         robot.talk.kill()
@@ -160,7 +154,6 @@ def test_a_server_that_is_killed_is_told_at_once_and_so_is_the_next(robot: Robot
 
 
 def test_a_server_that_is_killed_under_a_desk_that_waits_has_lost_the_goal(robot: Robot) -> None:
-    """server dead, bridge alive"""
     with Desk(robot.broker) as somebody, Listener(robot.broker, "talk/reply/#") as replies:
         asked = somebody.start("--robot", "anna", "say", "--wait", "--", LONG)
         replies.await_message(lambda each: "ACTIVE" in each.text)  # else the desk may not know that it was accepted
@@ -170,7 +163,6 @@ def test_a_server_that_is_killed_under_a_desk_that_waits_has_lost_the_goal(robot
 
 
 def test_a_robot_that_ends_says_goodbye(robot: Robot) -> None:
-    """robot offline"""
     with robot.listen() as listener:
         online = listener.messages[0]
         assert online.expiry is not None
@@ -187,7 +179,6 @@ def test_a_robot_that_ends_says_goodbye(robot: Robot) -> None:
 
 @pytest.mark.parametrize(("how", "code"), [("interrupted", 130), ("unread", 141), ("too-late", 124)])
 def test_a_goal_of_a_desk_that_goes_away_is_cancelled_at_the_robot(lasting_robot: Robot, how: str, code: int) -> None:
-    """a desk that goes away"""
     words = {"unread": ["--feedback"], "too-late": ["--timeout", "0.5"]}.get(how, [])
     with Desk(lasting_robot.broker) as somebody:
         asked = somebody.start("--robot", "anna", "say", "--wait", *words, "--id", how, "--", LONG)

@@ -42,7 +42,6 @@ def assert_spoken(robot: Robot, *texts: str) -> None:
 
 
 def test_a_robot_that_is_offline_is_told_at_once_and_speaks_nothing_of_it_when_it_comes(robot: Robot) -> None:
-    """robot offline, or unknown"""
     assert robot.bridge.terminate() == 0
     with limits():
         for name, words in (("anna", "anna is offline: nothing was sent"), ("nobody", "no robot 'nobody' is known")):
@@ -59,7 +58,6 @@ def test_a_robot_that_is_offline_is_told_at_once_and_speaks_nothing_of_it_when_i
 
 
 def test_a_broker_that_is_not_there_is_told_and_nothing_is_spoken_when_it_is_back(robot: Robot) -> None:
-    """robot offline"""
     robot.broker.kill()
     assert_refused(robot.desk("say", "hello"), 3, f"no broker at {robot.broker.url}")
     robot.broker.start()
@@ -104,7 +102,6 @@ def test_a_connection_that_breaks_under_an_answer_is_made_again(
 
 
 def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:
-    """duplicates"""
     line = '{"seq": %d, "request": "say", "id": "once", "text": "only once"}'
     with Asker(robot.broker, "olga") as olga:
         for seq in (1, 2, 3):
@@ -122,7 +119,6 @@ def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:
 
 @pytest.mark.parametrize("bridge", ["the same", "another"])
 def test_a_goal_that_an_earlier_server_had_is_not_sent_to_the_next(robot: Robot, bridge: str) -> None:
-    """duplicates"""
     assert robot.desk("say", "--wait", "--id", "mine", "only once").code == 0
     if bridge == "another":
         robot.bridge.kill()
@@ -137,7 +133,6 @@ def test_a_goal_that_an_earlier_server_had_is_not_sent_to_the_next(robot: Robot,
 
 
 def test_a_retained_message_is_dropped_as_it_comes(robot: Robot) -> None:
-    """retained"""
     robot.talk.run("say", "--id", "mine", "--", LONG)
     robot.talk.watcher.wait_for("mine", "ACTIVE")
     with Asker(robot.broker, "olga") as olga:
@@ -154,7 +149,6 @@ def test_a_retained_message_is_dropped_as_it_comes(robot: Robot) -> None:
 def test_what_the_broker_has_kept_for_a_robot_is_not_spoken_when_it_comes(
     make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
 ) -> None:
-    """retained"""
     talk = make_talk(scripted=True)
     talk.run("say", "--id", "mine", "--", LONG)
     with Asker(broker, "olga") as olga:
@@ -171,7 +165,7 @@ def test_what_the_broker_has_kept_for_a_robot_is_not_spoken_when_it_comes(
 
 
 def test_what_is_no_request_is_answered_with_the_error_of_the_wire(lasting_robot: Robot) -> None:
-    """wrong JSON, 64 KiB; `tests/unit/test_fleet_policy.py` has all of these errors"""
+    """`tests/unit/test_fleet_policy.py` has all of these errors."""
     status = b'{"seq": 7, "request": "status"}'
     with Asker(lasting_robot.broker, "olga") as olga:
         olga.send(status.ljust(LONGEST_LINE - 1))
@@ -186,7 +180,6 @@ def test_what_is_no_request_is_answered_with_the_error_of_the_wire(lasting_robot
 def test_a_desk_may_do_what_the_robot_allows_and_nothing_else(
     make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
 ) -> None:
-    """request not allowed"""
     talk = make_talk(scripted=True)
     robot = Robot(talk, broker, make_bridge(talk, broker, "anna"))
     assert_refused(robot.desk("set", "--rate", "300"), 10, "anna: this robot takes no set from afar")

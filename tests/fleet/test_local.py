@@ -16,10 +16,11 @@ from talkcli.errors import Busy, ServerUnavailable
 from talkcli.fleet.local import apart, dial
 from talkcli.protocol.events import busy_greeting, greeting
 from talkcli.protocol.lines import encode
+from tests.fleet.conftest import in_loop
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+    from collections.abc import AsyncIterator, Iterator
 
     from talkcli.fleet.local import Local
 
@@ -35,13 +36,6 @@ def listening() -> Iterator[socket.socket]:
         listening.listen()
         listening.settimeout(PATIENCE)
         yield listening
-
-
-def run(work: Callable[[], Awaitable[None]]) -> None:
-    async def within() -> None:
-        await asyncio.wait_for(work(), 2 * PATIENCE)
-
-    asyncio.run(within())
 
 
 async def accepted(listening: socket.socket) -> socket.socket:
@@ -70,216 +64,183 @@ def lines(connected: socket.socket, count: int) -> list[bytes]:
 
 @pytest.mark.parametrize("parts", [(GREETING,), (GREETING[:9], GREETING[9:]), (GREETING + b'{"event": 1}\n',)])
 @pytest.mark.parametrize("wait", [0.0, 0.5])
-def test_a_server_may_greet_at_once_or_later_or_in_pieces(
+@in_loop
+async def test_a_server_may_greet_at_once_or_later_or_in_pieces(
     listening: socket.socket, parts: tuple[bytes, ...], wait: float
 ) -> None:
-    async def work() -> None:
-        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
-        with await accepted(listening) as server:
-            for each in parts:
-                await asyncio.sleep(wait)  # 0.2 s are waited for in the loop, and the rest in a thread
-                server.sendall(each)
-            local = await dialing
-            assert (local.boot, local.pid) == ("a1b2", 7)
-            local.write(b"asked\n")
-            server.sendall(b"answered\n")
-            assert await asyncio.to_thread(lines, server, 2) == [
-                encode({"request": "hello", "name": "bob"}),
-                b"asked\n",
-            ]
-            heard = [each for _ in range(len(parts[-1].splitlines())) for each in await local.read()]
-            assert heard == [*parts[-1].splitlines()[1:], b"answered"]
-            local.close()
-            assert server.recv(1) == b""
-
-    run(work)
+    dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+    with await accepted(listening) as server:
+        for each in parts:
+            await asyncio.sleep(wait)  # 0.2 s are waited for in the loop, and the rest in a thread
+            server.sendall(each)
+        local = await dialing
+        assert (local.boot, local.pid) == ("a1b2", 7)
+        local.write(b"asked\n")
+        server.sendall(b"answered\n")
+        assert await asyncio.to_thread(lines, server, 2) == [
+            encode({"request": "hello", "name": "bob"}),
+            b"asked\n",
+        ]
+        heard = [each for _ in range(len(parts[-1].splitlines())) for each in await local.read()]
+        assert heard == [*parts[-1].splitlines()[1:], b"answered"]
+        local.close()
+        assert server.recv(1) == b""
 
 
-def test_lines_that_the_server_does_not_take_at_once_come_later_and_in_order(listening: socket.socket) -> None:
+@in_loop
+async def test_lines_that_the_server_does_not_take_at_once_come_later_and_in_order(listening: socket.socket) -> None:
     sent = [b"%d " % each + b"x" * 60_000 + b"\n" for each in range(50)]
-
-    async def work() -> None:
-        async with greeted(listening) as (local, server):
-            for each in sent:
-                local.write(each)
-            assert (await asyncio.to_thread(lines, server, 51))[1:] == sent
-            local.write(b"and more\n")
-            assert await asyncio.to_thread(lines, server, 1) == [b"and more\n"]
-            local.close()
-
-    run(work)
+    async with greeted(listening) as (local, server):
+        for each in sent:
+            local.write(each)
+        assert (await asyncio.to_thread(lines, server, 51))[1:] == sent
+        local.write(b"and more\n")
+        assert await asyncio.to_thread(lines, server, 1) == [b"and more\n"]
+        local.close()
 
 
 @pytest.mark.parametrize("who", ["the server", "the bridge"])
-def test_a_read_ends_with_the_connection(listening: socket.socket, who: str) -> None:
-    async def work() -> None:
-        async with greeted(listening) as (local, server):
-            reading = asyncio.create_task(local.read())
-            await asyncio.sleep(0.05)
-            (server if who == "the server" else local).close()
-            assert await reading == []
-            for _ in range(2):
-                local.write(b"to nobody\n")
-                local.close()
-            assert await local.read() == []
-
-    run(work)
-
-
-def test_a_server_that_says_much_does_not_block_the_loop(listening: socket.socket) -> None:
-    async def work() -> None:
-        async with greeted(listening) as (local, server):
-            server.setblocking(False)
-            said = 0
-            with contextlib.suppress(BlockingIOError):
-                while True:
-                    said += server.send(b'{"event": "alive"}\n' * 500)
-            turns = reads = heard = 0
-
-            def look() -> None:
-                nonlocal turns
-                turns += 1
-                asyncio.get_running_loop().call_soon(look)
-
-            look()
-            while heard < said // 19:
-                heard += len(await local.read())
-                reads += 1
-            assert turns >= reads > 1
+@in_loop
+async def test_a_read_ends_with_the_connection(listening: socket.socket, who: str) -> None:
+    async with greeted(listening) as (local, server):
+        reading = asyncio.create_task(local.read())
+        await asyncio.sleep(0.05)
+        (server if who == "the server" else local).close()
+        assert await reading == []
+        for _ in range(2):
+            local.write(b"to nobody\n")
             local.close()
+        assert await local.read() == []
 
-    run(work)
+
+@in_loop
+async def test_a_server_that_says_much_does_not_block_the_loop(listening: socket.socket) -> None:
+    async with greeted(listening) as (local, server):
+        server.setblocking(False)
+        said = 0
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                said += server.send(b'{"event": "alive"}\n' * 500)
+        turns = reads = heard = 0
+
+        def look() -> None:
+            nonlocal turns
+            turns += 1
+            asyncio.get_running_loop().call_soon(look)
+
+        look()
+        while heard < said // 19:
+            heard += len(await local.read())
+            reads += 1
+        assert turns >= reads > 1
+        local.close()
 
 
-def test_a_connection_on_which_a_line_can_not_be_sent_has_ended(listening: socket.socket) -> None:
+@in_loop
+async def test_a_connection_on_which_a_line_can_not_be_sent_has_ended(listening: socket.socket) -> None:
     """Part of the line may have been sent: the next line would be another request."""
-
-    async def work() -> None:
-        async with greeted(listening) as (local, server):
-            lines(server, 1)
-            reading = asyncio.create_task(local.read())
-            await asyncio.sleep(0)
-            server.shutdown(socket.SHUT_RD)
-            local.write(b"asked\n")
-            assert await reading == []
-            local.write(b"asked again\n")
-            local.close()
-
-    run(work)
+    async with greeted(listening) as (local, server):
+        lines(server, 1)
+        reading = asyncio.create_task(local.read())
+        await asyncio.sleep(0)
+        server.shutdown(socket.SHUT_RD)
+        local.write(b"asked\n")
+        assert await reading == []
+        local.write(b"asked again\n")
+        local.close()
 
 
 @pytest.mark.parametrize("given_up", [False, True])
-def test_without_threads_nothing_is_left_over(
+@in_loop
+async def test_without_threads_nothing_is_left_over(
     listening: socket.socket, monkeypatch: pytest.MonkeyPatch, given_up: bool
 ) -> None:
-    async def work() -> None:
-        slots = asyncio.Semaphore(1)
-        dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
-        with await accepted(listening) as server:
-            with monkeypatch.context() as patched:
-                patched.setattr(threading.Thread, "start", no_more_threads)
-                if given_up:
-                    dialing.cancel()
-                with pytest.raises(asyncio.CancelledError if given_up else RuntimeError):
-                    await dialing
-            assert lines(server, 2)[1] == b""
-        assert not slots.locked()
-
-    run(work)
+    slots = asyncio.Semaphore(1)
+    dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
+    with await accepted(listening) as server:
+        with monkeypatch.context() as patched:
+            patched.setattr(threading.Thread, "start", no_more_threads)
+            if given_up:
+                dialing.cancel()
+            with pytest.raises(asyncio.CancelledError if given_up else RuntimeError):
+                await dialing
+        assert lines(server, 2)[1] == b""
+    assert not slots.locked()
 
 
 @pytest.mark.parametrize("said", [encode(busy_greeting()), b"220 mail\n", b""])
-def test_a_server_that_refuses_the_connection_is_none(
+@in_loop
+async def test_a_server_that_refuses_the_connection_is_none(
     listening: socket.socket, said: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("talkcli.client.connect.BUSY_LIMIT", 0.3)
-
-    async def work() -> None:
-        dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
-        with contextlib.suppress(TimeoutError):
-            while not dialing.done():  # a busy one is tried again
-                listening.settimeout(0.5)
-                with await accepted(listening) as server:
-                    server.sendall(said)
-        with pytest.raises(Busy if said.startswith(b"{") else ServerUnavailable):
-            await dialing
-
-    run(work)
+    dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+    with contextlib.suppress(TimeoutError):
+        while not dialing.done():  # a busy one is tried again
+            listening.settimeout(0.5)
+            with await accepted(listening) as server:
+                server.sendall(said)
+    with pytest.raises(Busy if said.startswith(b"{") else ServerUnavailable):
+        await dialing
 
 
 @pytest.mark.parametrize("wait", [0.0, 0.4])
-def test_a_dial_that_is_cancelled_keeps_its_slot_until_the_server_has_greeted(
+@in_loop
+async def test_a_dial_that_is_cancelled_keeps_its_slot_until_the_server_has_greeted(
     listening: socket.socket, wait: float
 ) -> None:
-    async def work() -> None:
-        slots = asyncio.Semaphore(1)
-        dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
-        await asyncio.sleep(wait)
-        with await accepted(listening) as server:
-            dialing.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await dialing
-            assert slots.locked()
-            server.sendall(GREETING)
-            await slots.acquire()
-            assert lines(server, 2) == [encode({"request": "hello", "name": "bob"}), b""]
-
-    run(work)
-    gc.collect()  # what is left open would be told here
+    slots = asyncio.Semaphore(1)
+    dialing = asyncio.create_task(dial(listening.getsockname(), "bob", slots=slots))
+    await asyncio.sleep(wait)
+    with await accepted(listening) as server:
+        dialing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await dialing
+        assert slots.locked()
+        server.sendall(GREETING)
+        await slots.acquire()
+        assert lines(server, 2) == [encode({"request": "hello", "name": "bob"}), b""]
+    gc.collect()  # which would warn of a socket that is left open
 
 
-def test_a_dial_without_a_free_descriptor_gives_its_slot_back(
+@in_loop
+async def test_a_dial_without_a_free_descriptor_gives_its_slot_back(
     listening: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def none_left(_: str | None) -> None:
         raise OSError("Too many open files")
 
-    async def work() -> None:
-        slots = asyncio.Semaphore(1)
-        with pytest.raises(OSError, match="Too many"):
-            await dial(listening.getsockname(), "bob", slots=slots)
-        assert not slots.locked()
-
     monkeypatch.setattr("talkcli.fleet.local.reach", none_left)
-    run(work)
+    slots = asyncio.Semaphore(1)
+    with pytest.raises(OSError, match="Too many"):
+        await dial(listening.getsockname(), "bob", slots=slots)
+    assert not slots.locked()
 
 
 # Work in a thread of its own
 
 
-def test_work_apart_returns_its_result_or_raises_its_error() -> None:
-    def fail() -> None:
-        raise ServerUnavailable("nobody is there")
-
-    async def work() -> None:
-        assert await apart(threading.get_ident) != threading.get_ident()
-        with pytest.raises(ServerUnavailable, match="nobody is there"):
-            await apart(fail)
-
-    run(work)
-
-
-def test_the_result_of_cancelled_work_is_undone_once_its_thread_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_loop
+async def test_the_result_of_cancelled_work_is_undone_once_its_thread_has_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     go = threading.Event()
-
-    async def work() -> None:
-        undone, over = asyncio.Event(), asyncio.Event()
-        waiting = apart(lambda: go.wait(5), lambda result: undone.set() if result else None, over.set)
-        await asyncio.sleep(0)
-        waiting.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await waiting
-        assert not over.is_set()
-        go.set()
-        await undone.wait()
-        await over.wait()
-        over.clear()
-        monkeypatch.setattr(threading.Thread, "start", no_more_threads)
-        with pytest.raises(RuntimeError, match="can't start new thread"):
-            await apart(threading.get_ident, finished=over.set)
-        assert over.is_set()
-
-    run(work)
+    undone, over = asyncio.Event(), asyncio.Event()
+    assert await apart(threading.get_ident) != threading.get_ident()
+    waiting = apart(lambda: go.wait(5), lambda result: undone.set() if result else None, over.set)
+    await asyncio.sleep(0)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    assert not over.is_set()
+    go.set()
+    await undone.wait()
+    await over.wait()
+    over.clear()
+    monkeypatch.setattr(threading.Thread, "start", no_more_threads)
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        await apart(threading.get_ident, finished=over.set)
+    assert over.is_set()
 
 
 def test_the_end_of_the_loop_does_not_wait_for_work_whose_result_is_undone_then() -> None:

@@ -56,7 +56,6 @@ def assert_stale(robot: Robot, stall: Callable[[], object], go_on: Callable[[], 
 
 @pytest.mark.slow
 def test_what_comes_while_a_robot_is_suspended_for_long_is_refused(robot: Robot) -> None:
-    """link stalls, robot suspends, then goes on"""
     assert_stale(robot, robot.bridge.stop_process, robot.bridge.go_on)
 
 
@@ -74,20 +73,17 @@ def assert_spoken(robot: Robot, stall: Callable[[], object], go_on: Callable[[],
 
 @pytest.mark.slow
 def test_what_comes_while_a_robot_is_suspended_for_a_moment_is_spoken(robot: Robot) -> None:
-    """link stalls, robot suspends, then goes on"""
     assert_spoken(robot, robot.bridge.stop_process, robot.bridge.go_on)
 
 
 @pytest.mark.slow
 def test_what_a_line_has_held_for_long_is_refused(stalled: tuple[Robot, Proxy]) -> None:
-    """link stalls, robot suspends, then goes on"""
     robot, proxy = stalled
     assert_stale(robot, lambda: proxy.hold("to_client"), proxy.release)
 
 
 @pytest.mark.slow
 def test_where_no_echo_comes_back_nothing_is_spoken_that_may_be_old(stalled: tuple[Robot, Proxy]) -> None:
-    """link stalls, robot suspends, then goes on"""
     robot, proxy = stalled
     with Asker(robot.broker, "olga") as olga:
         proxy.hold("to_broker")
@@ -105,13 +101,11 @@ def test_where_no_echo_comes_back_nothing_is_spoken_that_may_be_old(stalled: tup
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["to_client", "to_broker"])
 def test_what_a_line_has_held_for_a_moment_is_spoken(stalled: tuple[Robot, Proxy], way: Way) -> None:
-    """link stalls, robot suspends, then goes on"""
     robot, proxy = stalled
     assert_spoken(robot, lambda: proxy.hold(way), proxy.release)
 
 
 def test_how_long_the_broker_keeps_a_sentence_counts_in_the_queue_of_the_robot_too(robot: Robot) -> None:
-    """link stalls, robot suspends, then goes on"""
     robot.talk.run("say", "--", LONG)
     robot.talk.watcher.wait_for(None, "ACTIVE")
     with Asker(robot.broker, "olga") as olga:
@@ -133,7 +127,6 @@ def test_how_long_the_broker_keeps_a_sentence_counts_in_the_queue_of_the_robot_t
 def test_a_sentence_that_the_line_has_held_begins_no_later_than_its_ttl_and_six_seconds(
     stalled: tuple[Robot, Proxy],
 ) -> None:
-    """link stalls, robot suspends, then goes on"""
     robot, proxy = stalled
     robot.talk.run("say", "--", LONG)
     robot.talk.watcher.wait_for(None, "ACTIVE")

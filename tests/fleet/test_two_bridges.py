@@ -33,7 +33,6 @@ def assert_answers(robot: Robot) -> None:
 def test_the_younger_of_two_bridges_ends_and_the_older_goes_on(
     robot: Robot, make_talk: MakeTalk, make_bridge: MakeBridge
 ) -> None:
-    """two bridges of one name"""
     another = make_talk(scripted=True)
     with robot.listen() as listener:
         assert_ends(make_bridge(another, robot.broker, "anna", online=False))
@@ -46,7 +45,6 @@ def test_the_younger_of_two_bridges_ends_and_the_older_goes_on(
 def test_of_two_bridges_that_find_the_broker_together_the_younger_ends(
     robot: Robot, make_talk: MakeTalk, make_bridge: MakeBridge
 ) -> None:
-    """two bridges of one name"""
     another = make_talk(scripted=True)
     robot.broker.kill()
     younger = make_bridge(another, robot.broker, "anna", online=False)
@@ -61,7 +59,6 @@ def test_of_two_bridges_that_find_the_broker_together_the_younger_ends(
 def test_a_bridge_that_began_while_the_older_had_no_network_ends_when_that_is_back(
     make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
 ) -> None:
-    """two bridges of one name"""
     with Proxy(broker.port) as proxy:
         talk, another = make_talk(scripted=True), make_talk(scripted=True)
         older = make_bridge(talk, broker, "anna", port=proxy.port)
@@ -84,7 +81,6 @@ def test_a_bridge_that_began_while_the_older_had_no_network_ends_when_that_is_ba
 def test_what_a_bridge_has_left_behind_without_a_word_keeps_no_other_from_its_name(
     make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
 ) -> None:
-    """two bridges of one name"""
     talk = make_talk(scripted=True)
     with Proxy(broker.port) as proxy:
         lost = make_bridge(make_talk(scripted=True), broker, "anna", port=proxy.port)
