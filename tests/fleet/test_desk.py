@@ -7,7 +7,7 @@ import json
 import re
 import signal
 import socket
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -92,20 +92,6 @@ def test_a_sentence_has_the_same_output_while_it_is_spoken(open_robot: Robot) ->
                 assert done.code == 0, done
                 shown.append((done.code, re.sub(rf"{goal}|\d+\.\d+", "", done.out), done.err))
     assert shown[2:] == shown[:2]
-
-
-def test_a_sentence_has_the_same_events_for_programs(open_robot: Robot) -> None:
-    """Ids, times, and the sender of the goal differ."""
-
-    def events(done: Finished) -> list[tuple[Any, ...]]:
-        assert done.code == 0, done
-        lines = [json.loads(each) for each in done.out.splitlines()]
-        return [(*sorted(each), each.get("event"), each.get("state"), each.get("word")) for each in lines]
-
-    words = ["--json", "say", "--wait", "--feedback", "--", "the door opens"]
-    found = events(open_robot.desk(*words))
-    assert found == events(open_robot.talk.run(*words))
-    assert [each[-1] for each in found if each[-1]] == ["the", "door", "opens"]
 
 
 def test_watchers_at_both_ends_see_the_same(open_robot: Robot) -> None:

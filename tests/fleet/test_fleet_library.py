@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 from typing import TYPE_CHECKING
@@ -11,8 +12,10 @@ import pytest
 from talkcli import Fleet, State
 from talkcli.errors import AccessDenied, ServerUnavailable, UnknownGoal, UsageError
 from tests.fleet import told
+from tests.fleet.conftest import fleet_of
 from tests.fleet.many import request
 from tests.fleet.robot import LONG
+from tests.support.broker import Broker
 from tests.support.mqtt import Listener
 from tests.support.ports import Port
 
@@ -22,7 +25,6 @@ if TYPE_CHECKING:
 
     from talkcli import Outcome
     from tests.fleet.many import RealRobots
-    from tests.support.broker import Broker
 
 PAIR, BOTH = ["wh-1", "wh-2"], ("wh-*", "@warehouse")
 
@@ -37,6 +39,10 @@ def found(outcomes: Iterable[Outcome]) -> dict[str, tuple[str, int]]:
 
 def alike(state: str, code: int = 0, names: Iterable[str] = PAIR) -> dict[str, tuple[str, int]]:
     return dict.fromkeys(names, (state, code))
+
+
+def descriptors() -> int:
+    return len(os.listdir("/proc/self/fd"))
 
 
 def said(outcome: Outcome) -> Any:
@@ -162,15 +168,47 @@ def test_a_goal_has_the_name_of_its_sender(pair: RealRobots) -> None:
 
 def test_no_request_leaves_anything_open(fleet: Fleet) -> None:
     assert found(fleet.status("wh-*"))  # what is imported once, opens what stays open
-    before = len(os.listdir("/proc/self/fd"))
+    gc.collect()
+    before = descriptors()
     for to in BOTH:
         assert found(fleet.say(to, "length=0")) == alike("SUCCEEDED")
         fleet.status(to).close()
+        with fleet.status(to) as asked:
+            assert next(iter(asked)).exit_code == 0
+            assert descriptors() > before
         with pytest.raises(UsageError):
             fleet.say(to, "hello", rate=9)
         with pytest.raises(ServerUnavailable):
             list(fleet.status("nobody*"))
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert descriptors() == before
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("to", BOTH)
+def test_a_round_that_is_dropped_leaves_nothing_open(fleet: Fleet, to: str) -> None:
+    list(fleet.status(to))
+    gc.collect()
+    before = descriptors()
+    for _ in range(5):
+        for _ in fleet.status(to):
+            break
+    gc.collect()
+    assert descriptors() == before
+
+
+def test_a_refusal_by_the_broker_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    rules = "topic readwrite #\nuser olga\ntopic read talk/robot/+/presence\ntopic readwrite talk/reply/olga/+/+\n"
+    with Broker(acl=rules) as broker:
+        with Listener(broker) as publisher:
+            told.presence(publisher, "wh-1", groups=["warehouse"])
+        fleet = fleet_of(broker, monkeypatch, user="olga")
+        before = 0
+        for _ in range(3):
+            assert found(fleet.say("wh-*", "hello")) == {"wh-1": ("REFUSED", 10)}
+            with pytest.raises(AccessDenied, match="does not let 'olga'"):
+                list(fleet.say("@warehouse", "hello"))
+            before = before or descriptors()
+        assert descriptors() == before
 
 
 # Errors
@@ -231,12 +269,3 @@ def test_without_a_broker_each_request_is_raised() -> None:
         Fleet()
     with pytest.raises(UsageError):
         Fleet("http://127.0.0.1")
-
-
-def test_a_login_without_rights_is_raised(secure_broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in secure_broker.env("otto").items():
-        monkeypatch.setenv(name, value)
-    fleet = Fleet()
-    for ask in (fleet.robots, lambda: list(fleet.say("@all", "hello")), lambda: list(fleet.cancel("*"))):
-        with pytest.raises(AccessDenied, match="does not let 'otto'"):
-            ask()

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.fleet import topics
 from tests.fleet.homeassistant import BIRTH, HomeAssistant
 from tests.fleet.robot import LONG, Robot
 from tests.support.bridge import Bridge
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from tests.fleet.conftest import MakeBridge
 
 ANNA = "homeassistant/device/talk/anna/config"
-DOTTED = "homeassistant/device/talk-dots/r2_dd2/config"
 
 
 @pytest.fixture(scope="module")
@@ -104,24 +102,6 @@ def test_a_robot_without_the_option_tells_home_assistant_nothing(robot: Robot) -
     assert "homeassistant" not in robot.broker.log  # neither published nor subscribed to
     with HomeAssistant(robot.broker) as home:
         assert home.publish(*BIRTH) == NO_SUBSCRIBERS
-
-
-def test_robots_and_home_assistant_work_by_the_printed_rules(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
-    robots = ("anna", "r2.d2")
-    rules = topics.access(("olga",), homeassistant=True, name="r2.d2")
-    with Broker(users=dict.fromkeys((*robots, "olga", "homeassistant"), "secret"), acl=f"{rules}\n") as broker:
-        bridges = [
-            make_bridge(make_talk(scripted=True), broker, name, "--homeassistant", user=name, observer="olga")
-            for name in robots
-        ]
-        with HomeAssistant(broker, user="homeassistant") as home:
-            home.await_message(lambda each: each.topic == DOTTED)
-            home.await_message(lambda each: each.topic == ANNA)
-            device = home.device()
-            home.command(device, "say", "hello")
-            home.await_states(device, last="SUCCEEDED")
-        for each in bridges:
-            assert each.terminate() == 0
 
 
 def test_a_robot_that_may_not_announce_itself_says_so(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.client.connect import Interrupted
-from talkcli.errors import AccessDenied, Lost, ServerUnavailable
+from talkcli.errors import Lost
 from talkcli.fleet.broker import from_environment
 from talkcli.fleet.selection import Selection
 from talkcli.fleet.sighting import Away, Back, Begun, Changed, Happened, Missed
@@ -20,7 +20,6 @@ from talkcli.protocol.events import StateChanged
 from tests.fleet import told
 from tests.support.connection import PATIENCE
 from tests.support.mqtt import Listener
-from tests.support.ports import Port
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -249,20 +248,3 @@ def test_a_broker_that_stays_away_is_lost(broker: Broker, monkeypatch: pytest.Mo
         with pytest.raises(Lost, match=r"was away for 0\.5 s: (no broker at .*refused|the broker at .* went away)$"):
             looking.find(Back)
         assert looking.find(Away).limit == 0.5
-
-
-def test_without_a_broker_it_does_not_begin() -> None:
-    from talkcli.fleet.broker import Broker as Somewhere
-    from talkcli.fleet.lookout import Lookout
-
-    with Port() as port:
-        looking = Lookout(Somewhere("127.0.0.1", port.number, tls=False)).follow()
-        with pytest.raises(ServerUnavailable, match="no broker at"):
-            next(looking)
-
-
-def test_a_login_without_rights_is_an_error(secure_broker: Broker) -> None:
-    looking = Looking(secure_broker, user="otto")
-    with pytest.raises(AccessDenied, match="does not let 'otto' write to"):
-        looking.find(Begun)
-    looking.__exit__()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import json
-import os
 import signal
 import threading
 import time
@@ -12,16 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.errors import AccessDenied, UsageError
+from talkcli.errors import UsageError
 from tests.fleet import told as robots_told
 from tests.fleet.asker import Asker
 from tests.fleet.conftest import fleet_of
 from tests.fleet.many import RealRobots, alike, assert_told, at_once, request, told
 from tests.fleet.pretended import Pretended
 from tests.fleet.robot import LONG
-from tests.fleet.watching import Watching
 from tests.support.bridge import Desk
-from tests.support.broker import Broker
 from tests.support.connection import PATIENCE
 from tests.support.mqtt import Listener
 from tests.support.proxy import Proxy
@@ -33,6 +28,7 @@ if TYPE_CHECKING:
     from talkcli import Fleet
     from tests.conftest import MakeTalk
     from tests.fleet.conftest import MakeBridge
+    from tests.support.broker import Broker
     from tests.support.processes import Finished, Process
 
 PAIR = ["wh-1", "wh-2"]
@@ -272,28 +268,6 @@ def test_a_robot_that_is_called_as_a_part_of_a_topic_is_heard_as_any_other(
             assert_told(done, 0, {name: (f"of-{number}", "SUCCEEDED", 0)}, "1 of 1 as asked")
 
 
-@pytest.mark.parametrize("moment", [1e300, -1e15])
-def test_a_moment_that_no_calendar_has_keeps_nobody_from_seeing_the_rest(broker: Broker, moment: float) -> None:
-    goal = {"id": "odd", "state": "SUCCEEDED", "text": "hello", "created_at": moment, "ended_at": moment}
-    status = {"active": None, "text": None, "pending": 0, "paused": False, "last": {**goal, "at": moment}}
-    event = {"event": "state", "id": "odd", "state": "SUCCEEDED", "at": moment, "n": 1, "goal": goal}
-    presence = {"talk": 1, "online": True, "session": "s", "since": moment, "groups": ["all"], "version": "0.1.0"}
-    presence |= {"allow": [], "server": robots_told.SERVER}
-    with Listener(broker) as publisher, Desk(broker) as desk:
-        publisher.publish("talk/robot/odd-1/presence", presence, retain=True)
-        publisher.publish("talk/robot/odd-1/status", status, retain=True)
-        plain, for_programs = at_once(desk, ["fleet", "status"], ["--json", "fleet", "status"])
-        assert (plain.code, plain.err, plain.out.splitlines()[1].split()[:3]) == (0, "", ["odd-1", "yes", "0.1.0"])
-        assert (for_programs.code, json.loads(for_programs.out)["status"]["last"]["state"]) == (0, "SUCCEEDED")
-        watching = Watching(desk)
-        publisher.publish("talk/robot/odd-1/event/state", event)
-        assert "SUCCEEDED" in watching.until("odd ")
-        publisher.publish("talk/robot/odd-1/presence", {**presence, "session": "t"}, retain=True)
-        watching.until("online")
-        done = watching.end()
-    assert_plain(done)
-
-
 # The desk
 
 
@@ -346,43 +320,3 @@ def test_a_patient_sentence_waits_for_room_longer_than_for_an_answer(fleet: Flee
     room.join()
     assert {each.robot: (each.state, each.exit_code) for each in outcomes} == dict.fromkeys(PAIR, ("PENDING", 0))
     assert pair.each(lambda each: each.talk.watcher.wait_for_terminal(goal)) == ["SUCCEEDED"] * 2
-
-
-def descriptors() -> int:
-    return len(os.listdir("/proc/self/fd"))
-
-
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("to", ["*", "@all"])
-def test_a_round_that_is_left_before_its_end_leaves_nothing_open(fleet: Fleet, to: str) -> None:
-    list(fleet.status(to))  # what is imported once, opens what stays open
-    gc.collect()
-    before = descriptors()
-    for _ in range(5):
-        for _ in fleet.status(to):
-            break
-    gc.collect()
-    assert descriptors() == before
-    with fleet.status(to) as asked:
-        assert next(iter(asked)).exit_code == 0
-        assert descriptors() > before
-    assert descriptors() == before
-
-
-def test_what_the_broker_refuses_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
-    rules = "topic readwrite #\nuser olga\ntopic read talk/robot/+/presence\ntopic readwrite talk/reply/olga/+/+\n"
-    with Broker(acl=rules) as broker:
-        with Listener(broker) as publisher:
-            robots_told.presence(publisher, "wh-1", groups=["warehouse"])
-        fleet = fleet_of(broker, monkeypatch, user="olga")
-
-        def refused() -> None:
-            assert [(each.state, each.exit_code) for each in fleet.say("wh-*", "hello")] == [("REFUSED", 10)]
-            with pytest.raises(AccessDenied):
-                list(fleet.say("@warehouse", "hello"))
-
-        refused()
-        before = descriptors()
-        for _ in range(5):
-            refused()
-        assert descriptors() == before

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import socket
-import ssl
 import subprocess
 import time
 from typing import TYPE_CHECKING
@@ -19,27 +17,21 @@ from tests.support.surroundings import (
     find_program,
     needs,
     short_directory,
-    stop_child,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-#: Seconds in which a broker must answer.
+#: Seconds in which a broker must listen.
 _START = 10.0
-#: A client of MQTT 5 with a clean start and no name: length, protocol, level, flags, keepalive, no properties.
-_CONNECT = bytes([0x10, 13, 0, 4, *b"MQTT", 5, 2, 0, 60, 0, 0, 0])
-#: What the answer to it begins with; that it may be a refusal is no matter.
-_CONNACK = 0x20
 
 
 class Broker(contextlib.AbstractContextManager["Broker"]):
-    """A running broker, which keeps nothing on disk; `close()` or `with` ends it and removes its directory.
+    """A running broker that keeps nothing on disk; `close()` or `with` ends it and removes its directory.
 
-    `secure`: by TLS alone. `users`: their passwords by their names; then nobody else is let in, unless `anonymous`.
-    `certificates`: clients come with a certificate (and so `secure`), whose name is the user. `acl`: the text of an
-    access control list. `max_packet`: bytes. `expired`: so is its certificate. `settings`: more lines of mosquitto's
-    configuration.
+    `secure`: by TLS alone. `users`: passwords by name; nobody else is let in, unless `anonymous`. `certificates`: a
+    client's certificate names the user (implies `secure`). `acl`: the text of an access control list. `max_packet`:
+    bytes. `expired`: an expired certificate of its own. `settings`: more lines of mosquitto's configuration.
     """
 
     def __init__(
@@ -56,7 +48,6 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
     ) -> None:
         needs("mosquitto")
         self.secure = secure or certificates or expired
-        self._certificates = certificates
         self._users = dict(users or {})
         self._process: subprocess.Popen[bytes] | None = None
         with contextlib.ExitStack() as stack:
@@ -93,7 +84,7 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
 
     @property
     def url(self) -> str:
-        """What a client is told of it."""
+        """The URL for a client."""
         return self.url_at(self.port)
 
     @property
@@ -108,14 +99,11 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
         return self._running().pid
 
     def url_at(self, port: int) -> str:
-        """Return what a client is told of it that is to come by another port, as a `Proxy` has one."""
+        """Return the URL for a client that connects by another port, such as a proxy's."""
         return f"mqtts://localhost:{port}" if self.secure else f"mqtt://{HOST}:{port}"
 
     def env(self, user: str | None = None, password: str | bool = True, cert: str | None = None) -> dict[str, str]:
-        """Return the variables of a client: as a user with the user's password, none (False) or another one.
-
-        `cert`: the name of a client with a certificate.
-        """
+        """Return a client's variables: a user, the user's password (False for none), the name of a certificate."""
         result = {"TALK_BROKER": self.url}
         if self.secure:
             result["TALK_MQTT_CA"] = authority().file
@@ -130,7 +118,7 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
         return result
 
     def start(self) -> None:
-        """Start the broker and wait until it answers; again, at the same port, after `kill()`."""
+        """Start the broker and wait until it listens; again, at the same port, after `kill()`."""
         with open(f"{self.directory}/log", "ab") as log:
             self._process = subprocess.Popen(
                 dying_with_parent([find_program("mosquitto") or "mosquitto", "-c", self._settings]),
@@ -140,11 +128,12 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
                 stderr=log,
             )
         end = time.monotonic() + _START
-        while not self._answers():
-            code = self._process.poll()
-            assert code is None, f"mosquitto ended with {code}: {self.log}"
-            assert time.monotonic() < end, f"mosquitto does not answer within {_START} s: {self.log}"
-            time.sleep(0.005)  # it says nowhere when it begins to listen
+        with socket.socket() as probe:
+            while probe.connect_ex((HOST, self.port)):
+                code = self._process.poll()
+                assert code is None, f"mosquitto ended with {code}: {self.log}"
+                assert time.monotonic() < end, f"mosquitto does not listen within {_START} s: {self.log}"
+                time.sleep(0.005)  # it says nowhere when it begins to listen
 
     def kill(self) -> None:
         """Kill the broker, as if it had crashed: its clients' connections end, all that it kept is gone."""
@@ -152,40 +141,10 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
         self._running().wait()
         self._process = None
 
-    def stop_process(self) -> None:
-        """Stop the broker's process as it is (SIGSTOP); it has stopped when this returns."""
-        stop_child(self.pid)
-
-    def go_on(self) -> None:
-        """Let a broker that was stopped go on (SIGCONT)."""
-        os.kill(self.pid, signal.SIGCONT)
-
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None:
             raise RuntimeError("the broker was killed, and not started again")
         return self._process
-
-    def _answers(self) -> bool:
-        """Return whether it answers a client; one that it has no reason to let in is answered, too."""
-        with contextlib.suppress(OSError), self._connect() as connection:
-            connection.sendall(_CONNECT)
-            answer = connection.recv(1)
-            assert answer in (b"", bytes([_CONNACK])), answer
-            return bool(answer)
-        return False
-
-    def _connect(self) -> socket.socket:
-        plain = socket.create_connection((HOST, self.port), _START)
-        if not self.secure:
-            return plain
-        context = ssl.create_default_context()
-        context.check_hostname = False
-        context.verify_mode = ssl.CERT_NONE  # an expired certificate is none of its business
-        if self._certificates:
-            own = authority().client("probe")
-            context.load_cert_chain(own.file, own.key)
-        with plain:
-            return context.wrap_socket(plain)
 
     def _write_passwords(self, users: Mapping[str, str]) -> str:
         needs("mosquitto_passwd")

@@ -1,7 +1,4 @@
-"""Certificates for brokers and their clients, made by openssl: an authority of the tests' own, and a stranger.
-
-All are made once, in a directory that goes with the process. Keys are of elliptic curves, which take milliseconds.
-"""
+"""Certificates for brokers and clients, made by openssl once a process: an authority of the tests' own, and another."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from dataclasses import dataclass
 
 from tests.support.surroundings import needs, short_directory
 
-#: What a verifier as strict as Python 3.13's asks of an authority, of a server and of a client.
+#: Extensions that Python 3.13's strict verification asks for.
 _EXTENSIONS = """
 [req]
 distinguished_name = name
@@ -50,7 +47,7 @@ class Certificate:
 
 
 class Authority:
-    """One that signs: its own certificate is `file`."""
+    """A certificate authority; `file` is its own certificate."""
 
     def __init__(self, directory: str, name: str) -> None:
         needs("openssl")

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from talkcli.fleet.presence import Presence
+from talkcli.fleet.status import Status
 from talkcli.frozen import replace
 from talkcli.goals.states import State
-from talkcli.terminal.fleet import HEADS, Robot, robot_lines
+from talkcli.protocol.events import StateChanged, from_json
+from talkcli.terminal.fleet import HEADS, FleetTranscript, Robot, robot_lines
 from talkcli.terminal.text import NARROWEST, Screen, printable, width
 
 NOW = 1_000_000.0
@@ -115,3 +119,20 @@ def test_colours_are_those_of_the_states() -> None:
     assert head.startswith("\x1b[1mROBOT")
     assert '\x1b[1;32m"please' in anna
     assert "\x1b[31mOFFLINE\x1b[0m" in bert
+
+
+@pytest.mark.parametrize("moment", [1e300, -1e300, 1e15, -1e15])
+def test_a_moment_that_no_calendar_has_is_shown_all_the_same(moment: float) -> None:
+    goal = {"id": "odd", "state": "SUCCEEDED", "text": "hello", "created_at": moment, "ended_at": moment, "at": moment}
+    event = from_json({"event": "state", "id": "odd", "state": "SUCCEEDED", "at": moment, "n": 1, "goal": goal})
+    presence = Presence.read("anna", json.dumps({"since": moment}).encode())
+    status = Status.read(json.dumps({"last": goal}).encode())
+    assert presence
+    assert status
+    assert status.last
+    assert isinstance(event, StateChanged)
+    robot = replace(ANNA, since=presence.since, last_at=status.last.at)
+    assert robot_lines([robot], Screen(), NOW)[1].split()[:2] == ["anna", "yes"]
+    transcript = FleetTranscript(full=True)
+    assert "SUCCEEDED" in transcript.lines("anna", event, Screen(), NOW)[0]
+    assert transcript.change(None, robot, Screen(), NOW)
