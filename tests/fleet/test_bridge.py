@@ -271,15 +271,6 @@ def robot_goals(robot: Robot) -> list[Message]:
 # Presence
 
 
-def test_presence_describes_the_robot_and_its_server(lasting_robot: Robot) -> None:
-    said = kept(lasting_robot.broker, f"{ANNA}/presence")
-    assert (said["talk"], said["online"], said["groups"]) == (1, True, ["all"])
-    assert said["server"]["pid"] == lasting_robot.talk.pid
-    assert said["server"]["boot"] == lasting_robot.talk.request("status")["server"]["boot"]
-    assert said["allow"] == ["say", "cancel", "status", "wait", "log", "voices", "pause", "resume"]
-    assert abs(time.time() - said["since"]) < 60
-
-
 def test_a_robot_without_a_server_says_so_and_refuses_requests_until_it_is_back(robot: Robot) -> None:
     with Asker(robot.broker) as asker:
         goal = asker.say("never heard " * 50, wait=True)

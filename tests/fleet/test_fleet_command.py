@@ -190,8 +190,10 @@ def test_each_event_has_a_line_with_its_robot(robot: Robot, somebody: Desk) -> N
     assert (watching.end().code, watching.process.stderr and watching.process.stderr.closed) == (130, True)
 
 
-def test_robots_and_servers_that_come_and_go_have_lines(broker: Broker, robots: Listener, somebody: Desk) -> None:
-    watching = Watching(somebody)
+def test_robots_and_servers_that_come_and_go_have_lines_or_objects(
+    broker: Broker, robots: Listener, somebody: Desk
+) -> None:
+    watching, for_programs = Watching(somebody), Watching(somebody, "--json", "--robot", "wh-*")
     assert watching.lines[0].split("  ")[1] == f"3 robots, 1 OFFLINE, 1 without a server; {broker.url}"
     told.presence(robots, "wh-2", session="1")
     told.presence(robots, "wh-1", server=None)
@@ -208,27 +210,17 @@ def test_robots_and_servers_that_come_and_go_have_lines(broker: Broker, robots: 
         ["anna", "OFFLINE"],
         ["bert", "online", "no", "server"],
     ]
-    assert watching.end().code == 130
-
-
-def test_with_json_each_event_is_an_object_with_its_robot(robots: Listener, somebody: Desk) -> None:
-    watching = Watching(somebody, "--json", "--robot", "wh-*")
     told.event(robots, "anna", "c-1", "ACTIVE")
     told.event(robots, "wh-1", "a-2", "SUCCEEDED", "please step back")
-    watching.until('SUCCEEDED", "text": "please')
-    told.presence(robots, "wh-1", online=False)
-    watching.until('"presence", ')
-    found: list[dict[str, Any]] = [json.loads(each) for each in watching.lines]
-    assert [(each["robot"], each["event"]) for each in found] == [
-        ("wh-1", "snapshot"),
-        ("wh-2", "snapshot"),
-        ("wh-1", "state"),
-        ("wh-1", "presence"),
-    ]
+    for_programs.until('SUCCEEDED", "text": "please')
+    found: list[dict[str, Any]] = [json.loads(each) for each in for_programs.lines]
+    events = [(each["robot"], each["event"]) for each in found]
+    changes = [(name, "presence") for name in ("wh-2", "wh-1", "wh-1", "wh-1")]
+    assert events == [("wh-1", "snapshot"), ("wh-2", "snapshot"), *changes, ("wh-1", "state")]
     assert found[0]["status"]["active"] == "a-2"
-    assert found[2]["goal"]["text"] == "please step back"
-    assert found[3]["presence"]["online"] is False
-    assert watching.end().code == 130
+    assert [found[2]["presence"]["online"], found[3]["presence"]["server"]] == [True, None]
+    assert found[-1]["goal"]["text"] == "please step back"
+    assert (watching.end().code, for_programs.end().code) == (130, 130)
 
 
 @pytest.mark.usefixtures("robots")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-import threading
 from typing import TYPE_CHECKING
 
 import pytest
@@ -89,17 +88,6 @@ def test_a_sentence_ends_on_each_with_one_id(fleet: Fleet, to: str, names: list[
         assert 5 < goal.ttl <= 10
 
 
-@pytest.mark.parametrize("to", BOTH)
-def test_an_outcome_comes_as_soon_as_its_robot_is_done(fleet: Fleet, pair: RealRobots, to: str) -> None:
-    assert pair["wh-1"].talk.request("say", text=LONG)["ok"]
-    outcomes = fleet.say(to, "hello", id=f"soon-{BOTH.index(to)}")
-    first = next(iter(outcomes))
-    assert (first.robot, first.state, len(outcomes)) == ("wh-2", "SUCCEEDED", 2)
-    pair["wh-1"].talk.watcher.wait_for(f"soon-{BOTH.index(to)}", "PENDING")  # wh-2 may be done before wh-1 has taken it
-    request(pair, "cancel")
-    assert found(outcomes) == {"wh-1": ("RECALLED", 6)}
-
-
 def test_a_sentence_is_cancelled_everywhere(fleet: Fleet, pair: RealRobots) -> None:
     assert pair["wh-1"].talk.request("say", id="before-it", text=LONG)["ok"]
     outcomes = fleet.say("wh-*", LONG, id="given-up")
@@ -142,19 +130,6 @@ def test_the_other_requests_are_those_of_a_client(fleet: Fleet, pair: RealRobots
     assert found(fleet.cancel(to, key="door")) == alike("PREEMPTED")
     assert found(fleet.wait(to, [goal])) == alike("PREEMPTED", 7)
     assert found(fleet.wait(to)) == found(fleet.cancel(to)) == alike("IDLE")
-
-
-def test_several_threads_use_one_fleet(fleet: Fleet) -> None:
-    every: list[dict[str, tuple[str, int]]] = []
-    threads = [
-        threading.Thread(target=lambda n=n: every.append(found(fleet.say(BOTH[n % 2], "hello", id=f"by-{n}"))))
-        for n in range(4)
-    ]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join(10)
-    assert every == [alike("SUCCEEDED")] * 4
 
 
 @pytest.mark.usefixtures("fleet")

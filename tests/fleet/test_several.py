@@ -230,12 +230,6 @@ def test_an_id_that_no_goal_can_have_is_refused_at_once(desk: Desk, line: list[s
     assert (done.code, done.out, words in done.err) == (code, "", True), done
 
 
-def test_a_name_is_preferred_to_a_variable_that_picks_several(desk: Desk) -> None:
-    one, alone = at_once(desk, ["--robot", "wh-[!2]", "status"], ["--robot", "wh-1", "wait"])
-    assert_told(one, 0, alike(["wh-1"], "-", "IDLE", 0), "1 of 1 as asked")
-    assert (alone.code, alone.out, alone.err) == (0, "", "")
-
-
 # Commands that take a while: interrupted, out of time, without a reader, on a terminal
 
 

@@ -294,7 +294,9 @@ def test_a_sentence_can_be_cancelled_until_all_outcomes_were_taken(fleet: Fleet,
     assert pair["wh-2"].talk.request("say", text=LONG)["ok"]
     outcomes = fleet.say(to, "length=0", id=goal)
     for each in outcomes:
-        if each.robot == "wh-1":
+        if each.robot == "wh-1":  # which is done first
+            assert len(outcomes) == 2
+            pair["wh-2"].talk.watcher.wait_for(goal, "PENDING")
             outcomes.cancel()
         else:
             assert (each.robot, each.state) == ("wh-2", "RECALLED")
