@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
     #: Starts a bridge for a test, and returns it, online unless that is False: `make_bridge(talk, broker, "anna")`.
     MakeBridge = Callable[..., Bridge]
+    MakeRobot = Callable[..., Robot]
+
+    from tests.conftest import MakeTalk
 
 _P = ParamSpec("_P")
 
@@ -80,6 +83,17 @@ def make_bridge() -> Iterator[MakeBridge]:
             if bridge.running:
                 code = bridge.terminate()
                 assert code == 0, f"the bridge {bridge.name} ended with {code}: {bridge.log}"
+
+
+@pytest.fixture
+def make_robot(make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge) -> MakeRobot:
+    """Starts robots that speak by a script: `make_robot("anna", "--allow", "say", groups=["warehouse"])`."""
+
+    def make(name: str, *options: str, **named: Any) -> Robot:
+        talk = make_talk(scripted=True)
+        return Robot(talk, broker, make_bridge(talk, broker, name, *options, **named))
+
+    return make
 
 
 @pytest.fixture

@@ -21,9 +21,7 @@ from tests.support.surroundings import needs_packages
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from tests.conftest import MakeTalk
-    from tests.fleet.conftest import MakeBridge
-    from tests.support.bridge import Bridge
+    from tests.fleet.conftest import MakeRobot
     from tests.support.broker import Broker
     from tests.support.processes import Finished
     from tests.support.proxy import Way
@@ -64,12 +62,9 @@ def test_a_bridge_that_is_killed_is_offline_within_a_second_and_the_next_tells_t
 
 
 @pytest.mark.slow
-def test_a_robot_whose_network_is_gone_is_offline_within_20_seconds(
-    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
-) -> None:
+def test_a_robot_whose_network_is_gone_is_offline_within_20_seconds(broker: Broker, make_robot: MakeRobot) -> None:
     with Proxy(broker.port) as proxy:
-        talk = make_talk(scripted=True)
-        robot = Robot(talk, broker, make_bridge(talk, broker, "anna", port=proxy.port))
+        robot = make_robot("anna", port=proxy.port)
         with robot.listen() as listener:
             gone = time.monotonic()
             proxy.hold()
@@ -232,10 +227,10 @@ def test_a_robot_is_waited_for_no_longer(broker: Broker, robot: str, line: str, 
 # Two bridges of one name
 
 
-def assert_ends(younger: Bridge) -> None:
-    assert younger.wait(BACK) == 11, younger.log
-    assert f"another bridge is '{younger.name}' already" in younger.log
-    assert "Traceback" not in younger.log
+def assert_ends(younger: Robot) -> None:
+    log = younger.bridge.log if younger.bridge.wait(BACK) == 11 else "it did not end with 11"
+    assert "another bridge is 'anna' already" in log
+    assert "Traceback" not in log
 
 
 def assert_answers(robot: Robot) -> None:
@@ -245,66 +240,55 @@ def assert_answers(robot: Robot) -> None:
     assert robot.spoken == ["still here"]
 
 
-def test_the_younger_of_two_bridges_ends_and_the_older_goes_on(
-    robot: Robot, make_talk: MakeTalk, make_bridge: MakeBridge
-) -> None:
-    another = make_talk(scripted=True)
+def test_the_younger_of_two_bridges_ends_and_the_older_goes_on(robot: Robot, make_robot: MakeRobot) -> None:
     with robot.listen() as listener:
-        assert_ends(make_bridge(another, robot.broker, "anna", online=False))
+        another = make_robot("anna", online=False)
+        assert_ends(another)
         assert_answers(robot)
         told = [each.json for each in listener.messages]
     assert {(each["online"], each["server"]["pid"]) for each in told} == {(True, robot.talk.pid)}
-    assert another.watcher.goals() == []
+    assert another.talk.watcher.goals() == []
 
 
-def test_of_two_bridges_that_find_the_broker_together_the_younger_ends(
-    robot: Robot, make_talk: MakeTalk, make_bridge: MakeBridge
-) -> None:
-    another = make_talk(scripted=True)
+def test_of_two_bridges_that_find_the_broker_together_the_younger_ends(robot: Robot, make_robot: MakeRobot) -> None:
     robot.broker.kill()
-    younger = make_bridge(another, robot.broker, "anna", online=False)
-    younger.await_log("no broker")  # so it has begun
+    another = make_robot("anna", online=False)
+    another.bridge.await_log("no broker")  # so it has started
     robot.broker.start()
-    assert_ends(younger)
+    assert_ends(another)
     robot.bridge.await_online(BACK)
     assert_answers(robot)
-    assert another.watcher.goals() == []
+    assert another.talk.watcher.goals() == []
 
 
 def test_a_bridge_that_began_while_the_older_had_no_network_ends_when_that_is_back(
-    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
+    broker: Broker, make_robot: MakeRobot
 ) -> None:
     with Proxy(broker.port) as proxy:
-        talk, another = make_talk(scripted=True), make_talk(scripted=True)
-        older = make_bridge(talk, broker, "anna", port=proxy.port)
-        robot = Robot(talk, broker, older)
+        robot = make_robot("anna", port=proxy.port)
         with robot.listen() as listener:
             proxy.refuse()
             proxy.cut()
             listener.await_message(robot.is_offline)
-            younger = make_bridge(another, broker, "anna")
+            another, first, pid = make_robot("anna"), listener.messages[0], robot.talk.pid
             proxy.accept()
-            assert_ends(younger)
-            first = listener.messages[0]
+            assert_ends(another)
             listener.await_message(
-                lambda each: robot.is_online(each) and each is not first and each.json["server"]["pid"] == talk.pid
+                lambda each: robot.is_online(each) and each is not first and each.json["server"]["pid"] == pid
             )
         assert_answers(robot)
-        assert another.watcher.goals() == []
+        assert another.talk.watcher.goals() == []
 
 
-def test_what_a_bridge_has_left_behind_without_a_word_keeps_no_other_from_its_name(
-    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
-) -> None:
-    talk = make_talk(scripted=True)
+def test_the_remains_of_a_killed_bridge_keep_no_other_from_its_name(broker: Broker, make_robot: MakeRobot) -> None:
     with Proxy(broker.port) as proxy:
-        lost = make_bridge(make_talk(scripted=True), broker, "anna", port=proxy.port)
+        lost = make_robot("anna", port=proxy.port)
         proxy.hold()  # so that the broker doesn't hear of its end
-        lost.kill()
-        robot = Robot(talk, broker, make_bridge(talk, broker, "anna"))
+        lost.bridge.kill()
+        robot = make_robot("anna")
         assert_answers(robot)
         with robot.listen() as listener:
-            proxy.cut()  # now it does, and publishes the will of the one that is gone
+            proxy.cut()  # now it does, and publishes the will of the killed bridge
             will = listener.await_message(robot.is_offline)
             listener.await_message(lambda each: robot.is_online(each) and each.arrived > will.arrived)
         assert robot.desk("status").code == 0

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from tests.conftest import MakeTalk
-    from tests.fleet.conftest import MakeBridge
+    from tests.fleet.conftest import MakeBridge, MakeRobot
     from tests.fleet.robot import Robot
     from tests.support.connection import Message
     from tests.support.mqtt import Message as Published
@@ -107,8 +107,8 @@ def test_each_session_has_its_name_and_hears_its_own_answers_alone(lasting_robot
         assert eve.say("hello")["client"]["name"] == "mqtt:eve"
 
 
-def test_a_group_is_asked_by_one_message(robot: Robot, make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
-    make_bridge(make_talk(scripted=True), robot.broker, "berta", groups=["warehouse", "night"])
+def test_a_group_is_asked_by_one_message(robot: Robot, make_robot: MakeRobot) -> None:
+    make_robot("berta", groups=["warehouse", "night"])
     with Asker(robot.broker) as asker:
         for group in ("warehouse", "night"):
             asker.send({"seq": 101, "request": "say", "text": f"to {group}"}, to=f"talk/group/{group}")

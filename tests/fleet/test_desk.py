@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from tests.conftest import MakeTalk
-    from tests.fleet.conftest import MakeBridge
     from tests.support.processes import Clients, Finished, Process
 
 ALLOW = ("--allow", "say,cancel,status,wait,log,voices,pause,resume,set")
@@ -126,19 +125,14 @@ def test_watchers_at_both_ends_see_the_same(open_robot: Robot) -> None:
     assert len([each for each in afar if '"event": "word"' in each]) == 3
 
 
-def test_lines_are_spoken_in_their_order_though_they_are_more_than_the_robots_share(
-    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
-) -> None:
-    talk = make_talk(scripted=True)
-    make_bridge(talk, broker, "anna")
+def test_lines_are_spoken_in_their_order_also_if_there_are_more_than_may_wait(robot: Robot) -> None:
     lines = [f"length=0.01 {n}" for n in range(25)]
     for words in (["--wait"], []):
-        with Desk(broker) as somebody:
+        with Desk(robot.broker) as somebody:
             done = somebody.run("--robot", "anna", "say", "--lines", *words, stdin="\n".join(lines))
-        assert done.code == 0, done
-        assert len(done.out.splitlines()) == len(lines)
-    assert talk.run("wait").code == 0
-    assert talk.watcher.texts("SUCCEEDED") == lines * 2
+        assert (done.code, len(done.out.splitlines())) == (0, len(lines)), done
+    assert robot.talk.run("wait").code == 0
+    assert robot.talk.watcher.texts("SUCCEEDED") == lines * 2
 
 
 @pytest.mark.parametrize(

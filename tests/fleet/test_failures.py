@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from talkcli.fleet.message import Message
     from tests.conftest import MakeTalk
-    from tests.fleet.conftest import MakeBridge
+    from tests.fleet.conftest import MakeBridge, MakeRobot
     from tests.support.broker import Broker
     from tests.support.processes import Finished, Talk
 
@@ -182,19 +182,16 @@ def test_what_is_no_request_is_answered_with_the_error_of_the_wire(lasting_robot
     assert lasting_robot.spoken == []
 
 
-def test_a_desk_may_do_what_the_robot_allows_and_nothing_else(
-    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
-) -> None:
-    talk = make_talk(scripted=True)
-    robot = Robot(talk, broker, make_bridge(talk, broker, "anna"))
-    assert_refused(robot.desk("set", "--rate", "300"), 10, "anna: this robot takes no set from afar")
-    robot.bridge.terminate()
-    assert make_bridge(talk, broker, "anna", "--allow", "say,set").await_online()["allow"] == ["say", "set"]
-    assert robot.desk("set", "--rate", "300").code == 0
-    assert talk.request("set")["settings"]["rate"] == 300
-    assert_refused(robot.desk("cancel"), 10, "anna: this robot takes no cancel from afar")
-    assert_refused(robot.desk("status"), 10, "anna: this robot takes no status from afar")
-    assert robot.desk("say", "hello").code == 0
+def test_a_desk_may_do_what_the_robot_allows_and_nothing_else(make_robot: MakeRobot) -> None:
+    anna = make_robot("anna")
+    assert_refused(anna.desk("set", "--rate", "300"), 10, "anna: this robot takes no set from afar")
+    bert = make_robot("bert", "--allow", "say,set")
+    assert bert.bridge.await_online()["allow"] == ["say", "set"]
+    assert bert.desk("set", "--rate", "300").code == 0
+    assert bert.talk.request("set")["settings"]["rate"] == 300
+    for each in ("cancel", "status"):
+        assert_refused(bert.desk(each), 10, f"bert: this robot takes no {each} from afar")
+    assert bert.desk("say", "hello").code == 0
 
 
 # Strangers
@@ -260,15 +257,12 @@ def test_a_robot_publishes_nothing_on_the_response_topic_of_another(lasting_robo
     assert lasting_robot.spoken == []
 
 
-def test_with_no_text_only_the_asker_reads_a_sentence(
-    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
-) -> None:
-    talk = make_talk(scripted=True)
-    robot = Robot(talk, broker, make_bridge(talk, broker, "anna", "--no-text"))
+def test_with_no_text_only_the_asker_reads_a_sentence(broker: Broker, make_robot: MakeRobot) -> None:
+    robot = make_robot("anna", "--no-text")
     with Listener(broker, "talk/robot/anna/+", "talk/robot/anna/event/+") as everybody:
         done = robot.desk("say", "--wait", "--feedback", "--key", "door", "the secret word")
         assert (done.code, "secret" in done.out) == (0, True), done
-        assert talk.run("say", "--wait", "--key", "door", "another secret").code == 0
+        assert robot.talk.run("say", "--wait", "--key", "door", "another secret").code == 0
         everybody.await_message(lambda each: each.topic.endswith("/state") and each.json["state"] == "SUCCEEDED")
         everybody.await_message(lambda each: each.topic.endswith("/status") and "SUCCEEDED" in each.text)
         told = everybody.messages

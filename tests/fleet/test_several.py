@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tests.conftest import MakeTalk
-    from tests.fleet.conftest import MakeBridge
+    from tests.fleet.conftest import MakeRobot
     from tests.fleet.robot import Robot
 
 PAIR = ["wh-1", "wh-2"]
@@ -329,32 +328,28 @@ def test_a_sentence_is_spoken_although_nobody_reads_the_output(pair: RealRobots,
     assert pair.each(lambda each: each.talk.watcher.wait_for_terminal("never-read")) == ["SUCCEEDED"] * 2
 
 
-def test_one_that_is_offline_is_told_at_once_and_never_speaks_it(
-    robot: Robot, make_talk: MakeTalk, make_bridge: MakeBridge
-) -> None:
-    goals = {"*": "by-a-glob", "@all": "by-a-group"}
-    talk = make_talk(scripted=True)
-    late = make_bridge(talk, robot.broker, "late")
-    with Listener(robot.broker, "talk/robot/late/presence") as listener, Desk(robot.broker) as somebody:
-        assert late.terminate() == 0
-        listener.await_message(lambda each: each.json["online"] is False)
+def test_one_that_is_offline_is_told_at_once_and_never_speaks_it(robot: Robot, make_robot: MakeRobot) -> None:
+    late = make_robot("late")
+    with Listener(robot.broker, late.presence) as listener, Desk(robot.broker) as somebody:
+        assert late.bridge.terminate() == 0
+        listener.await_message(late.is_offline)
         with limits():
             began = time.monotonic()
-            waiting = [
-                somebody.start("--robot", to, "say", "--wait", "--id", goal, "--", LONG) for to, goal in goals.items()
-            ]
+            goals = {"*": "by-a-glob", "@all": "by-a-group"}
+            words = ["say", "--wait", "--id"]
+            waiting = [somebody.start("--robot", to, *words, goal, "--", LONG) for to, goal in goals.items()]
             for each in waiting:
                 assert each.stdout
                 assert each.stdout.readline() == "late - OFFLINE 3\n"
                 assert_within(time.monotonic() - began, AT_ONCE, "that a robot is offline, while another speaks")
-        late.start()
-        late.await_online()
+        late.bridge.start()
+        late.bridge.await_online()
         for goal in goals.values():
             robot.talk.watcher.wait_for(goal, "PENDING")
-        assert somebody.run("--robot", "anna", "cancel").code == 0
+        assert robot.desk("cancel").code == 0
         assert [somebody.finish(each).code for each in waiting] == [13, 13]
-        assert somebody.run("--robot", "late", "say", "--wait", "this alone").code == 0
-    assert talk.watcher.texts("PENDING") == ["this alone"]
+        assert late.desk("say", "--wait", "this alone").code == 0
+    assert late.talk.watcher.texts("PENDING") == ["this alone"]
 
 
 # Terminals

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from talkcli import Fleet
-    from tests.conftest import MakeTalk
-    from tests.fleet.conftest import MakeBridge
+    from tests.fleet.conftest import MakeBridge, MakeRobot
     from tests.support.broker import Broker
     from tests.support.processes import Finished, Process
 
@@ -272,17 +271,16 @@ def test_a_robot_that_is_called_as_a_part_of_a_topic_is_heard_as_any_other(
 
 
 def test_one_that_leaves_the_group_while_it_speaks_is_cancelled_as_the_others(
-    broker: Broker, make_bridge: MakeBridge, make_talk: MakeTalk
+    broker: Broker, make_robot: MakeRobot, make_bridge: MakeBridge
 ) -> None:
-    talks = [make_talk(scripted=True) for _ in PAIR]
-    _, leaving = (make_bridge(talk, broker, name, groups=["warehouse"]) for talk, name in zip(talks, PAIR, strict=True))
+    robots = [make_robot(name, groups=["warehouse"]) for name in PAIR]
     with Desk(broker) as desk, Listener(broker, "talk/robot/wh-2/request/+") as asked:
         waiting = desk.start("--robot", "@warehouse", "say", "--wait", "--id", "left", "--", LONG)
-        for each in talks:
-            each.watcher.wait_for("left", "ACTIVE")
-        assert leaving.terminate() == 0
-        make_bridge(talks[1], broker, "wh-2")
-        # The desk has heard of it, and asks how the goal stands.
+        for each in robots:
+            each.talk.watcher.wait_for("left", "ACTIVE")
+        assert robots[1].bridge.terminate() == 0
+        make_bridge(robots[1].talk, broker, "wh-2")
+        # The desk has heard of it, and asks for the state of the goal.
         asked.await_message(lambda each: bool(each.payload) and each.json["request"] == "wait")
         waiting.send_signal(signal.SIGINT)
         assert_told(desk.finish(waiting), 130, alike(PAIR, "left", "PREEMPTED", 7), "0 of 2 as asked")

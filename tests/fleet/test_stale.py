@@ -16,8 +16,7 @@ from tests.support.proxy import Proxy
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from tests.conftest import MakeTalk
-    from tests.fleet.conftest import MakeBridge
+    from tests.fleet.conftest import MakeRobot
     from tests.support.broker import Broker
     from tests.support.proxy import Way
 
@@ -28,11 +27,10 @@ TOO_LONG, SHORT = STALE + 1.0, STALE / 2
 
 
 @pytest.fixture
-def stalled(make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge) -> Iterator[tuple[Robot, Proxy]]:
+def stalled(broker: Broker, make_robot: MakeRobot) -> Iterator[tuple[Robot, Proxy]]:
     """A robot behind a proxy, that has just come online."""
     with Proxy(broker.port) as proxy:
-        talk = make_talk(scripted=True)
-        yield Robot(talk, broker, make_bridge(talk, broker, "anna", port=proxy.port)), proxy
+        yield make_robot("anna", port=proxy.port), proxy
 
 
 def assert_stale(robot: Robot, stall: Callable[[], object], go_on: Callable[[], object]) -> None:
