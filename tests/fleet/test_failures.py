@@ -151,7 +151,7 @@ def test_a_retained_message_is_dropped_as_it_comes(robot: Robot) -> None:
     assert_spoken(robot, LONG)
 
 
-def test_what_the_broker_has_kept_for_a_robot_is_not_spoken_when_it_comes(
+def test_a_message_that_the_broker_has_kept_is_not_spoken(
     make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
 ) -> None:
     talk = make_talk(scripted=True)
@@ -169,7 +169,7 @@ def test_what_the_broker_has_kept_for_a_robot_is_not_spoken_when_it_comes(
         assert olga.lines == []
 
 
-def test_what_is_no_request_is_answered_with_the_error_of_the_wire(lasting_robot: Robot) -> None:
+def test_a_malformed_request_is_answered_with_the_error_of_the_wire(lasting_robot: Robot) -> None:
     """`tests/unit/test_fleet_policy.py` has all of these errors."""
     status = b'{"seq": 7, "request": "status"}'
     with Asker(lasting_robot.broker, "olga") as olga:

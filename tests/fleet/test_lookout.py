@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import queue
 import select
 import threading
 from typing import TYPE_CHECKING, Any
@@ -31,20 +32,20 @@ if TYPE_CHECKING:
 class Looking(contextlib.AbstractContextManager["Looking"]):
     """A lookout in a thread of its own, which `with` starts and ends."""
 
-    def __init__(self, broker: Broker, selection: str | None = None, *, user: str | None = None) -> None:
+    def __init__(self, broker: Broker, selection: str | None = None) -> None:
         from talkcli.fleet.lookout import Lookout  # which needs paho
 
-        where = from_environment(broker.env(user))
-        self._lookout = Lookout(where, None if selection is None else Selection(selection))
-        self._changed = threading.Condition()
-        self._seen: list[Sighting] = []
-        self._error: Exception | None = None
+        self._lookout = Lookout(from_environment(broker.env()), Selection(selection) if selection else None)
+        self._queue: queue.SimpleQueue[Sighting | Exception] = queue.SimpleQueue()
         self._wake, self._write = os.pipe()
         self._thread = threading.Thread(target=self._look, daemon=True)
-        self._thread.start()
+        #: all sightings after the first, as far as `find` has looked
+        self.seen: list[Sighting] = []
 
     def __enter__(self) -> Looking:
-        self.find(Begun)
+        self._thread.start()
+        self.begun = self.find(Begun)
+        self.seen.clear()
         return self
 
     def __exit__(self, *_error: object) -> None:
@@ -54,40 +55,25 @@ class Looking(contextlib.AbstractContextManager["Looking"]):
         os.close(self._wake)
         os.close(self._write)
 
-    @property
-    def seen(self) -> list[Sighting]:
-        """All sightings since it began."""
-        with self._changed:
-            return self._seen[1:]
-
-    def find(self, kind: type[Any], wanted: Callable[[Any], bool] = lambda _: True, within: float = PATIENCE) -> Any:
+    def find(self, kind: type[Any], wanted: Callable[[Any], bool] = lambda _: True) -> Any:
         """Wait for the first sighting of a kind, and return it; raise the error that has ended the lookout."""
-
-        def found() -> list[Sighting]:
-            return [each for each in self._seen if isinstance(each, kind) and wanted(each)]
-
-        with self._changed:
-            self._changed.wait_for(lambda: found() or self._error, within)
-            if not found() and self._error:
-                raise self._error
-            assert found(), f"only this was seen: {self._seen}"
-            return found()[0]
+        found = [each for each in self.seen if isinstance(each, kind) and wanted(each)]
+        while not found:
+            each = self._queue.get(timeout=PATIENCE)
+            if isinstance(each, Exception):
+                raise each
+            self.seen.append(each)
+            found = [each] if isinstance(each, kind) and wanted(each) else []
+        return found[0]
 
     def _look(self) -> None:
         try:
             for each in self._lookout.follow({self._wake: select.POLLIN}):
-                self._keep(each)
+                self._queue.put(each)
         except Interrupted:
             pass
         except Exception as error:  # noqa: BLE001 - the test's own thread raises it
-            self._keep(None, error)
-
-    def _keep(self, sighting: Sighting | None, error: Exception | None = None) -> None:
-        with self._changed:
-            self._error = error
-            if sighting:
-                self._seen.append(sighting)
-            self._changed.notify_all()
+            self._queue.put(error)
 
 
 @pytest.fixture
@@ -111,17 +97,16 @@ def names(sightings: list[Sighting]) -> list[str]:
 
 def test_it_begins_with_the_standing_of_each_robot(broker: Broker, robots: Listener) -> None:
     with Looking(broker) as looking:
-        assert looking.find(Begun).standings == ()
+        assert looking.begun.standings == ()
         told.presence(robots, "anna")
         change = looking.find(Changed)
         assert (change.name, change.before, change.now.online) == ("anna", None, True)
     told.presence(robots, "bert", online=False)
     told.status(robots, "anna", active="a-2", text="hello", last="a-1")
     with Looking(broker) as looking:
-        anna, bert = looking.find(Begun).standings
+        anna, bert = looking.begun.standings
         assert (anna.presence.name, anna.presence.online, anna.status.text) == ("anna", True, "hello")
         assert (bert.presence.name, bert.presence.online, bert.status) == ("bert", False, None)
-        assert looking.seen == []
 
 
 def test_it_sees_robots_and_servers_come_and_go_but_not_a_renewed_presence(broker: Broker, robots: Listener) -> None:
@@ -244,7 +229,7 @@ def test_a_broker_that_stays_away_is_lost(broker: Broker, monkeypatch: pytest.Mo
     monkeypatch.setattr(lookout, "ABSENCE_LIMIT", 0.5)
     with Looking(broker) as looking:
         broker.kill()
-        # The second is so where a busy machine has not tried once by then.
+        # The second if a busy machine has not tried once by then.
         with pytest.raises(Lost, match=r"was away for 0\.5 s: (no broker at .*refused|the broker at .* went away)$"):
             looking.find(Back)
         assert looking.find(Away).limit == 0.5

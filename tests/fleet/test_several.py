@@ -250,7 +250,7 @@ def states(pair: RealRobots, goal_id: str) -> list[str]:
 
 
 @pytest.mark.parametrize("to", PICKS)
-def test_ctrl_c_cancels_on_all_that_took_it(pair: RealRobots, desk: Desk, to: str) -> None:
+def test_ctrl_c_cancels_it_at_all_robots(pair: RealRobots, desk: Desk, to: str) -> None:
     """One robot speaks the goal; at the other it waits behind another goal, which goes on."""
     before, goal = (f"{each}-{PICKS.index(to)}" for each in ("before", "interrupted"))
     assert pair["wh-2"].talk.request("say", id=before, text=LONG)["ok"]
@@ -278,7 +278,7 @@ def test_ctrl_c_takes_nothing_from_a_robot_that_is_done(pair: RealRobots, desk: 
     assert states(pair, "done-on-one") == ["SUCCEEDED", "RECALLED"]
 
 
-def test_what_is_not_done_in_time_is_cancelled_with_124(pair: RealRobots, desk: Desk) -> None:
+def test_a_sentence_that_is_not_done_in_time_is_cancelled_with_124(pair: RealRobots, desk: Desk) -> None:
     """A goal of others that was waited for is left alone; a robot counts as asked if all its goals have ended."""
     request(pair, "say", id="over", text="length=0")
     request(pair, "say", id="in-front", text=LONG)
@@ -309,7 +309,7 @@ def test_an_interrupted_wait_leaves_the_goals_of_others_alone(pair: RealRobots, 
     assert states(pair, "others") == ["ACTIVE", "ACTIVE"]
 
 
-def test_where_the_reader_of_the_output_goes_away_it_is_cancelled_with_141(pair: RealRobots, desk: Desk) -> None:
+def test_a_reader_that_goes_away_cancels_it_with_141(pair: RealRobots, desk: Desk) -> None:
     waiting = desk.start("--robot", "@warehouse", "say", "--wait", "--id", "unread", "--", LONG)
     await_state(pair, "unread", "ACTIVE")
     assert waiting.stdout
@@ -328,7 +328,7 @@ def test_a_sentence_is_spoken_although_nobody_reads_the_output(pair: RealRobots,
     assert pair.each(lambda each: each.talk.watcher.wait_for_terminal("never-read")) == ["SUCCEEDED"] * 2
 
 
-def test_one_that_is_offline_is_told_at_once_and_never_speaks_it(robot: Robot, make_robot: MakeRobot) -> None:
+def test_an_offline_robot_is_told_at_once_and_never_speaks_it(robot: Robot, make_robot: MakeRobot) -> None:
     late = make_robot("late")
     with Listener(robot.broker, late.presence) as listener, Desk(robot.broker) as somebody:
         assert late.bridge.terminate() == 0

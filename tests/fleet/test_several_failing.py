@@ -77,7 +77,7 @@ MIXED: list[tuple[str, list[str], int, int]] = [
 ]
 
 
-def test_failures_alike_are_the_exit_code_and_others_make_it_13(desk: Desk) -> None:
+def test_equal_failures_are_the_exit_code_and_different_ones_make_it_13(desk: Desk) -> None:
     *plain, for_programs, quiet = at_once(
         desk,
         *(["--robot", to, "cancel"] for to, _, _, _ in MIXED),

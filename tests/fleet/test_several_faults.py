@@ -31,19 +31,17 @@ if TYPE_CHECKING:
     from tests.support.processes import Finished, Process
 
 PAIR = ["wh-1", "wh-2"]
-#: Whatever picks both.
+#: A glob and a group that pick both.
 PICKS = ("wh-*", "@warehouse")
-#: Seconds after which what was asked counts as lost where the broker stays away.
-ABSENCE = 30.0
-#: Seconds of silence after which a robot counts as gone.
-SILENCE = 15.0
+#: Seconds until a goal is lost if the broker stays away, and until a silent robot counts as gone.
+ABSENCE, SILENCE = 30.0, 15.0
 #: Goals that may be pending from afar.
 PENDING = 20
 
 
 @pytest.fixture
 def far(pair: RealRobots) -> Iterator[tuple[Desk, Proxy]]:
-    """Somebody who asks over a line that may stall and break; what is still to be said is cancelled in the end."""
+    """A desk behind a proxy; what the robots still have to say is cancelled in the end."""
     with Proxy(pair.broker.port) as proxy, Desk(pair.broker, port=proxy.port) as result:
         yield result, proxy
         proxy.release()
@@ -51,14 +49,14 @@ def far(pair: RealRobots) -> Iterator[tuple[Desk, Proxy]]:
 
 
 def speaking(desk: Desk, robots: RealRobots, to: str, goal_id: str) -> Process:
-    """Return a command that waits for what all of them speak."""
+    """Return a command that waits for a goal that both speak."""
     waiting = desk.start("--robot", to, "say", "--wait", "--id", goal_id, "--", LONG)
     robots.each(lambda each: each.talk.watcher.wait_for(goal_id, "ACTIVE"))
     return waiting
 
 
 def states(robots: RealRobots, goal_id: str) -> list[str]:
-    """Return how this goal stands at each robot."""
+    """Return the state of this goal at each robot."""
     return [each["state"] for each in robots.each(lambda each: each.talk.goal(goal_id))]
 
 
@@ -72,7 +70,7 @@ def line_of(process: Process) -> str:
 
 
 @pytest.mark.parametrize("to", PICKS)
-def test_what_is_cancelled_before_it_has_left_is_never_spoken(
+def test_a_sentence_that_is_cancelled_before_it_was_sent_is_never_spoken(
     pair: RealRobots, far: tuple[Desk, Proxy], to: str
 ) -> None:
     desk, proxy = far
@@ -93,7 +91,7 @@ def test_what_is_cancelled_before_it_has_left_is_never_spoken(
 
 
 @pytest.mark.parametrize("to", PICKS)
-def test_who_is_back_in_time_cancels_what_was_to_be_cancelled_meanwhile(
+def test_a_desk_that_reconnects_in_time_cancels_what_was_interrupted(
     pair: RealRobots, far: tuple[Desk, Proxy], to: str
 ) -> None:
     desk, proxy = far
@@ -108,17 +106,16 @@ def test_who_is_back_in_time_cancels_what_was_to_be_cancelled_meanwhile(
     assert states(pair, goal) == ["PREEMPTED", "PREEMPTED"]
 
 
-def test_where_the_broker_is_back_too_late_for_a_cancel_it_is_said_that_they_may_speak_on(broker: Broker) -> None:
+def test_robots_may_speak_on_if_the_broker_is_back_too_late_for_a_cancel(broker: Broker) -> None:
     with RealRobots(broker, PAIR, ["warehouse"]) as robots, Desk(broker) as desk:
-        goals = {to: f"speaks-on-{number}" for number, to in enumerate(PICKS)}
-        first = desk.start("--robot", PICKS[0], "say", "--wait", "--id", goals[PICKS[0]], "--", LONG)
-        robots.each(lambda each: each.talk.watcher.wait_for(goals[PICKS[0]], "ACTIVE"))
-        second = desk.start("--robot", PICKS[1], "say", "--wait", "--ttl", "0", "--id", goals[PICKS[1]], "--", LONG)
-        robots.each(lambda each: each.talk.watcher.wait_for(goals[PICKS[1]], "PENDING"))
+        words, waiting = ["say", "--wait", "--ttl", "0", "--id"], []
+        for to, state in zip(PICKS, ("ACTIVE", "PENDING"), strict=True):
+            waiting.append(desk.start("--robot", to, *words, state, "--", LONG))
+            robots.each(lambda each, state=state: each.talk.watcher.wait_for(state, state))  # type: ignore[misc]
         broker.kill()
-        for each in (first, second):
+        for each in waiting:
             each.send_signal(signal.SIGINT)
-        for each in (first, second):
+        for each in waiting:
             done = desk.finish(each)
             assert (done.code, done.out) == (130, "")
             assert done.err == (
@@ -127,12 +124,11 @@ def test_where_the_broker_is_back_too_late_for_a_cancel_it_is_said_that_they_may
             )
         broker.start()
         robots.each(lambda each: each.bridge.await_online(within=20))
-        assert states(robots, goals[PICKS[0]]) == ["ACTIVE", "ACTIVE"]
-        assert states(robots, goals[PICKS[1]]) == ["PENDING", "PENDING"]
+        assert [states(robots, goal) for goal in ("ACTIVE", "PENDING")] == [["ACTIVE"] * 2, ["PENDING"] * 2]
         assert desk.run("--robot", "@warehouse", "cancel").code == 0
 
 
-def test_where_all_are_offline_it_ends_though_the_broker_goes_before_it_has_told_of_all(
+def test_a_command_to_offline_robots_ends_at_once_if_the_broker_goes(
     broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Listener(broker) as publisher:
@@ -147,7 +143,7 @@ def test_where_all_are_offline_it_ends_though_the_broker_goes_before_it_has_told
 
 
 @pytest.mark.slow
-def test_where_the_broker_goes_before_it_has_told_of_all_who_was_asked_is_lost_after_half_a_minute(
+def test_the_robots_are_lost_after_half_a_minute_without_a_broker(
     broker: Broker,
 ) -> None:
     with RealRobots(broker, PAIR, ["warehouse"]) as robots, Desk(broker) as desk:
@@ -174,7 +170,7 @@ def test_where_the_broker_goes_before_it_has_told_of_all_who_was_asked_is_lost_a
 
 
 @pytest.mark.slow
-def test_who_was_stopped_for_longer_than_a_robot_may_be_silent_has_lost_nothing(pair: RealRobots, desk: Desk) -> None:
+def test_a_desk_that_was_suspended_has_lost_nothing(pair: RealRobots, desk: Desk) -> None:
     """What has come meanwhile counts before anybody is taken for gone."""
     waiting = [
         desk.start("--robot", to, "say", "--wait", "--ttl", "0", "--id", f"stopped-{number}", "--", "length=4 on we go")
@@ -235,7 +231,7 @@ def assert_plain(done: Finished) -> None:
 
 
 @pytest.mark.parametrize("to", ["*", "@all", "odd-1"])
-def test_what_one_robot_sends_that_is_no_goal_is_its_own_failure_alone(pair: RealRobots, desk: Desk, to: str) -> None:
+def test_a_malformed_answer_of_one_robot_is_its_own_failure_alone(pair: RealRobots, desk: Desk, to: str) -> None:
     commands = [*COMMANDS, *([("pause", "", None)] if to == "odd-1" else [])]  # which would hold what others say
     lines = [["--robot", to, *command.split(), *([what] if what else [])] for command, what, _ in commands]
     with Pretended(pair.broker, "odd-1", odd, ["odd"]):
@@ -270,7 +266,7 @@ def test_a_robot_that_is_called_as_a_part_of_a_topic_is_heard_as_any_other(
 # The desk
 
 
-def test_one_that_leaves_the_group_while_it_speaks_is_cancelled_as_the_others(
+def test_a_robot_that_leaves_the_group_while_it_speaks_is_cancelled_too(
     broker: Broker, make_robot: MakeRobot, make_bridge: MakeBridge
 ) -> None:
     robots = [make_robot(name, groups=["warehouse"]) for name in PAIR]

@@ -122,7 +122,7 @@ def test_colours_are_those_of_the_states() -> None:
 
 
 @pytest.mark.parametrize("moment", [1e300, -1e300, 1e15, -1e15])
-def test_a_moment_that_no_calendar_has_is_shown_all_the_same(moment: float) -> None:
+def test_a_robot_with_an_impossible_time_is_shown_all_the_same(moment: float) -> None:
     goal = {"id": "odd", "state": "SUCCEEDED", "text": "hello", "created_at": moment, "ended_at": moment, "at": moment}
     event = from_json({"event": "state", "id": "odd", "state": "SUCCEEDED", "at": moment, "n": 1, "goal": goal})
     presence = Presence.read("anna", json.dumps({"since": moment}).encode())
