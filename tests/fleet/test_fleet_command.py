@@ -140,21 +140,6 @@ def test_more_robots_are_shown_than_mosquitto_queues_messages_for_a_client(broke
     assert done.out.count("SUCCEEDED") == 600
 
 
-def test_on_a_terminal_the_table_fits(broker: Broker, robots: Listener) -> None:
-    for number in range(40):
-        name = f"robot-{number}-of-the-warehouse"
-        told.presence(robots, name, online=number % 7 > 0, server=told.SERVER if number % 5 else None)
-        told.status(robots, name, active="a-2", text="请往后退，门即将关闭 " * 9, last="a-1", paused=number % 9 == 0)
-    with Desk(broker) as somebody, Terminal([*TALK, "fleet", "status"], somebody.env, 80) as terminal:
-        assert terminal.finish() == 0
-        lines = terminal.screen.lines
-    assert terminal.screen.wraps == 0
-    assert len([each for each in lines if each]) == 44
-    assert "PAUSED" in terminal.text
-    # Names are cut if there is no room, but not the word OFFLINE.
-    assert sum("OFFLINE" in each for each in lines) == 7
-
-
 # talk fleet watch
 
 

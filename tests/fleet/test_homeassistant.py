@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.fleet.homeassistant import BIRTH, HomeAssistant
 from tests.fleet.robot import LONG, Robot
-from tests.support.bridge import Bridge
-from tests.support.broker import Broker
 from tests.support.mqtt import NO_SUBSCRIBERS
-from tests.support.processes import Talk
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from tests.conftest import MakeTalk
-    from tests.fleet.conftest import MakeBridge
+    from tests.fleet.conftest import MakeBridge, MakeRobot
+    from tests.support.broker import Broker
 
 ANNA = "homeassistant/device/talk/anna/config"
 
 
-@pytest.fixture(scope="module")
-def announced() -> Iterator[Robot]:
-    """A robot that is announced to Home Assistant, for all tests."""
-    with Broker() as broker, contextlib.closing(Talk(scripted=True)) as talk:
-        with Bridge(talk, broker, "anna", "--homeassistant") as bridge:
-            bridge.await_online()
-            yield Robot(talk, broker, bridge)
-            assert bridge.terminate() == 0, bridge.log
-        talk.stop()
+@pytest.fixture
+def announced(make_robot: MakeRobot) -> Robot:
+    return make_robot("anna", "--homeassistant")
 
 
 def test_a_message_is_spoken_and_the_entities_show_how_it_ends(announced: Robot) -> None:
@@ -75,25 +64,22 @@ def test_a_broker_that_has_forgotten_the_device_is_told_again(announced: Robot) 
         home.await_states(home.device(), state="idle")
 
 
-def test_a_device_is_unavailable_without_its_server_or_its_robot_and_stays(
-    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
-) -> None:
-    talk = make_talk(scripted=True)
-    bridge = make_bridge(talk, broker, "anna", "--homeassistant", "--allow", "say,status")
-    with HomeAssistant(broker) as home:
+def test_a_device_is_unavailable_without_its_server_or_its_robot_and_stays(make_robot: MakeRobot) -> None:
+    robot = make_robot("anna", "--homeassistant", "--allow", "say,status")
+    with HomeAssistant(robot.broker) as home:
         device = home.device()
         assert device["components"]["cancel"] == {"platform": "button"}
         home.await_states(device, state="idle")
-        talk.kill()
+        robot.talk.kill()
         home.await_states(device, state="unavailable")
-        talk.start_server()
+        robot.talk.start_server()
         home.await_states(device, state="idle")
-        bridge.kill()
+        robot.bridge.kill()
         home.await_states(device, state="unavailable")
-        bridge.start()
+        robot.bridge.start()
         home.await_states(device, state="idle")
-        assert bridge.terminate() == 0
-    with HomeAssistant(broker) as later:
+        assert robot.bridge.terminate() == 0
+    with HomeAssistant(robot.broker) as later:
         later.await_states(later.device(), state="unavailable")
 
 

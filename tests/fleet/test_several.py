@@ -21,7 +21,6 @@ from tests.support.terminal import Terminal
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from tests.fleet.conftest import MakeRobot
@@ -31,69 +30,48 @@ PAIR = ["wh-1", "wh-2"]
 AS_ASKED = "talk: 2 of 2 as asked\n"
 
 
-def nothing(_: RealRobots, __: str) -> None:
-    """Leave the robots as they are."""
-
-
-def said(pair: RealRobots, goal_id: str) -> None:
-    """Have both robots speak this goal to its end."""
-    request(pair, "say", id=goal_id, text="length=0")
-    pair.each(lambda each: each.talk.watcher.wait_for_terminal(goal_id))
-
-
-def pending(pair: RealRobots, goal_id: str) -> None:
-    """Have this goal wait at both robots, behind one that has no end."""
-    request(pair, "say", id=f"before-{goal_id}", text=LONG)
-    request(pair, "say", id=goal_id, text="length=0")
-
-
-def begun(pair: RealRobots, goal_id: str) -> None:
-    """Have both robots speak this goal, which has no end, or let it wait for one that has none."""
-    request(pair, "say", id=goal_id, text=LONG)
-
-
-def held(pair: RealRobots, goal_id: str) -> None:
-    """Have such a goal paused at both robots."""
-    begun(pair, goal_id)
-    request(pair, "pause")
-
-
-#: A command, with `{}` for a goal of its own; what is done before; the goal that is shown (`{first}`: that of the first
-#: command) and the state; the key that an object has besides.
-COMMANDS: list[tuple[str, Callable[[RealRobots, str], None], str, str, str | None]] = [
-    ("say --id {} hello", nothing, "{}", "PENDING", "goal"),
-    ("say --wait --id {} hello", nothing, "{}", "SUCCEEDED", "goal"),
-    ("cancel {}", pending, "{}", "RECALLED", "goal"),
-    ("cancel", nothing, "-", "IDLE", None),
-    ("wait {}", said, "{}", "SUCCEEDED", "goal"),
-    ("wait", nothing, "-", "IDLE", None),
-    ("status", nothing, "-", "IDLE", "status"),
-    ("status {}", said, "{}", "SUCCEEDED", "goal"),
-    ("pause", begun, "{first}", "PAUSED", "paused"),
-    ("status", held, "{first}", "PAUSED", "status"),
-    ("status", begun, "{first}", "ACTIVE", "status"),
-    ("resume", nothing, "-", "RESUMED", "paused"),
-    ("set --rate 150", nothing, "-", "SET", "settings"),
+#: Requests to both robots before a command, by name; {} is a goal of the command's own.
+SCENES: dict[str, list[dict[str, str]]] = {
+    "nothing": [],
+    "spoken": [{"name": "say", "id": "{}", "text": "length=0"}],
+    "waiting": [{"name": "say", "id": "before-{}", "text": LONG}, {"name": "say", "id": "{}", "text": "length=0"}],
+    "speaking": [{"name": "say", "id": "{}", "text": LONG}],
+    "paused": [{"name": "say", "id": "{}", "text": LONG}, {"name": "pause"}],
+}
+#: A command, the scene, the goal that is shown ({first}: that of the first command), its state, a key of the object.
+COMMANDS: list[tuple[str, str, str, str, str | None]] = [
+    ("say --id {} hello", "nothing", "{}", "PENDING", "goal"),
+    ("say --wait --id {} hello", "nothing", "{}", "SUCCEEDED", "goal"),
+    ("cancel {}", "waiting", "{}", "RECALLED", "goal"),
+    ("cancel", "nothing", "-", "IDLE", None),
+    ("wait {}", "spoken", "{}", "SUCCEEDED", "goal"),
+    ("wait", "nothing", "-", "IDLE", None),
+    ("status", "nothing", "-", "IDLE", "status"),
+    ("status {}", "spoken", "{}", "SUCCEEDED", "goal"),
+    ("pause", "speaking", "{first}", "PAUSED", "paused"),
+    ("status", "paused", "{first}", "PAUSED", "status"),
+    ("status", "speaking", "{first}", "ACTIVE", "status"),
+    ("resume", "nothing", "-", "RESUMED", "paused"),
+    ("set --rate 150", "nothing", "-", "SET", "settings"),
 ]
 
 
-@pytest.mark.parametrize(
-    ("command", "prepare", "goal", "state", "key"), COMMANDS, ids=[f"{row[0]}, {row[1].__name__}" for row in COMMANDS]
-)
+def prepare(pair: RealRobots, scene: str, goal: str) -> None:
+    for each in SCENES[scene]:
+        request(pair, **{name: value.format(goal) for name, value in each.items()})
+    if scene == "spoken":
+        pair.each(lambda each: each.talk.watcher.wait_for_terminal(goal))
+
+
+@pytest.mark.parametrize("row", COMMANDS, ids=[f"{row[0]}, {row[1]}" for row in COMMANDS])
 def test_each_robot_has_a_line_or_an_object(
-    pair: RealRobots,
-    desk: Desk,
-    command: str,
-    prepare: Callable[[RealRobots, str], None],
-    goal: str,
-    state: str,
-    key: str | None,
+    pair: RealRobots, desk: Desk, row: tuple[str, str, str, str, str | None]
 ) -> None:
+    command, scene, goal, state, key = row
     forms = [["--robot", "wh-*"], ["--robot", "@warehouse", "--json"], ["--quiet"]]
-    name = "-".join(re.findall("[a-z]+", f"{command} {prepare.__name__}"))
-    goals = [f"{name}-{number}" for number in range(len(forms))]
+    goals = [f"{'-'.join(re.findall('[a-z]+', command))}-{scene}-{number}" for number in range(len(forms))]
     for each in goals:
-        prepare(pair, each)
+        prepare(pair, scene, each)
     lines = [[*form, *command.format(each).split()] for form, each in zip(forms, goals, strict=True)]
     plain, for_programs, quiet = at_once(desk, *lines)
     shown = [goal.format(each, first=goals[0]) for each in goals]
@@ -124,7 +102,7 @@ def test_the_settings_of_each_robot_are_listed_under_its_name(pair: RealRobots, 
 
 
 def test_each_goal_that_a_command_selects_has_a_line(pair: RealRobots, desk: Desk) -> None:
-    pending(pair, "a-goal")
+    prepare(pair, "waiting", "a-goal")
     with Listener(pair.broker, "talk/reply/+/+/+") as answers:
         named, unnamed = desk.start("wait", "before-a-goal", "a-goal"), desk.start("wait")
         assert answers.find(lambda _: sum(b'"ok": true' in each.payload for each in answers.messages) == 4, PATIENCE)

@@ -10,12 +10,10 @@ import pytest
 
 from talkcli.fleet.policy import ASKABLE
 from tests.fleet import told as robots_told
-from tests.fleet.asker import Asker
 from tests.fleet.many import RealRobots, alike, assert_told, at_once, objects, request, told
 from tests.fleet.robot import LONG
 from tests.support.bridge import Desk
 from tests.support.broker import Broker
-from tests.support.connection import PATIENCE
 from tests.support.mqtt import Listener
 from tests.support.ports import Port
 
@@ -25,8 +23,8 @@ if TYPE_CHECKING:
 BOTH, OFFLINE = ["wh-1", "wh-2"], [f"off-{number}" for number in range(1, 8)]
 #: A glob and a group that pick both and no others.
 PICKS = ("wh-[12]", "@willing")
-#: Goals that may be pending from afar; characters of a text that no server takes, and that no request can hold.
-PENDING, TOO_LONG, FAR_TOO_LONG = 20, 20_000, 70_000
+#: Characters of a text that no server takes, and of one that no request can hold.
+TOO_LONG, FAR_TOO_LONG = 20_000, 70_000
 
 
 @pytest.fixture(scope="module")
@@ -136,17 +134,6 @@ def test_a_text_that_is_too_long_is_rejected_by_each(robots: RealRobots, desk: D
             assert found == {(name, "REJECTED", 5) for name in BOTH}
             assert (done.code, f"the text has {length:,} characters" in done.err) == (5, True)
     assert not [text for texts in robots.spoken().values() for text in texts if "xx" in text]
-
-
-def test_a_full_queue_rejects_a_sentence(robots: RealRobots, desk: Desk, broker: Broker) -> None:
-    request(robots, "say", text=LONG)
-    with Asker(broker) as bob:
-        for number in range(PENDING):
-            bob.send({"seq": number, "request": "say", "text": "length=0"}, to="talk/group/willing")
-        assert bob.listener.find(lambda _: sum("ok" in each for each in bob.lines) == len(BOTH) * PENDING, PATIENCE)
-    for done in at_once(desk, *(["--robot", each, "--json", "say", "hello"] for each in PICKS)):
-        assert (done.code, done.err.splitlines()[-1]) == (5, "talk: 0 of 2 as asked")
-        assert [each["goal"]["reason"] for each in objects(done).values()] == ["queue_full"] * 2
 
 
 def test_an_unknown_goal_makes_it_8(robots: RealRobots, desk: Desk) -> None:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from tests.fleet.conftest import MakeRobot
     from tests.support.broker import Broker
-    from tests.support.proxy import Way
 
 #: Seconds after the newest echo that came back for which messages are taken.
 STALE = 6.0
@@ -33,11 +32,25 @@ def stalled(broker: Broker, make_robot: MakeRobot) -> Iterator[tuple[Robot, Prox
         yield make_robot("anna", port=proxy.port), proxy
 
 
-def assert_stale(robot: Robot, stall: Callable[[], object], go_on: Callable[[], object]) -> None:
-    """Assert that sentences sent during a long stall are refused, and one sent after it is spoken."""
+def stall(stalled: tuple[Robot, Proxy], how: str) -> Callable[[], None]:
+    """Suspend the robot, or hold one way of its line; return the function that ends that."""
+    robot, proxy = stalled
+    if how == "suspended":
+        robot.bridge.stop_process()
+        return robot.bridge.go_on
+    proxy.hold("to_client" if how == "to_client" else "to_broker")
+    return proxy.release
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["suspended", "to_client"])
+def test_a_sentence_that_was_held_for_long_is_refused_and_the_next_is_spoken(
+    stalled: tuple[Robot, Proxy], how: str
+) -> None:
+    robot, _ = stalled
     with Asker(robot.broker, "olga") as olga, robot.listen("echo") as listener:
         began = time.monotonic()
-        stall()
+        go_on = stall(stalled, how)
         asked = olga.post("say", text="late")
         for kind in ("say", "request"):
             olga.send('{"request": "say", "text": "late, too"}', kind=kind, response=None)
@@ -53,14 +66,11 @@ def assert_stale(robot: Robot, stall: Callable[[], object], go_on: Callable[[], 
 
 
 @pytest.mark.slow
-def test_what_comes_while_a_robot_is_suspended_for_long_is_refused(robot: Robot) -> None:
-    assert_stale(robot, robot.bridge.stop_process, robot.bridge.go_on)
-
-
-def assert_spoken(robot: Robot, stall: Callable[[], object], go_on: Callable[[], object]) -> None:
-    """Assert that a sentence sent during a short stall is spoken."""
+@pytest.mark.parametrize("how", ["suspended", "to_client", "to_broker"])
+def test_a_sentence_that_was_held_for_a_moment_is_spoken(stalled: tuple[Robot, Proxy], how: str) -> None:
+    robot, _ = stalled
     with Desk(robot.broker) as somebody:
-        stall()
+        go_on = stall(stalled, how)
         asked = somebody.start("--robot", "anna", "say", "--wait", "in time")
         time.sleep(SHORT)
         go_on()
@@ -70,18 +80,7 @@ def assert_spoken(robot: Robot, stall: Callable[[], object], go_on: Callable[[],
 
 
 @pytest.mark.slow
-def test_what_comes_while_a_robot_is_suspended_for_a_moment_is_spoken(robot: Robot) -> None:
-    assert_spoken(robot, robot.bridge.stop_process, robot.bridge.go_on)
-
-
-@pytest.mark.slow
-def test_what_a_line_has_held_for_long_is_refused(stalled: tuple[Robot, Proxy]) -> None:
-    robot, proxy = stalled
-    assert_stale(robot, lambda: proxy.hold("to_client"), proxy.release)
-
-
-@pytest.mark.slow
-def test_where_no_echo_comes_back_nothing_is_spoken_that_may_be_old(stalled: tuple[Robot, Proxy]) -> None:
+def test_without_echoes_no_sentence_is_spoken_that_may_be_old(stalled: tuple[Robot, Proxy]) -> None:
     robot, proxy = stalled
     with Asker(robot.broker, "olga") as olga:
         proxy.hold("to_broker")
@@ -96,14 +95,7 @@ def test_where_no_echo_comes_back_nothing_is_spoken_that_may_be_old(stalled: tup
     assert robot.spoken == ["in time"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("way", ["to_client", "to_broker"])
-def test_what_a_line_has_held_for_a_moment_is_spoken(stalled: tuple[Robot, Proxy], way: Way) -> None:
-    robot, proxy = stalled
-    assert_spoken(robot, lambda: proxy.hold(way), proxy.release)
-
-
-def test_how_long_the_broker_keeps_a_sentence_counts_in_the_queue_of_the_robot_too(robot: Robot) -> None:
+def test_the_expiry_of_a_message_counts_in_the_queue_of_the_robot_too(robot: Robot) -> None:
     robot.talk.run("say", "--", LONG)
     robot.talk.watcher.wait_for(None, "ACTIVE")
     with Asker(robot.broker, "olga") as olga:
@@ -122,7 +114,7 @@ def test_how_long_the_broker_keeps_a_sentence_counts_in_the_queue_of_the_robot_t
 
 
 @pytest.mark.slow
-def test_a_sentence_that_the_line_has_held_begins_no_later_than_its_ttl_and_six_seconds(
+def test_a_sentence_that_was_held_begins_no_later_than_its_ttl_and_six_seconds(
     stalled: tuple[Robot, Proxy],
 ) -> None:
     robot, proxy = stalled
