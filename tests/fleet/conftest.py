@@ -47,7 +47,7 @@ def in_loop(test: Callable[_P, Coroutine[Any, Any, None]]) -> Callable[_P, None]
 
 @pytest.fixture
 def broker() -> Iterator[Broker]:
-    """A broker without TLS, which lets everybody in, and do anything: what mosquitto does on a machine of its own."""
+    """A broker without TLS, logins or rules."""
     with Broker() as result:
         yield result
 
@@ -126,7 +126,7 @@ def pair() -> Iterator[RealRobots]:
 
 @pytest.fixture
 def desk(pair: RealRobots) -> Iterator[Desk]:
-    """A desk that asks both robots of the pair; what they still have to say is cancelled in the end."""
+    """A desk that asks both robots of the pair; all their goals are cancelled in the end."""
     with Desk(pair.broker, env={"TALK_ROBOT": "wh-*"}) as result:
         yield result
     request(pair, "resume")
@@ -135,7 +135,7 @@ def desk(pair: RealRobots) -> Iterator[Desk]:
 
 @pytest.fixture
 def fleet(pair: RealRobots, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
-    """The library for the pair; what they still have to say is cancelled in the end."""
+    """The library for the pair; all their goals are cancelled in the end."""
     yield fleet_of(pair.broker, monkeypatch)
     request(pair, "resume")
     request(pair, "cancel")

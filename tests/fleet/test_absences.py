@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.client.client import Client
+from talkcli import Fleet
 from talkcli.fleet import topics
 from tests.fleet.robot import LONG, Robot
 from tests.support.bridge import Desk
 from tests.support.connection import PATIENCE
 from tests.support.mqtt import Listener
 from tests.support.proxy import Proxy
-from tests.support.surroundings import needs_packages
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -95,7 +94,7 @@ def test_a_broker_that_is_killed_in_mid_sentence_costs_no_result(robot: Robot) -
 
 @pytest.mark.parametrize("way", ["to_client", "to_broker"])
 def test_a_goal_whose_acceptance_was_lost_on_the_way_is_asked_for_and_spoken_once(robot: Robot, way: Way) -> None:
-    with Proxy(robot.broker.port) as proxy, desk_of(robot, proxy.port) as client:
+    with Proxy(robot.broker.port) as proxy, Fleet(robot.broker.url_at(proxy.port)).robot("anna") as client:
         proxy.hold(way)
         said: list[str] = []
         saying = threading.Thread(target=lambda: said.append(client.say("only once").wait().state.name))
@@ -107,16 +106,6 @@ def test_a_goal_whose_acceptance_was_lost_on_the_way_is_asked_for_and_spoken_onc
         saying.join(BACK)
         assert said == ["SUCCEEDED"]
     assert robot.spoken == ["only once"]
-
-
-def desk_of(robot: Robot, port: int) -> Client:
-    """Return a client of the robot, which comes to the broker by that port."""
-    needs_packages("paho")
-    from talkcli.fleet.broker import from_environment
-    from talkcli.fleet.robot import reach
-
-    found = from_environment({"TALK_BROKER": robot.broker.url_at(port), "TALK_MQTT_USER": "olga"})
-    return Client.over(reach(robot.name, found))
 
 
 @pytest.mark.slow

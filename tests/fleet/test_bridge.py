@@ -58,7 +58,7 @@ def _from(name: str, words: bytes) -> Callable[[Published], bool]:
 
 
 def kept(broker: Broker, topic: str, wanted: Callable[[Any], bool] = bool, within: float = 5) -> Message:
-    """Return what the broker keeps, or comes to keep, on a topic."""
+    """Return the retained message of a topic, once it is wanted."""
     with Listener(broker, topic) as listener:
         return listener.await_message(lambda each: bool(each.payload) and wanted(each.json), within).json
 
@@ -83,7 +83,7 @@ def test_a_sentence_is_answered_as_on_the_socket(lasting_robot: Robot, asker: As
         assert (each.payload[-1:], each.topic) == (b"\n", f"{asker.response}/anna")
 
 
-def test_what_answers_a_request_has_its_correlation_and_number(asker: Asker) -> None:
+def test_an_answer_has_the_correlation_and_the_number_of_its_request(asker: Asker) -> None:
     asker.send({"seq": 7, "request": "say", "text": "hello", "wait": True}, correlation=b"one")
     asker.send({"request": "status"}, correlation=b"two")
     asker.reply(7)
@@ -212,7 +212,7 @@ def test_an_asker_that_waits_for_room_is_told_that_the_robot_lives(lasting_robot
 
 
 @pytest.mark.parametrize("where", ["here", "by its id", "elsewhere", "at the robot"])
-def test_a_cancel_ends_what_waits_for_room_too_wherever_it_comes_from(
+def test_a_cancel_from_anywhere_ends_goals_that_wait_for_room_too(
     lasting_robot: Robot, asker: Asker, where: str
 ) -> None:
     fill(lasting_robot, asker)
@@ -234,7 +234,7 @@ def test_a_cancel_ends_what_waits_for_room_too_wherever_it_comes_from(
     assert len(robot_goals(lasting_robot)) == (20 if where == "by its id" else 0)
 
 
-def test_a_goodbye_takes_back_what_waits_and_lets_the_server_go(lasting_robot: Robot, asker: Asker) -> None:
+def test_a_goodbye_takes_back_waiting_goals_and_closes_the_connection(lasting_robot: Robot, asker: Asker) -> None:
     fill(lasting_robot, asker)
     with lasting_robot.talk.connect() as wire:  # one for all questions, so that no closing one is counted
         before = wire.request("status")["server"]["clients"]

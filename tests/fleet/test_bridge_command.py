@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from tests.conftest import MakeTalk
     from tests.fleet.conftest import MakeBridge
     from tests.support.broker import Broker
     from tests.support.processes import Talk
@@ -34,11 +33,6 @@ if TYPE_CHECKING:
 def home() -> Iterator[str]:
     with short_directory() as path:
         yield path
-
-
-@pytest.fixture
-def talk(make_talk: MakeTalk) -> Talk:
-    return make_talk(scripted=True)
 
 
 def bridge(home: str, *words: str, **extra: str) -> tuple[int, str, str]:
@@ -145,20 +139,20 @@ def test_systemd_finds_nothing_wrong(home: str, name: str) -> None:
     assert (done.code, done.err) == (0, ""), done
 
 
-def test_a_supervisor_is_told_the_state_with_and_without_a_broker(home: str, talk: Talk, broker: Broker) -> None:
+def test_a_supervisor_is_told_the_state_with_and_without_a_broker(home: str, scripted: Talk, broker: Broker) -> None:
     broker.kill()
     with Supervisor(f"{home}/n") as supervisor:
         own = {"NOTIFY_SOCKET": supervisor.address, "WATCHDOG_USEC": "1000000"}
         command = command_of(printed(home, "system"))
         with subprocess.Popen(
-            command, env=talk.env | broker.env() | own, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
+            command, env=scripted.env | broker.env() | own, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
         ) as process:
             try:
                 ready = supervisor.wait_for("READY", "1")
                 supervisor.wait_for("STATUS", "OFFLINE, server there, 0 goals pending")
                 broker.start()
                 supervisor.wait_for("STATUS", f"anna at {broker.url}: online, server there", since=ready)
-                talk.request("pause")
+                scripted.request("pause")
                 with Asker(broker) as asker:
                     asker.say("a secret")
                     pending = supervisor.wait_for("STATUS", "1 goal pending")
@@ -176,10 +170,10 @@ def test_a_supervisor_is_told_the_state_with_and_without_a_broker(home: str, tal
 
 
 def test_the_bridge_uses_the_socket_that_is_named(
-    home: str, talk: Talk, broker: Broker, make_bridge: MakeBridge
+    home: str, scripted: Talk, broker: Broker, make_bridge: MakeBridge
 ) -> None:
     with serving(environment(home, TALK_SOCKET=f"{home}/s")):
-        make_bridge(talk, broker, "berta", "--socket", f"{home}/s")
+        make_bridge(scripted, broker, "berta", "--socket", f"{home}/s")
         with Asker(broker) as asker:
             asker.send({"seq": 1, "request": "status"}, to="talk/robot/berta")
             assert asker.reply(1)["server"]["socket"] == f"{home}/s"

@@ -9,14 +9,12 @@ import re
 import signal
 import socket
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli import Client, State
+from talkcli import Client, Fleet, State
 from talkcli.errors import Lost
-from talkcli.fleet.broker import from_environment
-from talkcli.fleet.robot import reach
 from tests.fleet.robot import LONG, Robot
 from tests.fleet.told import presence
 from tests.support.bridge import Bridge, Desk, desk
@@ -216,8 +214,7 @@ TOO_LONG = "word " * 1_200
 @pytest.fixture
 def client(lasting_robot: Robot) -> Iterator[Client]:
     """A client of the robot in this process."""
-    broker = from_environment(lasting_robot.broker.env())
-    with Client.over(reach("anna", broker)) as client:
+    with Fleet(lasting_robot.broker.url).robot("anna") as client:
         yield client
 
 
@@ -234,35 +231,35 @@ def test_a_sentence_that_the_broker_does_not_take_is_refused_before_it_is_sent(m
 def test_a_cancel_whose_answer_is_lost_ends_nothing_that_came_later(robot: Robot) -> None:
     robot.talk.request("pause")
     robot.talk.run("say", "--id", "old", "old")
-    with Proxy(robot.broker.port) as proxy, Desk(robot.broker, port=proxy.port) as somebody:
-        broker = from_environment(somebody.env)
-        with Client.over(reach("anna", broker)) as client, ThreadPoolExecutor(1) as thread:
-            with Listener(robot.broker, "talk/reply/+/+/anna") as listener:
-                proxy.hold("to_client")
-                asked = thread.submit(client.cancel)
-                listener.await_message(lambda each: b'"count": 1' in each.payload)
-            robot.talk.run("say", "--id", "new", "new")
-            proxy.cut()
-            proxy.release()
-            with pytest.raises(Lost, match="it may have been carried out"):
-                asked.result(30)
-            assert client.goal("old").state is State.RECALLED
-            assert client.goal("new").state is State.PENDING
+    with (
+        Proxy(robot.broker.port) as proxy,
+        Fleet(robot.broker.url_at(proxy.port)).robot("anna") as client,
+        ThreadPoolExecutor(1) as thread,
+    ):
+        with Listener(robot.broker, "talk/reply/+/+/anna") as listener:
+            proxy.hold("to_client")
+            asked = thread.submit(client.cancel)
+            listener.await_message(lambda each: b'"count": 1' in each.payload)
+        robot.talk.run("say", "--id", "new", "new")
+        proxy.cut()
+        proxy.release()
+        with pytest.raises(Lost, match="it may have been carried out"):
+            asked.result(30)
+        assert client.goal("old").state is State.RECALLED
+        assert client.goal("new").state is State.PENDING
 
 
-def test_goals_with_a_time_to_live_and_data_go_out_from_any_thread(client: Client) -> None:
+def test_a_goal_may_be_sent_from_several_threads(client: Client) -> None:
+    fields: dict[str, Any] = {"ttl": 60, "data": {"number": [1]}, "id": "the-same", "follow": False}
     with ThreadPoolExecutor(4) as threads:
-        said = [
-            threads.submit(client.say, "a", ttl=60, data={"number": [1]}, id="the-same", follow=False)
-            for _ in range(20)
-        ]
+        said = [threads.submit(client.say, "a", **fields) for _ in range(20)]
     handles = [each.result() for each in said]
     assert {each.id for each in handles} == {"the-same"}
     assert sum(not each.attached for each in handles) == 1
 
 
 @pytest.mark.slow  # a broker doesn't tell that it keeps something back, so the whole patience of 5 s is waited for
-def test_who_may_not_read_the_answers_is_told_before_anything_is_sent(make_talk: MakeTalk) -> None:
+def test_a_login_that_may_not_read_answers_is_told_before_anything_is_sent(make_talk: MakeTalk) -> None:
     rules = "user anna\ntopic readwrite #\n\nuser olga\ntopic write talk/#\ntopic read talk/robot/+/presence\n"
     with (
         Broker(users={"anna": "a", "olga": "b"}, acl=rules) as broker,

@@ -272,7 +272,7 @@ def test_with_no_text_only_the_asker_reads_a_sentence(broker: Broker, make_robot
 
 @pytest.mark.timeout(20)
 def test_broker_that_dies_while_it_is_answered_ends_the_connection(broker: Broker) -> None:
-    """What comes is answered where it is heard: that the broker is gone by then must not be waited for in there."""
+    """The answer is sent from the callback, which must not wait for a broker that is gone."""
     needs_packages("paho")
     from talkcli.fleet.link import Link
 

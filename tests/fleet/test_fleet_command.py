@@ -49,9 +49,6 @@ def listed(done: Finished) -> list[str]:
     return [each.split()[0] for each in lines]
 
 
-# talk fleet status
-
-
 @pytest.mark.usefixtures("robots")
 def test_the_table_and_the_objects_show_each_robot(broker: Broker) -> None:
     done = run(broker, "fleet", "status")
@@ -138,9 +135,6 @@ def test_more_robots_are_shown_than_mosquitto_queues_messages_for_a_client(broke
     done = run(broker, "fleet", "status")
     assert listed(done) == [f"wh-{number:03}" for number in range(600)]
     assert done.out.count("SUCCEEDED") == 600
-
-
-# talk fleet watch
 
 
 @pytest.fixture

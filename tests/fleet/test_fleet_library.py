@@ -48,9 +48,6 @@ def said(outcome: Outcome) -> Any:
     return outcome.said
 
 
-# The robots
-
-
 def test_all_robots_that_the_broker_knows_are_listed_by_name(fleet: Fleet, pair: RealRobots) -> None:
     with Listener(pair.broker) as publisher:
         told.presence(publisher, "anna", online=False, groups=["night"])
@@ -71,9 +68,6 @@ def test_one_robot_is_a_client(fleet: Fleet, pair: RealRobots) -> None:
         assert [each.word for each in goal.feedback(5)] == ["the", "door", "opens"]
         assert goal.wait(5).state is State.SUCCEEDED
         assert client.status().server["pid"] == pair["wh-1"].talk.pid
-
-
-# Several at once
 
 
 @pytest.mark.parametrize(("to", "names"), [("wh-*", PAIR), ("@warehouse", PAIR), ("wh-2", ["wh-2"])])
@@ -184,9 +178,6 @@ def test_a_refusal_by_the_broker_leaves_nothing_open(monkeypatch: pytest.MonkeyP
                 list(fleet.say("@warehouse", "hello"))
             before = before or descriptors()
         assert descriptors() == before
-
-
-# Errors
 
 
 def test_a_failure_at_a_robot_is_an_outcome_with_its_error(fleet: Fleet) -> None:

@@ -217,9 +217,6 @@ async def test_a_dial_without_a_free_descriptor_gives_its_slot_back(
     assert not slots.locked()
 
 
-# Work in a thread of its own
-
-
 @in_loop
 async def test_the_result_of_cancelled_work_is_undone_once_its_thread_has_ended(
     monkeypatch: pytest.MonkeyPatch,
@@ -243,7 +240,7 @@ async def test_the_result_of_cancelled_work_is_undone_once_its_thread_has_ended(
     assert over.is_set()
 
 
-def test_the_end_of_the_loop_does_not_wait_for_work_whose_result_is_undone_then() -> None:
+def test_the_end_of_the_loop_does_not_wait_for_work_and_the_result_is_undone() -> None:
     go, undone = threading.Event(), threading.Event()
 
     async def leave() -> None:

@@ -52,7 +52,7 @@ def robots(broker: Broker) -> Iterator[RealRobots]:
 
 @pytest.fixture
 def desk(broker: Broker, robots: RealRobots) -> Iterator[Desk]:
-    """A desk; what the robots still have to say is cancelled in the end."""
+    """A desk; all goals are cancelled in the end."""
     with Desk(broker) as result:
         yield result
     request(robots, "cancel")
@@ -122,9 +122,6 @@ def test_a_pick_of_no_robot_is_3_and_so_is_no_broker(desk: Desk, broker: Broker)
     with Port() as port, Desk(broker, port=port.number) as somebody:
         done = somebody.run("--robot", "*", "cancel")
     assert (done.code, done.out, "talk: no broker at mqtt://" in done.err) == (3, "", True), done
-
-
-# Requests that a robot's server refuses
 
 
 def test_a_text_that_is_too_long_is_rejected_by_each(robots: RealRobots, desk: Desk) -> None:

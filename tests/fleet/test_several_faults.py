@@ -41,7 +41,7 @@ PENDING = 20
 
 @pytest.fixture
 def far(pair: RealRobots) -> Iterator[tuple[Desk, Proxy]]:
-    """A desk behind a proxy; what the robots still have to say is cancelled in the end."""
+    """A desk behind a proxy; all goals are cancelled in the end."""
     with Proxy(pair.broker.port) as proxy, Desk(pair.broker, port=proxy.port) as result:
         yield result, proxy
         proxy.release()
@@ -64,9 +64,6 @@ def line_of(process: Process) -> str:
     """Return the next line that a command writes."""
     assert process.stdout
     return process.stdout.readline()
-
-
-# The line and the broker
 
 
 @pytest.mark.parametrize("to", PICKS)
@@ -186,8 +183,6 @@ def test_a_desk_that_was_suspended_has_lost_nothing(pair: RealRobots, desk: Desk
         assert_told(desk.finish(each), 0, alike(PAIR, f"stopped-{number}", "SUCCEEDED", 0), "2 of 2 as asked")
 
 
-# The answers of a robot
-
 EVIL = "\x1b[31mred"
 NO_STATE, NO_SUCH_STATE, NO_ID = {"id": "odd"}, {"id": "odd", "state": "DANCING"}, {"id": EVIL, "state": "PENDING"}
 #: Answers of one robot to a request with this text, first id, or kind.
@@ -261,9 +256,6 @@ def test_a_robot_that_is_called_as_a_part_of_a_topic_is_heard_as_any_other(
         lines = [["--robot", to, "say", "--wait", "--id", f"of-{n}", "hello"] for n, to in enumerate(picks)]
         for number, done in enumerate(at_once(desk, *lines)):
             assert_told(done, 0, {name: (f"of-{number}", "SUCCEEDED", 0)}, "1 of 1 as asked")
-
-
-# The desk
 
 
 def test_a_robot_that_leaves_the_group_while_it_speaks_is_cancelled_too(

@@ -1,4 +1,4 @@
-"""A loudspeaker for a machine that has none, and the proof of what came out of it.
+"""A loudspeaker for a machine that has none, and a check of the sound that it played.
 
 ALSA's file plugin, which every machine with `aplay` has, writes what it plays into a FIFO; `listen` takes it from there
 as fast as a sound card would, and no faster: so a player ends when its sound is over, as in real life. It hears what is

@@ -1,4 +1,4 @@
-"""A TCP port on 127.0.0.1 which a test has for as long as it needs it, whether anybody listens there or not."""
+"""A TCP port on 127.0.0.1 that a test owns, whether or not a program listens there."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ HOST = "127.0.0.1"
 
 
 class Port(contextlib.AbstractContextManager["Port"]):
-    """A free port, `number`, for one who sets SO_REUSEADDR before it binds, as mosquitto does; nobody else gets it.
+    """A free port, `number`, for a program that sets SO_REUSEADDR before it binds, as mosquitto does.
 
-    On Linux a socket stays bound to it and never listens: so a connection is refused while a broker is down, where
-    otherwise it might be given this very port for its own end, and so be connected to itself.
+    On Linux a socket stays bound to the port and never listens. So a connection is refused while a broker is down;
+    otherwise the client might be given this port for its own end, and be connected to itself.
     """
 
     def __init__(self) -> None:
