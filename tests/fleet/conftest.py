@@ -62,23 +62,17 @@ def secure_broker() -> Iterator[Broker]:
 
 @pytest.fixture
 def make_bridge() -> Iterator[MakeBridge]:
-    """Starts bridges; each that still runs at the end is ended by SIGTERM, and must have gone well.
-
-    A test asks for its broker before, so that this is there until then: it takes their goodbyes.
-    """
+    """Starts bridges; those that still run at the end must end well by SIGTERM. A test asks for its broker before."""
     bridges: list[Bridge] = []
-
-    def make(*words: Any, online: bool = True, **named: Any) -> Bridge:
-        bridge = Bridge(*words, **named)
-        bridges.append(bridge)
-        if online:
-            bridge.await_online()
-        return bridge
-
     with contextlib.ExitStack() as stack:
-        # Entered before the first bridge and left in reverse: all are closed, whichever fails its check.
-        for_all = stack.enter_context(contextlib.ExitStack())
-        yield lambda *words, **named: for_all.enter_context(contextlib.closing(make(*words, **named)))
+
+        def make(*words: Any, online: bool = True, **named: Any) -> Bridge:
+            bridges.append(bridge := stack.enter_context(Bridge(*words, **named)))
+            if online:
+                bridge.await_online()
+            return bridge
+
+        yield make
         for bridge in bridges:
             if bridge.running:
                 code = bridge.terminate()

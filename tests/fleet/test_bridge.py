@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -53,8 +54,8 @@ def fill(robot: Robot, asker: Asker) -> None:
     assert [asker.say(f"{each}")["state"] for each in range(20)] == ["PENDING"] * 20
 
 
-def _from(name: str, words: bytes) -> Callable[[Published], bool]:
-    return lambda each: each.topic.endswith(f"/{name}") and words in each.payload
+def is_answer(topic: str, number: int, each: Published) -> bool:
+    return each.topic == topic and f'"seq": {number}'.encode() in each.payload
 
 
 def kept(broker: Broker, topic: str, wanted: Callable[[Any], bool] = bool, within: float = 5) -> Message:
@@ -114,8 +115,8 @@ def test_a_group_is_asked_by_one_message(robot: Robot, make_robot: MakeRobot) ->
             asker.send({"seq": 101, "request": "say", "text": f"to {group}"}, to=f"talk/group/{group}")
             asker.listener.await_message(lambda each: each.topic.endswith("/berta"))
         asker.send({"seq": 102, "request": "say", "text": "to all"}, to="talk/group/all")
-        for name in ("anna", "berta"):
-            asker.listener.await_message(_from(name, b'"seq": 102'))
+        for topic in (f"{asker.response}/anna", f"{asker.response}/berta"):
+            asker.listener.await_message(partial(is_answer, topic, 102))
         assert after(asker, robot.talk) == ["to all"]
 
 

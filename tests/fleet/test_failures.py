@@ -13,6 +13,7 @@ from talkcli.fleet import broker as brokers
 from talkcli.fleet.bridge import Bridge, Settings
 from talkcli.fleet.broker import from_environment
 from tests.fleet.asker import Asker
+from tests.fleet.conftest import in_loop
 from tests.fleet.robot import LONG, Robot
 from tests.support.bridge import desk
 from tests.support.connection import PATIENCE
@@ -70,7 +71,8 @@ def test_a_broker_that_is_not_there_is_told_and_nothing_is_spoken_when_it_is_bac
     assert_spoken(robot)
 
 
-def test_a_connection_that_breaks_under_an_answer_is_made_again(
+@in_loop
+async def test_a_connection_that_breaks_under_an_answer_is_made_again(
     scripted: Talk, broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The request was read, and the answer can't be sent while the bridge still waits for room for it."""
@@ -86,23 +88,20 @@ def test_a_connection_that_breaks_under_an_answer_is_made_again(
         while not wanted():  # noqa: ASYNC110 - a bridge tells nobody
             await asyncio.sleep(0.01)
 
-    async def run() -> None:
-        asyncio.get_running_loop().set_exception_handler(lambda _loop, told: bugs.append(told))
-        settings = Settings("anna", from_environment(broker.env()), ("say",), socket=scripted.socket)
-        bridge = Bridge(settings, lambda: settings.broker)
-        work = asyncio.create_task(bridge.run())
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, told: bugs.append(told))
+    settings = Settings("anna", from_environment(broker.env()), ("say",), socket=scripted.socket)
+    bridge = Bridge(settings, lambda: settings.broker)
+    work = asyncio.create_task(bridge.run())
+    await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)
+    with Asker(broker, "olga") as olga:
+        monkeypatch.setattr(paho.Client, "_sock_send", send)
+        olga.send({"seq": 1, "request": "set", "rate": 200})
+        await asyncio.wait_for(until(lambda: not bridge.ready), PATIENCE)
         await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)
-        with Asker(broker, "olga") as olga:
-            monkeypatch.setattr(paho.Client, "_sock_send", send)
-            olga.send({"seq": 1, "request": "set", "rate": 200})
-            await asyncio.wait_for(until(lambda: not bridge.ready), PATIENCE)
-            await asyncio.wait_for(until(lambda: bridge.ready), PATIENCE)
-            olga.send({"seq": 2, "request": "say", "text": "hello"})
-            assert (await asyncio.to_thread(olga.reply, 2))["ok"]
-        bridge.end()
-        await work
-
-    asyncio.run(run())
+        olga.send({"seq": 2, "request": "say", "text": "hello"})
+        assert (await asyncio.to_thread(olga.reply, 2))["ok"]
+    bridge.end()
+    await work
     assert not bugs
 
 
