@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 GREETING = encode(greeting(__version__, 7, "a1b2"))
 PATIENCE = 10.0
+pytestmark = pytest.mark.timeout(20)
 
 
 @pytest.fixture
