@@ -1,14 +1,13 @@
-"""The examples of a fleet, in the README and in its own document: with a real broker, server and bridge.
+"""The examples of a fleet, in the README and in its own document, with a real broker, server and bridge.
 
-The broker is elsewhere, and so are its logins: `talk` is told so beside what stands in an example, and mosquitto's own
-clients by their files. What would change the machine has a stand-in.
+Settings beside an example name the test's broker and its logins. Stand-ins keep the machine as it is.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
-import signal
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -37,16 +36,16 @@ if TYPE_CHECKING:
 PASSWORDS = {each: f"password-of-{each}" for each in ("anna", "olga", "ha")}
 #: Where the examples of requests are answered.
 _REPLIES = block("Requests and replies: A request").partition(" -e ")[2].split()[0]
-#: Seconds in which a robot must be there, or have done what it was asked.
+#: Seconds in which a robot must be online, or have carried out a request.
 LIMIT = 20.0
-#: What the examples' broker is here; what is no matter of theirs.
+#: Runs `talk` with the test's broker in place of the examples'.
 _TALK = """if [ "$1" = serve ]; then exec @PYTHON -m talkcli "$@"; fi
 test "$TALK_BROKER" = mqtts://broker || exit 99
 test -n "$TALK_MQTT_PASSWORD_FILE" || exit 98
 export TALK_BROKER=@URL TALK_MQTT_CA=@CA TALK_MQTT_PASSWORD_FILE="@DIRECTORY/$TALK_MQTT_USER.password"
 exec @PYTHON -m talkcli "$@"
 """
-#: What would change the machine does so below a directory of the test, and asks for no password.
+#: Writes below a directory of the test, and asks for no password.
 _SUDO = """program=$1
 shift
 case $program in
@@ -104,7 +103,7 @@ def _online(message: Message) -> bool:
 
 
 def _set_up_clients(shell: Shell, broker: Broker, user: str | None = None) -> None:
-    """Tell mosquitto's clients which broker it is, and who they are, as the document says."""
+    """Write the files that tell mosquitto's clients the broker and the login."""
     lines = [f"-h {'localhost' if broker.secure else '127.0.0.1'}", f"-p {broker.port}"]
     if user:
         lines += [f"-u {user}", f"-P {PASSWORDS[user]}"]
@@ -135,7 +134,7 @@ def site(make_talk: MakeTalk, tmp_path: Path, place: str) -> Iterator[Site]:
 
 @runs("A fleet: A robot", "A fleet: A desk", "A fleet: Home Assistant, cron")
 def test_readmes_robot_and_its_desk(tmp_path: Path, place: str) -> None:
-    """Two commands make a robot, with logins and the broker's rules; a desk and a plain text have it speak."""
+    """Two commands set up a robot with logins and the broker's rules. A desk and a plain text make it speak."""
     needs_packages("paho")
     operators = ("olga", "ha")
     with contextlib.ExitStack() as stack:
@@ -151,27 +150,20 @@ def test_readmes_robot_and_its_desk(tmp_path: Path, place: str) -> None:
         shell.program("talk", script)
         _set_up_clients(shell, broker, "ha")
         listener = stack.enter_context(Listener(broker, "talk/robot/anna/#", user="olga"))
-        robot = shell.start(f'{block("A fleet: A robot")}bridge=$!\ntrap "kill $bridge" USR1\nwait\nwait\n')
+        shell.start(f"{block('A fleet: A robot')}wait\nwait\n")
         listener.await_message(_online, LIMIT)
         done = shell.run(block("A fleet: A desk"), TALK_SOCKET="/nowhere")
         assert (done.returncode, done.stderr) == (0, ""), done
         assert "exit code" not in done.stdout
-        assert done.stdout.startswith("olga:")
         listener.await_message(lambda each: _tells(each, "the shift is over", ("SUCCEEDED",)), LIMIT)
         done = shell.run(block("A fleet: Home Assistant, cron"))
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
         found = listener.await_message(lambda each: _tells(each, "the washing is done", ("SUCCEEDED",)), LIMIT)
         assert found.json["goal"]["client"]["name"] == "mqtt:ha"
-        robot.send_signal(signal.SIGUSR1)
-        listener.await_message(lambda each: bool(each.payload) and b'"online": false' in each.payload, LIMIT)
-        done = shell.run(block("A fleet: A desk"), TALK_SOCKET="/nowhere")
-        assert done.stdout == "anna: exit code 3\n"
-        assert "anna is offline: nothing was sent" in done.stderr
 
 
 @runs("A fleet: Several", "A fleet: Several #2")
 def test_several_robots(tmp_path: Path, place: str) -> None:
-    """A glob, a group, everybody and one that is offline; and the same by the library."""
     needs_packages("paho")
     say, cancel, status, table, follow = commands("A fleet: Several")
     with contextlib.ExitStack() as stack:
@@ -185,13 +177,10 @@ def test_several_robots(tmp_path: Path, place: str) -> None:
 
         done = shell.run(say)
         assert (done.returncode, done.stderr) == (0, "talk: 2 of 2 as asked\n")
-        found = sorted(line.split() for line in done.stdout.splitlines())
-        assert [(robot, *rest) for robot, _, *rest in found] == [(f"wh-{n}", "SUCCEEDED", "0") for n in (1, 2)]
         assert '"the shift is over"' in watching.stdout.readline()
 
         done = shell.run(cancel)
         assert (done.returncode, done.stderr) == (0, "talk: 3 of 3 as asked\n")
-        assert sorted(done.stdout.splitlines()) == [f"{each} - IDLE 0" for each in robots.names]
 
         code = block("A fleet: Several #2").replace("mqtts://broker", broker.url)
         python = shell.directory / "several.py"
@@ -204,15 +193,13 @@ def test_several_robots(tmp_path: Path, place: str) -> None:
         assert robots["bert"].bridge.terminate() == 0
         done = shell.run(status)
         assert (done.returncode, done.stdout) == (0, "bert bert is offline: nothing was sent\n")
-        assert done.stderr.splitlines()[-1] == "talk: 2 of 3 as asked"
-        assert [line.split()[:2] for line in shell.run(table).stdout.splitlines()[1:]] == [
-            ["bert", "OFFLINE"], ["wh-1", "yes"], ["wh-2", "yes"],
-        ]  # fmt: skip
+        listed = [line.split()[:2] for line in shell.run(table).stdout.splitlines()[1:]]
+        assert listed == [["bert", "OFFLINE"], ["wh-1", "yes"], ["wh-2", "yes"]]
 
 
 @runs("A site")
 def test_broker_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> None:
-    """What its lines make is a broker that lets in those logins, by TLS alone, for what each may do."""
+    """The broker lets in those logins alone, by TLS, each for its own rights."""
     needs_packages("paho")
     needs("mosquitto_passwd")
     etc = tmp_path / "etc"
@@ -241,90 +228,66 @@ def test_broker_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> No
             assert desk.run("--robot", "anna", "status").code == 10
 
 
-@runs("Topics")
-def test_plain_text_is_said_and_cancelled(site: Site) -> None:
-    site.talk.request("pause")  # else it may have been spoken before
-    assert site.run("Topics") == ""
-    goal = site.goal("the washing is done", "RECALLED")
-    assert (goal["client"]["name"], goal["by"]["client"]["name"]) == ("mqtt:ha", "mqtt:ha")
-
-
 @runs(
+    "Topics",
     "Requests and replies: A request",
     "Requests and replies: A request #2",
     "Requests and replies: A request #3",
     "Requests and replies: A session",
 )
-def test_request_is_answered_once_and_hung_up(site: Site) -> None:
+def test_plain_texts_requests_and_sessions(site: Site) -> None:
+    site.talk.request("pause")  # otherwise the text may already have been spoken
+    assert site.run("Topics") == ""
+    goal = site.goal("the washing is done", "RECALLED")
+    assert (goal["client"]["name"], goal["by"]["client"]["name"]) == ("mqtt:ha", "mqtt:ha")
+    site.talk.request("resume")
     example = json.loads(block("Requests and replies: A request #2"))
     answer = json.loads(site.run("Requests and replies: A request").splitlines()[0])
     assert _part(answer, example) == example
     site.goal("the door is open", "SUCCEEDED")
-    site.await_last_line("the door is open")  # else it may be what the next one takes for its answer
+    site.await_last_line("the door is open")  # the next one may take it for its answer
     again = json.loads(site.run("Requests and replies: A request").splitlines()[0])
     assert again["attached"] is True
     assert site.run("Requests and replies: A request #3") == ""
     goal = site.goal("the shift is over", "SUCCEEDED")
     assert (goal["id"], 9 < goal["ttl"] <= 10) == ("shift-3", True)
     with site.talk.connect() as wire:
-        wire.request("log", count=20)
-        assert [each["goal"]["text"] for each in wire.items].count("the door is open") == 1
         before = wire.request("status")["server"]["clients"]
         assert site.run("Requests and replies: A session") == ""
         wait_until(lambda: wire.request("status")["server"]["clients"] == before - 1)
 
 
 def _part(whole: Any, like: Any) -> Any:
-    """Return what of an object an example shows of it."""
-    if not isinstance(like, dict):
-        return whole
-    return {name: _part(whole[name], value) for name, value in like.items()}
+    """Return the part of an object that an example shows."""
+    return {name: _part(whole[name], value) for name, value in like.items()} if isinstance(like, dict) else whole
 
 
-def _shape(value: Any) -> Any:
-    """Return an object's keys, and those of what it holds."""
-    return {name: _shape(each) for name, each in value.items()} if isinstance(value, dict) else None
-
-
-@runs(*(f"What a robot tells everybody: Presence{each}" for each in ("", " #2", " #3")))
-def test_presence_has_the_keys_of_the_examples(site: Site) -> None:
-    there, gone = (json.loads(block(f"What a robot tells everybody: Presence #{each}")) for each in (2, 3))
-    found = json.loads(site.run("What a robot tells everybody: Presence"))
-    assert _shape(found) == _shape(there)
-    assert {**found, "server": None, "session": "", "since": 0, "version": ""} == {
-        **there, "server": None, "session": "", "since": 0, "version": "",
-    }  # fmt: skip
-    site.bridge.terminate()
-    assert json.loads(site.run("What a robot tells everybody: Presence")) == {**gone, "session": found["session"]}
-
-
-@runs("What a robot tells everybody: Status", "What a robot tells everybody: Status #2")
-def test_status_has_the_keys_of_the_example(site: Site) -> None:
-    site.run("Requests and replies: A request")
-    goal = site.goal("the door is open", "SUCCEEDED")
-    example = json.loads(block("What a robot tells everybody: Status #2"))
-    found: dict[str, Any] = {}
-
-    def told() -> bool:
-        found.update(json.loads(site.run("What a robot tells everybody: Status")))
-        return found["active"] is None and found["last"] is not None
-
-    wait_until(told)  # at most once a second
-    example["last"]["at"] = goal["ended_at"]
-    assert found == example
-
-
-@runs("What a robot tells everybody: Events")
-def test_events_are_followed(site: Site) -> None:
+@runs(
+    *(f"What a robot tells everybody: Presence{each}" for each in ("", " #2", " #3")),
+    "What a robot tells everybody: Status",
+    "What a robot tells everybody: Status #2",
+    "What a robot tells everybody: Events",
+)
+def test_events_status_and_presence(site: Site) -> None:
     before = site.broker.log.count("SUBACK")
     following = site.shell.start(block("What a robot tells everybody: Events"))
     wait_until(lambda: site.broker.log.count("SUBACK") > before)
     site.run("Requests and replies: A request")
+    goal = site.goal("the door is open", "SUCCEEDED")
     assert following.stdout
-    states: list[str] = []
-    while states[-1:] != ["SUCCEEDED"]:
-        topic, _, event = following.stdout.readline().partition(" ")
-        if topic.strip():
-            assert topic == "talk/robot/anna/event/state"
-            states.append(json.loads(event)["state"])
+    events = [each for each in itertools.islice(following.stdout, 6) if each.strip()][:3]
+    assert [each.partition(" ")[0] for each in events] == ["talk/robot/anna/event/state"] * 3
+    states = [json.loads(each.partition(" ")[2])["state"] for each in events]
     assert states == ["PENDING", "ACTIVE", "SUCCEEDED"]
+
+    example = json.loads(block("What a robot tells everybody: Status #2"))
+    example["last"]["at"] = goal["ended_at"]
+    wait_until(lambda: bool(json.loads(site.run("What a robot tells everybody: Status")) == example))  # one per second
+
+    there, gone = (json.loads(block(f"What a robot tells everybody: Presence #{each}")) for each in (2, 3))
+    found = json.loads(site.run("What a robot tells everybody: Presence"))
+    vary = dict.fromkeys(("server", "session", "since", "version"))
+    assert (found.keys(), found["server"].keys()) == (there.keys(), there["server"].keys())
+    assert {**found, **vary} == {**there, **vary}
+    site.bridge.terminate()
+    assert json.loads(site.run("What a robot tells everybody: Presence")) == {**gone, "session": found["session"]}

@@ -1,7 +1,7 @@
 """README's commands that install, run as they stand there: pip and pipx for real, in a copy of this checkout.
 
-Two things have stand-ins, since they would change the machine: apt-get does nothing (that its packages exist is looked
-up), and what sudo does below `/opt` and `/usr/local` is done below a directory of the test.
+Stand-ins keep the machine as it is: apt-get does nothing, and sudo writes below a directory of the test instead of
+`/opt` and `/usr/local`.
 """
 
 from __future__ import annotations
@@ -109,9 +109,6 @@ def test_first_command_is_heard(newcomer: Shell, sink: Sink) -> None:
     """From a checkout to the sentence, and `kill %1` ends the server."""
     needs("bash")
     _needs_a_registry(newcomer, "click")
-    said = re.search(' say "([^"]+)"', block("Start"))
-    assert said, "the README's first command says nothing"
-    text = said[1]
     with sink.record() as recording:
         done = newcomer.run(
             'exec bash -c "$1"',  # as on a terminal: sh knows no %1 where it reads a script
@@ -123,9 +120,9 @@ def test_first_command_is_heard(newcomer: Shell, sink: Sink) -> None:
         recording.wait_until_quiet(0.1)
     assert done.returncode == 0, done
     assert f"ready on {newcomer.env['TALK_SOCKET']}" in done.stderr
-    assert re.search(rf"SUCCEEDED .*{text}", done.stdout), done
+    assert re.search(r"SUCCEEDED .*talk is ready", done.stdout), done
     assert not os.path.exists(newcomer.env["TALK_SOCKET"])
-    assert_heard(recording, render([Sentence(text)]))
+    assert_heard(recording, render([Sentence("talk is ready")]))
 
 
 @runs("Start #2")
@@ -198,34 +195,9 @@ def test_install_for_all_users(newcomer: Shell) -> None:
     assert "/system/opt/talk/bin/python" in _follow_the_advice(newcomer, f"{talk} --robot anna status")
 
 
-def _packages(text: str) -> set[str]:
-    """Return the packages that a text installs with apt-get, in a script or within a sentence."""
-    scripts = [*re.findall(r"^```sh\n(.*?)^```$", text, re.MULTILINE | re.DOTALL), *([] if "```" in text else [text])]
-    commands = [each for script in scripts for each in script.replace("\\\n", " ").splitlines()]
-    commands += [each.replace("\n", " ") for each in re.findall(r"(?<!`)`([^`]+)`(?!`)", text)]
-    found = (re.search(r"apt-get install -(?:y|yq) ([a-z0-9.+ -]+)", each) for each in commands)
-    return {name for each in found if each for name in each[1].split()}
-
-
-def test_packages_are_debians() -> None:
-    """Every package that the README names for apt-get, also within a sentence, is one that apt-get knows."""
-    needs("apt-cache")
-    packages = _packages(README.text)
-    assert {"pipx", "libespeak-ng1", "alsa-utils", "pulseaudio"} <= packages
-    command = ["apt-cache", "show", "--no-all-versions", *sorted(packages)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    known = set(re.findall("^Package: (.+)$", done.stdout, re.MULTILINE))
-    if not known & packages and not os.environ.get("CI"):
-        pytest.skip("apt-get has no lists of packages: apt-get update")
-    assert packages - known == set()
-
-
 @runs("Start #3")
 def test_ci_runs_the_second_command() -> None:
-    """It is what runs this test there: CI takes it from the README, in its own words, and the packages for it too.
-
-    After it come only the tests that it leaves out.
-    """
+    """CI takes the command from the README, and runs the slow tests after it."""
     needs("bash")
     ci = (ROOT / ".ci/run").read_text(encoding="utf-8")
     finds = next(each for each in ci.splitlines() if each.startswith("test_command="))
@@ -233,8 +205,6 @@ def test_ci_runs_the_second_command() -> None:
     assert done.stdout.decode() == block("Start #3")
     steps = [each for each in ci.splitlines() if each and not each.startswith("step ")]
     assert steps[-2:] == ['eval "$test_command"', '"$bin/pytest" -n 4 -m slow']
-    before = README.text[: README.text.index(block("Start #3"))].rpartition("passes the tests (")[2]
-    assert "pulseaudio" in _packages(before) <= _packages(ci)
 
 
 @runs("Neural voices")

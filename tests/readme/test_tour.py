@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def speaking(make_talk: MakeTalk) -> Talk:
-    """A server with the real engine that speaks fast, to nobody, and takes the time of it, so goals can be preempted."""
+    """A server with the real engine that speaks fast to nobody, in real time, so that goals can be preempted."""
     return make_talk("--player", "null", "--rate", "450")
 
 
@@ -80,7 +80,11 @@ def test_options_of_a_goal_and_cancelling(speaking: Talk, shell: Shell) -> None:
     ids.append(speaking.request("say", text="four minutes", key="eta")["goal"]["id"])
     ended = {line: shell.run(line).stdout.split() for line in reversed(cancels)}
     assert (ended["talk cancel --key eta"], ended["talk cancel --before 12"][-1:]) == (ids[4:], ids[:1])
-    assert (ended["talk cancel 12 13"], ended["talk cancel --current"], ended["talk cancel"]) == (ids[1:2], [], ids[2:4])
+    assert (ended["talk cancel 12 13"], ended["talk cancel --current"], ended["talk cancel"]) == (
+        ids[1:2],
+        [],
+        ids[2:4],
+    )
     assert shell.run(resume).returncode == 0
     assert not speaking.request("status")["server"]["paused"]
 
