@@ -1,4 +1,4 @@
-"""Lines that are no request: an error with a code or a close, and nothing else; and odd ones that simply work."""
+"""Malformed lines are answered by an error with a code, or by a close, and change nothing."""
 
 from __future__ import annotations
 
@@ -28,77 +28,52 @@ def say(rest: str) -> bytes:
     return b'{"request": "say", "text": "hello"' + rest.encode() + b"}"
 
 
-#: A line, and the code of the error that answers it; the connection stays open and usable.
+#: A line, and the code of the error that answers it. `tests/unit/test_lines.py` has many more.
 REFUSED: dict[str, tuple[bytes, str]] = {
     "a blank line": (b"", "bad_json"),
-    "not JSON": (b"say hello", "bad_json"),
-    "half an object": (b'{"request": "say", "text": "hello"', "bad_json"),
-    "two objects in a line": (say("") + say(""), "bad_json"),
     "an array": (b'[{"request": "say", "text": "hello"}]', "bad_json"),
-    "a number": (b"7", "bad_json"),
-    "null": (b"null", "bad_json"),
-    "a string": (b'"status"', "bad_json"),
     "brackets 60,000 deep": (b"[" * 60_000, "bad_json"),
     "objects 9,000 deep": (say(', "data": ' + '{"a":' * 9_000), "bad_json"),
     "an integer of 5,000 digits": (say(', "seq": ' + "9" * 5_000), "bad_json"),
     "NaN": (say(', "data": {"a": NaN}'), "bad_json"),
-    "Infinity": (say(', "data": {"a": Infinity}'), "bad_json"),
-    "-Infinity": (say(', "data": {"a": -Infinity}'), "bad_json"),
-    "a number past every float": (say(', "data": {"a": 1e999}'), "bad_json"),
     "a key twice": (say(', "text": "good bye"'), "bad_json"),
-    "a key twice, further in": (say(', "data": {"a": 1, "a": 2}'), "bad_json"),
     "bytes that are no UTF-8": (b'{"request": "say", "text": "hell\xf6"}', "bad_encoding"),
-    "an overlong NUL": (b'{"request": "say", "text": "hell\xc0\x80"}', "bad_encoding"),
-    "half of a pair in UTF-8": (b'{"request": "say", "text": "\xed\xa0\x80"}', "bad_encoding"),
     "a NUL": (b'{"request": "say",\0 "text": "hello"}', "bad_json"),
-    "a NUL within the text": (b'{"request": "say", "text": "hel\0lo"}', "bad_json"),
-    "a byte order mark": (b"\xef\xbb\xbf" + say(""), "bad_json"),
-    "no request": (b"{}", "bad_request"),
     "a greeting of another protocol": (b'{"talk": 2, "version": "9"}', "bad_request"),
-    "a request that is no string": (b'{"request": ["say"], "text": "hello"}', "bad_request"),
     "an unknown request": (b'{"request": "sing", "text": "hello"}', "unknown_request"),
-    "another case": (b'{"request": "SAY", "text": "hello"}', "unknown_request"),
     "an unknown field": (say(', "loud": true'), "unknown_field"),
     "a number that is no integer": (say(', "seq": 1.5'), "bad_field"),
-    "a number that is a flag": (say(', "seq": true'), "bad_field"),
-    "say without a text": (b'{"request": "say"}', "bad_field"),
+    "a number that is a string": (say(', "seq": "7"'), "bad_field"),
     "a TLS hello": (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(128, 255)), "bad_encoding"),
     "an HTTP request": (b"GET /say?text=hello HTTP/1.1\r", "bad_json"),
 }
-NO_FLAGS: list[object] = ["yes", 1, []]
-NO_STRINGS: list[object] = [None, 7, True, ["hello"], {"a": "hello"}]
+#: `tests/unit/test_requests.py` has all of them.
 WRONG_TYPES: list[tuple[str, str, object]] = [
-    *(("say", "text", each) for each in NO_STRINGS),
-    *(("say", each, value) for each in ("wait", "preempt") for value in NO_FLAGS),
-    ("say", "wait", None),
-    ("say", "format", None),
-    *(("say", "data", each) for each in ("a", 7, [1], {"a": "b" * 1024})),
-    *(("hello", "name", each) for each in (7, "", "n" * 65, ["a"])),
-    ("hello", "urgent", 1),
-    *(("cancel", "ids", each) for each in ("a-1", [7], [""], ["a" * 65], [["a-1"]], {"a-1": 1})),
-    *(("cancel", "before", each) for each in (7, "", ["a-1"])),
-    ("cancel", "current", "yes"),
-    *(("wait", "ids", each) for each in ("a-1", [None])),
-    *(("status", "id", each) for each in (7, "", "a" * 65)),
+    ("say", "text", None),
+    ("say", "data", {"a": "é" * 170}),  # its length is that in ASCII
+    ("hello", "name", ""),
+    ("cancel", "ids", [7]),
+    ("wait", "ids", ["i"] * 4_097),
+    ("status", "id", "a" * 65),
 ]
 
 
 @pytest.fixture
 def talk(scripted: Talk) -> Iterator[Talk]:
-    """A server to which nothing happens: no goal, no descriptor more than before, and it still speaks."""
+    """A server that must have spoken nothing, hold no more descriptors than before, and still speak at the end."""
 
-    def speak(wire: Wire, text: str) -> str:
-        goal_id = wire.request("say", text=text, wait=True)["goal"]["id"]
+    def speak(wire: Wire) -> str:
+        goal_id = wire.request("say", text="length=0", wait=True)["goal"]["id"]
         assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
         return str(goal_id)
 
     with scripted.connect() as wire:
-        spoken = speak(wire, "here")
+        spoken = speak(wire)
         before = descriptors(scripted)
         yield scripted
         assert wire.request("status")["active"] is None
         assert [each["recent"]["id"] for each in wire.items] == [spoken]
-        last = speak(wire, "still here")
+        last = speak(wire)
         scripted.watcher.wait_for_terminal(last)
         rejected = [each for each in scripted.watcher.goals() if scripted.watcher.states(each) == ["REJECTED"]]
         assert scripted.watcher.goals() == [spoken, *rejected, last]
@@ -110,7 +85,7 @@ def talk(scripted: Talk) -> Iterator[Talk]:
 
 
 def descriptors(talk: Talk) -> int:
-    """Return how many descriptors the server has open; 0 where the system doesn't tell."""
+    """Return the number of descriptors that the server has open, or 0 if the system doesn't tell."""
     place = f"/proc/{talk.pid}/fd"
     return len(os.listdir(place)) if os.path.isdir(place) else 0
 
@@ -127,6 +102,7 @@ def test_bad_lines_are_answered_with_their_code(talk: Talk) -> None:
             raw.send(line + b"\n" + STATUS)
             _, error, *status = raw.receive_lines(4)
             assert_error(error, code)
+            assert "seq" not in error, "no number could be read"
             assert [each.keys() - {"recent"} for each in status[:-1]] == [{"seq"}], f"{name}: {status}"
             assert (status[-1]["seq"], status[-1]["ok"]) == (7, True), name
 
@@ -135,16 +111,16 @@ def test_wrong_types_are_refused_and_do_nothing(talk: Talk) -> None:
     with talk.connect() as wire:
         for kind, field, value in WRONG_TYPES:
             text = {"text": "hello"} if kind == "say" else {}
-            wire.send({"request": kind, **text, field: value})
+            wire.send({"seq": 2**40, "request": kind, **text, field: value})
             reply = wire.receive()
             assert_error(reply, "bad_field")
-            assert field in reply["error"]["message"], reply
+            assert (field in reply["error"]["message"], reply["seq"]) == (True, 2**40), reply
             assert wire.request("status")["ok"]  # a valid one in between: ten bad ones in a row end the connection
 
 
 def test_row_49_a_field_that_the_server_does_not_know_is_an_error(talk: Talk) -> None:
-    kinds = ("hello", "say", "wait", "cancel", "status", "voices", "watch")
-    names = ("loudness", "Text", "", "seq ", "x" * 1000, "\x1b[2J", "\ud800")
+    kinds = ("hello", "say", "cancel", "watch")
+    names = ("loudness", "Text", "", "x" * 1000, "\ud800")
     with talk.connect() as wire:
         for kind, name in itertools.product(kinds, names):
             text = {"text": "never-ends"} if kind == "say" else {}
@@ -155,17 +131,15 @@ def test_row_49_a_field_that_the_server_does_not_know_is_an_error(talk: Talk) ->
 
 def test_nested_data_is_taken_or_refused_at_any_depth(talk: Talk) -> None:
     with talk.connect() as wire:
-        for depth in (*range(100, 200, 7), *range(800, 1100)):
+        for depth in (*range(160, 180), *range(960, 1_010)):
             data = '{"":' * depth + "1" + "}" * depth
-            wire.send_raw(say(f', "format": "none", "data": {data}') + b"\n" + STATUS)
+            wire.send_raw(say(f', "format": "none", "data": {data}') + b"\n")
             reply = wire.receive()
             if reply["ok"]:
-                assert reply["goal"]["state"] == "REJECTED"  # its format is not known, so that nothing is spoken
+                assert reply["goal"]["state"] == "REJECTED"  # for its unknown format, so nothing is spoken
             else:
                 assert reply["error"]["code"] in {"bad_field", "bad_json"}
-            while "ok" not in (status := wire.receive()):
-                assert "recent" in status
-            assert status["seq"] == 7
+            assert wire.request("status")["ok"]
 
 
 def test_line_that_is_too_long_ends_the_connection(talk: Talk) -> None:
@@ -180,15 +154,6 @@ def test_line_that_is_too_long_ends_the_connection(talk: Talk) -> None:
         assert raw.receive_lines(3)[2]["ok"]
 
 
-def test_requests_that_stand_before_a_line_that_is_too_long_are_carried_out(talk: Talk) -> None:
-    with Raw(talk.socket) as raw:
-        raw.send(b'{"seq": 1, "request": "cancel"}\n{"seq": 2, "request": "resume"}\n' + b"a" * (MAX_LINE + 1))
-        _, canceled, resumed, error = raw.receive_all()
-        assert (canceled["seq"], canceled["ok"]) == (1, True)
-        assert (resumed["seq"], resumed["paused"]) == (2, False)
-        assert_error(error, "line_too_long")
-
-
 def test_as_many_as_stand_before_a_line_that_is_too_long_are_answered_and_none_behind_it(talk: Talk) -> None:
     requests = [b'{"seq": %d, "request": "resume"}\n' % number for number in range(101)]
     with Raw(talk.socket) as raw:
@@ -199,11 +164,7 @@ def test_as_many_as_stand_before_a_line_that_is_too_long_are_answered_and_none_b
 
 
 def test_nothing_but_bad_lines_end_the_connection(talk: Talk) -> None:
-    for lines in (
-        b"\n" * 10_000,
-        b"null\n" * 10_000,
-        b"GET / HTTP/1.1\r\nHost: robot\r\n" + b"X: y\r\n" * 20 + b"\r\n",
-    ):
+    for lines in (b"\n" * 10_000, b"GET / HTTP/1.1\r\nHost: robot\r\n" + b"X: y\r\n" * 20 + b"\r\n"):
         with Raw(talk.socket) as raw:
             raw.send(lines)
             _, *errors = raw.receive_all()
@@ -213,7 +174,7 @@ def test_nothing_but_bad_lines_end_the_connection(talk: Talk) -> None:
 
 
 def test_connection_that_ends_early_is_nothing(talk: Talk) -> None:
-    talk.request("status")  # answered when all that happened before it is in the log
+    talk.request("status")  # by its reply, all earlier events are in the log
     before = talk.log
     for data in (b"", b"{", say(""), b"\n", b'{"request": "say", "text": "hel'):
         Raw(talk.socket).__exit__()
@@ -235,4 +196,3 @@ def test_descriptors_that_are_passed_are_not_kept(talk: Talk) -> None:
             raw.socket.sendmsg([STATUS], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, passed)])
         replies = [each for each in raw.receive_lines(1 + 2 * 20) if "ok" in each]
         assert [each["ok"] for each in replies] == [True] * 20
-        # the fixture counts the server's descriptors

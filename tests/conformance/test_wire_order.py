@@ -1,9 +1,8 @@
-"""The wire: greeting, replies, events in their order, and clients of few lines."""
+"""The wire: the greeting, replies, and the order of events."""
 
 from __future__ import annotations
 
 import json
-import subprocess
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,6 @@ import pytest
 from talkcli import __version__
 from tests.conformance.rawsocket import Raw
 from tests.conformance.witness import await_ends
-from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
@@ -30,7 +28,7 @@ def line(**fields: object) -> bytes:
 
 
 def shape(message: Message) -> str:
-    """Return a message in a word: its event's state, or what it is."""
+    """Return an event's state or kind, "reply" or "item"."""
     if "event" in message:
         return str(message.get("state", message["event"]))
     return "reply" if "ok" in message else "item"
@@ -150,22 +148,18 @@ def test_replies_that_are_owed_reach_a_client_that_has_closed_its_half(scripted:
 
 @pytest.mark.parametrize("behind", ["nothing", "cancel"])
 def test_requests_that_wait_for_the_voices_keep_their_order(make_talk: MakeTalk, behind: str) -> None:
-    """A goal with a voice waits at the start until the voices are known, and what comes after it waits with it."""
-    count = 150
+    """At the start, a goal with a voice and all requests after it wait until the voices are known."""
+    count = 60
     talk = make_talk("--max-queue", str(2 * count), scripted=True, env={"SCRIPTED_START": "slow=0.5"})
     with talk.connect() as wire:
         boot = wire.greeting["boot"]
         for number in range(5_000, 5_000 + count):
-            wire.send(
-                {"seq": number, "request": "say", "text": "length=0", **({} if number % 3 else {"voice": "default"})}
-            )
+            voice = {} if number % 3 else {"voice": "default"}
+            wire.send({"seq": number, "request": "say", "text": "length=0", **voice})
         wire.send({"seq": 6_000, "request": "say", "text": "length=0", "voice": "default", "id": "last"})
         wire.send({"seq": 6_001, "request": "wait", "ids": ["last"]})
         wire.send({"seq": 6_002, "request": "set", "rate": 100})
-        if behind == "cancel":
-            assert wire.request("cancel")["ok"]
-        else:
-            assert wire.request("status")["ok"]
+        assert wire.request("cancel" if behind == "cancel" else "status")["ok"]
         told = [(each["seq"], each) for each in wire.items if "ok" in each]
     assert [seq for seq, _ in told] == [*range(5_000, 5_000 + count), 6_000, 6_001, 6_002]
     assert all(each["ok"] for _, each in told)
@@ -223,13 +217,14 @@ def test_past_a_thousand_requests_that_wait_for_the_voices_goals_are_rejected(ma
         assert [each["seq"] for each in wire.items if "ok" in each] == [*range(5_000, 6_000), 7_000]
 
 
-def test_one_line_of_socat_says_a_sentence(scripted: Talk) -> None:
-    needs("socat")
-    command = """echo '{"request": "say", "text": "battery low"}' | socat -t 2 - UNIX-CONNECT:"$TALK_SOCKET" """
-    done = subprocess.run(command, shell=True, env=scripted.env, capture_output=True, text=True, timeout=20, check=True)
-    greeting, reply = (json.loads(each) for each in done.stdout.splitlines())
-    assert (greeting["talk"], reply["goal"]["text"]) == (1, "battery low")
-    assert scripted.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
+@pytest.mark.parametrize("extra", [{"wait": True}, {"feedback": True}, {}])
+def test_a_rejected_goal_has_a_state_and_a_result_if_the_client_waits(scripted: Talk, extra: dict[str, bool]) -> None:
+    with Raw(scripted.socket) as raw:
+        raw.send(line(request="say", text="", **extra))
+        raw.half_close()
+        _, reply, *events = raw.receive_all()
+    assert [shape(each) for each in events] == (["REJECTED", "result"] if extra else [])
+    assert {each["goal"]["state"] for each in (reply, *events[1:])} == {"REJECTED"}
 
 
 def test_lists_come_one_item_a_line(scripted: Talk) -> None:
