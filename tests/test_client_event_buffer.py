@@ -1,4 +1,4 @@
-"""The client library against a server that follows a script: what nobody takes, and what comes twice."""
+"""The client library against a server that follows a script: events that the program doesn't take, or get twice."""
 
 from __future__ import annotations
 
@@ -8,32 +8,9 @@ from talkcli import Client
 from talkcli.client.following import MAX_FEEDBACK, MAX_STATES
 from talkcli.errors import Lost, UnknownGoal
 from talkcli.goals.states import State
-from talkcli.protocol.events import Event, Result, Snapshot, StateChanged, WordHeard
+from talkcli.protocol.events import Event, Result, Snapshot, StateChanged
 from talkcli.protocol.lines import MAX_LINE
-from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import OVERVIEW, Peer, goal, result, serving
-
-# What nobody takes
-
-
-def test_words_that_nobody_takes_are_dropped_but_no_state() -> None:
-    count = MAX_FEEDBACK + 3_000
-
-    def play(peer: Peer) -> None:
-        peer.accept()
-        peer.send(peer.state("PENDING"), peer.state("ACTIVE"), *(peer.word(each) for each in range(1, count + 1)))
-        peer.send(peer.state("SUCCEEDED"), result())
-
-    with serving(play) as path, Client(path) as client:
-        handle = client.say("a", feedback=True)
-        assert handle.wait(PATIENCE).state is State.SUCCEEDED
-        *seen, last = handle.events()
-        numbers = [each.number for each in seen if isinstance(each, WordHeard)]
-        assert numbers == list(range(count - MAX_FEEDBACK + 1, count + 1))  # the newest
-        states = [each.state for each in seen if isinstance(each, StateChanged)]
-        assert states == [State.PENDING, State.ACTIVE, State.SUCCEEDED]
-        assert isinstance(seen[-1], StateChanged)
-        assert last == Result(handle.goal)
 
 
 def test_words_are_not_kept_for_a_goal_that_was_sent_without_feedback() -> None:
@@ -48,7 +25,7 @@ def test_words_are_not_kept_for_a_goal_that_was_sent_without_feedback() -> None:
         assert handle.speech_paused
 
 
-def test_watch_that_nobody_takes_is_bounded_and_ends() -> None:
+def test_watch_that_is_not_read_is_bounded_and_ends() -> None:
     def play(peer: Peer) -> None:
         peer.reply("watch", **OVERVIEW)
         for _ in range(MAX_STATES + 500):
@@ -85,11 +62,8 @@ def test_watch_ends_with_its_iterator() -> None:
         assert len(watches) == 0
 
 
-# The same thing twice, and things in parts
-
-
 def test_event_that_comes_twice_is_one() -> None:
-    """To a connection that waits for a goal and watches all, the server tells each state as to two."""
+    """A connection that waits for a goal and watches all goals gets each state twice."""
 
     def play(peer: Peer) -> None:
         peer.reply("watch", **OVERVIEW)

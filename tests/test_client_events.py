@@ -1,4 +1,4 @@
-"""Events of the client library: their form in JSON, and what a handle and a watch hear of a real server."""
+"""Events of the client library: their form in JSON, and those that a handle and a watch get from a real server."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import talkcli
 from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard
 from talkcli.client.following import MAX_FEEDBACK, MAX_STATES, EventBuffer
-from talkcli.errors import Lost, UnknownGoal, UsageError
+from talkcli.errors import UnknownGoal, UsageError
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.protocol import events
 from talkcli.protocol.events import ServerStatus
@@ -54,24 +54,6 @@ def test_event_goes_to_json_and_back(event: Event) -> None:
     assert next(iter(message)) == "event"
     assert events.from_json(message) == event
     assert events.from_json({**message, "new": 1}) == event
-
-
-def test_events_in_json_are_those_of_the_wire(scripted: Talk) -> None:
-    with scripted.connect() as wire:
-        wire.request("watch")
-        wire.request("say", text="length=0.1 one two", feedback=True)
-        wire.request("pause")
-        wire.request("resume")
-        came = [*wire.events]
-        while came[-1]["event"] != "result":
-            came.append(wire.receive(PATIENCE))
-    came = [each for each in came if each["event"] != "alive"]
-    assert {each["event"] for each in came} == {"state", "word", "paused", "result"}
-    for each in came:
-        event = events.from_json(each)
-        assert event
-        assert event.to_json() == each
-        assert list(event.to_json()) == list(each)
 
 
 @pytest.mark.parametrize(
@@ -154,10 +136,6 @@ def test_events_of_a_goal_end_with_its_result(client: Client) -> None:
     assert handle.wait(0) is handle.goal
 
 
-def test_events_without_feedback_are_states(client: Client) -> None:
-    assert told(list(client.say("length=0.1").events(5))) == [State.PENDING, State.ACTIVE, State.SUCCEEDED, Result]
-
-
 def test_feedback_of_a_goal_sent_without_it_begins_with_the_question(client: Client, scripted: Talk) -> None:
     for follow in (True, False):
         first = client.say("never-ends", follow=follow)
@@ -167,6 +145,7 @@ def test_feedback_of_a_goal_sent_without_it_begins_with_the_question(client: Cli
         first.cancel()
         assert [each.word for each in words] == ["length=0.1", "one"]
         assert handle.state is State.SUCCEEDED
+    assert told(list(client.say("length=0").events(5))) == [State.PENDING, State.ACTIVE, State.SUCCEEDED, Result]
 
 
 def test_goal_that_was_rejected_has_a_result_and_no_words(client: Client) -> None:
@@ -212,32 +191,6 @@ def test_events_of_a_goal_that_is_cancelled_while_they_are_iterated(client: Clie
         if isinstance(event, WordHeard) and event.number == 1:
             assert handle.cancel().state is State.PREEMPTED
     assert told(found)[-3:] == [State.PREEMPTING, State.PREEMPTED, Result]
-
-
-def test_events_time_out_and_the_goal_goes_on(client: Client, scripted: Talk) -> None:
-    handle = client.say("never-ends words=1", feedback=True)
-    scripted.watcher.wait_for_word(handle.id)
-    found: list[Event] = []
-    with pytest.raises(TimeoutError, match=handle.id):
-        found.extend(handle.events(0.3))
-    assert told(found) == [State.PENDING, State.ACTIVE, "never-ends"]
-    assert scripted.goal(handle.id)["state"] == "ACTIVE"
-    handle.cancel()
-    assert told(list(handle.events(5))) == [State.PREEMPTING, State.PREEMPTED, Result]
-
-
-def test_goal_is_lost_with_its_server(client: Client, scripted: Talk) -> None:
-    handle = client.say("never-ends words=1", feedback=True)
-    watch = client.events()
-    for _ in handle.feedback(5):
-        scripted.kill()
-    assert (handle.state, handle.goal.reason) == (State.LOST, "lost")
-    *_, last = handle.events()
-    assert last == Result(handle.goal)
-    with pytest.raises(Lost, match="went away"):
-        list(watch)
-    with pytest.raises(StopIteration):
-        next(watch)
 
 
 def test_late_feedback_of_an_unknown_goal_is_an_error(client: Client) -> None:
@@ -307,25 +260,24 @@ def test_poll_of_a_goal_that_nothing_is_heard_of_says_so(client: Client) -> None
     assert told(polled(handle))[-1] is Result
 
 
-def test_poll_tells_that_the_goal_is_lost_with_its_server(client: Client, scripted: Talk) -> None:
-    handle = client.say("never-ends words=1")
-    scripted.kill()
-    assert told(polled(handle))[-1] is Result
-    assert (handle.state, handle.goal.reason, handle.poll()) == (State.LOST, "lost", None)
-
-
-def test_poll_tells_that_the_goal_is_lost_where_the_server_says_nothing_any_more(
-    client: Client, scripted: Talk, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("how", ["killed", "frozen"])
+def test_poll_tells_that_the_goal_is_lost(
+    client: Client, scripted: Talk, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     began = time.monotonic()
     handle = client.say("never-ends words=1")
-    monkeypatch.setattr("talkcli.client.connection.SILENCE_LIMIT", 0.3)
-    scripted.freeze()
+    if how == "killed":
+        scripted.kill()
+    else:
+        monkeypatch.setattr("talkcli.client.connection.SILENCE_LIMIT", 0.3)
+        scripted.freeze()
     assert told(polled(handle))[-1] is Result
-    assert time.monotonic() - began >= 0.3
-    assert (handle.state, "nothing for 0.3 s" in (handle.goal.message or "")) == (State.LOST, True)
-    scripted.thaw()
-    scripted.run("cancel")
+    assert (handle.state, handle.goal.reason, handle.poll()) == (State.LOST, "lost", None)
+    if how == "frozen":
+        assert time.monotonic() - began >= 0.3
+        assert "nothing for 0.3 s" in (handle.goal.message or "")
+        scripted.thaw()
+        scripted.run("cancel")
 
 
 # All events
@@ -369,41 +321,3 @@ def test_watch_begins_with_a_snapshot_and_tells_everything(client: Client, scrip
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # nothing twice, nothing missing
     handle = client.say("length=0 one", feedback=True)
     assert told(until_all_ended(watch, 1)) == told(list(handle.events(5)))[:-1]
-
-
-def test_two_watches_of_a_client_hear_the_same(client: Client) -> None:
-    first, second = client.events(), client.events()
-    handles = [client.say(f"length=0 {number}", feedback=True) for number in range(3)]
-    one, two = until_all_ended(first, 3), until_all_ended(second, 3)
-    assert one[1:] == two[1:]
-    assert [type(each) for each in (one[0], two[0])] == [Snapshot, Snapshot]
-    assert [len([each for each in handle.feedback(5)]) for handle in handles] == [2, 2, 2]  # noqa: C416
-
-
-def test_watch_that_is_broken_off_can_be_begun_anew(client: Client) -> None:
-    for turn in range(3):
-        watch = client.events()
-        handle = client.say(f"length=0 {turn}")
-        assert len(until_all_ended(watch, 1)) >= 4
-        assert handle.wait(5).state is State.SUCCEEDED
-    assert isinstance(next(client.events()), Snapshot)
-
-
-def test_close_ends_the_watch_of_another_thread(client: Client) -> None:
-    ended: list[str] = []
-    begun = threading.Event()
-
-    def watch() -> None:
-        try:
-            for _ in client.events():
-                begun.set()
-        except Lost as error:
-            ended.append(str(error))
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    assert begun.wait(5)
-    client.close()
-    thread.join(5)
-    assert len(ended) == 1
-    assert "closed" in ended[0]

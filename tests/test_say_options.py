@@ -1,9 +1,8 @@
-"""The options of `say`: each does what its help says; what contradicts itself is refused before anything is sent."""
+"""The options of `say` do what its help says. Contradictions are refused before anything is sent."""
 
 from __future__ import annotations
 
 import fcntl
-import importlib.util
 import json
 import os
 import re
@@ -11,7 +10,6 @@ import shlex
 import signal
 import struct
 import subprocess
-import sys
 import termios
 import time
 import wave
@@ -20,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.conformance.bareserve import TALK, environment, run
-from tests.support.surroundings import needs, short_directory
+from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,7 +34,7 @@ def alone(*words: str, **extra: str) -> Any:
 
 
 def busy(talk: Talk) -> str:
-    """Have something spoken that does not end, and return its id."""
+    """Start a goal that does not end, and return its id once it is heard."""
     goal_id = talk.run("say", "never-ends words=1").id
     talk.watcher.wait_for_word(goal_id)
     return goal_id
@@ -48,50 +46,25 @@ def busy(talk: Talk) -> str:
 @pytest.mark.parametrize(
     ("words", "hints"),
     [
-        (["--flush", "--queue", "hello"], ["--flush", "--queue"]),
-        (["--timeout", "3", "hello"], ["--timeout", "--wait"]),
-        (["--lines", "hello"], ["--lines", "TEXT"]),
         (["--lines", "-"], ["--lines", "TEXT"]),
         (["--lines", "--id", "mine"], ["--lines", "--id"]),
         (["--lines", "--timeout", "3"], ["--timeout", "--wait"]),
         (["--ahead", "3", "hello"], ["--ahead", "--lines"]),
-        ([], ["TEXT"]),
         (["-o", "x.wav"], ["TEXT"]),
         (["-o", "x.wav", "-w", "--key", "k", "hello"], ["--output", "--wait, --key"]),
         (["-o", "x.wav", "--queue", "hello"], ["--output", "--queue"]),
-        (["-o", "x.wav", "--preempt", "hello"], ["--output", "--preempt"]),
         (["-o", "x.wav", "--lines"], ["--output", "--lines"]),
-        (["-o", "x.wav", "-f", "hello"], ["--output", "--feedback"]),
-        (["-o", "x.wav", "--flush", "--priority", "0", "hello"], ["--flush, --priority"]),
+        (["-o", "x.wav", "-f", "--lead-in", "3", "hello"], ["--output", "--feedback", "--lead-in"]),
         (["-o", "x.wav", "--ttl", "0", "--throttle", "0", "hello"], ["--ttl, --throttle"]),
         (["-o", "x.wav", "--id", "mine", "--as", "me", "hello"], ["--id, --as"]),
-        (["--rate", "79", "hello"], ["--rate", "80"]),
-        (["--rate", "451", "hello"], ["--rate", "450"]),
-        (["--rate", "1e3", "hello"], ["--rate"]),
-        (["--volume", "1.01", "hello"], ["--volume"]),
-        (["--volume", "nan", "hello"], ["--volume"]),
-        (["--pitch", "-1", "hello"], ["--pitch"]),
-        (["--voice", "", "hello"], ["--voice", "variable"]),
-        (["--ttl", "-1", "hello"], ["--ttl"]),
-        (["--ttl", "inf", "hello"], ["--ttl", "0"]),
-        (["--throttle", "nan", "hello"], ["--throttle"]),
-        (["--key", "", "hello"], ["--key"]),
-        (["--key", "k" * 65, "hello"], ["key", "64"]),
-        (["--priority", "1000001", "hello"], ["priority"]),
-        (["--priority", "high", "hello"], ["--priority"]),
-        (["--id", "12", "hello"], ["id '12'"]),
-        (["--id", "4k7f-7", "hello"], ["4k7f-7"]),
-        (["--id", "a b", "hello"], ["a b"]),
-        (["--id", "", "hello"], ["--id"]),
-        (["--id", "k\udcff", "hello"], ["--id", "0xff"]),
         (["--key", "k\udcff\udcfe", "hello"], ["--key", "0xff"]),
         (["--as", "日\udcff", "hello"], ["--as", "0xff"]),
-        (["-o", "x.wav", "--voice", "k\udcff", "hello"], ["--voice", "0xff"]),
-        (["--as", "", "hello"], ["--as", "variable"]),
         (["--as=", "-o", "x.wav", "hello"], ["--as", "variable"]),
+        (["--lead-in", "5001", "hello"], ["--lead-in", "5000"]),
     ],
 )
 def test_contradictions_and_values_out_of_range_are_usage_errors(words: list[str], hints: list[str]) -> None:
+    """`tests/golden/errors.txt` has many more."""
     done = alone("say", *words)
     assert (done.code, done.out) == (2, ""), done
     assert [each for each in hints if each not in done.err] == [], done.err
@@ -100,34 +73,21 @@ def test_contradictions_and_values_out_of_range_are_usage_errors(words: list[str
 # Order
 
 
-def test_preempt_and_queue(make_talk: MakeTalk) -> None:
+def test_preempt_queue_flush_and_priority_reach_the_server(make_talk: MakeTalk) -> None:
     talk = make_talk("--preempt", scripted=True)
     first = busy(talk)
-    queued = talk.run("say", "--queue", "length=0").id
-    assert talk.watcher.states(queued) == ["PENDING"]
-    assert talk.run("say", "--wait", "--preempt", "length=0").code == 0
+    queued = [talk.run("say", "--queue", "--priority", each, "length=0").id for each in ("-1", "0", "5")]
+    assert [talk.watcher.states(each) for each in queued] == [["PENDING"]] * 3
+    assert talk.run("say", "--wait", "--preempt", "--priority", "9", "length=0").code == 0
     assert talk.watcher.wait_for_terminal(first) == "PREEMPTED"
-    assert talk.watcher.wait_for_terminal(queued) == "SUCCEEDED"
-
-
-def test_flush_drops_what_waits(scripted: Talk) -> None:
-    first = busy(scripted)
-    pending = scripted.run("say", "pending").id
-    important = scripted.run("say", "--priority", "1", "length=0 important").id
-    done = scripted.run("say", "--wait", "--flush", "length=0 now")
-    assert done.code == 0
-    ends = [scripted.watcher.wait_for_terminal(each) for each in (first, pending, important)]
+    assert {talk.watcher.wait_for_terminal(each) for each in queued} == {"SUCCEEDED"}
+    begun = [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"]
+    assert begun[2:] == queued[::-1]
+    first = busy(talk)
+    pending, important = (talk.run("say", "--queue", "--priority", each, "length=0").id for each in ("0", "1"))
+    assert talk.run("say", "--wait", "--flush", "length=0 now").code == 0
+    ends = [talk.watcher.wait_for_terminal(each) for each in (first, pending, important)]
     assert ends == ["PREEMPTED", "RECALLED", "SUCCEEDED"]
-
-
-def test_priority_goes_first(scripted: Talk) -> None:
-    first = busy(scripted)
-    ids = [scripted.run("say", "--priority", each, "length=0").id for each in ("-1", "0", "5")]
-    scripted.run("cancel", first)
-    for each in ids:
-        scripted.watcher.wait_for_terminal(each)
-    begun = [each["id"] for each in scripted.watcher.events() if each.get("state") == "ACTIVE"]
-    assert begun == [first, *reversed(ids)]
 
 
 def test_ttl_and_key_and_wait_tell_what_became_of_it(scripted: Talk) -> None:
@@ -167,18 +127,17 @@ def test_settings_of_a_goal_are_sent_and_the_environment_is_not(make_talk: MakeT
     talk = make_talk(scripted=True)
     done = run([*TALK, "say", "--wait", "length=0"], {**talk.env, **env})
     assert done.code == 0, done.err
-    for option, value in (("--rate", "250"), ("--volume", "0.5"), ("--pitch", "20"), ("--voice", "en")):
-        assert talk.run("say", "--wait", option, value, "length=0").code == 0
+    given = ("--rate", "250", "--volume", "0.5", "--pitch", "20", "--voice", "en")
+    assert talk.run("say", "--wait", *given, "length=0").code == 0
     unknown = talk.run("say", "--voice", "nobody-speaks-it", "length=0")
     assert (unknown.code, unknown.out) == (5, "")
     assert "nobody-speaks-it" in unknown.err
 
 
-@pytest.mark.parametrize("name", [".mp3", "..ogg", ".wav"])
-def test_a_file_s_name_is_no_ending(tmp_path: Path, name: str) -> None:
-    done = alone("say", "-o", str(tmp_path / name), "--rate", "450", "hi")
+def test_a_hidden_file_s_name_has_no_ending(tmp_path: Path) -> None:
+    done = alone("say", "-o", str(tmp_path / ".mp3"), "--rate", "450", "hi", TALK_NAME="patrol")
     assert (done.code, done.err) == (0, "")
-    assert (tmp_path / name).read_bytes()[:4] == b"RIFF"
+    assert (tmp_path / ".mp3").read_bytes()[:4] == b"RIFF"
 
 
 def test_ctrl_c_while_the_text_is_read_ends_the_terminal_s_line(scripted: Talk) -> None:
@@ -189,7 +148,7 @@ def test_ctrl_c_while_the_text_is_read_ends_the_terminal_s_line(scripted: Talk) 
         client.stdin.write(b"battery")
         client.stdin.flush()
         while struct.unpack("i", fcntl.ioctl(client.stdin, termios.FIONREAD, bytes(4)))[0]:
-            time.sleep(0.005)  # that another process has read is no event
+            time.sleep(0.005)  # no event tells that another process has read
         client.send_signal(signal.SIGINT)
         assert client.stderr
         assert client.stderr.read() == b"\n"
@@ -198,14 +157,9 @@ def test_ctrl_c_while_the_text_is_read_ends_the_terminal_s_line(scripted: Talk) 
 
 def test_a_lead_in_of_its_own_takes_its_time_and_is_no_part_of_the_goal(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
-    for lead_in in (("--lead-in", "300"), ("--lead-in=300",)):
-        goal = json.loads(talk.run("--json", "say", "--wait", *lead_in, "battery low").out.splitlines()[-1])
-        assert goal["state"] == "SUCCEEDED"
-        assert goal["ended_at"] - goal["started_at"] >= goal["duration"] + 0.3
-    refused = talk.run("say", "-o", "x.wav", "--lead-in", "300", "battery low")
-    assert (refused.code, refused.out) == (2, "")
-    assert refused.err.startswith("talk: --output writes a file, without a server: leave out --lead-in\n")
-    assert talk.run("say", "--lead-in", "5001", "x").code == 2
+    goal = json.loads(talk.run("--json", "say", "--wait", "--lead-in", "300", "hi").out.splitlines()[-1])
+    assert goal["state"] == "SUCCEEDED"
+    assert goal["ended_at"] - goal["started_at"] >= goal["duration"] + 0.3
 
 
 def test_speech_that_is_paused_is_noted(scripted: Talk) -> None:
@@ -283,11 +237,10 @@ def test_output_writes_a_file_without_a_server(tmp_path: Path) -> None:
     told = json.loads(alone("--json", "say", "-o", str(file), "battery low").out)
     assert told["output"] == str(file)
     assert told["text"] == "battery low"
-    for closed in (">&-", "1</dev/null"):
-        with short_directory() as home:
-            script = f'"$@" --json say -o {shlex.quote(str(file))} one {closed}'
-            done = run(["bash", "-c", script, "bash", *TALK], environment(home, TALK_SOCKET=f"{home}/s"))
-            assert (done.code, done.err) == (0, "")
+    with short_directory() as home:
+        script = f'"$@" --json say -o {shlex.quote(str(file))} one >&-'
+        done = run(["bash", "-c", script, "bash", *TALK], environment(home, TALK_SOCKET=f"{home}/s"))
+        assert (done.code, done.err) == (0, "")
     assert told["seconds"] == pytest.approx(seconds, abs=0.05)
 
 
@@ -306,18 +259,13 @@ def _seconds_of(tmp_path: Path, *words: str, **env: str) -> float:
 
 
 def test_output_goes_to_standard_output(tmp_path: Path) -> None:
-    needs("aplay")
-    # The device "null" takes everything at once.
-    script = 'printf "battery low" | "$@" say -o - - | tee said.wav | aplay -q -D null && "$@" say -o - x > x.wav'
     with short_directory() as home:
         env = environment(home, TALK_SOCKET=f"{home}/s")
-        piped = ["bash", "-c", f"set -o pipefail; {script}", "bash", *TALK]
-        done = subprocess.run(piped, env=env, cwd=tmp_path, capture_output=True, text=True, timeout=30, check=False)
-        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+        script = 'printf "battery low" | "$@" say -o - - | cat > said.wav'
+        done = run(["bash", "-c", f"set -o pipefail; {script}", "bash", *TALK], env, cwd=tmp_path)
+        assert (done.code, done.out, done.err) == (0, "", "")
         gone = run(["bash", "-c", '"$@" say -o - one two three | true; echo ${PIPESTATUS[0]}', "bash", *TALK], env)
         assert (gone.out, gone.err) == ("141\n", "")
-        closed = run(["bash", "-c", '"$@" say -o - one >&-', "bash", *TALK], env)
-        assert (closed.code, closed.err) == (141, "")
         full = run(["bash", "-c", '"$@" say -o - one > /dev/full', "bash", *TALK], env)
         assert (full.code, full.err) == (1, "talk: standard output cannot be written: No space left on device\n")
     said = (tmp_path / "said.wav").read_bytes()
@@ -351,13 +299,10 @@ def test_a_text_that_is_too_long_is_told_what_takes_any(scripted: Talk) -> None:
 
 
 def test_output_takes_settings_from_options_then_from_the_environment(tmp_path: Path) -> None:
-    usual = _seconds_of(tmp_path)
-    slow = _seconds_of(tmp_path, TALK_RATE="100")
-    assert slow > 1.5 * usual
-    assert _seconds_of(tmp_path, "--rate", "100") == pytest.approx(slow, abs=0.1)
-    assert _seconds_of(tmp_path, "--rate", "200", TALK_RATE="100") == pytest.approx(usual, abs=0.1)
+    usual = _seconds_of(tmp_path, "--rate", "200", TALK_RATE="100")
     assert _seconds_of(tmp_path, TALK_RATE="") == pytest.approx(usual, abs=0.1)
-    for variable, value in (("TALK_RATE", "5"), ("TALK_RATE", "fast"), ("TALK_VOLUME", "nan")):
+    assert _seconds_of(tmp_path, TALK_RATE="100") > 1.5 * usual
+    for variable, value in (("TALK_RATE", "5"), ("TALK_VOLUME", "nan")):
         done = alone("say", "-o", str(tmp_path / "never.wav"), "hello", **{variable: value})
         assert done.code == 2
         assert variable in done.err
@@ -386,29 +331,9 @@ def test_output_that_is_interrupted_leaves_nothing(tmp_path: Path) -> None:
             [*TALK, "say", "-o", str(tmp_path / "x.wav"), "--rate", "80", "--", "one two three. " * 600],
             env=environment(home),
         )
-        while not os.listdir(tmp_path):  # the hidden file appears as the engine starts
+        while not os.listdir(tmp_path):  # the hidden file appears when the engine starts
             assert client.poll() is None
             time.sleep(0.005)
         client.send_signal(signal.SIGINT)
         assert client.wait(10) == 130
     assert os.listdir(tmp_path) == []
-
-
-def test_as_from_the_environment_is_no_contradiction_of_output(tmp_path: Path) -> None:
-    assert alone("say", "-o", str(tmp_path / "x.wav"), "hello", TALK_NAME="patrol").code == 0
-
-
-# What it costs
-
-
-def test_say_loads_nothing_that_it_does_not_use(scripted: Talk) -> None:
-    unused = ["terminal.text", "engine"]
-    unused += ["cli.feedback", "cli.stdin"]
-    assert all(importlib.util.find_spec(f"talkcli.{each}") for each in unused)
-    code = (
-        "import sys; from talkcli.cli import run; assert run({}) == 0;"
-        "print([m for m in {} if 'talkcli.' + m in sys.modules])"
-    )
-    for words in (["say", "--wait", "length=0"], ["say", "--key", "k", "--priority", "3", "--ttl", "9", "length=0"]):
-        done = run([sys.executable, "-c", code.format(words, unused)], scripted.env)
-        assert done.out.splitlines()[-1] == "[]", done
