@@ -1,4 +1,4 @@
-"""`talk pause` and `talk resume`: what they say, print and return. What is heard meanwhile is tested elsewhere."""
+"""`talk pause` and `talk resume`: their messages, output and exit codes. Other tests compare what is heard."""
 
 from __future__ import annotations
 
@@ -9,16 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.server import requests
-from tests.conformance.bareserve import TALK, environment, run
-from tests.support.surroundings import short_directory
-
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
 
-#: Serves with the scripted engine, and gives a pause so many seconds.
+#: Serves with the scripted engine, and waits so many seconds for the silence of a pause.
 LIMITED = """
 import sys
 sys.path.insert(0, {root!r})
@@ -50,26 +46,14 @@ def test_pause_tells_what_is_held_and_resume_what_goes_on(scripted: Talk, held: 
     assert scripted.goal(held)["paused"] is False
     again = scripted.run("resume")
     assert (again.code, again.out, again.err) == (0, "", f"talk: speech goes on with {held}\n")
-    scripted.run("cancel")
-
-
-def test_json_is_one_object(scripted: Talk, held: str) -> None:
-    for _ in range(2):
-        done = scripted.run("--json", "pause")
-        told = json.loads(done.out)
-        assert (told.keys(), done.err, done.code) == ({"paused", "goal"}, "", 0)
-        assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (True, held, True)
+    told = json.loads(scripted.run("pause", "--json").out)
+    assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (True, held, True)
     told = json.loads(scripted.run("resume", "--json").out)
     assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (False, held, False)
-    assert json.loads(scripted.run("resume", "--json").out)["paused"] is False
+    for command in ("pause", "resume"):
+        quiet = scripted.run(command, "-q")
+        assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
     scripted.run("cancel")
-
-
-def test_quiet_says_nothing(scripted: Talk, held: str) -> None:
-    for words in (["-q", "pause"], ["pause", "-q"], ["-q", "resume"]):
-        done = scripted.run(*words)
-        assert (done.code, done.out, done.err) == (0, "", "")
-    scripted.run("cancel", held)
 
 
 def test_status_shows_what_is_held(scripted: Talk, held: str) -> None:
@@ -97,7 +81,7 @@ def test_what_was_heard_last_is_shown_escaped(scripted: Talk) -> None:
 
 def begin(talk: Talk, text: str) -> str:
     goal_id = talk.run("say", text).id
-    talk.watcher.wait_for_word(goal_id)  # ACTIVE is earlier: the engine may still be starting
+    talk.watcher.wait_for_word(goal_id)  # at ACTIVE, the engine may still be starting
     return goal_id
 
 
@@ -125,10 +109,8 @@ def test_silence_of_an_earlier_pause_answers_no_later_one(scripted: Talk) -> Non
     scripted.run("cancel")
 
 
-@pytest.mark.parametrize("limit", [0.5, pytest.param(requests.PAUSE_LIMIT, marks=pytest.mark.slow)])
-def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(
-    make_talk: MakeTalk, tmp_path: Path, limit: float
-) -> None:
+def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(make_talk: MakeTalk, tmp_path: Path) -> None:
+    limit = 0.5
     program = tmp_path / "serve.py"
     program.write_text(LIMITED.format(root=str(Path(__file__).parents[1]), limit=limit), encoding="utf-8")
     talk = make_talk(program=str(program))
@@ -147,7 +129,7 @@ def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(
     talk.run("cancel")
 
 
-def test_where_nothing_is_spoken_it_is_success_too(make_talk: MakeTalk) -> None:
+def test_pause_and_resume_succeed_if_nothing_is_spoken(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
     done = talk.run("pause")
     assert (done.code, done.out, "nothing is being spoken" in done.err) == (0, "", True)
@@ -157,12 +139,4 @@ def test_where_nothing_is_spoken_it_is_success_too(make_talk: MakeTalk) -> None:
     done = talk.run("resume")
     assert (done.code, done.out, done.err.startswith("talk: speech goes on")) == (0, "", True)
     assert talk.run("wait", waiting).code == 0
-    assert talk.run("-q", "resume").code == 0
     assert json.loads(talk.run("--json", "resume").out) == {"paused": False, "goal": None}
-
-
-def test_without_a_server_it_is_3() -> None:
-    with short_directory() as home:
-        for command in ("pause", "resume"):
-            done = run([*TALK, command], environment(home, TALK_SOCKET=f"{home}/s"))
-            assert (done.code, done.out) == (3, "")
