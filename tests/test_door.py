@@ -1,4 +1,4 @@
-"""The door of a full server: who waits there comes in when another leaves, and is sent away only if none does."""
+"""A full server: waiting clients are let in when others leave, and refused only if no place gets free."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from talkcli.server.connection import Connection
 from talkcli.server.run import Server, Settings
+from tests.support.loop import in_loop
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -28,7 +29,7 @@ class Client:
         self.socket.sendall(says)
 
     def heard(self) -> list[str]:
-        """Return what it was told by now, in a word for each line."""
+        """Return one word for each line that has arrived."""
         told = b""
         with contextlib.suppress(BlockingIOError):
             while data := self.socket.recv(65536):
@@ -37,7 +38,7 @@ class Client:
 
 
 class Unused:
-    """A listener: who connects here has a socket already."""
+    """A listener that is never asked: the clients here have sockets already."""
 
     path, mode = "unused", 0o600
 
@@ -48,7 +49,7 @@ def _word(line: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def server_for(clients: int) -> Iterator[Callable[[bytes], Client]]:
-    """Give what connects a client, which has said something already, to a server with so many places."""
+    """Return a function that connects a client, after its first words, to a server with so many places."""
     served = Server(Settings(max_clients=clients), cast("Any", Unused()))
     made: list[Client] = []
 
@@ -72,45 +73,39 @@ async def turns() -> None:
         await asyncio.sleep(0)
 
 
-def test_who_waits_at_the_door_is_greeted_when_another_leaves() -> None:
-    async def play() -> None:
-        with server_for(1) as connect:
-            first, second, third = connect(b""), connect(b""), connect(b"")
-            await turns()
-            assert [each.heard() for each in (first, second, third)] == [["greeting"], [], []]
-            first.socket.close()
-            await turns()
-            assert sorted(each.heard() for each in (second, third)) == [[], ["greeting"]]
+@in_loop
+async def test_waiting_client_is_greeted_when_another_leaves() -> None:
+    with server_for(1) as connect:
+        first, second, third = connect(b""), connect(b""), connect(b"")
         await turns()
-
-    asyncio.run(play())
-
-
-def test_who_comes_as_another_goes_is_not_sent_away() -> None:
-    async def play() -> None:
-        with server_for(1) as connect:
-            first = connect(HELLO)
-            await turns()
-            first.socket.close()
-            second = connect(HELLO)  # nothing was read since
-            await turns()
-            assert second.heard() == ["greeting", "True"]
+        assert [each.heard() for each in (first, second, third)] == [["greeting"], [], []]
+        first.socket.close()
         await turns()
+        assert sorted(each.heard() for each in (second, third)) == [[], ["greeting"]]
+    await turns()
 
-    asyncio.run(play())
 
-
-def test_nobody_is_sent_away_before_a_word_and_who_is_in_a_hurry_gets_in() -> None:
-    async def play() -> None:
-        with server_for(1) as connect:
-            connect(HELLO)
-            urgent, other = connect(URGENT), connect(HELLO)
-            await turns()
-            assert (urgent.heard(), other.heard()) == (["greeting", "True"], ["busy"])
-            urgent.socket.close()  # it had no place of its own: nobody comes in for it
-            late = connect(b"")
-            await turns()
-            assert late.heard() == []
+@in_loop
+async def test_client_that_comes_as_another_leaves_is_let_in() -> None:
+    with server_for(1) as connect:
+        first = connect(HELLO)
         await turns()
+        first.socket.close()
+        second = connect(HELLO)  # the server has read nothing since
+        await turns()
+        assert second.heard() == ["greeting", "True"]
+    await turns()
 
-    asyncio.run(play())
+
+@in_loop
+async def test_silent_client_waits_and_urgent_client_is_let_in() -> None:
+    with server_for(1) as connect:
+        connect(HELLO)
+        urgent, other = connect(URGENT), connect(HELLO)
+        await turns()
+        assert (urgent.heard(), other.heard()) == (["greeting", "True"], ["busy"])
+        urgent.socket.close()  # it took no place, so its end frees none
+        late = connect(b"")
+        await turns()
+        assert late.heard() == []
+    await turns()

@@ -1,6 +1,6 @@
-"""The service's timers: what a suspend of the machine, or a change of its wall clock, does to goals that wait.
+"""The effects of a suspend, or of a change of the wall clock, on waiting goals.
 
-Nothing here can put the machine to sleep, so the clock is the test's own: it jumps, as it does when a machine wakes up.
+The tests can't suspend the machine, so they use a clock of their own that jumps ahead.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.states import State
 from talkcli.server import speech
 from talkcli.server.speech import Speech
+from tests.support.loop import in_loop
 
 if TYPE_CHECKING:
     from talkcli.engine import protocol
 
 
 class _BusyEngine:
-    """Takes every goal, and says nothing."""
+    """An engine that accepts every goal and reports nothing."""
 
     def __init__(self) -> None:
         self.said: list[str] = []
@@ -33,7 +34,7 @@ class _BusyEngine:
         self.said.append(goal.text)
 
     def follow(self, goal_id: str, followed: bool, by_neural: bool) -> None:
-        """Take note of what makes no difference here."""
+        """Do nothing."""
 
 
 class _Clock:
@@ -64,44 +65,36 @@ async def _until(served: Speech, goal_id: str, state: State, limit: float) -> fl
     return time.monotonic() - began
 
 
-def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine_wakes(
+@in_loop
+async def test_a_goal_whose_time_ended_in_a_suspend_is_recalled_when_the_machine_wakes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     slept = _Clock()
     monkeypatch.setattr(speech, "elapsed", slept)
-
-    async def scenario() -> None:
-        served = await _queued_behind_another(ttl=600)
-        await asyncio.sleep(0)  # the loop's own timer for the ten minutes is set
-        slept.ahead += 3_600
-        await _until(served, "4k7f-2", State.RECALLED, speech.LOOK_EVERY + 1)
-
-    asyncio.run(scenario())
+    served = await _queued_behind_another(ttl=600)
+    await asyncio.sleep(0)  # the loop has set its timer for the ten minutes
+    slept.ahead += 3_600
+    await _until(served, "4k7f-2", State.RECALLED, speech.LOOK_EVERY + 1)
 
 
-def test_no_request_after_a_suspend_finds_a_goal_whose_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_loop
+async def test_no_request_after_a_suspend_finds_a_goal_whose_time_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
     slept = _Clock()
     monkeypatch.setattr(speech, "elapsed", slept)
-
-    async def scenario() -> None:
-        served = await _queued_behind_another(ttl=600)
-        slept.ahead += 3_600
-        served.now()  # what every request begins with
-        assert served.scheduler.pending_count == 0
-
-    asyncio.run(scenario())
+    served = await _queued_behind_another(ttl=600)
+    slept.ahead += 3_600
+    served.now()  # every request begins with this
+    assert served.scheduler.pending_count == 0
 
 
-def test_the_wall_clock_ends_no_goal(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def scenario() -> None:
-        served = await _queued_behind_another(ttl=600)
-        with monkeypatch.context() as patched:
-            now = time.time()
-            patched.setattr(time, "time", lambda: now + 86_400)
-            served.now()
-        assert served.scheduler.pending_count == 1
-
-    asyncio.run(scenario())
+@in_loop
+async def test_the_wall_clock_ends_no_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    served = await _queued_behind_another(ttl=600)
+    with monkeypatch.context() as patched:
+        now = time.time()
+        patched.setattr(time, "time", lambda: now + 86_400)
+        served.now()
+    assert served.scheduler.pending_count == 1
 
 
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that counts a suspend")

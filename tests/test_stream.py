@@ -1,6 +1,6 @@
-"""A client's socket as the server uses it: at once in, in one piece out, and the end told once.
+"""A client's socket in the server: input is read at once, output goes out in one piece, and the end is told once.
 
-Turns of the event loop are counted, and calls of the system, not time.
+The tests count turns of the event loop and system calls, not time.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import pytest
 
 from talkcli.server import stream
 from talkcli.server.stream import Stream, Streams
+from tests.support.loop import in_loop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -32,7 +33,7 @@ class Counted(socket.socket):
 
 
 class Told(asyncio.Protocol):
-    """Notes all that a stream tells."""
+    """Records the calls of a stream."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -62,7 +63,7 @@ class Told(asyncio.Protocol):
 
 
 class Pair:
-    """A stream, what it tells, and the client's end of its socket."""
+    """A stream, the record of its calls, and the client's end of its socket."""
 
     def __init__(self) -> None:
         ours, self.client = socket.socketpair()
@@ -74,7 +75,7 @@ class Pair:
         self.stream = Stream(Streams(loop), self.socket, self.told, HIGH)
 
     def receive(self) -> bytes:
-        """Return what has come at the client's end by now."""
+        """Return the bytes that have arrived at the client's end."""
         received = b""
         with contextlib.suppress(BlockingIOError, ConnectionResetError):
             while data := self.client.recv(1 << 20):
@@ -94,7 +95,7 @@ async def paired() -> AsyncIterator[Pair]:
 
 
 async def turn() -> None:
-    """Let the loop do what is due, and what follows from that at once."""
+    """Let the loop run the callbacks that are due, and those that follow from them."""
     await asyncio.sleep(0)
     await asyncio.sleep(0)
 
@@ -107,110 +108,96 @@ async def until_lost(pair: Pair) -> None:
     pytest.fail("the end was not told")
 
 
-def test_what_is_there_already_is_read_and_what_was_written_is_sent_before_anything_else_happens() -> None:
-    async def play() -> None:
-        async with paired() as pair:
-            pair.client.send(b"hello\n")
-            pair.stream.write(b"greeting\n")
-            pair.stream.begin()
-            assert (pair.told.data, pair.receive()) == (b"hello\n", b"greeting\n")
-
-    asyncio.run(play())
+@in_loop
+async def test_begin_reads_waiting_input_and_sends_waiting_output_at_once() -> None:
+    async with paired() as pair:
+        pair.client.send(b"hello\n")
+        pair.stream.write(b"greeting\n")
+        pair.stream.begin()
+        assert (pair.told.data, pair.receive()) == (b"hello\n", b"greeting\n")
 
 
-def test_what_is_written_in_one_turn_goes_out_in_one_piece() -> None:
-    async def play() -> None:
-        async with paired() as pair:
-            pair.stream.begin()
-            for number in range(5):
-                pair.stream.write(b"%d\n" % number)
-            assert (pair.receive(), pair.socket.sent) == (b"", 0)
+@in_loop
+async def test_output_of_one_turn_goes_out_in_one_piece() -> None:
+    async with paired() as pair:
+        pair.stream.begin()
+        for number in range(5):
+            pair.stream.write(b"%d\n" % number)
+        assert (pair.receive(), pair.socket.sent) == (b"", 0)
+        await turn()
+        assert (pair.receive(), pair.socket.sent) == (b"0\n1\n2\n3\n4\n", 1)
+        await turn()
+        assert pair.socket.sent == 1
+
+
+@in_loop
+async def test_large_output_is_sent_before_the_turn_ends() -> None:
+    async with paired() as pair:
+        pair.stream.begin()
+        pair.stream.write(b"x" * 65_536)
+        assert len(pair.receive()) == 65_536
+
+
+@in_loop
+async def test_congestion_is_told_once_and_all_output_arrives() -> None:
+    async with paired() as pair:
+        pair.stream.begin()
+        written = b""
+        while not pair.told.congested:
+            written += b"%08d" % len(written) * 1_000
+            pair.stream.write(written[-8_000:])
+        assert pair.stream.size > HIGH
+        written += b"the rest"
+        pair.stream.write(b"the rest")
+        received = b""
+        while len(received) < len(written):
+            received += pair.receive()
             await turn()
-            assert (pair.receive(), pair.socket.sent) == (b"0\n1\n2\n3\n4\n", 1)
-            await turn()
-            assert pair.socket.sent == 1
-
-    asyncio.run(play())
+        assert received == written
+        assert (pair.told.congested, pair.stream.size) == ([True, False], 0)
 
 
-def test_a_lot_is_sent_before_the_turn_ends() -> None:
-    async def play() -> None:
-        async with paired() as pair:
-            pair.stream.begin()
-            pair.stream.write(b"x" * 65_536)
-            assert len(pair.receive()) == 65_536
-
-    asyncio.run(play())
-
-
-def test_client_that_does_not_read_is_told_of_once_and_gets_all_in_the_end() -> None:
-    async def play() -> None:
-        async with paired() as pair:
-            pair.stream.begin()
-            written = b""
-            while not pair.told.congested:
-                written += b"%08d" % len(written) * 1_000
-                pair.stream.write(written[-8_000:])
-            assert pair.stream.size > HIGH
-            written += b"the rest"
-            pair.stream.write(b"the rest")
-            received = b""
-            while len(received) < len(written):
-                received += pair.receive()
-                await turn()
-            assert received == written
-            assert (pair.told.congested, pair.stream.size) == ([True, False], 0)
-
-    asyncio.run(play())
-
-
-def test_reading_stops_and_goes_on() -> None:
-    async def play() -> None:
-        async with paired() as pair:
-            pair.stream.begin()
-            pair.stream.pause_reading()
-            pair.client.send(b"hello\n")
-            await turn()
-            assert pair.told.data == b""
-            for _ in range(2):
-                pair.stream.resume_reading()
-            await turn()
-            assert pair.told.data == b"hello\n"
-
-    asyncio.run(play())
-
-
-def test_end_of_the_input_is_told_once_and_the_answers_still_go_out() -> None:
-    async def play() -> None:
-        async with paired() as pair:
-            pair.stream.begin()
-            pair.client.shutdown(socket.SHUT_WR)
-            await turn()
-            pair.stream.pause_reading()
+@in_loop
+async def test_reading_stops_and_goes_on() -> None:
+    async with paired() as pair:
+        pair.stream.begin()
+        pair.stream.pause_reading()
+        pair.client.send(b"hello\n")
+        await turn()
+        assert pair.told.data == b""
+        for _ in range(2):
             pair.stream.resume_reading()
-            await turn()
-            assert (pair.told.ends, pair.told.lost, pair.stream.closing) == (1, [], False)
-            pair.stream.write(b"answer\n")
-            pair.stream.close()
-            await until_lost(pair)
-            assert (pair.receive(), pair.told.lost) == (b"answer\n", [None])
-
-    asyncio.run(play())
+        await turn()
+        assert pair.told.data == b"hello\n"
 
 
-def test_end_of_the_input_closes_where_the_receiver_says_so() -> None:
-    async def play() -> None:
-        async with paired() as pair:
-            pair.told.stays_open = False
-            pair.stream.begin()
-            pair.client.close()
-            await until_lost(pair)
-            assert (pair.told.ends, pair.told.lost, pair.socket.fileno()) == (1, [None], -1)
+@in_loop
+async def test_end_of_the_input_is_told_once_and_replies_still_go_out() -> None:
+    async with paired() as pair:
+        pair.stream.begin()
+        pair.client.shutdown(socket.SHUT_WR)
+        await turn()
+        pair.stream.pause_reading()
+        pair.stream.resume_reading()
+        await turn()
+        assert (pair.told.ends, pair.told.lost, pair.stream.closing) == (1, [], False)
+        pair.stream.write(b"answer\n")
+        pair.stream.close()
+        await until_lost(pair)
+        assert (pair.receive(), pair.told.lost) == (b"answer\n", [None])
 
-    asyncio.run(play())
+
+@in_loop
+async def test_end_of_the_input_closes_the_stream_if_the_receiver_says_so() -> None:
+    async with paired() as pair:
+        pair.told.stays_open = False
+        pair.stream.begin()
+        pair.client.close()
+        await until_lost(pair)
+        assert (pair.told.ends, pair.told.lost, pair.socket.fileno()) == (1, [None], -1)
 
 
-def test_close_sends_what_the_client_has_not_taken_yet_and_abort_does_not() -> None:
+def test_close_sends_the_rest_of_the_output_and_abort_does_not() -> None:
     async def play(*, abort: bool) -> int:
         async with paired() as pair:
             pair.stream.begin()
@@ -233,86 +220,78 @@ def test_close_sends_what_the_client_has_not_taken_yet_and_abort_does_not() -> N
     assert asyncio.run(play(abort=True)) < 1_000_000
 
 
-def test_client_that_is_gone_is_seen_by_what_is_written_and_what_it_sent_can_still_be_read() -> None:
-    async def play() -> None:
-        async with paired() as pair:
-            pair.stream.begin()
-            pair.stream.pause_reading()
-            pair.client.send(b"a last request\n")
-            pair.client.close()
-            pair.stream.write(b"answer\n")
-            last = []
-            pair.told.connection_lost = lambda error: last.append((error, pair.socket.recv(100)))  # type: ignore[method-assign]
-            await turn()
-            ((error, received),) = last
-            assert isinstance(error, BrokenPipeError)
-            assert received == b"a last request\n"
-            assert pair.socket.fileno() == -1
-
-    asyncio.run(play())
+@in_loop
+async def test_write_to_a_client_that_is_gone_ends_the_stream_and_its_input_can_still_be_read() -> None:
+    async with paired() as pair:
+        pair.stream.begin()
+        pair.stream.pause_reading()
+        pair.client.send(b"a last request\n")
+        pair.client.close()
+        pair.stream.write(b"answer\n")
+        last = []
+        pair.told.connection_lost = lambda error: last.append((error, pair.socket.recv(100)))  # type: ignore[method-assign]
+        await turn()
+        ((error, received),) = last
+        assert isinstance(error, BrokenPipeError)
+        assert received == b"a last request\n"
+        assert pair.socket.fileno() == -1
 
 
-def test_receiver_that_meets_a_bug_loses_the_connection() -> None:
-    async def play() -> None:
-        said = []
-        asyncio.get_running_loop().set_exception_handler(lambda _, context: said.append(context["exception"]))
-        async with paired() as pair:
-            pair.told.fault = ZeroDivisionError("a bug")
-            pair.stream.begin()
-            pair.client.send(b"hello\n")
-            await until_lost(pair)
-        assert [type(each) for each in said] == [ZeroDivisionError]
-
-    asyncio.run(play())
+@in_loop
+async def test_bug_in_the_receiver_ends_the_connection() -> None:
+    said = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: said.append(context["exception"]))
+    async with paired() as pair:
+        pair.told.fault = ZeroDivisionError("a bug")
+        pair.stream.begin()
+        pair.client.send(b"hello\n")
+        await until_lost(pair)
+    assert [type(each) for each in said] == [ZeroDivisionError]
 
 
-def test_one_callback_sends_what_all_streams_were_given_in_a_turn() -> None:
-    async def play() -> None:
-        loop = asyncio.get_running_loop()
-        calls = []
-        streams = Streams(loop)
-        call = loop.call_soon
-        async with paired() as first, paired() as second:
-            pairs = [first, second]
+@in_loop
+async def test_one_callback_sends_the_output_of_all_streams() -> None:
+    loop = asyncio.get_running_loop()
+    calls = []
+    streams = Streams(loop)
+    call = loop.call_soon
+    async with paired() as first, paired() as second:
+        pairs = [first, second]
+        for pair in pairs:
+            pair.stream = Stream(streams, pair.socket, pair.told, HIGH)
+        loop.call_soon = lambda *values, **named: calls.append(call(*values, **named))  # type: ignore[assignment, method-assign]
+        for _ in range(3):
             for pair in pairs:
-                pair.stream = Stream(streams, pair.socket, pair.told, HIGH)
-            loop.call_soon = lambda *values, **named: calls.append(call(*values, **named))  # type: ignore[assignment, method-assign]
-            for _ in range(3):
-                for pair in pairs:
-                    pair.stream.write(b"word\n")
-            loop.call_soon = call  # type: ignore[method-assign]
-            assert len(calls) == 1
-            await turn()
-            assert [pair.receive() for pair in pairs] == [b"word\n" * 3] * 2
-
-    asyncio.run(play())
+                pair.stream.write(b"word\n")
+        loop.call_soon = call  # type: ignore[method-assign]
+        assert len(calls) == 1
+        await turn()
+        assert [pair.receive() for pair in pairs] == [b"word\n" * 3] * 2
 
 
-def test_past_what_may_wait_for_all_the_one_that_holds_most_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def play() -> None:
-        loop = asyncio.get_running_loop()
-        streams = Streams(loop)
-        async with contextlib.AsyncExitStack() as stack:
-            pairs = [await stack.enter_async_context(paired()) for _ in range(3)]
-            for pair in pairs:
-                pair.stream = Stream(streams, pair.socket, pair.told, HIGH)
-                pair.stream.write(b"x" * 1_000_000)  # more than the system takes
-            taken = 1_000_000 - pairs[0].stream.size
-            monkeypatch.setattr(stream, "ALL_OUTPUT", streams.waiting + 3_000)
-            pairs[0].stream.write(b"x" * 1_000)
-            pairs[1].stream.hold(1_500)  # behind a list that it doesn't read either
-            pairs[1].stream.hold(500)
-            assert not any(each.stream.closing for each in pairs)
-            pairs[2].stream.write(b"x" * 1_000)
-            await until_lost(pairs[1])
-            assert [each.stream.closing for each in pairs] == [False, True, False]
-            assert streams.waiting == 2 * (1_000_000 - taken) + 2_000
-            pairs[1].stream.hold(-2_000)  # it hears of the end later
-            assert len(pairs[0].receive()) == taken
-            await turn()
-            assert streams.waiting == pairs[0].stream.size + pairs[2].stream.size
-            for pair in (pairs[0], pairs[2]):
-                pair.stream.abort()
-            assert (streams.waiting, streams.open) == (0, set())
-
-    asyncio.run(play())
+@in_loop
+async def test_past_the_limit_for_all_output_the_largest_backlog_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = asyncio.get_running_loop()
+    streams = Streams(loop)
+    async with contextlib.AsyncExitStack() as stack:
+        pairs = [await stack.enter_async_context(paired()) for _ in range(3)]
+        for pair in pairs:
+            pair.stream = Stream(streams, pair.socket, pair.told, HIGH)
+            pair.stream.write(b"x" * 1_000_000)  # more than the system takes
+        taken = 1_000_000 - pairs[0].stream.size
+        monkeypatch.setattr(stream, "ALL_OUTPUT", streams.waiting + 3_000)
+        pairs[0].stream.write(b"x" * 1_000)
+        pairs[1].stream.hold(1_500)  # as for a list that its client doesn't read
+        pairs[1].stream.hold(500)
+        assert not any(each.stream.closing for each in pairs)
+        pairs[2].stream.write(b"x" * 1_000)
+        await until_lost(pairs[1])
+        assert [each.stream.closing for each in pairs] == [False, True, False]
+        assert streams.waiting == 2 * (1_000_000 - taken) + 2_000
+        pairs[1].stream.hold(-2_000)  # released after its end
+        assert len(pairs[0].receive()) == taken
+        await turn()
+        assert streams.waiting == pairs[0].stream.size + pairs[2].stream.size
+        for pair in (pairs[0], pairs[2]):
+            pair.stream.abort()
+        assert (streams.waiting, streams.open) == (0, set())
