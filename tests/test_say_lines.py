@@ -44,7 +44,7 @@ class Typing:
         return self.client.stdout.readline().rstrip("\n")
 
     def end(self, number: signal.Signals | None = None) -> tuple[int, list[str], str]:
-        """Send it a signal, or close its input; return its exit code, what it prints from now on, and its notes."""
+        """Send it a signal, or close its input. Return its exit code, the rest of its output, and its messages."""
         assert self.client.stdin
         assert self.client.stdout
         assert self.client.stderr
@@ -70,6 +70,9 @@ def test_each_line_is_a_goal_and_its_id_is_printed(scripted: Talk) -> None:
     said = ["length=0 one", "length=0 two", "length=0 -x 日本", "length=0 last"]
     assert [scripted.goal(each)["text"] for each in ids] == said
     assert scripted.watcher.texts("ACTIVE") == said
+    for words in ([], ["-f"], ["-w", "--json"]):
+        done = scripted.run("say", "--lines", *words, stdin="\n\r\n")
+        assert (done.code, done.out, done.err) == (0, "", ""), "nothing to say is success"
 
 
 def test_input_that_never_ends_is_spoken_line_by_line(scripted: Talk) -> None:
@@ -86,33 +89,31 @@ def test_input_that_never_ends_is_spoken_line_by_line(scripted: Talk) -> None:
     assert scripted.goal(out[0])["text"] == "length=0 without a newline"
 
 
-def test_nothing_to_say_is_success(scripted: Talk) -> None:
-    for words in ([], ["-f"], ["-w", "--json"]):
-        done = scripted.run("say", "--lines", *words, stdin="\n\r\n")
-        assert (done.code, done.out, done.err) == (0, "", "")
-
-
-def test_options_hold_for_each_line(scripted: Talk) -> None:
-    done = scripted.run(
-        "--json", "say", "--lines", "--as", "reader", "--priority", "3", "--ttl", "9", "--key", "k", stdin="a\nb\n"
-    )
-    for line in done.out.splitlines():
-        goal = json.loads(line)
-        assert (goal["priority"], goal["key"], goal["client"]["name"]) == (3, "k", "reader")
-        assert 8 < goal["ttl"] <= 9
+def test_options_hold_for_each_line_and_the_time_that_is_left_is_sent(scripted: Talk) -> None:
+    options = ("--as", "reader", "--priority", "3", "--ttl", "9", "--ahead", "1")
+    text = "length=0.5 one\n\0\nlength=0 two\nlength=0 three\n"
+    done = scripted.run("--json", "say", "--lines", *options, stdin=text)
+    goals = [json.loads(each) for each in done.out.splitlines()]
+    assert [each["state"] for each in goals] == ["PENDING", "REJECTED", "PENDING", "PENDING"]  # as accepted
+    goals.pop(1)
+    assert [(each["priority"], each["client"]["name"]) for each in goals] == [(3, "reader")] * 3
+    first, second, third = [each["ttl"] for each in goals]
+    assert 9 >= first >= second > third
+    assert third <= 8.5
+    ended = scripted.run("--json", "say", "--lines", "-w", "--key", "k", stdin="length=0\nfail=audio_lost\n")
+    goals = [json.loads(each) for each in ended.out.splitlines()]
+    assert {each["key"] for each in goals} == {"k"}
+    assert (goals[-1]["state"], ended.code) == ("ABORTED", 4)
 
 
 def test_a_line_that_is_refused_is_reported_by_its_number_and_the_rest_goes_on(scripted: Talk) -> None:
     text = "length=0 one\n\nnul \0\nlength=0 two\n" + "x" * 10_001 + "\n" + "y" * 300_000 + "\nlength=0 three\n"
-    for words in (["say", "--lines"], ["say", "--lines", "-w"]):
-        done = scripted.run(*words, stdin=text)
-        assert done.code == 5
-        assert len(done.out.split()) == 3
-        notes = done.err.splitlines()
-        assert [each.split(":")[1] for each in notes] == [" line 3", " line 5", " line 6"]
-        assert "NUL" in notes[0]
-        assert "10,001 characters" in notes[1]
-        assert "300,000 bytes" in notes[2]
+    done = scripted.run("say", "--lines", stdin=text)
+    assert (done.code, len(done.out.split())) == (5, 3)
+    notes = done.err.splitlines()
+    assert [each.split(":")[1] for each in notes] == [" line 3", " line 5", " line 6"]
+    for note, words in zip(notes, ("NUL", "10,001 characters", "300,000 bytes"), strict=True):
+        assert words in note
     quiet = scripted.run("-q", "say", "--lines", stdin=text)
     assert (quiet.code, quiet.out, quiet.err) == (5, "", "")
 
@@ -162,17 +163,6 @@ def test_wait_tells_how_each_ended_and_the_first_failure(scripted: Talk) -> None
     refused_first = scripted.run("say", "--lines", "--wait", stdin="\0\nfail=audio_lost\n")
     assert refused_first.code == 5
     assert scripted.run("say", "--lines", "--wait", stdin="length=0\nlength=0 b\n").code == 0
-
-
-def test_json_is_the_goal_as_accepted_or_as_it_ended(scripted: Talk) -> None:
-    accepted = [
-        json.loads(each) for each in scripted.run("--json", "say", "--lines", stdin="a\n\0\nb\n").out.splitlines()
-    ]
-    assert [each["text"] for each in accepted] == ["a", "\0", "b"]
-    assert accepted[1]["state"] == "REJECTED"
-    ended = scripted.run("--json", "say", "--lines", "-w", stdin="length=0\nfail=audio_lost\n")
-    assert [json.loads(each)["state"] for each in ended.out.splitlines()] == ["SUCCEEDED", "ABORTED"]
-    assert ended.code == 4
 
 
 def test_feedback_of_all_lines(scripted: Talk) -> None:
@@ -263,16 +253,6 @@ def test_a_line_that_comes_long_after_the_last_goal_ended_is_spoken(scripted: Ta
     typing.type("length=0 two\n")
     scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
     assert typing.end()[0] == 0
-
-
-def test_what_is_left_of_the_ttl_is_sent(scripted: Talk) -> None:
-    text = "length=0.5 one\nlength=0 two\nlength=0 three\n"
-    done = scripted.run("--json", "say", "--lines", "--ttl", "10", "--ahead", "1", stdin=text)
-    goals = [json.loads(each) for each in done.out.splitlines()]
-    assert [each["state"] for each in goals] == ["PENDING"] * 3  # as they were accepted
-    first, second, third = [each["ttl"] for each in goals]
-    assert 10 >= first >= second > third
-    assert third <= 9.5
 
 
 @limits()
@@ -375,6 +355,11 @@ def test_signal_cancels_what_is_its_own_and_nothing_else(make_talk: MakeTalk, nu
     assert [talk.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED", "RECALLED"]
     assert talk.watcher.wait_for_terminal(theirs) == "SUCCEEDED"
     assert talk.watcher.states(ids[2]) == ["PENDING", "RECALLED"]
+    typing = Typing(talk, "say", "--lines")  # without --wait, its goals go on
+    typing.type(f"{ENDLESS}\nsecond\n")
+    ids = [typing.line() for _ in range(2)]
+    assert typing.end(number) == (128 + number, [], "")
+    assert talk.goal(ids[1])["state"] == "PENDING"
 
 
 @pytest.mark.parametrize("words", [["--json", "--wait"], ["-f"]])
@@ -394,16 +379,6 @@ def test_line_that_waits_for_room_is_never_spoken_after_the_signal(make_talk: Ma
         states = [each["goal"]["state"] if "event" in each else each["state"] for each in last]
         assert sorted(states) == ["PREEMPTED", "RECALLED"]
     assert talk.run("--json", "status").out.count('"PENDING"') == 0
-
-
-def test_signal_without_wait_just_ends(scripted: Talk) -> None:
-    typing = Typing(scripted, "say", "--lines")
-    typing.type(ENDLESS + "second\n")
-    first, second = typing.line(), typing.line()
-    code, out, err = typing.end(signal.SIGTERM)
-    assert (code, out, err) == (143, [], "")
-    scripted.watcher.wait_for_word(first)
-    assert scripted.goal(second)["state"] == "PENDING"
 
 
 def test_timeout_is_for_all_lines(scripted: Talk) -> None:
@@ -429,7 +404,7 @@ def test_server_that_goes_away(scripted: Talk, words: list[str]) -> None:
     first = typing.line().split()[0]
     scripted.watcher.wait_for_word(first)
     scripted.kill()
-    assert typing.client.wait(10) == (12 if words else 3)  # nothing more can be sent, whatever is still to come
+    assert typing.client.wait(10) == (12 if words else 3)
     _, out, err = typing.end()
     assert "nothing more can be sent to the server" in err
     assert ("it may still be spoken" in err) == bool(words)
@@ -462,7 +437,7 @@ def test_no_server_is_told_before_anything_is_read() -> None:
 
 
 def piped(talk: Talk, *words: str, read: bool = True) -> tuple[Forked, int]:
-    """Start `say --lines` with its output in a pipe; return it, and the end to read; `read`: whether that is open."""
+    """Start `say --lines` with its output in a pipe, and return it with the reading end, which may be closed."""
     reader, writer = os.pipe()
     if not read:
         os.close(reader)
@@ -471,10 +446,16 @@ def piped(talk: Talk, *words: str, read: bool = True) -> tuple[Forked, int]:
     return client, reader
 
 
-@pytest.mark.parametrize("words", [[], ["-f"]])
-def test_standard_output_that_was_closed_from_the_start_matters_to_nothing(scripted: Talk, words: list[str]) -> None:
-    client, _ = piped(scripted, *words, read=False)
-    assert client.communicate("length=0 a\n\0\nlength=0 b\n", 10)[1].startswith("talk: line 2: ")
+@pytest.mark.parametrize(("words", "read"), [([], False), (["-f"], False), ([], True)])
+def test_lines_are_spoken_if_the_reader_of_their_ids_has_gone(scripted: Talk, words: list[str], read: bool) -> None:
+    client, reader = piped(scripted, *words, read=read)
+    assert client.stdin
+    client.stdin.write("length=0 a\n")
+    client.stdin.flush()
+    if read:
+        with open(reader, encoding="utf-8") as lines:
+            assert lines.readline()
+    assert client.communicate("\0\nlength=0 b\n", 10)[1].startswith("talk: line 2: ")
     assert client.returncode == 5
     scripted.watcher.wait_until(lambda _: scripted.watcher.texts("SUCCEEDED") == ["length=0 a", "length=0 b"])
 
@@ -496,18 +477,6 @@ def test_reader_that_goes_away_while_it_waits_cancels_what_is_its_own(
         os.close(reader)
         assert client.wait(10) == 141
     assert [scripted.watcher.wait_for_terminal(each) for each in (first, second["id"])] == ["PREEMPTED", "RECALLED"]
-
-
-def test_reader_that_goes_away_stops_no_lines_that_nobody_waits_for(scripted: Talk) -> None:
-    client, reader = piped(scripted)
-    assert client.stdin
-    client.stdin.write("length=0 a\n")
-    client.stdin.flush()
-    with open(reader, encoding="utf-8") as lines:
-        scripted.watcher.wait_for_terminal(lines.readline().strip())
-    assert client.communicate("length=0 b\nlength=0 c\n", 10) == ("", "")
-    assert client.returncode == 0
-    scripted.watcher.wait_until(lambda _: scripted.watcher.texts("SUCCEEDED") == [f"length=0 {each}" for each in "abc"])
 
 
 def test_standard_input_that_cannot_be_read_is_told(scripted: Talk) -> None:

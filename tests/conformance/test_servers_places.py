@@ -1,4 +1,4 @@
-"""Server and client meet in one place, whatever the environment of each has; and what a server says at its start."""
+"""Server and client meet in one place, whatever the environment of each has. A server speaks its greeting."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from tests.conftest import MakeTalk
 
-#: Says where platformdirs would put the socket, and where a client looks.
+#: Prints the place that platformdirs gives the socket, and those where a client looks.
 PLACES = """
 import json, os, warnings
 warnings.simplefilter("ignore")
@@ -30,8 +30,6 @@ ENVIRONMENTS = {
     "a runtime directory": {"XDG_RUNTIME_DIR": "{home}/run"},
     "none": {},
     "none, another temporary directory": {"TMPDIR": "{home}/tmp"},
-    "none, no temporary directory named": {"TMPDIR": ""},
-    "one that is not there": {"XDG_RUNTIME_DIR": "{home}/gone"},
     "an empty name": {"XDG_RUNTIME_DIR": ""},
 }
 
@@ -59,19 +57,19 @@ def test_client_looks_where_platformdirs_puts_the_socket(home: str, name: str) -
 
 
 @pytest.mark.usefixtures("nobody_serves")
-@pytest.mark.parametrize("name", ["a runtime directory", "none", "none, another temporary directory"])
+@pytest.mark.parametrize("name", ["a runtime directory", "none"])
 def test_server_and_client_meet_without_naming_a_socket(home: str, name: str) -> None:
     env = filled(home, name)
     if "XDG_RUNTIME_DIR" not in env and os.path.isdir(f"/run/user/{os.getuid()}"):
-        pytest.skip("this user has a runtime directory, which is the place then, and not the test's")
+        pytest.skip("this user has a runtime directory, which is the place then")
     with serving(env, "--rate", "450") as server:
         assert f"ready on {home}/" in server.log
-        assert run([*TALK, "say", "--wait", "hello"], env).code == 0
+        assert run([*TALK, "say", "--wait", "hi"], env).code == 0
         second = run([*TALK, "serve", "--player", "null"], env)
         assert second.code == 11
         assert f"pid {server.process.pid}" in second.err
         if name == "a runtime directory":
-            # As cron and ssh start a client, and as a second server would be started from there: not found there.
+            # Cron and ssh start a client without that variable: it doesn't find the server.
             assert run([*TALK, "status"], environment(home)).code == 3
     assert run([*TALK, "status"], env).code == 3
 
@@ -94,12 +92,10 @@ def test_system_service_serves_in_the_directory_that_systemd_made(home: str) -> 
         assert f"ready on {home}/run/talk.sock" in server.log
 
 
-@pytest.mark.parametrize(("wanted", "near"), [("en-uss", "'en-us'"), ("germn", "'German'")])
-def test_voice_that_is_not_known_ends_the_server_with_2(home: str, wanted: str, near: str) -> None:
-    done = run([*TALK, "serve", "--player", "null", "--socket", f"{home}/s", "--voice", wanted], environment(home))
+def test_unknown_voice_ends_the_server_with_2(home: str) -> None:
+    done = run([*TALK, "serve", "--player", "null", "--socket", f"{home}/s", "--voice", "germn"], environment(home))
     assert (done.code, done.out) == (2, "")
-    assert f'"{wanted}"' in done.err
-    assert near in done.err
+    assert ('"germn"' in done.err, "'German'" in done.err) == (True, True)
     assert not os.path.exists(f"{home}/s")
 
 

@@ -1,4 +1,4 @@
-"""A client that was turned away, or that talks nonsense, changes nothing, not even with what it sent before it went."""
+"""A client that is refused changes nothing, even with requests that it sent before it left."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_what_a_client_past_the_door_sent_before_it_closed_is_not_carried_out(ma
             stack.enter_context(connected(talk))
         asking.request("hello", urgent=True)
         send_and_go(talk, b'{"request":"set","volume":0.1,"preempt":true}\n', b'{"request":"pause"}\n')
-        with connected(talk) as last:  # taken up after those, and answered: they are over
+        with connected(talk) as last:  # once it is answered, the clients before it have been served
             while last.recv(4096):
                 pass
         after = asking.request("status")["server"]
@@ -44,7 +44,7 @@ def connected(talk: Talk) -> socket.socket:
 
 
 def send_and_go(talk: Talk, *lines: bytes) -> None:
-    """Connect, send and close once for each of these, before the server looks."""
+    """Connect, send and close once for each of these lines, while the server is frozen."""
     talk.freeze()
     for each in lines:
         with connected(talk) as client:

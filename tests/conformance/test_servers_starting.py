@@ -1,9 +1,8 @@
-"""Servers that are started twice, or again: one serves a socket, and ids from before mean nothing to the next."""
+"""Servers that are started twice or again: one serves a socket, and ids don't survive a restart."""
 
 from __future__ import annotations
 
 import os
-import re
 import signal
 from typing import TYPE_CHECKING
 
@@ -18,9 +17,9 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 
-@pytest.mark.parametrize("times", [5, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [3, pytest.param(20, marks=pytest.mark.slow)])
 def test_row_45_of_two_servers_started_at_once_exactly_one_serves(times: int) -> None:
-    scripted = [SERVE[0], processes.SCRIPTED]  # the start of an engine is not what is tested
+    scripted = [SERVE[0], processes.SCRIPTED]
     with short_directory() as home:
         env = environment(home, TALK_SOCKET=f"{home}/s")
         for attempt in range(times):
@@ -40,7 +39,7 @@ def test_row_45_of_two_servers_started_at_once_exactly_one_serves(times: int) ->
 
 
 def test_second_server_says_who_serves_and_takes_nothing_away(scripted: Talk) -> None:
-    for options in ([], ["--socket", scripted.socket], ["--player", "null"]):
+    for options in ([], ["--socket", scripted.socket]):
         done = run([*TALK, "serve", *options], scripted.env)
         assert (done.code, done.out) == (11, "")
         assert f"pid {scripted.pid}" in done.err
@@ -48,7 +47,7 @@ def test_second_server_says_who_serves_and_takes_nothing_away(scripted: Talk) ->
 
 
 def test_row_48_ids_from_before_a_restart_are_unknown(scripted: Talk) -> None:
-    before = [scripted.run("say", "--wait", "length=0").id for _ in range(3)]
+    before = [scripted.run("say", "--wait", "length=0").id for _ in range(2)]
     scripted.stop()
     scripted.start_server()
     active, pending = (scripted.run("say", f"never-ends {each}").id for each in ("active", "pending"))
@@ -59,25 +58,7 @@ def test_row_48_ids_from_before_a_restart_are_unknown(scripted: Talk) -> None:
             done = scripted.run(*words)
             assert (done.code, done.out) == (8, ""), done
     assert [scripted.goal(each)["state"] for each in (active, pending)] == ["ACTIVE", "PENDING"]
-    assert scripted.run("say", "third").code == 0  # "later": no id that comes is one of those from before
+    assert scripted.run("say", "third").code == 0  # a later goal has no id from before either
     assert scripted.request("status")["server"]["pending"] == 2
     assert not set(before) & set(scripted.watcher.goals())
     assert len(scripted.run("cancel").out.split()) == 3
-
-
-def test_server_that_was_killed_is_followed_by_the_next(scripted: Talk) -> None:
-    scripted.run("say", "never-ends words=1")
-    scripted.watcher.wait_for(None, "ACTIVE")
-    scripted.kill()
-    assert os.path.exists(scripted.socket)
-    lost = scripted.run("status")
-    assert lost.code == 3
-    assert "nobody answers" in lost.err
-    scripted.start_server()
-    assert scripted.run("say", "--wait", "battery low").code == 0
-
-
-def test_ids_are_of_a_form_that_no_number_and_no_option_has(scripted: Talk) -> None:
-    goal_id = scripted.run("say", "length=0").id
-    assert re.fullmatch(r"[a-z0-9]{4}-1", goal_id)
-    assert scripted.run("status", "1").out.split()[1] == goal_id
