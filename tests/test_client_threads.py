@@ -111,33 +111,6 @@ def test_threads_share_the_events_of_one_goal(scripted: Talk) -> None:
         assert len([each for each in events if isinstance(each, WordHeard)]) == 201
 
 
-def test_watch_in_a_thread_beside_others(scripted: Talk) -> None:
-    with Client(scripted.socket) as client:
-        seen: list[Event] = []
-        begun, all_ended = threading.Event(), threading.Event()
-
-        def watch() -> None:
-            ended = 0
-            for event in client.events():
-                begun.set()
-                seen.append(event)
-                ended += isinstance(event, StateChanged) and event.state.terminal
-                if ended == 40:
-                    all_ended.set()
-                    return
-
-        def use() -> None:
-            assert begun.wait(5)
-            for _ in range(10):
-                assert client.say("length=0 one", feedback=True).wait(30).state is State.SUCCEEDED
-
-        run_all([watch, *[use] * 4])
-        assert all_ended.is_set()
-        numbers = [each.n or 0 for each in seen if isinstance(each, StateChanged | WordHeard)]
-        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-        assert len([each for each in seen if isinstance(each, WordHeard)]) == 80
-
-
 @pytest.mark.parametrize("how", ["killed", "closed"])
 def test_end_of_the_connection_ends_every_thread(scripted: Talk, how: str) -> None:
     with Client(scripted.socket) as client:

@@ -9,8 +9,6 @@ import signal
 import subprocess
 from typing import TYPE_CHECKING
 
-import pytest
-
 from talkcli.terminal.text import width
 from tests.conformance.bareserve import TALK
 from tests.support.terminal import Terminal
@@ -123,32 +121,6 @@ def test_who_paused_and_who_resumed_is_told(scripted: Talk) -> None:
     talk.run("cancel")
 
 
-@pytest.mark.parametrize("columns", [60, 120])
-def test_lines_fit_the_terminal_and_line_up(scripted: Talk, columns: int) -> None:
-    with at_terminal(scripted, columns, "watch") as watch:
-        watch.wait_for("silent")
-        goal_id = scripted.run("say", "--as", "patrol", "--", f"{LONG} 日本語日本語").id
-        watch.wait_for("ACTIVE")
-        behind = scripted.run("say", "battery low").id
-        watch.wait_for("PENDING")
-        scripted.run("cancel", goal_id)
-        watch.wait_for("SUCCEEDED")
-        watch.process.send_signal(signal.SIGINT)
-        assert watch.finish() == 130
-        lines = watch.lines
-    assert [each for each in lines if width(each) > columns] == []
-    goals = [each for each in lines if '"' in each]
-    # States that end at once are left out: the first goal's PENDING and PREEMPTING.
-    states = [each.split()[1] for each in goals]
-    assert states == ["ACTIVE", "PENDING", "PREEMPTED", "ACTIVE", "SUCCEEDED"], lines
-    assert {each.index('"') for each in goals} == {goals[0].index('"')}
-    assert '…"' in goals[0]
-    senders = [re.search(rf"{behind} +\"battery low\" +(?=\S)", each) for each in goals if behind in each]
-    assert len({each.end() for each in senders if each}) == 1
-    # In a narrow column, the client that stopped it has a line of its own.
-    assert re.search(rf"{goal_id} +\".*\"\n? +canceled by \S", "\n".join(lines))
-
-
 def test_lines_follow_a_window_that_is_resized(scripted: Talk) -> None:
     with at_terminal(scripted, 80, "watch", COLUMNS="200") as watch:
         watch.wait_for("silent")
@@ -162,24 +134,6 @@ def test_lines_follow_a_window_that_is_resized(scripted: Talk) -> None:
             text = line[line.index('"') : line.rindex('"') + 1]
             assert len(text) == (columns - 32) - (columns - 32) // 3 - 2
         scripted.run("cancel")
-
-
-def test_reason_that_is_too_long_for_its_column_has_a_line_of_its_own(scripted: Talk) -> None:
-    message = "audio_open_error:_No_such_file_or_directory"
-    text = f"fail=audio_device message={message}"
-    with at_terminal(scripted, 100, "watch") as watch:
-        watch.wait_for("silent")
-        scripted.run("say", "--", text)
-        watch.wait_for("ABORTED.*\n.*\n")
-        scripted.run("say", "")
-        watch.wait_for("REJECTED.*\n")
-        lines = watch.lines
-    at = next(place for place, each in enumerate(lines) if "ABORTED" in each)
-    assert lines[at].split('"')[1].startswith("fail=audio_device")
-    assert lines[at + 1] == " " * 10 + "audio_device: audio open error: No such file or directory"
-    # No line before it could have told its sender.
-    assert re.search(r'"" +invalid_text: the text is empty, from \S', lines[-1])
-    assert all(width(each) <= 100 for each in lines)
 
 
 def test_colour_by_outcome_on_a_terminal_alone(scripted: Talk) -> None:

@@ -168,25 +168,6 @@ def test_watcher_that_does_not_read_loses_feedback_alone(scripted: Talk) -> None
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the memory of a process is not told here")
-def test_what_waits_for_all_clients_together_has_a_limit(scripted: Talk) -> None:
-    text = "length=0 " + "🤖" * 9_900
-    goals = 12
-    with scripted.connect() as reading, contextlib.ExitStack() as stack:
-        before = peak_memory(scripted.pid)
-        for _ in range(200):
-            stack.enter_context(Raw(scripted.socket)).send(b'{"request": "watch"}\n')
-        for _ in range(goals):
-            assert reading.request("say", text=text, wait=True)["ok"]
-            assert reading.receive_event("result")["goal"]["state"] == "SUCCEEDED"
-        grown = (peak_memory(scripted.pid) - before) / 1024
-        clients = reading.request("status")["server"]["clients"]
-    # A megabyte waits for each of 200 clients, up to the limit. Buffers that grow reserve some more.
-    assert grown < 128, f"{grown:.0f} MiB"
-    assert 20 < clients < 100, "those for which there is room stay, and no more"
-    assert_told_in_order(scripted)  # to a client that reads
-
-
-@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="the memory of a process is not told here")
 @pytest.mark.parametrize("asked", ["wait", "cancel"])
 def test_lists_that_nobody_reads_take_no_more_memory_than_what_may_wait_of_them(
     make_talk: MakeTalk, asked: str

@@ -21,7 +21,7 @@ import pytest
 from talkcli.engine.synthesizers.models import NEEDED
 from tests.readme.blocks import block, commands, runs
 from tests.readme.shell import Shell
-from tests.support.compare import assert_heard, extent
+from tests.support.compare import assert_heard
 from tests.support.documents import README, ROOT
 from tests.support.real_voice import REAL_PACKAGE, REAL_VOICE
 from tests.support.reference import Sentence, render
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
 
     from tests.support.sink import Sink
 
-#: Longest time for an example: pip asks a registry, over whatever network there is.
+#: Longest time for an example: pip uses a registry, over any network.
 LIMIT = 90.0
-#: What of this machine's settings pip needs to reach its registry, and nothing by which it would write elsewhere.
+#: The settings of this machine that pip needs to reach its registry.
 _OF_PIP = re.compile(
     "PIP_(CERT|CONFIG_FILE|INDEX_URL|EXTRA_INDEX_URL|FIND_LINKS|TRUSTED_HOST|DEFAULT_TIMEOUT)|[a-z]+_proxy"
     "|SSL_CERT_FILE|REQUESTS_CA_BUNDLE",
     re.IGNORECASE,
 )
-#: What a checkout has, and a clone of it has not.
+#: Files that a checkout has, but no clone.
 _MADE = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache", ".hypothesis", "dist", "build")
 _SUDO = """system=SYSTEM
 for word in "$@"; do
@@ -51,7 +51,7 @@ for word in "$@"; do
 done
 exec "$@"
 """
-#: What is said then, by that voice and no other, once there is a server; it ends it, and tells which voice was heard.
+#: Speaks by that voice alone once the server is there, prints the goal, and ends the server.
 _SPEAK = (
     'id=$(talk --connect-timeout 20 say --wait --voice-only "talk is ready") && talk --json status "$id"; code=$?; '
     "kill $!; wait $!; exit $code"
@@ -60,7 +60,7 @@ _SPEAK = (
 
 @pytest.fixture
 def newcomer(tmp_path: pathlib.Path) -> Iterator[Shell]:
-    """A shell beside a fresh checkout; its HOME is empty but for what it does itself."""
+    """A shell beside a fresh checkout, with an empty HOME."""
     home = tmp_path / "home"
     home.mkdir()
     (home / ".hushlogin").touch()  # Ubuntu's bash greets a newcomer
@@ -71,7 +71,7 @@ def newcomer(tmp_path: pathlib.Path) -> Iterator[Shell]:
         with contextlib.closing(Shell(home, env, talk=False)) as shell:
             shell.program("python3", f'exec {sys.executable} "$@"')
             yield shell
-    shutil.rmtree(home)  # environments are large, and pytest keeps the directories of three runs
+    shutil.rmtree(home)  # environments are large, and pytest keeps those of three runs
 
 
 def _settings_of_pip() -> dict[str, str]:
@@ -83,7 +83,7 @@ def _settings_of_pip() -> dict[str, str]:
 
 
 def _needs_a_registry(shell: Shell, *packages: str) -> None:
-    """Skip where pip reaches no registry; in CI fail."""
+    """Skip the test if pip reaches no registry; fail in CI."""
     made = shell.run("python3 -m venv registry", limit=LIMIT)
     assert made.returncode == 0, made
     words = ["registry/bin/pip", "--timeout", "10", "--retries", "1", "download", "-q", "--no-deps", "-d", "downloaded"]
@@ -220,21 +220,3 @@ def test_two_commands_speak_by_a_neural_voice(tmp_path: pathlib.Path) -> None:
             done = shell.run(f"{install}\n{serve} & {_SPEAK}")
     assert (done.returncode, shell.calls("pip")) == (0, [["install", ".[neural]", install.split()[-1]]]), done
     assert REAL_VOICE in done.stdout
-
-
-@pytest.mark.slow
-def test_two_commands_in_a_fresh_environment_are_heard(newcomer: Shell, sink: Sink) -> None:
-    """From a checkout to the sentence by a neural voice."""
-    _needs_a_registry(newcomer, "click")
-    install, serve = commands("Neural voices")
-    with sink.record() as recording:
-        done = newcomer.run(
-            f"cd talk\npython3 -m venv .venv && . .venv/bin/activate && {install} && {{ {serve} & {_SPEAK}; }}",
-            limit=4 * LIMIT,
-            **{name: value for name, value in sink.env.items() if name != "HOME"},
-            ALSA_CONFIG_PATH=_alsa_settings(newcomer, sink),
-        )
-        recording.wait_until_quiet(0.1)
-    assert done.returncode == 0, done
-    assert REAL_VOICE in done.stdout
-    assert extent(recording.samples)
