@@ -1,8 +1,8 @@
-"""Writes down the surface of `talk`: help, errors, exit codes, the library, what the wire says to each request.
+"""Writes the surface of `talk`: help, errors, exit codes, the library, and the replies to each request.
 
-    python -m tests.golden.surface          writes tests/golden/*.txt anew; `git diff` shows what has changed
+    python -m tests.golden.surface          updates tests/golden/*.txt; `git diff` shows the changes
 
-Each file is one kind of promise, and each line of it can be read. What differs from run to run stands as its type.
+Each file is one kind of promise. A type stands for each value that differs from run to run.
 """
 
 from __future__ import annotations
@@ -26,101 +26,43 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 
-#: Command lines that are wrong, or find no server. Each is shown with its exit code and what it says.
-ERRORS = (
-    "nonsense",
-    "sey hello",
-    "--sockt /x status",
-    "--socket '' status",
-    "--connect-timeout 0 status",
-    "--connect-timeout soon status",
-    "--connect-timeout 0.1 status",
-    "--connect-timeout 5 --robot @all status",
-    "--connect-timeout 5 serve",
-    "--connect-timeout 5 bridge --name anna",
-    "--connect-timeout 5 fleet status",
-    "--connect-timeout 5 doctor",
-    "say --connect-timeout 5 -o x.wav hello",
-    "status --json --json extra words",
-    "say",
-    "say ''",
-    "say '  '",
-    "say hello",
-    "say --wait hello",
-    "say --prempt hello",
-    "say -t 5 hello",
-    "say -wt 0 hello",
-    "say -wt never hello",
-    "say --preempt --queue --flush hello",
-    "say --queue --flush hello",
-    "say --priority high hello",
-    "say --priority 1000001 hello",
-    "say --ttl -1 hello",
-    "say --ttl nan hello",
-    "say --key '' hello",
-    "say --throttle -1 hello",
-    "say --id '' hello",
-    "say --id 4k7f-12 hello",
-    "say --id 12 hello",
-    "say --id 'a b' hello",
-    "say --as '' hello",
-    "say --rate 79 hello",
-    "say --rate 451 hello",
-    "say --rate 99.5 hello",
-    "say --volume 1.1 hello",
-    "say --volume loud hello",
-    "say --pitch 101 hello",
-    "say --voice '' hello",
-    "say -o",
-    "say -o '' hello",
-    "say -o /nowhere/x.wav hello",
-    "say -o x.wav --key k hello",
-    "say --lines hello",
-    "say -- ''",
-    "wait --timeout -1",
-    "wait -t 0.1",
-    "wait ''",
-    "cancel",
-    "cancel ''",
-    "cancel --before ''",
-    "cancel --key ''",
-    "status",
-    "status a b",
-    "status ''",
-    "--json status",
-    "watch",
-    "watch now",
-    "log",
-    "log -n 0",
-    "log -n 2201",
-    "set",
-    "set --rate 5",
-    "set --ttl -1",
-    "set --preempt --no-preempt --rate x",
-    "pause",
-    "resume",
-    "voices",
-    "voices --language ''",
-    "serve --rate 5",
-    "serve --volume 2",
-    "serve --pitch -1",
-    "serve --max-queue 0",
-    "serve --max-text 10001",
-    "serve --max-clients 0",
-    "serve --lead-in 5001",
-    "serve --socket-mode 0888",
-    "serve --socket-mode 0066",
-    "serve --player null --device x",
-    "serve --player file:",
-    "serve --player null --driver parrot",
-    "serve --print-unit nonsense",
-    "serve now",
-    "completion",
-    "completion tcsh",
-    "doctor now",
-)
+#: Command lines that are wrong, or find no server, by command. Each is shown with its exit code and its output.
+ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("", (
+        "nonsense", "sey hello", "--sockt /x status", "--socket '' status", "--connect-timeout 0 status",
+        "--connect-timeout soon status", "--connect-timeout 0.1 status", "--connect-timeout 5 --robot @all status",
+        "--connect-timeout 5 serve", "--connect-timeout 5 bridge --name anna", "--connect-timeout 5 fleet status",
+        "--connect-timeout 5 doctor", "say --connect-timeout 5 -o x.wav hello", "status --json --json extra words",
+    )),
+    ("say", (
+        "", "''", "'  '", "hello", "--wait hello", "--prempt hello", "-t 5 hello", "-wt 0 hello", "-wt never hello",
+        "--preempt --queue --flush hello", "--queue --flush hello", "--priority high hello", "--priority 1000001 hello",
+        "--ttl -1 hello", "--ttl nan hello", "--key '' hello", "--throttle -1 hello", "--id '' hello",
+        "--id 4k7f-12 hello", "--id 12 hello", "--id 'a b' hello", "--as '' hello", "--rate 79 hello",
+        "--rate 451 hello", "--rate 99.5 hello", "--volume 1.1 hello", "--volume loud hello", "--pitch 101 hello",
+        "--voice '' hello", "-o", "-o '' hello", "-o /nowhere/x.wav hello", "-o x.wav --key k hello", "--lines hello",
+        "-- ''",
+    )),
+    ("wait", ("--timeout -1", "-t 0.1", "''")),
+    ("cancel", ("", "''", "--before ''", "--key ''")),
+    ("status", ("", "a b", "''")),
+    ("", ("--json status",)),
+    ("watch", ("", "now")),
+    ("log", ("", "-n 0", "-n 2201")),
+    ("set", ("", "--rate 5", "--ttl -1", "--preempt --no-preempt --rate x")),
+    ("pause", ("",)),
+    ("resume", ("",)),
+    ("voices", ("", "--language ''")),
+    ("serve", (
+        "--rate 5", "--volume 2", "--pitch -1", "--max-queue 0", "--max-text 10001", "--max-clients 0",
+        "--lead-in 5001", "--socket-mode 0888", "--socket-mode 0066", "--player null --device x", "--player file:",
+        "--player null --driver parrot", "--print-unit nonsense", "now",
+    )),
+    ("completion", ("", "tcsh")),
+    ("doctor", ("now",)),
+)  # fmt: skip
 
-#: A conversation with a server that has the scripted engine: each request that there is, and some that there is not.
+#: A conversation with a server that has the scripted engine: every request, and some that don't exist.
 REQUESTS: tuple[dict[str, Any], ...] = (
     {"request": "hello", "name": "golden"},
     {"seq": 1, "request": "voices"},
@@ -131,18 +73,8 @@ REQUESTS: tuple[dict[str, Any], ...] = (
     {"seq": 6, "request": "watch"},
     {"seq": 7, "request": "pause"},
     {"seq": 8, "request": "say", "text": "one length=0", "wait": True, "feedback": True, "id": "a/1", "preempt": False},
-    {
-        "seq": 9,
-        "request": "say",
-        "text": "two",
-        "key": "k",
-        "priority": 3,
-        "ttl": 60,
-        "rate": 90,
-        "volume": 1,
-        "pitch": 1,
-        "data": {"a": 1},
-    },
+    {"seq": 9, "request": "say", "text": "two", "key": "k", "priority": 3, "ttl": 60, "rate": 90, "volume": 1}
+    | {"pitch": 1, "data": {"a": 1}},
     {"seq": 10, "request": "say", "text": "three", "key": "k", "priority": 3, "preempt": False, "voice": "en"},
     {"seq": 11, "request": "say", "text": "four", "throttle": 5, "flush": True, "preempt": False},
     {"seq": 12, "request": "say", "text": "five", "format": "ssml"},
@@ -173,13 +105,13 @@ REQUESTS: tuple[dict[str, Any], ...] = (
 
 
 def surface() -> dict[str, str]:
-    """Return every file of the surface: its name, without ending, and what it has."""
+    """Return the text of each file of the surface by its name."""
     found = {f"help-{name or 'talk'}": text for name, text in _helps()}
     return {**found, "errors": _errors(), "library": _library(), "wire": _wire()}
 
 
 def write() -> None:
-    """Write the files anew; one that is of no use any more goes."""
+    """Write all files, and delete those that are no longer needed."""
     for each in HERE.glob("*.txt"):
         each.unlink()
     for name, text in surface().items():
@@ -187,7 +119,7 @@ def write() -> None:
 
 
 def _alone(home: str, words: list[str]) -> tuple[int, str, str]:
-    """Run `talk` where there is no server and no sound; return its exit code and what it wrote, without the place."""
+    """Run `talk` without a server and without sound; return its exit code and its output, with HOME for its place."""
     done = run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", COLUMNS="80", PULSE_SERVER="unix:/nowhere"))
     return done.code, done.out.replace(home, "HOME"), done.err.replace(home, "HOME")
 
@@ -203,7 +135,7 @@ def _helps() -> Iterator[tuple[str, str]]:
 def _errors() -> str:
     told = []
     with short_directory() as home:
-        for line in ERRORS:
+        for line in (f"{command} {words}".strip() for command, lines in ERRORS for words in lines):
             code, out, err = _alone(home, shlex.split(line))
             told.append(f"$ talk {line}\n{_indented(out)}{_indented(err, '! ')}= {code}\n")
     return "\n".join(told)
@@ -214,7 +146,7 @@ def _indented(text: str, mark: str = "  ") -> str:
 
 
 def _library() -> str:
-    """Return what `from talkcli import …` gives: each name, its signature, what is public in it; and the errors."""
+    """Return the names in `talkcli` with their public members, and the errors."""
     lines = [f"__all__ = {talkcli.__all__}"]
     for name in talkcli.__all__:
         found = getattr(talkcli, name)
@@ -249,7 +181,7 @@ def _signature(found: Any) -> str:
 
 
 def _wire() -> str:
-    """Return what a server with the scripted engine says to each of the requests, in its order."""
+    """Return the replies of a server with the scripted engine to each request, in their order."""
     talk = Talk(scripted=True)
     try:
         with talk.connect() as wire:
@@ -258,7 +190,7 @@ def _wire() -> str:
             for request in REQUESTS:
                 wire.send(request)
                 lines.append(f"> {json.dumps(request)}")
-                # The one goal that is left is spoken then, to its result.
+                # After "resume", the one goal that is left is spoken.
                 awaited = {"ok", "result"} if request.get("request") == "resume" else {"ok"}
                 while awaited:
                     message = wire.receive()
@@ -275,7 +207,7 @@ def _told(message: Mapping[str, Any]) -> str:
 
 
 def _steady(value: Any, name: str = "") -> Any:
-    """Return a message with the type in the place of what differs from run to run; messages for people stay."""
+    """Return a message with the types of the values that differ from run to run; messages for people stay."""
     if isinstance(value, dict):
         return {key: _steady(each, key) for key, each in value.items()}
     if isinstance(value, list):

@@ -1,7 +1,7 @@
-"""A shell for the README's examples: `talk` is a program in it, and what a test must not touch has a stand-in.
+"""A shell for the README's examples, with `talk` on its PATH and stand-ins for programs that tests must not touch.
 
-A stand-in writes down what it was called with. ssh's does what ssh does to a command: it joins the words with blanks
-and gives them to a shell, so that a mistake in quoting shows.
+A stand-in records its arguments. Like ssh, that for ssh joins the words of a command with blanks and gives them to a
+shell, so that a mistake in quoting shows.
 """
 
 from __future__ import annotations
@@ -36,32 +36,9 @@ done
 shift $((OPTIND - 1))
 shift  # the host
 if [ -n "$forward" ]; then
-    PYTHON RELAY "${forward%%:*}" "${forward#*:}" < /dev/null > /dev/null 2>&1 &
-    until [ -S "${forward%%:*}" ]; do sleep 0.02; done
-    exit
+    exec ln -s "${forward#*:}" "${forward%%:*}"
 fi
 exec sh -c "$*"
-"""
-
-#: What ssh -L does, for one user and one machine.
-_RELAY = """
-import asyncio, sys
-
-async def pump(reader, writer):
-    while data := await reader.read(65536):
-        writer.write(data)
-        await writer.drain()
-    writer.close()
-
-async def accept(reader, writer):
-    far_reader, far_writer = await asyncio.open_unix_connection(sys.argv[2])
-    await asyncio.gather(pump(reader, far_writer), pump(far_reader, writer), return_exceptions=True)
-
-async def main():
-    async with await asyncio.start_unix_server(accept, sys.argv[1]) as server:
-        await server.serve_forever()
-
-asyncio.run(main())
 """
 
 #: The filters of the README, for a machine that has no jq.
@@ -89,7 +66,7 @@ class Shell:
     """Runs examples in a directory of their own; `close()` ends what still runs."""
 
     def __init__(self, directory: Path, env: Mapping[str, str], *, talk: bool = True) -> None:
-        """With `talk` this checkout's is on the PATH."""
+        """With `talk`, put this checkout's program on the PATH."""
         self.directory = directory
         self._bin = directory / "bin"
         self._bin.mkdir()
@@ -107,15 +84,13 @@ class Shell:
         path.chmod(0o755)
 
     def stand_in(self, name: str, then: str = "exit 0", where: Path | None = None) -> None:
-        """Put a program on the PATH that writes down its arguments, and then does something else."""
+        """Put a program on the PATH that records its arguments, and then runs this script."""
         calls = self.directory / f"{name}.calls"
         self.program(name, f"{{ printf '%s\\037' \"$@\"; echo; }} >> {calls}\n{then}", where)
 
     def ssh(self) -> None:
         """Put an ssh on the PATH that runs the command here."""
-        relay = self.directory / "relay.py"
-        relay.write_text(_RELAY, encoding="utf-8")
-        self.stand_in("ssh", _SSH.replace("PYTHON", sys.executable).replace("RELAY", str(relay)))
+        self.stand_in("ssh", _SSH)
 
     def calls(self, name: str) -> list[list[str]]:
         """Return the arguments of each call of a stand-in."""
@@ -126,7 +101,7 @@ class Shell:
     def run(self, script: str, *arguments: str, limit: float = LIMIT, **env: str) -> subprocess.CompletedProcess[str]:
         """Run a script to its end, which must come within `limit` seconds."""
         began = self.start(script, *arguments, **env)
-        # Its number stays its group's until it is reaped, so what it leaves behind can be ended by that.
+        # Until it is reaped, its number is that of its group, so the processes that it left can be ended.
         wait_until(lambda: os.waitid(os.P_PID, began.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None, limit)
         os.killpg(began.pid, signal.SIGKILL)
         out, err = began.communicate(timeout=LIMIT)
@@ -166,7 +141,7 @@ class Shell:
 
 
 def wait_until(true: Callable[[], bool], seconds: float = PATIENCE) -> None:
-    """Wait for what no event tells: a file that a program writes, a program's end."""
+    """Wait until a condition holds of which no event tells."""
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "it did not happen"
@@ -174,6 +149,6 @@ def wait_until(true: Callable[[], bool], seconds: float = PATIENCE) -> None:
 
 
 def wait_for_watcher(talk: Talk) -> None:
-    """Wait until somebody watches beside the test's own watcher."""
-    with talk.connect() as wire:  # one connection, so that none that is just closing is counted
+    """Wait until a client watches beside the test's own watcher."""
+    with talk.connect() as wire:  # a closing connection would count
         wait_until(lambda: wire.request("status")["server"]["clients"] > 2)
