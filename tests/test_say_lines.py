@@ -142,18 +142,6 @@ def run_bytes(talk: Talk, data: bytes, *words: str) -> subprocess.CompletedProce
     )
 
 
-def test_the_longest_text_fits_and_one_byte_more_does_not(make_talk: MakeTalk) -> None:
-    talk = make_talk(scripted=True)
-    longest = "日" * 10_000
-    widest = "👩" * 10_000  # 40,000 bytes
-    done = run_bytes(talk, f"{longest}\r\n{widest}\r\n{widest}a\n".encode())
-    assert done.returncode == 5
-    assert len(done.stdout.split()) == 2
-    assert done.stderr.startswith(b"talk: line 3: ")
-    assert done.stderr.count(b"\n") == 1
-    talk.run("cancel")
-
-
 def test_wait_tells_how_each_ended_and_the_first_failure(scripted: Talk) -> None:
     text = "length=0 fine\nfail=audio_lost message=no_cable\n\0\nlength=0 too\n"
     done = scripted.run("say", "--lines", "--wait", stdin=text)

@@ -148,17 +148,6 @@ def test_colour_by_outcome_on_a_terminal_alone(scripted: Talk) -> None:
         assert coloured == [not extra] * 3
 
 
-def test_text_of_others_is_shown_escaped(scripted: Talk) -> None:
-    watch = Lines(scripted, "--words")
-    scripted.run("say", "--as", HOSTILE[:60], "--wait", "--", HOSTILE)
-    watch.next("SUCCEEDED")
-    assert watch.end() == 130
-    shown = "\n".join(watch.lines)
-    assert r'"a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end"' in shown
-    assert not re.search("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u202e]", shown), repr(shown)
-    assert not any(each.startswith("fake") for each in watch.lines)
-
-
 def test_a_server_that_goes_away_is_told(scripted: Talk) -> None:
     watch = Lines(scripted)
     goal_id = scripted.run("say", "never-ends").id

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli import __version__
 from tests.conformance.rawsocket import Raw
 from tests.conformance.witness import await_ends
 
@@ -32,21 +31,6 @@ def shape(message: Message) -> str:
     if "event" in message:
         return str(message.get("state", message["event"]))
     return "reply" if "ok" in message else "item"
-
-
-def test_greeting_and_first_requests(scripted: Talk) -> None:
-    with scripted.connect() as wire:
-        assert wire.greeting.keys() == {"talk", "version", "pid", "boot", "features"}
-        assert (wire.greeting["talk"], wire.greeting["version"]) == (1, __version__)
-        assert (wire.greeting["pid"], wire.greeting["features"]) == (scripted.pid, [])
-        wire.send({"request": "hello", "name": "patrol"})
-        assert wire.receive() == {"ok": True}  # without a number, the reply has none
-        goal = wire.request("say", text="length=0", data={"label": ["é", 1, None]})["goal"]
-    assert goal["id"].startswith(f"{wire.greeting['boot']}-")
-    assert goal.keys() == KEYS
-    assert goal["client"].keys() == {"pid", "uid", "command", "parent", "name"}
-    assert goal["client"]["name"] == "patrol"
-    assert goal["data"] == {"label": ["é", 1, None]}
 
 
 @pytest.mark.parametrize("text", ["length=0.1 one two", "length=0.1 crash"])
@@ -225,21 +209,6 @@ def test_a_rejected_goal_has_a_state_and_a_result_if_the_client_waits(scripted: 
         _, reply, *events = raw.receive_all()
     assert [shape(each) for each in events] == (["REJECTED", "result"] if extra else [])
     assert {each["goal"]["state"] for each in (reply, *events[1:])} == {"REJECTED"}
-
-
-def test_lists_come_one_item_a_line(scripted: Talk) -> None:
-    with scripted.connect() as wire:
-        said = wire.request("say", text="length=0", wait=True)["goal"]["id"]
-        wire.receive_event("result")
-        active, *pending = (wire.request("say", text="never-ends")["goal"]["id"] for _ in range(3))
-        scripted.watcher.wait_for(active, "ACTIVE")
-        reply = wire.request("status")
-        assert reply["active"]["id"] == active
-        kinds: list[tuple[str, Any]] = [
-            (name, each[name]["id"]) for each in wire.items for name in each.keys() - {"seq"}
-        ]
-        assert kinds == [*(("pending", each) for each in pending), ("recent", said)]
-        assert wire.request("cancel")["count"] == 3
 
 
 def test_request_is_not_taken_in_the_middle_of_what_an_end_brings_about(scripted: Talk) -> None:
