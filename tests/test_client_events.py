@@ -45,9 +45,6 @@ def client(scripted: Talk) -> Iterator[Client]:
         yield result
 
 
-# Form
-
-
 @pytest.mark.parametrize("event", EVENTS)
 def test_event_goes_to_json_and_back(event: Event) -> None:
     message = json.loads(json.dumps(event.to_json()))
@@ -109,9 +106,6 @@ def test_buffer_hands_out_in_order_and_drops_the_oldest_feedback() -> None:
     while buffer.take():
         taken += 1
     assert taken == MAX_STATES  # nothing that came after what is missing
-
-
-# A goal's events
 
 
 def told(found: list[Event]) -> list[object]:
@@ -189,9 +183,6 @@ def test_late_feedback_of_an_unknown_goal_is_an_error(client: Client) -> None:
         GoalHandle(client._connection, Goal("none-1", State.ACTIVE)).feedback(1)
 
 
-# Polled
-
-
 def polled(handle: GoalHandle) -> list[Event]:
     """Return what a handle gives until its result, asked again and again."""
     found: list[Event] = []
@@ -262,9 +253,6 @@ def test_poll_tells_that_the_goal_is_lost(
         assert "nothing for 0.3 s" in (handle.goal.message or "")
         scripted.thaw()
         scripted.run("cancel")
-
-
-# All events
 
 
 def until_all_ended(watch: Iterator[Event], count: int) -> list[Event]:

@@ -50,9 +50,6 @@ def untouched() -> Iterator[Client]:
         talk.stop()
 
 
-# say
-
-
 TAKEN = [each for each in OPTIONS if each.name not in {"wait", "format"}]
 
 
@@ -148,9 +145,6 @@ def test_patient_goal_whose_sender_hangs_up_is_not_spoken(make_talk: MakeTalk, t
         assert "never heard" not in str(client.log())
 
 
-# cancel, log, settings
-
-
 def test_cancel_by_key(client: Client) -> None:
     active, other = client.say("never-ends", key="k"), client.say("never-ends", key="j")
     pending = client.say("pending", key="k")
@@ -208,9 +202,6 @@ def test_voice_that_the_engine_has_not_cannot_be_set(untouched: Client) -> None:
     assert (refused.value.code, refused.value.exit_code) == ("unknown_voice", 2)
     assert isinstance(refused.value, RequestRefused)
     assert untouched.settings() == SETTINGS
-
-
-# pause and resume
 
 
 def test_speech_is_held_and_goes_on(client: Client, scripted: Talk) -> None:

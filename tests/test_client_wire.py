@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 
-# How long is waited
-
-
 def unanswered(peer: Peer) -> None:
     peer.receive("say")
 
@@ -135,9 +132,6 @@ def test_what_has_arrived_by_the_deadline_counts(timeout: float) -> None:
             next(handle.events(timeout))  # each event is handed out once
 
 
-# The end of the connection
-
-
 def test_result_that_came_before_the_server_went_away_counts() -> None:
     gone = threading.Event()
 
@@ -222,9 +216,6 @@ def test_events_of_kinds_not_known_here_are_ignored() -> None:
 
     with serving(play) as path, Client(path) as client:
         assert len(list(client.say("a", feedback=True).feedback(5))) == 1
-
-
-# Interrupts
 
 
 @pytest.fixture

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 NOBODY = 65534
-#: A client for users who may not be able to read this checkout or its interpreter.
-#: Listens where somebody else's server would, and answers nothing.
 #: Starts a program and passes it a socket, like systemd.
 PASSING = """
 import os, sys

@@ -27,7 +27,7 @@ def objects(out: str) -> list[dict[str, Any]]:
 
 
 def test_each_event_is_a_line_that_can_be_cut(scripted: Talk) -> None:
-    done = scripted.run("say", "-wf", "--", "length=0.4 battery d'été 日本")
+    done = scripted.run("say", "-wf", "--", "length=0.4 battery d'été 日本\x1b[m")
     goal_id = scripted.watcher.goals()[0]
     assert done.code == 0
     assert done.err == ""
@@ -37,7 +37,7 @@ def test_each_event_is_a_line_that_can_be_cut(scripted: Talk) -> None:
         f"{goal_id} word 1 0-10 0.000 length=0.4",
         f"{goal_id} word 2 11-18 0.100 battery",
         f"{goal_id} word 3 19-24 0.200 d'été",
-        f"{goal_id} word 4 25-27 0.300 日本",
+        f"{goal_id} word 4 25-30 0.300 日本\\x1b[m",
         f"{goal_id} SUCCEEDED",
     ]
 
@@ -86,9 +86,6 @@ def test_pause_and_resume_are_shown(scripted: Talk) -> None:
     shown = [each.split()[1] for each in lines]
     assert shown == ["ACTIVE", "word", "PAUSED", "RESUMED", "PREEMPTING", "PREEMPTED"]
     assert client.wait(10) == 143
-
-
-# wait
 
 
 def test_wait_follows_several_goals_in_the_servers_order(scripted: Talk) -> None:

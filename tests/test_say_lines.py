@@ -175,9 +175,6 @@ def test_throttled_lines_are_no_failure(scripted: Talk) -> None:
     assert "line 2: " in alike.err
 
 
-# How many are pending, and for how long
-
-
 @pytest.mark.parametrize(("words", "ahead"), [([], 10), (["--ahead", "2", "--wait"], 2)])
 def test_few_goals_are_pending_so_that_others_have_room(scripted: Talk, words: list[str], ahead: int) -> None:
     typing = Typing(scripted, "say", "--lines", *words)
@@ -265,9 +262,6 @@ def test_fifty_lines_a_second_are_spoken_while_they_are_new_and_others_are_spoke
     assert_within(other["started_at"] - other["queued_at"], 1, "the other client's sentence")
 
 
-# Room, speed, memory
-
-
 @pytest.mark.parametrize(("words", "most"), [(["--ttl", "60"], 1_000_000), ([], 0)])
 def test_no_more_is_read_than_is_kept(scripted: Talk, words: list[str], most: int) -> None:
     client = Forked(["say", "--lines", *words], scripted.env, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
@@ -319,9 +313,6 @@ def test_a_line_without_an_end_is_read_in_bounded_memory(scripted: Talk) -> None
     assert client.returncode == 5, err
     assert b"line 1: Talk rejected: the line has 450,000,000 bytes" in err
     assert len(out.split()) == 1
-
-
-# Ends before the input's
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])

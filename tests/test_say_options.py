@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-import re
 import shlex
 import signal
 import struct
@@ -40,9 +39,6 @@ def busy(talk: Talk) -> str:
     return goal_id
 
 
-# Refused
-
-
 @pytest.mark.parametrize(
     ("words", "hints"),
     [
@@ -68,9 +64,6 @@ def test_contradictions_and_values_out_of_range_are_usage_errors(words: list[str
     done = alone("say", *words)
     assert (done.code, done.out) == (2, ""), done
     assert [each for each in hints if each not in done.err] == [], done.err
-
-
-# Order
 
 
 def test_preempt_queue_flush_and_priority_reach_the_server(make_talk: MakeTalk) -> None:
@@ -161,21 +154,16 @@ def test_speech_that_is_paused_is_noted(scripted: Talk) -> None:
     held = busy(scripted)
     assert scripted.run("pause").code == 0
     note = "talk: speech is paused: talk resume\n"
-    done = scripted.run("say", "length=0")
-    assert (done.code, done.err) == (0, note)
-    assert re.fullmatch(r"\w{4}-\d+\n", done.out)
+    assert scripted.run("say", "length=0").err == note
     assert scripted.run("say", "-q", "length=0").err == ""
     waiting = scripted.start("say", "-w", "length=0")
     assert waiting.stdout
-    assert re.fullmatch(r"\w{4}-\d+\n", waiting.stdout.readline())
+    assert waiting.stdout.readline()  # its id, before it is spoken
     assert scripted.run("resume").code == 0
     scripted.run("cancel", held)
     ended = scripted.finish(waiting)
     assert (ended.code, ended.err) == (0, note)
     assert scripted.run("say", "length=0").err == ""
-
-
-# Ids of one's own
 
 
 def test_own_id_is_printed_and_spoken_once(scripted: Talk) -> None:
@@ -212,9 +200,6 @@ def test_client_that_attached_cancels_nothing(scripted: Talk, feedback: list[str
     assert waiting.stdout.readline() == "mine\n"
     scripted.run("cancel", "mine")
     assert scripted.finish(waiting).code == 7
-
-
-# Rendering
 
 
 def test_output_writes_a_file_without_a_server(tmp_path: Path) -> None:

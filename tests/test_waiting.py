@@ -200,9 +200,6 @@ async def test_bug_in_a_request_that_waited_harms_no_other_request(monkeypatch: 
     assert server.requests._size == 0
 
 
-# -- news
-
-
 class Readers:
     """All clients' streams, with the bytes that they have not read."""
 

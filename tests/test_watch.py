@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 LONG = "moving to the charger on the second floor, please step back from the door and from the lift never-ends"
-HOSTILE = "a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end"
 
 
 class Lines:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import re
-from functools import cache
 from typing import TYPE_CHECKING
 
 from talkcli import errors, paths
@@ -29,70 +27,25 @@ if TYPE_CHECKING:
 
     from tests.support.processes import Talk
 
-#: The index of the argument that is a goal's reason, by the name of the function.
-REASON_AT = {
-    "CannotSpeak": 0, "StartFailed": 0, "Ended": 2, "_lose_process": 1, "_recall": 1, "_stop": 1,
-    "_end": 2, "failed": 1,
-}  # fmt: skip
-#: The index of the argument that is the code of an error on the wire.
-CODE_AT = {"BadRequest": 1, "RequestRefused": 1, "failure": 1, "refuse": 0}
-CODE = re.compile(r"[a-z]+(_[a-z]+)*")
+ERRORS, LIMITS = tables(WIRE.section("Errors and limits"))
 
 
-@cache
-def sources(*, fleet: bool = False) -> list[tuple[str, ast.Call | ast.Tuple]]:
-    """Return the calls and tuples of the sources with the names of their files: those of the fleet, or all others."""
-    paths = [each for each in sorted((ROOT / "talkcli").rglob("*.py")) if (each.parent.name == "fleet") is fleet]
-    nodes = [(path.name, node) for path in paths for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
-    return [(name, node) for name, node in nodes if isinstance(node, ast.Call | ast.Tuple)]
-
-
-def constants(node: ast.AST | None) -> set[str]:
-    """Return the codes that an expression may have as its value."""
-    if isinstance(node, ast.IfExp):
-        return constants(node.body) | constants(node.orelse)
-    if isinstance(node, ast.BoolOp):
-        return set().union(*map(constants, node.values))
-    found = node.value if isinstance(node, ast.Constant) else None
-    return {found} if isinstance(found, str) and CODE.fullmatch(found) else set()
-
-
-def arguments(places: dict[str, int], keyword: str, *, fleet: bool = False) -> set[str]:
-    """Return the codes that calls of the sources pass at these indices, or by this keyword."""
-    found = set()
-    for _, node in sources(fleet=fleet):
-        if not isinstance(node, ast.Call):
-            continue
-        name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-        if name in places and len(node.args) > places[name]:
-            found |= constants(node.args[places[name]])
-        if name in places or name == "Goal":
-            found |= set().union(*(constants(each.value) for each in node.keywords if each.arg == keyword))
-    return found
-
-
-def reasons() -> set[str]:
-    """Return the reasons that the sources give to goals, by calls or as the first of a pair with a message."""
-    found = arguments(REASON_AT, "reason")
-    for name, node in sources():
-        if isinstance(node, ast.Call):  # of `Goal`, or of `replace`
-            found |= set().union(*(constants(each.value) for each in node.keywords if each.arg == "reason"))
-        if isinstance(node, ast.Tuple) and len(node.elts) == 2:
-            first, second = node.elts
-            for_people = isinstance(second, ast.JoinedStr | ast.Call) or " " in str(getattr(second, "value", ""))
-            if name in {"scheduler.py", "text.py", "speech.py"} and for_people:
-                found |= constants(first)
-            if name == "scheduler.py" and isinstance(first, ast.Name):
-                found |= constants(second)
-    return found
-
-
-def test_states_and_reasons_are_in_the_tables() -> None:
+def test_states_are_in_the_tables() -> None:
     states, found = tables(WIRE.section("States"))[:2]
     documented = {words(row[0])[0]: (int(row[1]), row[3] == "yes") for row in states[1:]}
     assert documented == {each.name: (int(each), each.terminal) for each in State}
-    assert sorted(first_column(found)) == sorted(reasons())
     assert all(State[state].terminal for row in found[1:] for state in row[1].split(", "))
+
+
+def test_keys_reasons_and_error_codes_of_the_tables_are_those_of_the_code() -> None:
+    """`tests/golden` and the tests of each fault have the codes themselves."""
+    assert first_column(tables(WIRE.section("The goal"))[0]) == list(Goal("", State.PENDING).to_json())
+    reasons, codes = first_column(tables(WIRE.section("States"))[1]), first_column(ERRORS)
+    refused = [errors.UnknownGoal, errors.BadRequest, *errors.BadRequest.__subclasses__()]
+    assert {each.code for each in refused} <= set(codes)
+    sources = "".join(each.read_text(encoding="utf-8") for each in (ROOT / "talkcli").rglob("*.py"))
+    for each in (*reasons, *codes, *first_column(tables(FLEET.section("What is refused"))[0])):
+        assert f'"{each}"' in sources, each
 
 
 def test_replies_to_all_requests_are_in_the_table() -> None:
@@ -107,7 +60,7 @@ def test_numbers_of_kept_goals_are_in_the_text() -> None:
 
 
 def test_limits_are_those_of_the_code() -> None:
-    limits = {row[0]: row[1] for row in tables(WIRE.section("Errors and limits"))[1][1:]}
+    limits = {row[0]: row[1] for row in LIMITS[1:]}
     assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")
     assert f"within {connection.FIRST_REQUEST:g} s" in limits["the first request"]
     assert f"within {connection.LINE_LIMIT:g} s" in limits["a line"]
@@ -159,10 +112,6 @@ def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [each.replace("UID", str(os.getuid())) for each in places] == paths.client_sockets(None)
 
 
-def test_goal_has_the_keys_of_the_table() -> None:
-    assert first_column(tables(WIRE.section("The goal"))[0]) == list(Goal("", State.PENDING).to_json())
-
-
 def test_server_has_the_keys_of_the_text(scripted: Talk) -> None:
     found = re.search(r"^`server` has (.*?)\.$", WIRE.section("Requests"), re.MULTILINE | re.DOTALL)
     assert found
@@ -174,26 +123,6 @@ def test_events_are_in_the_table() -> None:
     sent = {kind: set(each.__annotations__) for kind, each in events._KINDS.items() if kind != "snapshot"}
     assert set(table) == {*sent, "alive"}
     assert all(fields <= table[kind] for kind, fields in sent.items())
-
-
-def test_error_codes_are_in_the_table() -> None:
-    classes: list[type[errors.RequestRefused]] = [
-        errors.UnknownGoal,
-        errors.BadRequest,
-        *errors.BadRequest.__subclasses__(),
-    ]
-    codes = arguments(CODE_AT, "code") | {each.code for each in classes}
-    codes |= {"unknown_voice"}  # goes from `voice_fault` into the reply to `set`
-    assert codes >= {"bad_json", "unknown_field", "line_too_long", "too_slow", "bad_option", "internal_error"}
-    assert sorted(first_column(tables(WIRE.section("Errors and limits"))[0])) == sorted(codes)
-
-
-def test_error_codes_of_a_fleet_are_in_its_table() -> None:
-    codes = arguments({"BadRequest": 1, "failure": 1, "_refuse": 1}, "code", fleet=True)
-    codes |= {policy.STALE, errors.Busy.code}
-    codes -= set(first_column(tables(WIRE.section("Errors and limits"))[0]))
-    table = tables(FLEET.section("What is refused"))[0]
-    assert sorted(first_column(table)) == sorted(codes)
 
 
 def test_exit_codes_are_in_the_table() -> None:
