@@ -180,16 +180,11 @@ def test_a_forked_child_closes_its_copy_and_leaves_its_parents_connection(script
     assert (done.returncode, done.stdout, done.stderr) == (0, "PREEMPTED\n", "")
 
 
-@pytest.mark.parametrize("commands", [[], pytest.param([["say", "hello"], ["--json", "wait"]], marks=pytest.mark.slow)])
-def test_full_server_turns_goals_away_but_answers_status_and_cancel(
-    make_talk: MakeTalk, commands: list[list[str]]
-) -> None:
-    """The commands try for 5 s to be let in."""
+def test_full_server_turns_goals_away_but_answers_status_and_cancel(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-clients", "1", scripted=True, watched=False)
     with talk.connect() as only:
         goal_id = only.request("say", text="never-ends", wait=True)["goal"]["id"]
         began = time.monotonic()
-        turned_away = [talk.start(*each) for each in commands]
         assert talk.run("status", goal_id).code == 0
         assert talk.run("cancel").id == goal_id
         with Client.over(SocketConnection(talk.socket, urgent=True)) as urgent:
@@ -197,10 +192,5 @@ def test_full_server_turns_goals_away_but_answers_status_and_cancel(
         with pytest.raises(Busy, match="--max-clients"):
             SocketConnection(talk.socket, patience=0.5)
         assert 0.5 <= time.monotonic() - began < 2.5
-        for each in turned_away:
-            done = talk.finish(each)
-            assert (done.code, done.out) == (5, "")
-            assert "--max-clients" in done.err
-        assert not commands or 5 <= time.monotonic() - began < 7
         late = talk.start("say", "--wait", "length=0")
     assert talk.finish(late).code == 0  # it came in when there was room

@@ -1,4 +1,4 @@
-"""`talk serve` where `tests.support.processes.Talk` cannot be used: no socket is named, or it must not start."""
+"""`talk serve` for tests that name no socket, or in which it must not start."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 TALK = [sys.executable, "-m", "talkcli"]
 SERVE = [*TALK, "serve", "--player", "null"]
-#: Seconds in which anything here starts or ends.
+#: Seconds in which a process starts or ends.
 LIMIT = 20.0
 
 
 @dataclass(slots=True)
 class Ended:
-    """A process that has ended by itself."""
+    """The exit code and the output of a process."""
 
     code: int
     out: str
@@ -34,7 +34,7 @@ class Ended:
 
 
 class BareServe:
-    """A server in an environment that is given whole."""
+    """A server whose whole environment is given."""
 
     def __init__(self, command: Sequence[str], env: Mapping[str, str], pass_fds: Sequence[int] = ()) -> None:
         self.process: subprocess.Popen[str] | Forked
@@ -64,12 +64,12 @@ class BareServe:
         return "".join(self._lines)
 
     def serves(self) -> bool:
-        """Wait until it says that it serves, or has closed its standard error, and return which."""
+        """Wait until it serves or has closed its standard error; return whether it serves."""
         assert self._settled.wait(LIMIT), f"neither ready nor ended: {self.log}"
         return "ready on " in self.log
 
     def end(self, *signals: signal.Signals) -> int:
-        """Send it signals, one after the other, and return its exit code."""
+        """Send signals one after another, and return the exit code."""
         for each in signals:
             self.process.send_signal(each)
         code = self.process.wait(LIMIT)
@@ -77,7 +77,7 @@ class BareServe:
         return code
 
     def close(self) -> None:
-        """End it, however it is."""
+        """Kill it if it still runs."""
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
@@ -98,7 +98,7 @@ class BareServe:
 def serving(
     env: Mapping[str, str], *options: str, command: Sequence[str] = SERVE, pass_fds: Sequence[int] = ()
 ) -> Iterator[BareServe]:
-    """Run a server that is ready, and assert at the end that SIGTERM ends it well, if nothing has ended it before."""
+    """Run a server that is ready. At the end SIGTERM must end it, unless it has already ended."""
     server = BareServe([*command, *options], env, pass_fds)
     try:
         assert server.serves(), server.log
@@ -128,7 +128,7 @@ def run(command: Sequence[str], env: Mapping[str, str], **options: object) -> En
 
 
 def _forked(command: Sequence[str], env: Mapping[str, str]) -> list[str] | None:
-    """Return the words of `talk` in a command that can be forked; None if it can't."""
+    """Return the arguments of `talk` in a command that can be forked, else None."""
     if not forks(env):
         return None
     if list(command[:2]) == [sys.executable, SCRIPTED]:
@@ -137,5 +137,5 @@ def _forked(command: Sequence[str], env: Mapping[str, str]) -> list[str] | None:
 
 
 def environment(home: str, **extra: str) -> dict[str, str]:
-    """Return a clean environment whose temporary and home directories are this one."""
+    """Return a clean environment with this home and temporary directory."""
     return clean_environment(home, {"TMPDIR": home, **extra})

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conformance.bareserve import environment
+from tests.conformance.bareserve import TALK, Ended, environment, run
 from tests.conformance.rawsocket import GREETING, FakeServer, Raw
 from tests.conformance.witness import states
 from tests.support.surroundings import short_directory
@@ -108,21 +108,14 @@ def test_timeout_holds_whatever_the_server_does_not_say(says: bytes) -> None:
         done = _talk(home, "say", "--wait", "--timeout", "0.5", "--", "hello")
         seconds = time.monotonic() - began
     # Nothing was sent to a server that did not greet: that is no server.
-    assert done.returncode == (124 if says else 3), done
-    assert ("timed out after 0.5 s: say was sent" in done.stderr) == bool(says)
+    assert done.code == (124 if says else 3), done
+    assert ("timed out after 0.5 s: say was sent" in done.err) == bool(says)
     assert_within(seconds, 0.5 + 1 + START, "a timeout of 0.5 s")
 
 
-def _talk(home: str, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "talkcli", *words],
-        env=environment(home, TALK_SOCKET=f"{home}/s"),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=20,
-        check=False,
-    )
+def _talk(home: str, *words: str) -> Ended:
+    """Run `talk` in a process of its own, without a fork."""
+    return run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s"), cwd="/")
 
 
 def test_row_15_client_that_is_gone_at_once_is_spoken_for(scripted: Talk) -> None:
@@ -237,7 +230,7 @@ def test_row_34_sigterm_to_a_background_job_of_a_script(scripted: Talk) -> None:
 def _version() -> float:
     """Return the seconds of the shortest command, a control for a client that finds no server."""
     began = time.monotonic()
-    assert _talk("/", "--version").returncode == 0
+    assert _talk("/", "--version").code == 0
     return time.monotonic() - began
 
 
@@ -247,9 +240,9 @@ def test_row_35_no_server_is_told_at_once(words: Sequence[str]) -> None:
         began = time.monotonic()
         done = _talk(home, *words)
         seconds = time.monotonic() - began
-        assert (done.returncode, done.stdout) == (3, "")
-        assert f"{home}/s: not there" in done.stderr
-        assert "talk serve" in done.stderr
+        assert (done.code, done.out) == (3, "")
+        assert f"{home}/s: not there" in done.err
+        assert "talk serve" in done.err
         assert_within(seconds, 0.3, "the end of a client without a server")
 
 

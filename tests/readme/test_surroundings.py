@@ -1,12 +1,12 @@
-"""The examples that install, contain, serve and search: with stand-ins for what would change the machine."""
+"""The examples of containers, services and troubleshooting, with stand-ins that keep the machine as it is."""
 
 from __future__ import annotations
 
 import json
+import re
 from typing import TYPE_CHECKING
 
 from tests.readme.blocks import block, runs
-from tests.support.documents import ROOT
 
 if TYPE_CHECKING:
     from tests.readme.shell import Shell
@@ -23,7 +23,6 @@ def test_dockerfile() -> None:
     lines = block("In a container").splitlines()
     assert [each.split()[0] for each in lines] == ["FROM", "RUN", "COPY", "RUN", "CMD"]
     assert json.loads(lines[-1].removeprefix("CMD")) == ["talk", "serve"]
-    assert (ROOT / "pyproject.toml").is_file()  # what COPY . takes can be installed
 
 
 @runs("In a container #2", "In a container #3")
@@ -55,25 +54,17 @@ def test_services(shell: Shell) -> None:
         shell.stand_in(name, then)
     done = shell.run(block("As a service"))
     assert done.returncode == 0, done
-    user = shell.directory / ".config/systemd/user/talk.service"
-    for unit, options in (
-        (user, "serve --rate=150"),
-        (shell.directory / "system/talk.service", "serve --socket-mode=0660"),
-    ):
-        command = next(each for each in unit.read_text(encoding="utf-8").splitlines() if "ExecStart=" in each)
-        assert options in command.replace("--rate 150", "--rate=150")
+    units = {".config/systemd/user/talk.service": "--rate", "system/talk.service": "--socket-mode"}
+    for unit, option in units.items():
+        assert re.search(f"(?m)^ExecStart=.* serve {option}", (shell.directory / unit).read_text(encoding="utf-8"))
     assert shell.calls("systemctl") == [["--user", "daemon-reload"], ["--user", "enable", "--now", "talk"]]
     assert shell.calls("loginctl") == [["enable-linger"]]
-    assert shell.calls("sudo")[1:] == [
-        ["systemctl", "daemon-reload"],
-        ["systemctl", "enable", "--now", "talk"],
-        ["usermod", "-aG", "audio", "NAME"],
-    ]
+    called = [" ".join(each) for each in shell.calls("sudo")[1:]]
+    assert called == ["systemctl daemon-reload", "systemctl enable --now talk", "usermod -aG audio NAME"]
 
 
 @runs("Troubleshooting")
 def test_troubleshooting(shell: Shell) -> None:
-    """The server's player makes no sound, and doctor says so, there and over ssh."""
     shell.ssh()
     done = shell.run(block("Troubleshooting"))
     assert done.returncode == 0, done

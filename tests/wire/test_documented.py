@@ -41,7 +41,11 @@ def test_keys_reasons_and_error_codes_of_the_tables_are_those_of_the_code() -> N
     """`tests/golden` and the tests of each fault have the codes themselves."""
     assert first_column(tables(WIRE.section("The goal"))[0]) == list(Goal("", State.PENDING).to_json())
     reasons, codes = first_column(tables(WIRE.section("States"))[1]), first_column(ERRORS)
-    refused = [errors.UnknownGoal, errors.BadRequest, *errors.BadRequest.__subclasses__()]
+    refused: list[type[errors.RequestRefused]] = [
+        errors.UnknownGoal,
+        errors.BadRequest,
+        *errors.BadRequest.__subclasses__(),
+    ]
     assert {each.code for each in refused} <= set(codes)
     sources = "".join(each.read_text(encoding="utf-8") for each in (ROOT / "talkcli").rglob("*.py"))
     for each in (*reasons, *codes, *first_column(tables(FLEET.section("What is refused"))[0])):
