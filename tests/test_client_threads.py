@@ -1,9 +1,10 @@
-"""One client used by many threads at once: every answer and every event finds its thread, every goal has one result."""
+"""One client used by many threads: replies and events find their threads, and every goal has one result."""
 
 from __future__ import annotations
 
 import random
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -22,28 +23,15 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 
-def run_all(uses: list[Callable[[], None]], timeout: float = 60) -> None:
-    """Run each in a thread of its own, and raise what went wrong in any."""
-    wrong: list[BaseException] = []
-
-    def run(use: Callable[[], None]) -> None:
-        try:
-            use()
-        except BaseException as error:  # noqa: BLE001 - told in the test's own thread
-            wrong.append(error)
-
-    threads = [threading.Thread(target=run, args=(use,), daemon=True) for use in uses]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join(timeout)
-    assert not any(each.is_alive() for each in threads), "a thread hangs"
-    if wrong:
-        raise wrong[0]
+def run_all(uses: list[Callable[[], None]]) -> None:
+    """Run each in a thread of its own, and raise the errors."""
+    with ThreadPoolExecutor(len(uses)) as pool:
+        for each in [pool.submit(use) for use in uses]:
+            each.result(60)
 
 
 def check_events(events: list[Event], handle: GoalHandle) -> None:
-    """Assert that these are the events of one goal, from its beginning to its end, each once and in order."""
+    """Assert that these are all the events of one goal, each once and in order."""
     *before, last = events
     assert last == Result(handle.goal)
     assert not any(isinstance(each, Result | Snapshot) for each in before)
@@ -98,7 +86,7 @@ def test_eight_threads_say_hear_wait_and_cancel(make_talk: MakeTalk) -> None:
 
 
 def test_threads_share_the_events_of_one_goal(scripted: Talk) -> None:
-    """Each event is handed out once, to whichever thread asks; each thread's last is the result."""
+    """Each event goes to one of the threads. The result goes to all."""
     with Client(scripted.socket) as client:
         words = " ".join(map(str, range(200)))
         handle = client.say(f"length=0.5 {words}", feedback=True)

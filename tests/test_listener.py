@@ -95,15 +95,6 @@ def test_second_server_names_the_one_that_serves_and_never_the_one_before_it(hom
     assert found == [os.getpid()]
 
 
-def test_socket_that_somebody_else_put_in_its_place_is_not_removed(home: str) -> None:
-    path = f"{home}/s"
-    with serving(environment(home), "--socket", path):
-        os.unlink(path)
-        with socket.socket(socket.AF_UNIX) as other:
-            other.bind(path)
-    assert os.path.exists(path)
-
-
 def test_file_in_the_place_of_the_socket_is_not_removed(home: str) -> None:
     path = f"{home}/s"
     with open(path, "w", encoding="utf-8") as file:

@@ -54,6 +54,9 @@ def test_a_line_tells_when_how_what_who_and_why(scripted: Talk, history: list[st
     assert re.search(rf'"waits" .*, pid \d+ +canceled by \S*{script}.*, pid \d+$', lines[3])
     assert f'"never-ends {LONG}"' in lines[4]  # in a pipe, the whole text
     assert "\x1b" not in done.out
+    goals = [json.loads(each) for each in scripted.run("--json", "log").out.splitlines()]
+    assert [each["id"] for each in goals] == history
+    assert goals[-1] == scripted.goal(history[-1])
 
 
 def test_count_and_order(scripted: Talk) -> None:
@@ -64,13 +67,6 @@ def test_count_and_order(scripted: Talk) -> None:
     assert [each.split()[2] for each in scripted.run("log").out.splitlines()] == history[-20:]
     assert [each.split()[2] for each in scripted.run("log", "-n", "2").out.splitlines()] == history[-2:]
     assert [each.split()[2] for each in scripted.run("log", "--count", str(MAX_LOG)).out.splitlines()] == history
-
-
-def test_json_is_a_goal_a_line(scripted: Talk, history: list[str]) -> None:
-    done = scripted.run("--json", "log")
-    goals = [json.loads(each) for each in done.out.splitlines()]
-    assert [each["id"] for each in goals] == history
-    assert goals[-1] == scripted.goal(history[-1])
 
 
 def test_lines_fit_the_terminal_and_line_up(scripted: Talk, history: list[str]) -> None:

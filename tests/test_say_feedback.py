@@ -138,13 +138,3 @@ def test_wait_for_a_goal_that_has_ended_shows_its_end(scripted: Talk) -> None:
     assert (done.code, done.out) == (4, f"{goal_id} ABORTED\n")
     found = objects(scripted.run("--json", "wait", "-f", goal_id).out)
     assert found == [{"event": "result", "goal": scripted.goal(goal_id)}]
-
-
-def test_wait_that_gives_up_cancels_nothing(scripted: Talk) -> None:
-    goal_id = scripted.run("say", "never-ends words=1").id
-    scripted.watcher.wait_for_word(goal_id)
-    done = scripted.run("wait", "-f", "-t", "0.2", goal_id)
-    assert done.code == 124
-    assert done.err == f"talk: timed out after 0.2 s: {goal_id} has not ended\n"
-    assert scripted.run("wait", "-f", "none-1").code == 8
-    assert scripted.goal(goal_id)["state"] == "ACTIVE"

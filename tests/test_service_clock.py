@@ -87,16 +87,6 @@ async def test_no_request_after_a_suspend_finds_a_goal_whose_time_is_over(monkey
     assert served.scheduler.pending_count == 0
 
 
-@in_loop
-async def test_the_wall_clock_ends_no_goal(monkeypatch: pytest.MonkeyPatch) -> None:
-    served = await _queued_behind_another(ttl=600)
-    with monkeypatch.context() as patched:
-        now = time.time()
-        patched.setattr(time, "time", lambda: now + 86_400)
-        served.now()
-    assert served.scheduler.pending_count == 1
-
-
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that counts a suspend")
 def test_the_clock_is_the_one_that_counts_a_suspend() -> None:
     before = time.clock_gettime(time.CLOCK_BOOTTIME)

@@ -184,23 +184,6 @@ def test_a_cancel_or_a_pause_does_not_hurry_what_others_wait_for(make_talk: Make
     assert talk.watcher.wait_for_terminal("one") == "SUCCEEDED"
 
 
-def test_past_a_thousand_requests_that_wait_for_the_voices_goals_are_rejected(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "5000", scripted=True, env={"SCRIPTED_START": "slow=2"})
-    with talk.connect() as wire:
-        wire.send_raw(
-            b"".join(
-                line(seq=number, request="say", text="length=0", voice="default") for number in range(5_000, 6_001)
-            )
-        )
-        first = wire.receive()
-        assert (first["seq"], first["goal"]["reason"]) == (6_000, "queue_full")
-        assert "1,000 " in first["goal"]["message"]
-        wire.send({"seq": 7_000, "request": "voices"})  # the one behind them; it can't be rejected
-        wire.items.clear()
-        assert wire.request("cancel")["ok"]
-        assert [each["seq"] for each in wire.items if "ok" in each] == [*range(5_000, 6_000), 7_000]
-
-
 @pytest.mark.parametrize("extra", [{"wait": True}, {"feedback": True}, {}])
 def test_a_rejected_goal_has_a_state_and_a_result_if_the_client_waits(scripted: Talk, extra: dict[str, bool]) -> None:
     with Raw(scripted.socket) as raw:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
 from typing import TYPE_CHECKING
@@ -91,22 +89,6 @@ def test_client_in_shell(scripted: Talk, shell_client: str) -> None:
     scripted.stop()
     done = run(scripted, "sh", shell_client, "battery low")
     assert (done.stdout, done.returncode) == ("no result\n", 1)
-
-
-def test_client_in_shell_cancels_on_ctrl_c(scripted: Talk, shell_client: str) -> None:
-    client = subprocess.Popen(
-        ["sh", shell_client, "never-ends"],
-        env=scripted.env,
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    with client:
-        goal = scripted.watcher.wait_for(None, "ACTIVE")["id"]
-        os.killpg(client.pid, signal.SIGINT)
-        client.communicate(timeout=10)
-    assert client.returncode == 130
-    assert scripted.watcher.wait_for_terminal(goal) == "PREEMPTED"
 
 
 def test_client_in_plain_python(scripted: Talk) -> None:
