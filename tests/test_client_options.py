@@ -6,7 +6,6 @@ import contextlib
 import math
 import threading
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -16,23 +15,16 @@ from talkcli.client.client import batches
 from talkcli.errors import BadOption, RequestRefused, UsageError
 from talkcli.goals.options import OPTIONS
 from talkcli.protocol.lines import MAX_LINE, encode
+from tests.support.patched_serve import patched_serve
 from tests.support.processes import Talk
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from talkcli.goals.option import Option
     from tests.conftest import MakeTalk
 
-#: Serves with the scripted engine, and shows every so many seconds that it is alive.
-ALIVE = """
-import sys
-sys.path.insert(0, {root!r})
-from talkcli.server import subscribers
-from tests.support import scripted_serve
-subscribers.ALIVE_EVERY = {every}
-scripted_serve.main()
-"""
 SETTINGS = {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
 
 
@@ -127,9 +119,7 @@ def test_patient_goal_waits_for_room(make_talk: MakeTalk) -> None:
 
 def test_patient_goal_whose_sender_hangs_up_is_not_spoken(make_talk: MakeTalk, tmp_path: Path) -> None:
     """The server notices that a waiting client has hung up when it shows that it is alive."""
-    program = tmp_path / "serve.py"
-    program.write_text(ALIVE.format(root=str(Path(__file__).parents[1]), every=0.5), encoding="utf-8")
-    talk = make_talk("--max-queue", "1", program=str(program))
+    talk = make_talk("--max-queue", "1", program=patched_serve(tmp_path, subscribers__ALIVE_EVERY=0.5))
     with Client(talk.socket) as client:
         active = client.say("never-ends")
         talk.watcher.wait_for(active.id, "ACTIVE")

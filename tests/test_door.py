@@ -74,7 +74,7 @@ async def turns() -> None:
 
 
 @in_loop
-async def test_waiting_client_is_greeted_when_another_leaves() -> None:
+async def test_client_comes_in_when_another_leaves() -> None:
     with server_for(1) as connect:
         first, second, third = connect(b""), connect(b""), connect(b"")
         await turns()
@@ -82,11 +82,6 @@ async def test_waiting_client_is_greeted_when_another_leaves() -> None:
         first.socket.close()
         await turns()
         assert sorted(each.heard() for each in (second, third)) == [[], ["greeting"]]
-    await turns()
-
-
-@in_loop
-async def test_client_that_comes_as_another_leaves_is_let_in() -> None:
     with server_for(1) as connect:
         first = connect(HELLO)
         await turns()

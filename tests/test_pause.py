@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import json
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.support.patched_serve import patched_serve
+
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
-
-
-#: Serves with the scripted engine, and waits so many seconds for the silence of a pause.
-LIMITED = """
-import sys
-sys.path.insert(0, {root!r})
-from talkcli.server import requests
-from tests.support import scripted_serve
-requests.PAUSE_LIMIT = {limit}
-scripted_serve.main()
-"""
 
 
 @pytest.fixture
@@ -102,9 +94,7 @@ def test_silence_of_an_earlier_pause_answers_no_later_one(scripted: Talk) -> Non
 
 def test_each_pause_that_is_not_confirmed_is_answered_in_its_own_time(make_talk: MakeTalk, tmp_path: Path) -> None:
     limit = 0.5
-    program = tmp_path / "serve.py"
-    program.write_text(LIMITED.format(root=str(Path(__file__).parents[1]), limit=limit), encoding="utf-8")
-    talk = make_talk(program=str(program))
+    talk = make_talk(program=patched_serve(tmp_path, requests__PAUSE_LIMIT=limit))
     begin(talk, "never-ends ignore-pause")
     with talk.connect() as wire:
         wire.send({"seq": 1, "request": "pause"})

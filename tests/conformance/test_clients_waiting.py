@@ -157,17 +157,6 @@ def test_row_31_goal_that_ended_is_known_to_any_process(scripted: Talk) -> None:
     assert scripted.run("wait", ids[0], ids[2], ids[3], ids[0]).code == 4  # of the first that did not succeed
 
 
-def test_wait_returns_the_code_of_the_first_in_order_that_did_not_succeed(scripted: Talk) -> None:
-    active, *pending = (scripted.run("say", "never-ends", str(each)).id for each in range(3))
-    scripted.watcher.wait_for_word(active)
-    with scripted.connect() as wire:
-        _until_connected(wire, 2)
-        waiters = [scripted.start("wait", *ids) for ids in ((*pending, active), (active, *pending), ())]
-        _until_connected(wire, 5)
-    scripted.run("cancel")
-    assert [scripted.finish(each).code for each in waiters] == [6, 7, 0]  # without an id, it only waits
-
-
 @pytest.mark.parametrize("command", ["say", "wait"])
 @limits()
 def test_row_33_ctrl_c_cancels_the_client_s_own_goal_alone(scripted: Talk, command: str) -> None:

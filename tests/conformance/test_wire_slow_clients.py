@@ -16,6 +16,7 @@ import pytest
 
 from tests.conformance.rawsocket import Raw
 from tests.conformance.told import assert_told_in_order
+from tests.support.patched_serve import patched_serve
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -29,16 +30,6 @@ if TYPE_CHECKING:
 FIRST_REQUEST = 5.0
 LINE = 10.0
 LATE = 1.0
-#: Serves with the scripted engine and these limits.
-HASTY = """
-import sys
-sys.path.insert(0, {root!r})
-from talkcli.server import connection
-from tests.support import scripted_serve
-connection.FIRST_REQUEST, connection.LINE_LIMIT = {first}, {line}
-scripted_serve.main()
-"""
-ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 HELLO = b'{"request": "hello"}\n'
 
 
@@ -168,9 +159,8 @@ def test_lists_that_nobody_reads_take_no_more_memory_than_what_may_wait_of_them(
 def test_slow_clients_are_closed_by_the_limits(make_talk: MakeTalk, tmp_path: pathlib.Path, share: float) -> None:
     """All kinds of slow clients at once, for 12 s or a tenth of it. The longest limit is 10 s."""
     first, line = share * FIRST_REQUEST, share * LINE
-    program = tmp_path / "serve.py"
-    program.write_text(HASTY.format(root=ROOT, first=first, line=line))
-    talk = make_talk(program=str(program))
+    program = patched_serve(tmp_path, connection__FIRST_REQUEST=first, connection__LINE_LIMIT=line)
+    talk = make_talk(program=program)
     with limits(), contextlib.ExitStack() as stack:
         began = time.monotonic()
         raws = [stack.enter_context(Raw(talk.socket)) for _ in range(100)]
