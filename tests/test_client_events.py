@@ -72,9 +72,10 @@ def test_what_is_no_event_of_its_kind_is_an_error(message: JsonObject) -> None:
         events.from_json(message)
 
 
-@pytest.mark.parametrize("message", [{}, {"event": "alive"}, {"event": None}, {"event": ["state"]}, {"ok": True}])
-def test_kinds_not_known_here_are_none(message: JsonObject) -> None:
-    assert events.from_json(message) is None
+def test_an_unknown_kind_of_event_is_none() -> None:
+    for kind in ("alive", None, ["state"]):
+        assert events.from_json({"event": kind}) is None
+    assert events.from_json({"ok": True}) is None
 
 
 def test_library_is_imported_from_one_place() -> None:

@@ -30,32 +30,29 @@ class Typing:
     """A client whose standard input stays open."""
 
     def __init__(self, talk: Talk, *words: str) -> None:
-        self._talk = talk
         self.client = talk.start(*words, stdin=subprocess.PIPE)
-
-    def type(self, text: str) -> None:
-        assert self.client.stdin
-        self.client.stdin.write(text)
-        self.client.stdin.flush()
-
-    def line(self) -> str:
-        """Return the next line that the client prints."""
-        assert self.client.stdout
-        return self.client.stdout.readline().rstrip("\n")
-
-    def end(self, number: signal.Signals | None = None) -> tuple[int, list[str], str]:
-        """Send it a signal, or close its input. Return its exit code, the rest of its output, and its messages."""
         assert self.client.stdin
         assert self.client.stdout
         assert self.client.stderr
+        self._input, self._output, self.errors = self.client.stdin, self.client.stdout, self.client.stderr
+
+    def type(self, text: str) -> None:
+        self._input.write(text)
+        self._input.flush()
+
+    def line(self) -> str:
+        """Return the next line that the client prints."""
+        return self._output.readline().rstrip("\n")
+
+    def end(self, number: signal.Signals | None = None) -> tuple[int, list[str], str]:
+        """Send it a signal, or close its input. Return its exit code, the rest of its output, and its messages."""
         if number is None:
-            self.client.stdin.close()
+            self._input.close()
         else:
             self.client.send_signal(number)
-        out, err = self.client.stdout.read().splitlines(), self.client.stderr.read()
+        out, err = self._output.read().splitlines(), self.errors.read()
         code = self.client.wait(20)
-        if not self.client.stdin.closed:
-            self.client.stdin.close()
+        self._input.close()
         assert "Traceback" not in err, err
         return code, out, err
 
@@ -204,10 +201,9 @@ def test_lines_whose_ttl_is_over_while_they_wait_are_dropped(make_talk: MakeTalk
     if "--ttl=0" in words or "-q" in words:
         time.sleep(0.4)  # nothing tells that time passes
     else:
-        assert typing.client.stderr
         notes: list[str] = []
         while len(notes) < 2:  # with --wait, other lines tell how the line that was sent ended
-            notes += [each for each in [typing.client.stderr.readline()] if "was not sent" in each or not each]
+            notes += [each for each in [typing.errors.readline()] if "was not sent" in each or not each]
         assert time.monotonic() - began >= 0.3
         assert notes == [f"talk: line {number} was not sent: its ttl of 0.3 s is over\n" for number in (2, 3)]
     talk.run("cancel", *theirs)
@@ -385,8 +381,7 @@ def test_server_that_goes_away(scripted: Talk, words: list[str]) -> None:
 def test_a_server_that_went_away_while_nothing_was_spoken_is_told_with_the_next_line(scripted: Talk) -> None:
     typing = Typing(scripted, "say", "--lines")
     typing.type("\0\n")
-    assert typing.client.stderr
-    assert "line 1" in typing.client.stderr.readline()
+    assert "line 1" in typing.errors.readline()
     scripted.kill()
     typing.type("into the void\n")
     code, _, err = typing.end()

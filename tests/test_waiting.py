@@ -201,12 +201,16 @@ async def test_bug_in_a_request_that_waited_harms_no_other_request(monkeypatch: 
 
 
 class Readers:
-    """All clients' streams, with the bytes that they have not read."""
-
-    waiting = 0
+    """All clients' streams, with the numbers that they got and the bytes that they have not read."""
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()
+        self.waiting = 0
+        self.told: list[int] = []
+
+    def tell(self, number: int) -> None:
+        self.told.append(number)
+        self.waiting += 300_000
 
 
 @in_loop
@@ -232,9 +236,7 @@ async def test_a_cancel_of_thousands_of_pending_goals_leaves_the_others_their_tu
 
 
 @in_loop
-async def test_new_watcher_gets_only_events_after_its_snapshot(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_new_watcher_gets_only_events_after_its_snapshot(monkeypatch: pytest.MonkeyPatch) -> None:
     count = 500
     server, watcher = Server(count), Client()
     server.fill(1 + count)
@@ -250,41 +252,30 @@ async def test_new_watcher_gets_only_events_after_its_snapshot(
 
 @in_loop
 async def test_news_is_told_as_fast_as_clients_read_it() -> None:
-    readers, told = Readers(), []
+    readers = Readers()
     line = News(cast("Any", readers))
-
-    def tell(number: int) -> None:
-        told.append(number)
-        readers.waiting += 300_000
-
-    line.tell([partial(tell, number) for number in range(100)])
+    line.tell([partial(readers.tell, number) for number in range(100)])
     most = 0
     while not line.told:
         most = max(most, readers.waiting)
         readers.waiting = 0  # all clients have read
         await asyncio.sleep(0.001)
     assert most < 2_000_000
-    assert told == list(range(100))
+    assert readers.told == list(range(100))
 
 
 @in_loop
 async def test_wait_for_clients_that_do_not_read_news_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subscribers, "_PATIENCE", 0.02)
     monkeypatch.setattr(subscribers, "_LESS", 0.1)
-    loop, readers, told = asyncio.get_running_loop(), Readers(), []
-    waits = []
+    loop, readers, waits = asyncio.get_running_loop(), Readers(), []
     later = loop.call_later
     loop.call_later = lambda *values: waits.append(values) or later(*values)  # type: ignore[method-assign, func-returns-value]
     line = News(cast("Any", readers))
-
-    def tell(number: int) -> None:
-        told.append(number)
-        readers.waiting += 300_000
-
-    line.tell([partial(tell, number) for number in range(400)])
-    assert len(told) < 20
+    line.tell([partial(readers.tell, number) for number in range(400)])
+    assert len(readers.told) < 20
     await all_told(line)
-    assert told == list(range(400))
+    assert readers.told == list(range(400))
     # One wait after each of a hundred portions but the last, and one every two milliseconds for the first few.
     assert 99 <= len(waits) < 120
 

@@ -1,8 +1,9 @@
-"""Malformed lines are answered by an error with a code, or by a close, and change nothing."""
+"""Malformed lines are answered by an error with a code, or by a close. They change nothing, nor do refused clients."""
 
 from __future__ import annotations
 
 import array
+import contextlib
 import itertools
 import json
 import os
@@ -12,13 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from talkcli.server.run import DOOR
 from tests.conformance.rawsocket import Raw
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from tests.conftest import MakeTalk
     from tests.support.connection import Wire
     from tests.support.processes import Talk
+
 
 MAX_LINE = 64 * 1024
 STATUS = b'{"seq": 7, "request": "status"}\n'
@@ -196,3 +200,34 @@ def test_descriptors_that_are_passed_are_not_kept(talk: Talk) -> None:
             raw.socket.sendmsg([STATUS], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, passed)])
         replies = [each for each in raw.receive_lines(1 + 2 * 20) if "ok" in each]
         assert [each["ok"] for each in replies] == [True] * 20
+
+
+def test_what_a_client_past_the_door_sent_before_it_closed_is_not_carried_out(make_talk: MakeTalk) -> None:
+    talk = make_talk("--max-clients", "1", scripted=True, watched=False)
+    with contextlib.ExitStack() as stack:
+        asking = stack.enter_context(talk.connect())
+        before = asking.request("status")["server"]
+        for _ in range(DOOR):
+            stack.enter_context(Raw(talk.socket))
+        asking.request("hello", urgent=True)
+        send_and_go(talk, b'{"request":"set","volume":0.1,"preempt":true}\n', b'{"request":"pause"}\n')
+        with Raw(talk.socket) as last:  # once it is answered, the clients before it have been served
+            last.receive_all()
+        after = asking.request("status")["server"]
+    changed = {each for each in ("volume", "preempt", "paused") if before[each] != after[each]}
+    assert not changed
+    assert "a bug" not in talk.log
+
+
+def test_what_follows_ten_bad_lines_is_not_carried_out_where_the_client_has_gone_either(scripted: Talk) -> None:
+    send_and_go(scripted, b"garbage\n" * 10 + b'{"request":"pause"}\n')
+    assert scripted.request("status")["server"]["paused"] is False
+
+
+def send_and_go(talk: Talk, *lines: bytes) -> None:
+    """Connect, send and close once for each of these lines, while the server is frozen."""
+    talk.freeze()
+    for each in lines:
+        with Raw(talk.socket) as client:
+            client.send(each)
+    talk.thaw()

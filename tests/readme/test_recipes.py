@@ -9,6 +9,7 @@ import sys
 import types
 from typing import TYPE_CHECKING, Any
 
+from tests.conformance.bareserve import TALK, serving
 from tests.readme.blocks import block, runs
 from tests.readme.shell import Shell, wait_until
 from tests.support.surroundings import short_directory
@@ -136,16 +137,9 @@ def test_launch_file(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     (process,) = file["generate_launch_description"]()
     with short_directory() as place:
         env = {**shell.env, "TALK_SOCKET": f"{place}/s", "TALK_PLAYER": "null"}
-        server = subprocess.Popen(process.cmd, env=env, executable=str(shell.directory / "bin" / "talk"), stderr=-1)
-        with server:
-            try:
-                assert server.stderr
-                assert any(b'"ready"' in each for each in server.stderr)  # the greeting is in its log
-                server.send_signal(signal.SIGINT)  # as launch does
-                server.communicate(timeout=20)
-            finally:
-                server.kill()
-        assert server.returncode == 0
+        with serving(env, command=[*TALK, *process.cmd[1:]]) as server:
+            wait_until(lambda: '"ready"' in server.log)  # the greeting was spoken
+            assert server.end(signal.SIGINT) == 0  # as launch does
 
 
 @runs("Recipes: Simulation and CI")

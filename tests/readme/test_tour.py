@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 import wave
 from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.conformance.bareserve import TALK, serving
 from tests.readme.blocks import commands, runs
 from tests.readme.shell import wait_for_watcher, wait_until
-from tests.support.connection import PATIENCE
 from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
@@ -29,22 +26,12 @@ def speaking(make_talk: MakeTalk) -> Talk:
 
 def without_servers(name: str, talk: Talk) -> str:
     """Return the commands of an example. Those that start a server are run here, on a socket of their own."""
-    others = []
-    for line in commands(name):
-        if not line.startswith("talk serve"):
-            others.append(line)
-            continue
-        with short_directory() as place:
-            command = [sys.executable, "-m", "talkcli", *line.split()[1:], "--socket", f"{place}/s"]
-            with subprocess.Popen(command, env=talk.env, stderr=subprocess.PIPE, text=True) as server:
-                assert server.stderr
-                try:
-                    assert "ready on" in server.stderr.readline()
-                finally:
-                    server.send_signal(signal.SIGTERM)
-                    server.communicate(timeout=PATIENCE)
-            assert server.returncode == 0
-    return "\n".join(others)
+    servers = [each for each in commands(name) if each.startswith("talk serve")]
+    for each in servers:
+        command = [*TALK, *each.split()[1:]]
+        with short_directory() as place, serving({**talk.env, "TALK_SOCKET": f"{place}/s"}, command=command):
+            pass
+    return "\n".join(each for each in commands(name) if each not in servers)
 
 
 @runs("talk", "A tour: Speak", "A tour: Wait", "A tour: Preempt", "A tour: Sound")
