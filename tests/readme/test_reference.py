@@ -1,4 +1,4 @@
-"""The reference: every option as click has it, every variable that the code reads; and commands named in passing."""
+"""The documents: tables made from the code, commands in sentences, and links that lead somewhere."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from talkcli.cli.click_app import talk
 from talkcli.cli.commands import COMMANDS
 from tests.readme import reference
-from tests.support.documents import COMMAND_LINE, DOCUMENTS, ROOT, tables, words
+from tests.support.documents import COMMAND_LINE, CONTRIBUTING, DOCUMENTS, HOUSE, ROOT, Document, tables, words
 
 #: Variables that `talk` sets for its own processes.
 INTERNAL = {"TALK_LIVENESS_FD"}
@@ -52,3 +52,32 @@ def test_commands_in_sentences_can_be_parsed() -> None:
         if name == "say" and all(each.startswith("--") or each in {"-o", "-f", "-wf"} for each in arguments):
             arguments = ["text"] if arguments in (["-o"], ["-wf"], ["-f"]) else [*arguments, "text"]
         command.make_context(name, arguments, parent=click.Context(talk))
+
+
+LINK = re.compile(r"\[[^\]]*\]\(([^)]+)\)")
+#: A file of the project that a sentence names, from the top or within the package.
+PATH = re.compile(r"`((?:[.\w]+/)+[\w-]+\.(?:py|md|txt|svg))`")
+BY_PATH = {each.path: each for each in DOCUMENTS}
+
+
+def test_every_document_is_tested() -> None:
+    folders = (".github", "completions", "talkcli", "tests")
+    found = {ROOT / "README.md", *(each for folder in folders for each in (ROOT / folder).rglob("*.md"))}
+    assert found == set(BY_PATH)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda each: each.name)
+def test_links_lead_somewhere(document: Document) -> None:
+    for link in LINK.findall(document.prose):
+        if link.startswith("https://"):
+            continue
+        file, _, anchor = link.partition("#")
+        path = (document.path.parent / file).resolve() if file else document.path
+        assert path.exists(), link
+        assert not anchor or anchor in BY_PATH[path].anchors, link
+
+
+@pytest.mark.parametrize("document", [HOUSE, CONTRIBUTING], ids=lambda each: each.name)
+def test_files_that_are_named_exist(document: Document) -> None:
+    for path in PATH.findall(document.text):
+        assert (ROOT / path).exists() or (ROOT / "talkcli" / path).exists(), path
