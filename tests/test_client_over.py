@@ -1,9 +1,9 @@
-"""The library over a connection that is no socket: all that it needs of one is in the interface."""
+"""The library over a connection that is no socket, but has the interface of a connection."""
 
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Scripted:
-    """A server that is asked by calls, takes every goal, and speaks one while somebody waits."""
+    """A server that accepts every goal, and speaks while a client waits."""
 
     def __init__(self) -> None:
         self.path, self.boot = "nowhere", "fake"
@@ -36,7 +36,7 @@ class Scripted:
         self.followed = Followed()
         self.ended: str | None = None
         self.asked: list[Request] = []
-        #: what is to come
+        #: events that the next wait receives
         self.coming: list[JsonObject] = []
 
     def request(
@@ -59,16 +59,8 @@ class Scripted:
     def post(self, request: Request) -> None:
         self.asked.append(request)
 
-    def wait_until(
-        self,
-        done: Callable[[], bool],
-        deadline: float | None,
-        *,
-        since: float | None = None,
-        interruptible: bool = True,
-    ) -> bool:
-        del deadline, since, interruptible  # nothing takes time here
-        with self.changed:
+    def wait_until(self, done: Callable[[], bool], *_: Any, **__: Any) -> bool:
+        with self.changed:  # nothing takes time here
             while not done():
                 if not self.coming:
                     self.ended = self.ended or "that was all"

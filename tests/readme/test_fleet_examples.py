@@ -41,11 +41,11 @@ _REPLIES = block("Requests and replies: A request").partition(" -e ")[2].split()
 #: Seconds in which a robot must be online, or have carried out a request.
 LIMIT = 20.0
 #: Runs `talk` with the test's broker in place of the examples'.
-_TALK = """if [ "$1" = serve ]; then exec @PYTHON -m talkcli "$@"; fi
-test "$TALK_BROKER" = mqtts://broker || exit 99
-test -n "$TALK_MQTT_PASSWORD_FILE" || exit 98
-export TALK_BROKER=@URL TALK_MQTT_CA=@CA TALK_MQTT_PASSWORD_FILE="@DIRECTORY/$TALK_MQTT_USER.password"
-exec @PYTHON -m talkcli "$@"
+_TALK = f"""if [ "$1" != serve ]; then
+    test "$TALK_BROKER" = mqtts://broker -a -n "$TALK_MQTT_PASSWORD_FILE" || exit 99
+    export TALK_BROKER=$URL TALK_MQTT_CA=$CA TALK_MQTT_PASSWORD_FILE="$DIRECTORY/$TALK_MQTT_USER.password"
+fi
+exec {sys.executable} -m talkcli "$@"
 """
 #: Writes below a directory of the test, and asks for no password.
 _SUDO = """program=$1
@@ -141,11 +141,8 @@ def test_readmes_robot_and_its_desk(tmp_path: Path, place: str) -> None:
             broker.env(user)  # it writes the file of the password
         env = clean_environment(place) | {"TALK_SOCKET": f"{place}/s", "TALK_PLAYER": "null", "TALK_RATE": "450"}
         shell = stack.enter_context(contextlib.closing(Shell(tmp_path, env, talk=False)))
-        told = {"@URL": broker.url, "@CA": authority().file, "@DIRECTORY": broker.directory, "@PYTHON": sys.executable}
-        script = _TALK
-        for name, value in told.items():
-            script = script.replace(name, value)
-        shell.program("talk", script)
+        shell.env |= {"URL": broker.url, "CA": str(authority().file), "DIRECTORY": str(broker.directory)}
+        shell.program("talk", _TALK)
         _set_up_clients(shell, broker, "ha")
         listener = stack.enter_context(Listener(broker, "talk/robot/anna/#", user="olga"))
         shell.start(f"{block('A fleet: A robot')}wait\nwait\n")

@@ -25,7 +25,6 @@ from tests.support.surroundings import needs_packages
 if TYPE_CHECKING:
     import pytest
 
-    from tests.support.processes import Talk
 
 ERRORS, LIMITS = tables(WIRE.section("Errors and limits"))
 
@@ -114,12 +113,6 @@ def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in variables.items():
         places = [each.replace(f"${name}/", f"{value}/") for each in places]
     assert [each.replace("UID", str(os.getuid())) for each in places] == paths.client_sockets(None)
-
-
-def test_server_has_the_keys_of_the_text(scripted: Talk) -> None:
-    found = re.search(r"^`server` has (.*?)\.$", WIRE.section("Requests"), re.MULTILINE | re.DOTALL)
-    assert found
-    assert words(found[1]) == list(scripted.request("status")["server"])
 
 
 def test_events_are_in_the_table() -> None:
