@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli import Client
+from talkcli import Client, GoalHandle
 from talkcli.client.connect import Interrupted
 from talkcli.client.connection import SocketConnection
 from talkcli.client.following import MAX_FEEDBACK, MAX_STATES
@@ -229,8 +229,12 @@ def interrupt() -> Iterator[tuple[int, int]]:
         os.close(each)
 
 
-@pytest.mark.parametrize("how", ["events", "feedback", "wait"])
-def test_interrupt_ends_the_wait_for_a_goal_and_loses_nothing(interrupt: tuple[int, int], how: str) -> None:
+@pytest.mark.parametrize(
+    "wait", [lambda handle: [*handle.events(5)], lambda handle: [*handle.feedback(5)], GoalHandle.wait]
+)
+def test_interrupt_ends_the_wait_for_a_goal_and_loses_nothing(
+    interrupt: tuple[int, int], wait: Callable[[GoalHandle], object]
+) -> None:
     def play(peer: Peer) -> None:
         peer.accept()
         peer.send(peer.state("ACTIVE"))
@@ -240,34 +244,34 @@ def test_interrupt_ends_the_wait_for_a_goal_and_loses_nothing(interrupt: tuple[i
 
     with serving(play) as path, Client.over(SocketConnection(path, interrupt={interrupt[0]: select.POLLIN})) as client:
         handle = client.say("a", feedback=True)
-        waiting: dict[str, Callable[[], object]] = {
-            "events": lambda: list(handle.events(5)),
-            "feedback": lambda: list(handle.feedback(5)),
-            "wait": handle.wait,
-        }
         with pytest.raises(Interrupted):
-            waiting[how]()
+            wait(handle)
         os.read(interrupt[0], 1)
         client.status()
         assert [type(each) for each in handle.events(5)][-2:] == [WordHeard, Result]
 
 
-@pytest.mark.parametrize("how", ["watch", "say", "pause"])
-def test_interrupt_ends_what_may_take_long(interrupt: tuple[int, int], how: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "do"),
+    [
+        ("watch", lambda client: [*client.events()]),
+        ("say", lambda client: client.say("a", patient=True)),
+        ("pause", Client.pause),
+    ],
+)
+def test_interrupt_ends_a_call_that_may_take_long(
+    interrupt: tuple[int, int], kind: str, do: Callable[[Client], object]
+) -> None:
     def play(peer: Peer) -> None:
-        request = peer.receive(how)
-        if how == "watch":
+        request = peer.receive(kind)
+        if kind == "watch":
             peer.send({"seq": request["seq"], "ok": True, **OVERVIEW})
         os.write(interrupt[1], b"x")
 
-    with serving(play) as path, Client.over(SocketConnection(path, interrupt={interrupt[0]: select.POLLIN})) as client:
-        doing: dict[str, Callable[[], object]] = {
-            "watch": lambda: list(client.events()),
-            "say": lambda: client.say("a", patient=True),
-            "pause": client.pause,
-        }
-        with pytest.raises(Interrupted):
-            doing[how]()
+    with serving(play) as path:
+        client = Client.over(SocketConnection(path, interrupt={interrupt[0]: select.POLLIN}))
+        with client, pytest.raises(Interrupted):
+            do(client)
 
 
 def test_pause_of_all_speech_is_told_to_those_who_follow_with_feedback() -> None:
