@@ -22,7 +22,7 @@ from tests.support.surroundings import short_directory
 from tests.wire.test_recorded import VARIES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
 HERE = Path(__file__).parent
 
@@ -165,7 +165,7 @@ def _members(found: type) -> Iterator[str]:
         yield from (f"    {each.name} = {each.value}" for each in found)  # type: ignore[attr-defined]
         return
     if "__init__" in vars(found) and not vars(found).get("__annotations__"):
-        yield f"    def __init__{_signature(found.__init__)}"  # type: ignore[misc]
+        yield f"    def __init__{inspect.signature(found.__init__)}"  # type: ignore[misc]
     yield from (f"    {name}: {kind}" for name, kind in inspect.get_annotations(found).items())
     for name, member in sorted(vars(found).items()):
         if name.startswith("_"):
@@ -173,11 +173,7 @@ def _members(found: type) -> Iterator[str]:
         if isinstance(member, property):
             yield f"    {name}: {inspect.signature(member.fget).return_annotation}"  # type: ignore[arg-type]
         elif callable(member):
-            yield f"    def {name}{_signature(member)}"
-
-
-def _signature(found: Any) -> str:
-    return str(inspect.signature(found))
+            yield f"    def {name}{inspect.signature(member)}"
 
 
 def _wire() -> str:
@@ -186,7 +182,7 @@ def _wire() -> str:
     try:
         with talk.connect() as wire:
             boot = str(wire.greeting["boot"])
-            lines = [f"< {_told(wire.greeting)}"]
+            lines = [f"< {json.dumps(_steady(wire.greeting))}"]
             for request in REQUESTS:
                 wire.send(request)
                 lines.append(f"> {json.dumps(request)}")
@@ -194,16 +190,12 @@ def _wire() -> str:
                 awaited = {"ok", "result"} if request.get("request") == "resume" else {"ok"}
                 while awaited:
                     message = wire.receive()
-                    lines.append(f"< {_told(message)}")
+                    lines.append(f"< {json.dumps(_steady(message))}")
                     awaited -= {"ok"} & message.keys() | {str(message.get("event"))}
         talk.stop()
     finally:
         talk.close()
     return "\n".join(lines).replace(f"{boot}-", "BOOT-") + "\n"
-
-
-def _told(message: Mapping[str, Any]) -> str:
-    return json.dumps(_steady(message))
 
 
 def _steady(value: Any, name: str = "") -> Any:
