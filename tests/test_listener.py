@@ -51,14 +51,8 @@ def refused(home: str, *words: str, code: int = 11, **extra: str) -> str:
 @pytest.mark.parametrize(("mode", "umask"), [("0600", 0o000), ("0660", 0o077)])
 def test_socket_has_the_mode_that_was_asked_for(home: str, mode: str, umask: int) -> None:
     path = f"{home}/talk/s"
-    with serving(
-        environment(home),
-        "--socket",
-        path,
-        "--socket-mode",
-        mode,
-        command=["sh", "-c", f'umask {umask:04o}; exec "$@"', "sh", *SERVE],
-    ):
+    command = ["sh", "-c", f'umask {umask:04o}; exec "$@"', "sh", *SERVE]
+    with serving(environment(home), "--socket", path, "--socket-mode", mode, command=command):
         assert stat.S_IMODE(os.stat(path).st_mode) == int(mode, 8)
         assert stat.S_IMODE(os.stat(os.path.dirname(path)).st_mode) == 0o700
     assert not os.path.exists(path)

@@ -45,20 +45,18 @@ exec sh -c "$*"
 _JQ = """
 import json, sys
 wanted = sys.argv[-1]
-for line in sys.stdin:
-    each = json.loads(line)
-    if wanted == 'select(.event == "state").state' and each["event"] == "state":
-        print(each["state"], flush=True)
-    elif wanted == 'select(.event == "word").word' and each["event"] == "word":
-        print(each["word"], flush=True)
+for each in map(json.loads, sys.stdin):
+    if wanted.startswith("select(.event == "):
+        kind = wanted.split('"')[1]
+        if each["event"] == kind:
+            print(each[kind], flush=True)
     elif wanted == ".server.socket":
         print(each["server"]["socket"])
-    elif wanted.startswith("select(.exit_code != 0)"):
-        if each["exit_code"]:
-            print(each["robot"], each["error"]["message"])
-    elif wanted.startswith(".recent[]"):
+    elif not wanted.startswith("select("):
         for goal in each["recent"]:
             print(goal["state"], goal["client"]["parent"], goal["text"])
+    elif each["exit_code"]:
+        print(each["robot"], each["error"]["message"])
 """
 
 

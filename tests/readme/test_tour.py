@@ -5,23 +5,14 @@ from __future__ import annotations
 import wave
 from typing import TYPE_CHECKING
 
-import pytest
-
 from tests.conformance.bareserve import TALK, serving
 from tests.readme.blocks import commands, runs
 from tests.readme.shell import wait_for_watcher, wait_until
 from tests.support.surroundings import needs, short_directory
 
 if TYPE_CHECKING:
-    from tests.conftest import MakeTalk
     from tests.readme.shell import Shell
     from tests.support.processes import Talk
-
-
-@pytest.fixture
-def speaking(make_talk: MakeTalk) -> Talk:
-    """A server with the real engine that speaks fast to nobody, in real time, so that goals can be preempted."""
-    return make_talk("--player", "null", "--rate", "450")
 
 
 def without_servers(name: str, talk: Talk) -> str:

@@ -29,11 +29,13 @@ if TYPE_CHECKING:
 ERRORS, LIMITS = tables(WIRE.section("Errors and limits"))
 
 
-def test_states_are_in_the_tables() -> None:
+def test_states_and_replies_are_in_the_tables() -> None:
     states, found = tables(WIRE.section("States"))[:2]
     documented = {words(row[0])[0]: (int(row[1]), row[3] == "yes") for row in states[1:]}
     assert documented == {each.name: (int(each), each.terminal) for each in State}
     assert all(State[state].terminal for row in found[1:] for state in row[1].split(", "))
+    answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in words(row[0])[:1]}
+    assert answered == set(KINDS)
 
 
 def test_keys_reasons_and_error_codes_of_the_tables_are_those_of_the_code() -> None:
@@ -49,11 +51,6 @@ def test_keys_reasons_and_error_codes_of_the_tables_are_those_of_the_code() -> N
     sources = "".join(each.read_text(encoding="utf-8") for each in (ROOT / "talkcli").rglob("*.py"))
     for each in (*reasons, *codes, *first_column(tables(FLEET.section("What is refused"))[0])):
         assert f'"{each}"' in sources, each
-
-
-def test_replies_to_all_requests_are_in_the_table() -> None:
-    answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in words(row[0])[:1]}
-    assert answered == set(KINDS)
 
 
 def test_numbers_of_kept_goals_are_in_the_text() -> None:
@@ -122,15 +119,12 @@ def test_events_are_in_the_table() -> None:
     assert all(fields <= table[kind] for kind, fields in sent.items())
 
 
-def test_exit_codes_are_in_the_table() -> None:
+def test_exit_codes_and_commands_are_in_the_tables() -> None:
     rows = [row[0] for row in tables(README.section("Exit codes"))[0][1:]]
     assert rows[-1] == f"{errors.EXIT_SIGNAL}+n"
     classes = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.TalkError)]
     used = {each.exit_code for each in classes} | set(states.EXIT_CODES.values())
     used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_DIFFER, errors.EXIT_TIMEOUT}
     assert sorted(map(int, rows[:-1])) == sorted(used)
-
-
-def test_commands_are_in_the_table() -> None:
-    rows = tables(README.section("Commands"))[0][1:]
-    assert sorted(each.split()[0] for row in rows for each in words(row[0])) == sorted(commands.COMMANDS)
+    listed = [words(row[0]) for row in tables(README.section("Commands"))[0][1:]]
+    assert sorted(each.split()[0] for row in listed for each in row) == sorted(commands.COMMANDS)
