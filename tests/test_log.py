@@ -28,7 +28,7 @@ LONG = "please step back from the door and from the lift " * 5
 def history(scripted: Talk) -> list[str]:
     """The ids of one goal for each end state, in the order of their ends."""
     talk = scripted
-    succeeded = talk.run("say", "--wait", "--as", "patrol", "length=0").id
+    succeeded = talk.run("say", "--wait", "--as", "patrol\x1b[m", "length=0").id
     aborted = talk.run("say", "--wait", "fail=audio_lost message=no_cable").id
     rejected = json.loads(talk.run("--json", "say", "").out)["id"]
     active = talk.run("say", "--", f"never-ends {LONG}").id
@@ -48,7 +48,7 @@ def test_a_line_tells_when_how_what_who_and_why(scripted: Talk, history: list[st
     assert [each.split()[1] for each in lines] == states
     assert all(re.match(r"\d\d:\d\d:\d\d  \w", each) for each in lines)
     script = re.escape(sys.executable.split("/")[-1][:6])
-    assert re.search(rf'"length=0" +"patrol" \(\S*{script}.*, pid \d+\)  0\.0 s$', lines[0])
+    assert re.search(rf'"length=0" +"patrol\\x1b\[m" \(\S*{script}.*, pid \d+\)  0\.0 s$', lines[0])
     assert re.search(r", pid \d+  audio_lost: no cable$", lines[1])
     assert re.search(r'"" .*, pid \d+ +invalid_text: the text is empty$', lines[2])
     assert re.search(rf'"waits" .*, pid \d+ +canceled by \S*{script}.*, pid \d+$', lines[3])

@@ -81,10 +81,10 @@ def test_it_begins_with_what_is_now(scripted: Talk) -> None:
 
 def test_words_are_shown_if_asked_for(scripted: Talk) -> None:
     watch = Lines(scripted, "-f")
-    goal_id = scripted.run("say", "battery low").id
+    goal_id = scripted.run("say", "battery low\x1b[m").id
     watch.next("SUCCEEDED")
     words = [each for each in watch.lines if "  word  " in each]
-    assert [re.sub(r".*" + goal_id + " +", "", each) for each in words] == ["battery  0.00 s", "low  0.05 s"]
+    assert [re.sub(r".*" + goal_id + " +", "", each) for each in words] == ["battery  0.00 s", r"low\x1b[m  0.05 s"]
     assert watch.end() == 130
 
 
