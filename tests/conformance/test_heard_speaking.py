@@ -1,19 +1,19 @@
-"""Sentences that are spoken: what is heard is what libespeak-ng makes of them, in the order in which they were sent."""
+"""Sentences that are spoken: the sound is that of libespeak-ng, in the order in which the goals were sent."""
 
 from __future__ import annotations
 
 import os
 import re
-import time
 import wave
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from talkcli.engine.players.choice import MOST
 from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_same, heard, quick_talk, render_quick, send
 from tests.conformance.voices import Joe, with_both
-from tests.support.compare import EXTENT, assert_heard, assert_silent
+from tests.support.compare import assert_heard, assert_silent, extent
 from tests.support.reference import RATE, played, render
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from tests.support.sink import Sink
 
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
+#: Seconds that the monitor may lose at the start of a stream.
+LOST = 0.012
 
 
 @with_both
@@ -34,7 +36,7 @@ def test_row_01_a_goal_is_spoken_and_its_end_is_told(make_talk: MakeTalk, sink: 
     assert (done.code, done.err) == (0, "")
     goal = talk.goal(done.id)
     assert goal["state"] == "SUCCEEDED"
-    # Beside other tests a machine may be too slow for a neural voice: then that is told.
+    # A machine that is busy with other tests may be too slow for a neural voice: then the message says so.
     gaps = r"(, but with (\d) gaps? of \d\.\d s in all: .*)?" if isinstance(voice, Joe) else "()()"
     told = re.fullmatch(f"Talk completed successfully{gaps}", goal["message"])
     assert told, goal
@@ -43,17 +45,9 @@ def test_row_01_a_goal_is_spoken_and_its_end_is_told(make_talk: MakeTalk, sink: 
     (reference,) = voice.render([LOW], 200)
     assert goal["duration"] == pytest.approx(len(played(reference)) / RATE, abs=0.001)
     (compared,) = assert_heard(heard(talk), [reference])
-    # From 50 ms of silence on it is one; what is heard is longer by what the sound server first fills again, 60 ms.
+    # From 50 ms of silence on it is a gap; the heard silence is longer, as the sound server first fills 60 ms again.
     least, most = (sum(each > seconds for each in compared.gaps) for seconds in (0.12, 0.03))
     assert least <= int(told[2] or 0) <= most, (goal["message"], compared.gaps)
-
-
-def test_done_when_the_first_sentence_of_a_server_is_espeak_ngs_own(talk: Talk) -> None:
-    """A correlation above 0.95, and a length within 20 ms."""
-    assert talk.run("say", LOW, "--wait").code == 0
-    (compared,) = assert_heard(heard(talk), render([LOW]))
-    assert compared.correlation > 0.95
-    assert abs(compared.heard - compared.expected) <= EXTENT
 
 
 @with_both
@@ -85,51 +79,36 @@ def test_row_18_a_pending_goal_that_is_cancelled_is_never_spoken(make_talk: Make
     assert_heard(heard(talk), voice.render(texts))
 
 
-@pytest.fixture
-def empty(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathlib.Path:
-    """An empty directory, the one in which server and clients run."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def test_row_30_a_text_is_spoken_and_never_executed(
-    make_talk: MakeTalk, sink: Sink, empty: pathlib.Path, voice: Voice
+    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, voice: Voice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     texts = [
         "$(touch x)",
         "`touch x`",
-        "low; touch x",
-        "low | touch x & touch y",
+        "low; touch x | touch x & touch y",
         "it's \"touch x\" '; touch x; '",
         "one\ntouch x\ntwo",
         "hello \U0001f600 %s %n \\n",
         "-5",
     ]
+    monkeypatch.chdir(tmp_path)  # server and clients run in this directory
     talk = voice.serve(make_talk, sink)
+    refused = talk.run("say", "--wiat", LOW)
+    assert (refused.code, refused.out, "talk say -- " in refused.err) == (2, "", True)
     said = [talk.run("say", "--", text) for text in texts]
     assert [(each.code, each.err) for each in said] == [(0, "")] * len(texts)
     assert talk.run("wait", *(each.id for each in said)).code == 0
     assert [talk.goal(each.id)["text"] for each in said] == texts
-    assert_heard(heard(talk), voice.render(texts))
-    assert os.listdir(empty) == []
+    assert talk.run("say", "--wait", *LOW.split()).code == 0  # words are joined
+    assert_heard(heard(talk), voice.render([*texts, LOW]))
+    assert os.listdir(tmp_path) == []
 
 
-def test_row_30_words_are_joined_and_a_misspelt_option_is_not_spoken(
-    make_talk: MakeTalk, sink: Sink, voice: Voice
-) -> None:
-    talk = voice.serve(make_talk, sink)
-    refused = talk.run("say", "--wiat", LOW)
-    assert (refused.code, refused.out) == (2, "")
-    assert "talk say -- " in refused.err
-    assert talk.run("say", "--wait", *LOW.split()).code == 0
-    assert_heard(heard(talk), voice.render([LOW]))
-
-
-def test_the_wheels_library_speaks_where_the_system_has_none(
+def test_the_wheels_library_speaks_if_the_system_has_none(
     make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("espeakng_loader")
-    # The loader finds this first and can't load it; the reference rendering comes from the wheel then, too.
+    # The loader finds this file first and can't load it. The reference rendering comes from the wheel then, too.
     (tmp_path / "libespeak-ng.so.1").touch()
     monkeypatch.setenv("LD_LIBRARY_PATH", str(tmp_path))
     talk = make_talk(sink=sink)
@@ -138,11 +117,23 @@ def test_the_wheels_library_speaks_where_the_system_has_none(
     assert_same(heard(talk), render([LOW])[0])
 
 
-def test_pacat_plays_a_sentence(make_talk: MakeTalk, sink: Sink) -> None:
-    talk = quick_talk(make_talk, sink, "--player", "pacat")
-    assert talk.run("say", "--wait", "--", LOW).code == 0
-    assert talk.run("say", "--wait", "--", HOME).code == 0
-    assert_heard(heard(talk), render_quick([LOW, HOME]))
+def test_only_silence_is_left_out_between_queued_sentences_and_never_too_much(talk: Talk) -> None:
+    """The time that a change of goals takes is a matter of speed; that enough of the pause stays is not."""
+    texts = [LOW, HOME, LOW]
+    goals = [send(talk, text) for text in texts]
+    assert talk.watcher.wait_for_terminal(goals[-1], 20) == "SUCCEEDED"
+    references = render(texts)
+    found = assert_heard(heard(talk), references)
+    for number in range(len(texts) - 1):
+        before, after = (extent(each) for each in references[number : number + 2])
+        assert before is not None
+        assert after is not None
+        own = (len(references[number]) - before[1] + after[0]) / RATE
+        pause = (found[number + 1].offset - found[number].offset) / RATE - found[number].expected
+        assert pause > own - MOST - LOST
+        whole = len(references[number]) / RATE
+        assert whole - MOST <= talk.goal(goals[number])["duration"] <= whole + 0.001
+    assert abs(talk.goal(goals[-1])["duration"] - len(references[-1]) / RATE) < 0.001
 
 
 def test_a_file_gets_every_sample_and_nothing_is_heard(make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path) -> None:
@@ -154,13 +145,4 @@ def test_a_file_gets_every_sample_and_nothing_is_heard(make_talk: MakeTalk, sink
         assert (file.getframerate(), file.getnchannels(), file.getsampwidth()) == (RATE, 1, 2)
         written = np.frombuffer(file.readframes(file.getnframes()), "<i2")
     assert np.array_equal(written, np.concatenate(render_quick([LONG, LOW])))
-    assert_silent(heard(talk))
-
-
-def test_the_null_player_takes_as_long_as_the_sentence_and_nothing_is_heard(make_talk: MakeTalk, sink: Sink) -> None:
-    talk = quick_talk(make_talk, sink, "--player", "null")
-    began = time.monotonic()
-    assert talk.run("say", "--wait", "--", HELP).code == 0
-    took = time.monotonic() - began
-    assert took >= len(render_quick([HELP])[0]) / RATE
     assert_silent(heard(talk))
