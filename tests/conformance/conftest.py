@@ -1,4 +1,4 @@
-"""The voices that what is heard is tested with."""
+"""The voices of the tests of sound."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session")
 def joe(tmp_path_factory: pytest.TempPathFactory) -> Joe:
-    """A real neural voice, without noise; the test is skipped where it is not installed.
+    """A real neural voice, without noise; the test is skipped if it is not installed.
 
-    Each sentence begins as behind a comma, in 36 ms or more of silence: what the monitor drops where a stream starts is
-    none of the sound then.
+    Each sentence begins as behind a comma, in 36 ms or more of silence, so the monitor drops no sound at its start.
     """
     place = tmp_path_factory.mktemp("voices")
     place.chmod(0o755)
@@ -33,11 +32,12 @@ def joe(tmp_path_factory: pytest.TempPathFactory) -> Joe:
     return Joe(str(place), str(tmp_path_factory.mktemp("cache")))
 
 
-#: Most of what is heard is tested with a neural voice by the slow tests alone, as each of its servers loads the voice,
-#: for a second: four minutes of tests. Each kind of thing, spoken, stopped, preempted, queued, held, has one each time.
 @pytest.fixture(params=["espeak", pytest.param("joe", marks=pytest.mark.slow)])
 def voice(request: pytest.FixtureRequest) -> Voice:
-    """The voice of a test's servers; those that have `with_both` are tested with both of them each time."""
+    """The voice of a test's servers: the neural one in slow runs alone, unless the test is marked `with_both`.
+
+    Each of its servers loads the voice for a second. One test of each kind is marked: spoken, stopped, queued, held.
+    """
     if request.param == "espeak":
         return ESPEAK
     found: Joe = request.getfixturevalue("joe")

@@ -1,4 +1,4 @@
-"""What the tests of what is heard share: sentences, goals that have begun, the processes behind a server."""
+"""Shared by the tests of sound: sentences, goals that have begun, and the processes behind a server."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
     Samples = npt.NDArray[np.int16]
 
-#: Short sentences, and one that goes on while something is done to it. Each begins with a moment of silence, before its
-#: "b" or "c": what the monitor drops where a stream starts, up to 10 ms, is none of the sound then.
+#: Short sentences, and a long one to interrupt. Each begins with a moment of silence before its "b" or "c", which takes
+#: the place of the sound that the monitor drops at the start of a stream, up to 10 ms.
 LOW = "battery low"
 HOME = "coming home"
 HELP = "please help, I am stuck"
 LONG = "two three four five six seven eight nine ten eleven twelve"
 
-#: Words per minute where the rate is not what is tested: as many as there may be. LONG takes 1.3 s, HELP 0.6 s then.
+#: Words per minute for tests of anything but the rate: the fastest there are. LONG takes 1.3 s, HELP 0.6 s.
 QUICK = 450
 
 #: Seconds by which the time of a sample is known: blocks of the monitor, and of the sink before it.
@@ -51,7 +51,7 @@ def render_quick(sentences: Sequence[str | Sentence]) -> list[Samples]:
 
 
 def send(talk: Talk, text: str, **fields: Any) -> str:
-    """Send a goal that nobody waits for, and return its id."""
+    """Send a goal without waiting for it, and return its id."""
     reply = talk.request("say", text=text, **fields)
     assert reply["ok"], reply
     goal: Message = reply["goal"]
@@ -60,20 +60,20 @@ def send(talk: Talk, text: str, **fields: Any) -> str:
 
 
 def await_word(talk: Talk, goal_id: str, number: int = 3) -> None:
-    """Wait until a goal is in mid-sentence: until its third word is heard, or the one asked for."""
+    """Wait until this word of a goal is heard; the third is in mid-sentence."""
     wanted = {"event": "word", "id": goal_id, "number": number}
     talk.watcher.wait_until(lambda each: wanted.items() <= each.items(), what=f"word {number} of {goal_id}")
 
 
 def begin(talk: Talk, text: str, *, number: int = 3, **fields: Any) -> str:
-    """Send a goal and wait until it is in mid-sentence, at this word; return its id."""
+    """Send a goal, wait until this word of it is heard, and return its id."""
     goal_id = send(talk, text, **fields)
     await_word(talk, goal_id, number)
     return goal_id
 
 
 def begin_with_client(talk: Talk, text: str, *options: str, number: int = 3) -> tuple[str, Process]:
-    """Send a goal by a client that waits for it, and wait until it is in mid-sentence; return its id and the client."""
+    """Start a client that waits for its goal, wait until this word is heard, and return the id and the client."""
     known = {None, *talk.watcher.goals()}
     client = talk.start("say", "--wait", *options, "--", text)
     goal_id = str(talk.watcher.wait_until(lambda each: each.get("id") not in known)["id"])
@@ -82,13 +82,13 @@ def begin_with_client(talk: Talk, text: str, *options: str, number: int = 3) -> 
 
 
 def heard(talk: Talk, quiet: float = 0.2) -> Samples:
-    """Return all that was heard, once it is quiet."""
+    """Return everything that was heard, once it is quiet."""
     talk.recording.wait_until_quiet(quiet)
     return talk.recording.samples
 
 
 def assert_same(samples: Samples, reference: Samples) -> Comparison:
-    """Assert that one sentence was heard, whole, and nothing else; it may begin with sound at once."""
+    """Assert that one whole sentence was heard, and nothing else."""
     compared = compare(samples, reference)
     assert compared.same, compared
     return compared
@@ -103,7 +103,7 @@ def assert_aborted(goal: Message, reason: str, *words: str) -> None:
 
 
 def engine_process(talk: Talk) -> int:
-    """Return the process id of the server's engine, which may be about to be started, or to be reaped."""
+    """Return the process id of the server's engine, once there is exactly one."""
     return _only_child(lambda: talk.pid, "engine")
 
 
@@ -116,5 +116,5 @@ def _only_child(parent: Callable[[], int], what: str) -> int:
     end = time.monotonic() + _PATIENCE
     while len(found := children(parent())) != 1:
         assert time.monotonic() < end, f"not one {what}: {found}"
-        time.sleep(0.005)  # a child of a child is no event here
+        time.sleep(0.005)  # the child of a child sends no event
     return found[0]

@@ -1,7 +1,7 @@
-"""The voices that conformance is held with: how a server speaks with each, and what its sentences sound like.
+"""The voices of the conformance tests: how a server speaks with each, and the sound of its sentences.
 
-Libespeak-ng makes other samples of a sentence that it has said before, a neural voice without noise the same ones each
-time. So what it was to be is rendered by `say -o`, in an engine process of its own, without a server and a player.
+libespeak-ng makes other samples of a sentence that it has said before. A neural voice without noise makes the same ones
+each time, so its references are rendered by `say -o`, in an engine process of its own.
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ if TYPE_CHECKING:
     from tests.support.sink import Sink
 
     Samples = npt.NDArray[np.int16]
+    Environment = Mapping[str, str] | None
 
-#: Has a test run with both voices each time, not by the slow tests alone.
+#: Runs a test with both voices in the default run, too.
 with_both = pytest.mark.parametrize("voice", ["espeak", "joe"], indirect=True)
 
-#: Seconds of a block of samples, the blocks of a pause, and what no sample of it reaches.
+#: Seconds of a block of samples, the number of blocks in a pause, and the limit of a silent sample.
 _BLOCK, _PAUSE, _SILENT = 0.01, 8, 50
-#: Seconds in which a sentence must be rendered, its voice's load included.
+#: Seconds in which a sentence must be rendered, the loading of its voice included.
 _PATIENCE = 30.0
 
 
@@ -51,15 +52,8 @@ class Voice(Protocol):
         """Whether a sentence is the same each time, whatever was said before it."""
         ...
 
-    def serve(
-        self,
-        make_talk: MakeTalk,
-        sink: Sink,
-        *options: str,
-        rate: int = QUICK,
-        env: Mapping[str, str] | None = None,
-    ) -> Talk:
-        """Start a server that speaks with it at a recorded sink, and return it when it can."""
+    def serve(self, make_talk: MakeTalk, sink: Sink, *options: str, rate: int = QUICK, env: Environment = None) -> Talk:
+        """Start a server that speaks with this voice at a recorded sink."""
         ...
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
@@ -67,23 +61,16 @@ class Voice(Protocol):
         ...
 
     def render_with_words(self, sentence: Sentence) -> Rendering:
-        """Return the samples of a server's first sentence, with its words; of English words alone."""
+        """Return the samples of a server's first sentence, with its English words."""
         ...
 
 
 class Espeak:
-    """Libespeak-ng's."""
+    """The voice of libespeak-ng."""
 
     repeats = False
 
-    def serve(
-        self,
-        make_talk: MakeTalk,
-        sink: Sink,
-        *options: str,
-        rate: int = QUICK,
-        env: Mapping[str, str] | None = None,
-    ) -> Talk:
+    def serve(self, make_talk: MakeTalk, sink: Sink, *options: str, rate: int = QUICK, env: Environment = None) -> Talk:
         return make_talk("--rate", str(rate), *options, sink=sink, env=env)
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
@@ -96,35 +83,15 @@ class Espeak:
 ESPEAK = Espeak()
 
 
-def _behind_a_pause(samples: Samples, begin: float, end: float) -> float:
-    """Return where a word begins, heard between these seconds: a recognizer takes the pause before for a part of it."""
-    silent = [
-        int(np.abs(samples[int(at * RATE) : int((at + _BLOCK) * RATE)]).max(initial=0)) < _SILENT
-        for at in np.arange(begin, end, _BLOCK)
-    ]
-    for at in range(_PAUSE):
-        if all(silent[at : at + _PAUSE]) and False in silent[at + _PAUSE :]:
-            return begin + silent.index(False, at) * _BLOCK
-    return begin
-
-
 @dataclass(frozen=True)
 class Joe:
-    """A real neural voice, without noise."""
+    """A real neural voice, without noise; its files are in `voices`, its halves in `cache`."""
 
-    #: where it is without noise, and where its halves are kept
     voices: str
     cache: str
     repeats = True
 
-    def serve(
-        self,
-        make_talk: MakeTalk,
-        sink: Sink,
-        *options: str,
-        rate: int = QUICK,
-        env: Mapping[str, str] | None = None,
-    ) -> Talk:
+    def serve(self, make_talk: MakeTalk, sink: Sink, *options: str, rate: int = QUICK, env: Environment = None) -> Talk:
         env = {**self.places, **(env or {})}
         return serve_with(make_talk, REAL_VOICE, "--rate", str(rate), *options, sink=sink, env=env)
 
@@ -132,7 +99,7 @@ class Joe:
         return [self._rendered(each if isinstance(each, Sentence) else Sentence(each, rate)) for each in sentences]
 
     def render_with_words(self, sentence: Sentence) -> Rendering:
-        """Its words are where a recognizer of speech hears them, and behind a pause where that ends."""
+        """Return the samples with the words at the places that a speech recognizer hears, behind a pause."""
         samples = self._rendered(sentence)
         words = WORD.finditer(sentence.text.lower())
         heard = align(samples, sentence.text)
@@ -155,3 +122,15 @@ class Joe:
             samples = np.frombuffer(file.readframes(file.getnframes()), "<i2").astype(np.int16)
         samples.flags.writeable = False
         return samples
+
+
+def _behind_a_pause(samples: Samples, begin: float, end: float) -> float:
+    """Return where a word begins: a recognizer takes the pause before a word for a part of it."""
+    silent = [
+        int(np.abs(samples[int(at * RATE) : int((at + _BLOCK) * RATE)]).max(initial=0)) < _SILENT
+        for at in np.arange(begin, end, _BLOCK)
+    ]
+    for at in range(_PAUSE):
+        if all(silent[at : at + _PAUSE]) and False in silent[at + _PAUSE :]:
+            return begin + silent.index(False, at) * _BLOCK
+    return begin
