@@ -1,7 +1,6 @@
-"""What becomes of a sentence whose output is muted, unplugged, moved, suspended, or was never there: the truth.
+"""Outputs that are muted, unplugged, moved, suspended or missing: the end of a sentence is told truly.
 
-At a real PulseAudio and a real PipeWire, by the player "pulse". What is done to the sound server itself is beside it in
-`test_sound_server`; what is heard, in `conformance`.
+At a real PulseAudio and a real PipeWire, by the player "pulse". `test_sound_server` breaks the sound server itself.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import pytest
@@ -22,23 +20,23 @@ from talkcli.engine.players.pulse import SUSPENDED_FOR
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
 from tests.support.census import descendants
 from tests.support.pipewire import PipeWire
+from tests.support.processes import Talk
 from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
-    from tests.support.processes import Talk
 
-#: Seconds in which something that a sound server tells ends a sentence.
+#: Seconds in which a sentence ends if the sound server tells the reason.
 TOLD = 0.5
-#: Clients that either server takes at once, at most: MAX_CONNECTIONS of PulseAudio's, MAX_CLIENTS of PipeWire's.
+#: Clients that either server takes at once: MAX_CONNECTIONS of PulseAudio's, MAX_CLIENTS of PipeWire's.
 CLIENTS = 64
-#: A sink that counts as a device beside the one of the test.
+#: A sink that counts as a device, beside the one of the test.
 OTHER = "other"
-#: A session manager remembers how loud a device was by its name: each has one of its own.
+#: A session manager remembers the volume of a device by its name, so each test has a name of its own.
 _NAMES = (f"card{number}" for number in itertools.count())
 
 
@@ -58,8 +56,19 @@ def server(request: pytest.FixtureRequest) -> Iterator[Server]:
         yield found
 
 
+@pytest.fixture(scope="module")
+def talk(server: Server) -> Iterator[Talk]:
+    """A server for all tests at this sound server; none leaves a goal or a setting behind."""
+    found = Talk(("--rate", "450"), env=server.env)
+    try:
+        yield found
+        found.stop()
+    finally:
+        found.close()
+
+
 class Card(NamedTuple):
-    """A device, and the sound server's module that it is."""
+    """A device, and its module in the sound server."""
 
     name: str
     module: str
@@ -70,20 +79,15 @@ def card(server: Server) -> Iterator[Card]:
     """A device of its own, which is the default while the test runs."""
     name = next(_NAMES)
     with _loaded(server, name) as module:
-        server.pactl("set-default-sink", name)
-        _await_default(server, name)
+        _make_default(server, name)
         yield Card(name, module)
-
-
-@pytest.fixture
-def talk(make_talk: MakeTalk, server: Server) -> Talk:
-    return make_talk("--rate", "450", env=server.env)
 
 
 @contextlib.contextmanager
 def _loaded(server: Server, name: str) -> Iterator[str]:
-    """Have another sink."""
-    module = server.pactl("load-module", "module-null-sink", f"sink_name={name}", "rate=22050", "channels=1").strip()
+    """Add a sink. PulseAudio's renders up to 2 s ahead, which its clients wait for, unless it does without rewinds."""
+    words = ["rate=22050", "channels=1", *(["norewinds=1"] if isinstance(server, Sink) else [])]
+    module = server.pactl("load-module", "module-null-sink", f"sink_name={name}", *words).strip()
     try:
         yield module
     finally:
@@ -91,15 +95,16 @@ def _loaded(server: Server, name: str) -> Iterator[str]:
             server.pactl("unload-module", module)
 
 
-def _await_default(server: Server, name: str) -> None:
+def _make_default(server: Server, name: str) -> None:
+    server.pactl("set-default-sink", name)
     end = time.monotonic() + 10
     while f"Default Sink: {name}\n" not in server.pactl("info"):
         assert time.monotonic() < end, server.pactl("info")
-        time.sleep(0.01)  # a session manager decides it, and tells nobody
+        time.sleep(0.01)  # a session manager decides it, and sends no event
 
 
 def _move(server: Server, name: str) -> None:
-    """Have the one stream there is play to this sink. A session manager takes its time, and a busy one may miss it."""
+    """Move the only stream to this sink. A session manager takes its time, and a busy one may miss the request."""
     sinks = [each.split("\t")[:2] for each in server.pactl("list", "short", "sinks").splitlines()]
     (wanted,) = [number for number, each in sinks if each == name]
     asked = 0.0
@@ -113,18 +118,17 @@ def _move(server: Server, name: str) -> None:
             asked = time.monotonic()
 
 
+def _mute(server: Server, name: str, on: str = "1") -> None:
+    server.pactl("set-sink-mute", name, on)
+
+
+def _turn_down(server: Server, name: str) -> None:
+    server.pactl("set-sink-volume", name, "0")
+
+
 def _ended(talk: Talk, goal_id: str) -> Message:
     talk.watcher.wait_for_terminal(goal_id)
     return talk.goal(goal_id)
-
-
-def _stream(server: Server) -> str:
-    """Return the number of the stream that is being played."""
-    (line,) = server.pactl("list", "short", "sink-inputs").splitlines()
-    return line.split("\t")[0]
-
-
-# -- where it goes
 
 
 def test_a_goal_says_where_it_goes_and_how_loud_that_is(talk: Talk, server: Server, card: Card) -> None:
@@ -132,49 +136,34 @@ def test_a_goal_says_where_it_goes_and_how_loud_that_is(talk: Talk, server: Serv
     goal = begin(talk, LONG)
     wanted = {"player": "pulse", "device": card.name, "volume": 0.4, "muted": False}
     assert talk.goal(goal)["output"] == wanted  # while it is being spoken, too
-    stream = _stream(server)
-    server.pactl("set-sink-input-volume", stream, "50%")
+    (stream,) = server.pactl("list", "short", "sink-inputs").splitlines()
+    server.pactl("set-sink-input-volume", stream.split("\t")[0], "50%")
     ended = _ended(talk, goal)
     assert (ended["state"], ended["output"]) == ("SUCCEEDED", {**wanted, "volume": 0.2})
 
 
-def test_where_nobody_can_know_it_there_is_none(make_talk: MakeTalk, server: Server) -> None:
-    talk = make_talk("--player", "null", env=server.env)
-    done = talk.run("say", "--wait", "--", LOW)
-    assert (done.code, talk.goal(done.id)["output"]) == (0, None)
-
-
-@pytest.mark.usefixtures("card")
-def test_a_stream_that_is_moved_to_another_device_goes_on_there(talk: Talk, server: Server) -> None:
+def test_a_stream_that_is_moved_to_another_device_goes_on_there(talk: Talk, server: Server, card: Card) -> None:
+    """Another default device in mid-sentence ends nothing, either."""
     with _loaded(server, OTHER):
-        goal = begin(talk, ", ".join([LONG] * 3))
+        goal = begin(talk, f"{LONG}, {LONG}")
+        server.pactl("set-default-sink", OTHER)
+        _move(server, OTHER)
+        server.pactl("set-default-sink", card.name)
         _move(server, OTHER)
         ended = _ended(talk, goal)
         assert (ended["state"], ended["output"]["device"]) == ("SUCCEEDED", OTHER)
 
 
-def test_another_default_device_in_mid_sentence_ends_nothing(talk: Talk, server: Server, card: Card) -> None:
-    with _loaded(server, OTHER):
-        goal = begin(talk, LONG)
-        server.pactl("set-default-sink", OTHER)
-        assert _ended(talk, goal)["state"] == "SUCCEEDED"
-        server.pactl("set-default-sink", card.name)
-
-
-# -- nobody can hear it
-
-
-def test_a_dummy_is_no_output_but_for_who_names_it(make_talk: MakeTalk, server: Server, card: Card) -> None:
+def test_a_dummy_is_no_output_unless_it_is_named(make_talk: MakeTalk, server: Server, card: Card) -> None:
     with contextlib.ExitStack() as stack:
         if DUMMY not in server.pactl("list", "short", "sinks"):
             stack.enter_context(_loaded(server, DUMMY))
-        server.pactl("set-default-sink", DUMMY)
-        _await_default(server, DUMMY)
+        _make_default(server, DUMMY)
         done = (talk := make_talk(env=server.env)).run("say", "--wait", "--", LOW)
         goal = talk.goal(done.id)
         assert_aborted(goal, "audio_device", "the sound server has only a dummy output")
         assert (done.code, goal["spoken"]) == (4, "")
-        talk = make_talk("--player", "pulse", "--device", DUMMY, env=server.env)
+        talk = make_talk("--player", "pulse", "--device", DUMMY, "--rate", "450", env=server.env)
         assert talk.run("say", "--wait", "--", LOW).code == 0
         server.pactl("set-default-sink", card.name)
 
@@ -186,16 +175,15 @@ def test_a_device_that_is_unplugged_ends_the_sentence_and_the_next_is_heard(
         goal = begin(talk, LONG)
         unplugged = time.monotonic()
         server.pactl("unload-module", card.module)
-        ended = talk.watcher.wait_for(goal, "ABORTED") if isinstance(server, PipeWire) else None
-        if ended:  # PulseAudio has its other sink, to which the stream is moved
+        if isinstance(server, PipeWire):
+            ended = talk.watcher.wait_for(goal, "ABORTED")
             assert_within(talk.watcher.arrived(ended) - unplugged, TOLD, "the end of a goal whose device is gone")
             assert_aborted(talk.goal(goal), "audio_lost", "the sound server has only a dummy output left")
             assert_aborted(_ended(talk, send(talk, LOW)), "audio_device", "only a dummy output")
-        else:
+        else:  # PulseAudio moves the stream to its other sink
             assert _ended(talk, goal)["state"] == "SUCCEEDED"
         with _loaded(server, card.name):
-            server.pactl("set-default-sink", card.name)
-            _await_default(server, card.name)
+            _make_default(server, card.name)
             assert talk.run("say", "--wait", "--", LOW).code == 0
 
 
@@ -214,24 +202,11 @@ def test_a_suspended_device_ends_the_sentence_within_a_second(talk: Talk, server
         assert talk.run("say", "--wait", "--", LOW).code == 0
 
 
-# -- muted
-
-
-def _mute(server: Server, card: Card) -> None:
-    server.pactl("set-sink-mute", card.name, "1")
-
-
-def _turn_down(server: Server, card: Card) -> None:
-    server.pactl("set-sink-volume", card.name, "0")
-
-
-Mute = Callable[[Server, Card], None]
-every_way = pytest.mark.parametrize("mute", [_mute, _turn_down])
-
-
-@every_way
-def test_a_muted_sentence_is_played_and_everybody_is_told(talk: Talk, server: Server, mute: Mute, card: Card) -> None:
-    mute(server, card)
+@pytest.mark.parametrize("mute", [_mute, _turn_down])
+def test_a_muted_sentence_is_told_and_not_begun_if_it_must_be_audible(
+    talk: Talk, server: Server, mute: Callable[[Server, str], None], card: Card
+) -> None:
+    mute(server, card.name)
     done = talk.run("say", "--wait", "--", LOW)
     goal = talk.goal(done.id)
     words = f"Talk completed successfully, but the output was muted: {card.name}"
@@ -240,53 +215,36 @@ def test_a_muted_sentence_is_played_and_everybody_is_told(talk: Talk, server: Se
     assert done.err == f"talk: {done.id}: {words}\n"
     assert any(each.endswith(f'"{LOW}"  muted') for each in talk.run("status").out.splitlines())
     assert f"output   {card.name}, by pulse, volume " in talk.run("status", done.id).out
-
-
-@every_way
-def test_one_that_must_be_audible_is_not_begun_where_it_is_muted(
-    talk: Talk, server: Server, mute: Mute, card: Card
-) -> None:
-    mute(server, card)
     done = talk.run("say", "--wait", "--audible", "--", LOW)
     goal = talk.goal(done.id)
     assert_aborted(goal, "muted", f"the output is muted: {card.name}")
     assert (done.code, goal["spoken"], goal["duration"]) == (4, "", None)
 
 
-def test_one_that_must_be_audible_ends_where_it_becomes_muted(make_talk: MakeTalk, server: Server, card: Card) -> None:
+def test_a_sentence_that_becomes_muted_ends_if_it_must_be_audible_and_is_told_otherwise(
+    make_talk: MakeTalk, server: Server, card: Card
+) -> None:
     talk = make_talk("--rate", "450", "--audible", env=server.env)
     with limits():
         goal = begin(talk, LONG)
         muted = time.monotonic()
-        _mute(server, card)
+        _mute(server, card.name)
         ended = talk.watcher.wait_for(goal, "ABORTED")
         assert_within(talk.watcher.arrived(ended) - muted, TOLD, "the end of a goal that became muted")
         assert_aborted(talk.goal(goal), "muted")
-        server.pactl("set-sink-mute", card.name, "0")
-        assert talk.run("say", "--wait", "--", LOW).code == 0
-        own = talk.request("say", text=LONG, audible=False, wait=True)["goal"]["id"]
-        talk.watcher.wait_for(own, "ACTIVE")
-        _mute(server, card)
-        assert _ended(talk, own)["state"] == "SUCCEEDED"
-
-
-def test_a_moment_of_it_is_told_as_well(talk: Talk, server: Server, card: Card) -> None:
-    goal = begin(talk, LONG)
-    _mute(server, card)
-    while not talk.goal(goal)["output"]["muted"]:  # it ends by the assertion below if it is never told
-        if talk.goal(goal)["state"] != "ACTIVE":
-            break
-    server.pactl("set-sink-mute", card.name, "0")
-    ended = _ended(talk, goal)
-    assert (ended["state"], ended["output"]["muted"]) == ("SUCCEEDED", True)
-
-
-# -- no place for one more
+        _mute(server, card.name, "0")
+        own = begin(talk, LONG, audible=False)
+        _mute(server, card.name)
+        while not talk.goal(own)["output"]["muted"] and talk.goal(own)["state"] == "ACTIVE":
+            pass
+        _mute(server, card.name, "0")
+        told = _ended(talk, own)
+        assert (told["state"], told["output"]["muted"]) == ("SUCCEEDED", True)  # a moment of it is told as well
 
 
 @pytest.mark.usefixtures("card")
 def test_a_server_that_takes_no_more_clients_ends_the_sentence_in_words(make_talk: MakeTalk, server: Server) -> None:
-    talk = make_talk("--player", "pulse", env=server.env)
+    talk = make_talk("--player", "pulse", "--rate", "450", env=server.env)
     with contextlib.ExitStack() as crowd:
         for _ in range(CLIENTS):
             each = crowd.enter_context(socket.socket(socket.AF_UNIX))
@@ -296,14 +254,10 @@ def test_a_server_that_takes_no_more_clients_ends_the_sentence_in_words(make_tal
     assert talk.run("say", "--wait", "--", LOW).code == 0
 
 
-# -- the end
-
-
 @pytest.mark.usefixtures("card")
-def test_nothing_of_a_stream_is_left_behind(talk: Talk, server: Server) -> None:
-    """A cancel, and an engine that is killed; there is no player's process that could be."""
+def test_no_stream_is_left_by_a_cancel_or_by_an_engine_that_is_killed(talk: Talk, server: Server) -> None:
     begin(talk, LONG)
-    assert descendants(engine_process(talk)) == []
+    assert descendants(engine_process(talk)) == []  # no player's process, which could be left
     talk.run("cancel")
     assert server.pactl("list", "short", "sink-inputs") == ""
     begin(talk, LONG)
