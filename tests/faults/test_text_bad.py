@@ -33,32 +33,23 @@ _WHOLE = bool(os.environ.get("CI") or os.environ.get("TALK_TEST_FUZZ"))
 _FEW, _FEWER = (1, 1) if _WHOLE else (20, 200)
 
 MARKUP = (
-    "<speak>hello</speak>",
-    "<audio src='file:///etc/passwd'/> hello",
-    '<voice name="de"><prosody rate="x-slow">hello</prosody></voice>',
-    "[[h@'loU]]",
-    "hello [[_^_de]] &lt; &#65; {{x}}",
+    "<speak>hello</speak> &lt; &#65; {{x}}",
+    '<audio src="file:///etc/passwd"/><voice name="de"><prosody rate="x-slow">hello</prosody></voice>',
+    "[[h@'loU]] [[_^_de]]",
 )
 #: The longest words of several languages, each with its voice.
 LONGEST_WORDS = {
     "gmw/de": "Rindfleischetikettierungsüberwachungsaufgabenübertragungsgesetz",
-    "urj/fi": "lentokonesuihkuturbiinimoottoriapumekaanikkoaliupseerioppilas",
-    "gmq/sv": "nordvästersjökustartilleriflygspaningssimulatoranläggningsmaterielunderhållsuppföljningssystem",
     "trk/tr": "muvaffakiyetsizleştiricileştiriveremeyebileceklerimizdenmişsinizcesine",
-    "gmw/en": "pneumonoultramicroscopicsilicovolcanoconiosis",
-    "urj/hu": "megszentségteleníthetetlenségeskedéseitekért",
     "zle/ru": "превысокомногорассмотрительствующий",
     "grk/el": "λοπαδοτεμαχοσελαχογαλεοκρανιολειψανοδριμυποτριμματοσιλφιοκαραβομελιτο",
-    "aav/vi": "nghiêng",
-    "roa/fr": "anticonstitutionnellement",
 }
 RIGHT_TO_LEFT = {
     "sem/ar": "البطارية منخفضة، سأعود إلى القاعدة ٣ مرات (AB-12).",
-    "ira/fa": "باتری کم است\u200cها، برمی‌گردم.",
     "sem/he": "הסוללה חלשה, אני חוזר לבסיס 12:30.",
     "gmw/en": "low \u202eyrettab\u202c \u2067שלום\u2069 now",
 }
-#: What has no end, or too much of something; less of it where it takes minutes to be spoken.
+#: Texts with too much of something; less of it if it takes minutes to be spoken.
 ENDLESS = {
     "letters": "a" * 10_000,
     "capitals": "WXYZ" * 500,
@@ -79,22 +70,24 @@ ENDLESS = {
     "blanks": " " * 9_999 + "a",
     "lines": "\n" * 9_999 + "a",
 }
-#: Those that are rendered soon; the others, of which each is another script's, say no more for their second.
-_SOON = {"letters", "signs", "points", "letters with points", "accents", "letters with accents", "syllables"}
-_SOON |= {"pictures", "blanks", "lines"}
+#: Those that are rendered soon. The others tell little more: each is of another script.
+_SOON = ["letters", "signs", "points", "letters with points", "accents", "letters with accents", "syllables"]
+_SOON += ["pictures", "blanks", "lines"]
 
 
-def _samples(path: Path) -> bytes:
+def assert_rendered(path: Path, text: str, voice: str = "en") -> None:
+    """Assert that a text is spoken as libespeak-ng speaks it, to the sample."""
+    render(text, str(path), voice=voice)
     with wave.open(str(path)) as file:
-        data: bytes = file.readframes(file.getnframes())
-        return data
+        assert file.readframes(file.getnframes()) == reference([Sentence(text, voice=voice)])[0].tobytes(), (
+            voice,
+            text,
+        )
 
 
-@pytest.mark.parametrize("text", MARKUP)
-def test_markup_and_phonemes_are_spoken_as_text(text: str, tmp_path: Path) -> None:
-    render(text, str(tmp_path / "x.wav"))
-    (expected,) = reference([text])
-    assert _samples(tmp_path / "x.wav") == expected.tobytes()
+def test_markup_and_phonemes_are_spoken_as_text(tmp_path: Path) -> None:
+    for text in MARKUP:
+        assert_rendered(tmp_path / "x.wav", text)
 
 
 def test_commands_of_the_library_in_a_text_are_none(talk: Talk) -> None:
@@ -107,11 +100,9 @@ def test_commands_of_the_library_in_a_text_are_none(talk: Talk) -> None:
 
 
 def test_ordinary_sentences_are_what_the_library_makes_of_them(tmp_path: Path) -> None:
-    voices = ["gmw/en", "gmw/en", "gmw/de", "roa/fr", "roa/es", "roa/it", "roa/pt-BR", "zlw/pl", "zlw/cs", "zle/ru"]
-    for voice, text in zip(voices, SENTENCES, strict=False):
-        render(text, str(tmp_path / "x.wav"), voice=voice)
-        (expected,) = reference([Sentence(text, voice=voice)])
-        assert _samples(tmp_path / "x.wav") == expected.tobytes(), (voice, text)
+    voices = ["gmw/en", "gmw/en", "gmw/de", "roa/fr"]
+    for voice, text in [*zip(voices, SENTENCES, strict=False), ("zle/ru", SENTENCES[9])]:
+        assert_rendered(tmp_path / "x.wav", text, voice)
 
 
 def _every_character(common: bool) -> Iterator[str]:
@@ -142,7 +133,7 @@ def test_every_assigned_character_once(common: bool) -> None:
 def test_numbers_of_any_length_are_said(voice: str) -> None:
     """Without the guard these voices die of those with thirteen and fourteen digits."""
     chance = random.Random(voice)
-    numbers = ["".join(chance.choices("1234567890", k=digits)) for digits in range(1, 21) for _ in range(3)]
+    numbers = ["".join(chance.choices("1234567890", k=digits)) for digits in range(1, 21) if digits > 10]
     numbers += ["1111111111111", "1,111,111,111,111"]
     tally = speak_all([Case(voice, each) for each in numbers], guarded=True)
     assert (tally.texts, tally.deaths, tally.faults) == (len(numbers), [], [])
@@ -151,38 +142,33 @@ def test_numbers_of_any_length_are_said(voice: str) -> None:
 
 def test_the_longest_words_and_writing_from_right_to_left_are_spoken_whole(tmp_path: Path) -> None:
     for voice, text in [*LONGEST_WORDS.items(), *RIGHT_TO_LEFT.items()]:
-        render(text, str(tmp_path / "x.wav"), voice=voice)
-        (expected,) = reference([Sentence(text, voice=voice)])
-        assert _samples(tmp_path / "x.wav") == expected.tobytes(), (voice, text)
+        assert_rendered(tmp_path / "x.wav", text, voice)
 
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
-    "text",
-    [pytest.param(text, marks=() if name in _SOON else pytest.mark.slow) for name, text in ENDLESS.items()],
-    ids=ENDLESS.keys(),
+    "names", [_SOON, *(pytest.param([each], marks=pytest.mark.slow) for each in ENDLESS if each not in _SOON)]
 )
-def test_thousands_of_characters_of_one_kind_end(text: str) -> None:
-    assert fault(text) is None
-    tally = speak_all([Case("gmw/en", text), Case("gmw/en", LOW)], guarded=True)
-    assert (tally.texts, tally.deaths, tally.faults) == (2, [], [])
+def test_thousands_of_characters_of_one_kind_end(names: list[str]) -> None:
+    texts = [ENDLESS[each] for each in names]
+    assert [fault(each) for each in texts] == [None] * len(texts)
+    tally = speak_all([Case("gmw/en", each) for each in [*texts, LOW]], guarded=True)
+    assert (tally.texts, tally.deaths, tally.faults) == (len(texts) + 1, [], [])
     assert set(tally.outcomes) <= {"completed", "nothing_to_say"}
 
 
 def test_a_server_survives_bad_texts_and_speaks_the_next_one(talk: Talk) -> None:
-    """Each is begun and cancelled, as nobody listens for minutes; in between `status` answers."""
+    """Each text is begun and cancelled, as it would take minutes."""
     for text in ENDLESS.values():
         goal = send(talk, text)
         talk.watcher.wait_for(goal, "ACTIVE")
         assert talk.request("cancel", timeout=5)["ok"]
         assert talk.watcher.wait_for_terminal(goal) in {"PREEMPTED", "ABORTED", "SUCCEEDED"}
-    for text in MARKUP[:1]:
-        assert talk.run("say", "--wait", "--rate", "450", "--", text).code == 0
     assert talk.run("say", "--wait", "--rate", "450", "--", LOW).code == 0
 
 
 HOSTILE = "a\x1b[31mred\x07\x9b2J\u202egnp.exe\nfake line"
-#: A client that is nothing but a socket, so that it can be a program of any name.
+#: A client that needs nothing but a socket, so that its program can have any name.
 CLIENT = """
 import socket, sys
 with socket.socket(socket.AF_UNIX) as connection:
@@ -195,15 +181,14 @@ with socket.socket(socket.AF_UNIX) as connection:
 
 
 def test_terminal_escapes_in_texts_ids_keys_and_names_are_shown_escaped(scripted: Talk) -> None:
-    hostile = HOSTILE
     watch = scripted.start("watch")
-    goal = str(scripted.request("say", text=f"length=0.1 {hostile}", key=hostile)["goal"]["id"])
+    goal = str(scripted.request("say", text=f"length=0.1 {HOSTILE}", key=HOSTILE)["goal"]["id"])
     rejected = scripted.request("say", text="one", id="x\x1b[31m")
     assert not rejected["ok"] or rejected["goal"]["state"] == "REJECTED"
     scripted.watcher.wait_for_terminal(goal)
-    own = scripted.run("say", "--wait", "--as", hostile, "--key", hostile, "--", f"length=0.1 {hostile}")
+    own = scripted.run("say", "--wait", "--as", HOSTILE, "--key", HOSTILE, "--", f"length=0.1 {HOSTILE}")
     assert own.code == 0, own
-    failed = scripted.run("say", "--wait", "--as", hostile, "--", f"fail=engine_failed {hostile}")
+    failed = scripted.run("say", "--wait", "--as", HOSTILE, "--", f"fail=engine_failed {HOSTILE}")
     assert failed.code == 4
     evil = f"{scripted.directory}/ev\x1b[31m\u202e"
     os.symlink(sys.executable, evil)

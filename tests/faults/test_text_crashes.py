@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, send
+from tests.faults.broken import assert_answers
 from tests.faults.fuzz_texts import list_voices, speak_all
 from tests.faults.fuzz_texts_generator import Case
 from tests.support.compare import assert_heard
@@ -16,69 +17,42 @@ from tests.support.reference import render
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
     from tests.support.sink import Sink
 
-#: Too much for every version of libespeak-ng that is known: it writes past the end of a table.
+#: A text for which every known version of libespeak-ng writes past the end of a table.
 CRASHING = "a." * 200
 UNGUARDED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "fuzz_texts_serve.py")
 #: Seconds for each of a hundred crashing texts, from the first to the sound of the goal behind them.
 LOOP_LIMIT = 0.3
-#: Seconds in which `status` is answered, whatever happens.
-ANSWERED = 0.1
 
 
-@pytest.fixture
-def unguarded(make_talk: MakeTalk, sink: Sink) -> Callable[..., Talk]:
-    """Starts a server with the real engine, and without the guard before the library."""
-
-    def make(*options: str, heard: bool = True) -> Talk:
-        return make_talk(*options, program=UNGUARDED, sink=sink if heard else None)
-
-    return make
+def unguarded(make_talk: MakeTalk, sink: Sink, *options: str) -> Talk:
+    """Start a server with the real engine, and without the guard before the library."""
+    return make_talk(*options, program=UNGUARDED, sink=sink)
 
 
-def test_a_scripted_crash_in_the_middle_of_ten_goals(scripted: Talk) -> None:
-    goals = [send(scripted, "crash length=0.2" if number == 5 else f"goal {number}") for number in range(10)]
-    assert_nine_spoken(scripted, goals)
-
-
-def test_a_crashing_text_in_the_middle_of_ten_goals(unguarded: Callable[..., Talk]) -> None:
-    talk = unguarded("--rate", "450")
+def test_a_crashing_text_in_the_middle_of_ten_goals(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = unguarded(make_talk, sink, "--rate", "450")
     texts = [LOW, HOME, "battery two", "coming three", "battery four", CRASHING]
     texts += ["coming six", "battery seven", "coming eight", "battery nine"]
     goals = [send(talk, text) for text in texts]
-    assert_nine_spoken(talk, goals)
-    assert_aborted(talk.goal(goals[5]), "engine_crashed", "SIG")
-    talk.recording.wait_until_quiet(0.2)
-    # In two processes, of which the second begins anew: what was spoken before the crash, and after it.
-    assert_heard(talk.recording.samples, [*render(texts[:5], rate=450), *render(texts[6:], rate=450)])
-
-
-def assert_nine_spoken(talk: Talk, goals: list[str]) -> None:
-    """Assert that the sixth is ABORTED, once, and the others are spoken in their order, while `status` answers."""
     with limits():
-        assert_within(_answered(talk), ANSWERED, "status")
+        assert_answers(talk)
     states = [talk.watcher.wait_for_terminal(goal) for goal in goals]
     assert states == ["SUCCEEDED"] * 5 + ["ABORTED"] + ["SUCCEEDED"] * 4
     assert talk.watcher.states(goals[5]) == ["PENDING", "ACTIVE", "ABORTED"]  # never tried again
-    begun = [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"]
-    assert begun == goals
-
-
-def _answered(talk: Talk) -> float:
-    with talk.connect() as wire:
-        began = time.monotonic()
-        assert wire.request("status")["ok"]
-        return time.monotonic() - began
+    assert [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"] == goals
+    assert_aborted(talk.goal(goals[5]), "engine_crashed", "SIG")
+    talk.recording.wait_until_quiet(0.2)
+    # Spoken by two processes, of which the second begins anew: the goals before the crash, and those after it.
+    assert_heard(talk.recording.samples, [*render(texts[:5], rate=450), *render(texts[6:], rate=450)])
 
 
 @pytest.mark.parametrize("texts", [10, pytest.param(100, marks=pytest.mark.slow)])
-def test_crash_loop_of_100_texts(unguarded: Callable[..., Talk], sink: Sink, texts: int) -> None:
-    talk = unguarded("--max-queue", "200")
+def test_crash_loop_of_100_texts(make_talk: MakeTalk, sink: Sink, texts: int) -> None:
+    talk = unguarded(make_talk, sink, "--max-queue", "200")
 
     with limits():
         assert talk.run("voices").code == 0  # the engine is ready
@@ -97,7 +71,7 @@ def test_crash_loop_of_100_texts(unguarded: Callable[..., Talk], sink: Sink, tex
         print(f"{texts} crashing texts and a good one: {heard_at - began:.1f} s")
         assert_within(heard_at - began, texts * LOOP_LIMIT, f"the goal behind {texts} crashing texts")
 
-    # A process for each, which was ready: so the next one needed no wait.
+    # Each had a process that was ready, so the next one needed no wait.
     assert talk.log.count("talk: the engine crashed: it was killed by ") == texts
     assert "engine_failed" not in talk.log
 
@@ -114,8 +88,8 @@ def test_with_the_guard_known_crashing_texts_are_spoken(voice: str) -> None:
     cases = [Case(voice, text) for text in texts]
     guarded = speak_all(cases, guarded=True)
     assert (guarded.texts, guarded.deaths, guarded.faults) == (len(texts), [], [])
-    without = speak_all(cases, guarded=False)
-    assert (without.texts, without.faults) == (len(texts), [])
+    without = speak_all(cases[:3], guarded=False)
+    assert (without.texts, without.faults) == (3, [])
     assert without.deaths, "this library needs no guard: look for what still kills it"
 
 
