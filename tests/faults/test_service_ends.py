@@ -1,4 +1,4 @@
-"""Signals and standard error: what ends a server, how fast, and what doesn't."""
+"""Signals and standard error: how fast a server ends, and the faults that don't end it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 import time
 import uuid
 from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.daemon import log
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.conformance.hearing import begin, engine_process, send
 from tests.support import processes
@@ -251,3 +253,23 @@ def test_sigint_that_a_shell_had_ignored_stays_so(home: str) -> None:
         server.process.send_signal(signal.SIGINT)
         assert run([*TALK, "say", "--wait", "length=0"], environment(home, TALK_SOCKET=path)).code == 0
         assert server.process.poll() is None
+
+
+def test_storm_of_the_same_message_is_a_line_a_minute_with_a_number(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 1000.0
+    monkeypatch.setattr(log, "_seldom", {})
+    monkeypatch.setattr("talkcli.daemon.log.time.monotonic", lambda: now)
+    with open(2, "w", encoding="utf-8", closefd=False) as stderr:
+        monkeypatch.setattr(sys, "stderr", stderr)
+        for second in range(600):  # ten minutes, ten times a second
+            now = 1000.0 + second
+            for number in range(10):
+                log.seldom("descriptors", f"no descriptor {number}")
+        log.seldom("another", "of another kind")
+    lines = capfd.readouterr().err.splitlines()
+    assert len(lines) == 11
+    assert lines[0] == "talk: no descriptor 0"
+    assert lines[1] == "talk: no descriptor 0 (599 more of these were not logged)"
+    assert lines[-1] == "talk: of another kind"

@@ -1,8 +1,8 @@
 """The sink is suspended or unloaded, the sound server frozen or killed: goals end in time, and are heard again.
 
-A private PulseAudio each, with `aplay`, with `pacat` and with the connection of the engine's own. A goal is in
-mid-sentence when it happens, the next one comes while there is no sound, and the third is sent when there is sound
-again. All faults are there side by side, each at a sound server of its own: most of it is waiting.
+By `aplay`, by `pacat` and by the player "pulse". A goal is in mid-sentence at the fault, the next one comes while there
+is no sound, and the third is sent when there is sound again. Most of it is waiting, so all faults happen side by side,
+each at a sound server of its own. These are also row 41 of the conformance.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
@@ -20,6 +20,8 @@ from talkcli.engine.playback import FIRST_WITHIN, LOOK_EVERY, STALLED_AFTER
 from talkcli.engine.players.pulse import READY_WITHIN, SUSPENDED_FOR
 from tests.conformance.hearing import LONG, LOW, assert_aborted, assert_same, begin, heard, render_quick, send
 from tests.faults.broken import await_end, heard_again, nothing_left, told
+from tests.support.compare import assert_begun
+from tests.support.reference import render
 from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
 
@@ -32,8 +34,8 @@ if TYPE_CHECKING:
 
 #: Seconds from the return of the sink to the first sample of the next goal.
 AGAIN = 10.0
-#: Seconds from the fault, or the beginning of a goal, to its end: where a player is told that there is no sound any
-#: more, and how long what takes none is waited for, with the looks and messages in between.
+#: Seconds from the fault, or the beginning of a goal, to its end: if the player is told that the sound is lost,
+#: and the waits for a player that takes none, with the looks and messages in between.
 TOLD = 1.0
 STALLED = STALLED_AFTER + LOOK_EVERY + 0.2
 NEVER_TAKEN = FIRST_WITHIN + LOOK_EVERY + 0.2
@@ -41,61 +43,52 @@ SUSPENDED = SUSPENDED_FOR + 0.5
 NO_ANSWER = READY_WITHIN + 0.2
 
 
+class End(NamedTuple):
+    """How a goal ends: its reason, its limit in seconds, and words of its message."""
+
+    reason: str
+    within: float
+    words: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What happens to the sink, and how a goal ends that is in mid-sentence, and one that comes meanwhile."""
+    """A fault of the sink, and the ends of a goal in mid-sentence and of one that comes meanwhile."""
 
     breaks: Callable[[Sink], None]
     mends: Callable[[Sink], None]
-    lost: tuple[str, float]
-    meanwhile: tuple[str, float]
-    #: … by the player "pulse", which the server tells more
-    pulse: tuple[tuple[str, float], tuple[str, float]]
-
-    def ends(self, player: str) -> tuple[tuple[str, float], tuple[str, float]]:
-        return self.pulse if player == "pulse" else (self.lost, self.meanwhile)
+    ends: tuple[End, End]
+    #: the same by the player "pulse", which the server tells more
+    pulse: tuple[End, End]
 
 
-def _reload(sink: Sink) -> None:
-    sink.reload(warm=False)
-
-
-def _restart(sink: Sink) -> None:
-    sink.start_server(warm=False)
-
-
+GONE = "the sound server ended the stream"
 FAULTS = {
     "sink suspended": Fault(
         Sink.suspend,
         Sink.resume,
-        ("audio_stalled", STALLED),
-        ("audio_stalled", NEVER_TAKEN),
-        (("audio_stalled", SUSPENDED), ("audio_stalled", SUSPENDED)),
+        (End("audio_stalled", STALLED, "took no sound for 3 s"), End("audio_stalled", NEVER_TAKEN)),
+        (End("audio_stalled", SUSPENDED, "has suspended null"), End("audio_stalled", SUSPENDED)),
     ),
     "sink unloaded": Fault(
         Sink.unload,
-        _reload,
-        ("audio_lost", TOLD),
-        ("audio_device", TOLD),
-        (("audio_lost", TOLD), ("audio_device", TOLD)),
+        lambda sink: sink.reload(warm=False),
+        (End("audio_lost", TOLD, "error: "), End("audio_device", TOLD)),
+        (End("audio_lost", TOLD, GONE), End("audio_device", TOLD)),
     ),
     "sound server SIGSTOP": Fault(
         Sink.freeze,
         Sink.thaw,
-        ("audio_stalled", STALLED),
-        ("audio_stalled", NEVER_TAKEN),
-        (("audio_stalled", STALLED), ("audio_device", NO_ANSWER)),
+        (End("audio_stalled", STALLED, "took no sound for 3 s"), End("audio_stalled", NEVER_TAKEN)),
+        (End("audio_stalled", STALLED, "pulse took no sound for 3 s"), End("audio_device", NO_ANSWER)),
     ),
     "sound server SIGKILL": Fault(
         Sink.kill_server,
-        _restart,
-        ("audio_lost", TOLD),
-        ("audio_device", TOLD),
-        (("audio_lost", TOLD), ("no_player", TOLD)),
+        lambda sink: sink.start_server(warm=False),
+        (End("audio_lost", TOLD), End("audio_device", TOLD, "Connection refused")),
+        (End("audio_lost", TOLD, GONE), End("no_player", TOLD)),
     ),
 }
-
-
 #: The player of each fault; the other way round shows no more of the programs, and takes as long.
 PLAYERS = {
     "one each": ("pacat", "aplay", "aplay", "pacat"),
@@ -116,41 +109,44 @@ def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: str) -> None
             times = list(pool.map(_lose, FAULTS.values(), PLAYERS[players], talks, sinks))
         for what, player, talk, (lost, meanwhile, again) in zip(FAULTS, PLAYERS[players], talks, times, strict=True):
             talk.stop()
-            ends, case = FAULTS[what].ends(player), f"{what}, {player}"
+            ends, case = _ends(FAULTS[what], player), f"{what}, {player}"
             told(f"{case}: lost after, ended meanwhile after {lost:.3f}, {meanwhile:.3f} s; heard again", again)
-            assert_within(lost, ends[0][1], f"the end of a goal, {case}")
-            assert_within(meanwhile, ends[1][1], f"the end of a goal meanwhile, {case}")
+            assert_within(lost, ends[0].within, f"the end of a goal, {case}")
+            assert_within(meanwhile, ends[1].within, f"the end of a goal meanwhile, {case}")
             assert_within(again, AGAIN, f"the next goal, {case}")
 
 
+def _ends(fault: Fault, player: str) -> tuple[End, End]:
+    return fault.pulse if player == "pulse" else fault.ends
+
+
 def _lose(fault: Fault, player: str, talk: Talk, sink: Sink) -> tuple[float, float, float]:
-    """Have a fault, mended at last; return after how many seconds goals ended, and one was heard again."""
-    in_hand, next_one = (reason for reason, _ in fault.ends(player))
+    """Have a fault and mend it; return the seconds in which two goals ended, and one was heard again."""
+    first, second = _ends(fault, player)
     goal = begin(talk, LONG)
     broken = time.monotonic()
     fault.breaks(sink)
-    lost = _ends(talk, goal, in_hand, broken)
-    meanwhile = _ends(talk, send(talk, LOW), next_one, time.monotonic())
+    lost = _assert_ended(talk, goal, first, broken)
+    assert "two three" in talk.goal(goal)["spoken"] != LONG
+    if first.reason == "audio_lost":
+        assert_begun(talk.recording, render([LONG])[0], shortest=0.2)
+    meanwhile = _assert_ended(talk, send(talk, LOW), second, time.monotonic())
     fault.mends(sink)
     returned = time.monotonic()
     return lost, meanwhile, heard_again(talk, sink) - returned
 
 
-def _ends(talk: Talk, goal_id: str, reason: str, since: float) -> float:
-    """Assert that a goal is ABORTED, with its reason, and return after how many seconds."""
+def _assert_ended(talk: Talk, goal_id: str, end: End, since: float) -> float:
+    """Assert that a goal is ABORTED in this way, and return after how many seconds."""
     assert await_end(talk, goal_id, NEVER_TAKEN + 2) == "ABORTED"
-    event = talk.watcher.wait_for(goal_id, "ABORTED")
     goal = talk.goal(goal_id)
-    assert_aborted(goal, reason)
+    assert_aborted(goal, end.reason, end.words)
     assert goal["message"] != "Talk aborted: "
-    return talk.watcher.arrived(event) - since
+    return talk.watcher.arrived(talk.watcher.wait_for(goal_id, "ABORTED")) - since
 
 
 def test_sound_server_that_hangs_while_the_engine_starts(make_talk: MakeTalk, tmp_path: Path) -> None:
-    """libespeak-ng looks for PulseAudio when it is initialised, and would wait half a minute for one that hangs.
-
-    One that is frozen is a socket that takes clients, and says nothing.
-    """
+    """libespeak-ng looks for PulseAudio when it is initialised, and would wait half a minute for a frozen one."""
     with socket.socket(socket.AF_UNIX) as frozen:
         frozen.bind(str(tmp_path / "s"))
         frozen.listen()
@@ -163,7 +159,7 @@ def test_sound_server_that_hangs_while_the_engine_starts(make_talk: MakeTalk, tm
 def test_a_sound_server_that_takes_no_stream_is_no_reason_for_silence(
     make_talk: MakeTalk, sink: Sink, tmp_path: Path, hangs: bool
 ) -> None:
-    """ALSA has a way of its own to the device here; a system's settings may ask the same server first."""
+    """ALSA has its own way to the device here."""
     with limits(), socket.socket(socket.AF_UNIX) as frozen:
         if hangs:
             frozen.bind(str(tmp_path / "s"))

@@ -1,8 +1,9 @@
-"""The tables of faults name tests that exist, and that of this folder every test module of it."""
+"""The tables of faults name tests that exist, and the table of this folder names all its test modules."""
 
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -10,12 +11,13 @@ import pytest
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
-#: The folders that have such a table, in their README.
+#: The folders with such a table, in their README.
 FOLDERS = (HERE, ROOT / "tests" / "fleet")
-#: A file, a function, or both: `test_a.py::test_b`; `::test_c` is of the file that was named before it.
+#: A file, a function, or both: `test_a.py::test_b`; `::test_c` belongs to the file named before it.
 _NAMED = re.compile(r"`((?:tests/)?[\w/]*\.py)?(?:::(\w+))?`")
 
 
+@functools.cache
 def functions(path: Path) -> set[str]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     return {each.name for each in ast.walk(tree) if isinstance(each, ast.FunctionDef)}
@@ -51,15 +53,9 @@ def test_every_row_names_tests_that_exist(folder: Path) -> None:
 
 
 def test_every_module_of_faults_is_named() -> None:
-    """Those of the service beside the faults (units, sd_notify) are no rows."""
+    """The tests of systemd units and sd_notify are no rows."""
     shown = {path.name for row in rows(HERE) for path, _ in named(HERE, row)}
-    others = {
-        "test_table.py",
-        "test_engine_log.py",
-        "test_service_log.py",
-        "test_service_supervised.py",
-        "test_service_units.py",
-    }
+    others = {"test_table.py", "test_service_supervised.py", "test_service_units.py"}
     assert {each.name for each in HERE.glob("test_*.py")} - others == {
         each for each in shown if (HERE / each).is_file()
     }
