@@ -1,7 +1,6 @@
-"""The engine cannot start, as pyttsx3 or libespeak-ng is not there: goals end at once, until it is installed.
+"""The engine cannot start, as pyttsx3 or libespeak-ng is missing: goals end at once, until it is installed.
 
-What is missing is shadowed in the environment of a real server: by a module that comes before the installed one, and by
-a library that the loader finds first.
+A module or a library in the environment of a real server shadows the installed one.
 """
 
 from __future__ import annotations
@@ -16,13 +15,7 @@ import pytest
 
 from talkcli.engine.supervisor import BACK_OFF
 from tests.conformance.hearing import LOW, assert_aborted, send
-from tests.faults.broken import (
-    assert_answers,
-    heard_again,
-    python_path,
-    told,
-    write,
-)
+from tests.faults.broken import assert_answers, heard_again, python_path, told, write
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -37,7 +30,7 @@ AT_ONCE = 0.1
 #: Seconds that a start takes on a busy machine, above the wait before it.
 START = 1.0
 
-#: A module that is not there, for every process that would import it; each attempt leaves a line with its time.
+#: A module that cannot be imported; each attempt leaves a line with its time.
 MISSING = """
 import time
 with open({attempts!r}, "a") as file:
@@ -52,7 +45,7 @@ def get_data_path():
     return "{empty}"
 """
 WHEEL = os.path.dirname(espeakng_loader.__file__)
-#: What the system lacks besides its library: the module in the place of the wheel, and what is to be installed.
+#: What else is missing: the module in the place of the wheel, and the words that say what to install.
 WITHOUT = {
     "wheel": (MISSING, "libespeak-ng is missing ("),
     "data": (EMPTY, "there is no espeak-ng data: sudo apt-get install -y libespeak-ng1 espeak-ng-data"),
@@ -93,21 +86,19 @@ def test_without_libespeak_ng_or_its_data_goals_end_at_once_until_it_is_installe
     make_talk: MakeTalk, sink: Sink, tmp_path: Path, what: str
 ) -> None:
     wheel, words = WITHOUT[what]
-    write(
-        tmp_path / "espeakng_loader.py", wheel.format(attempts=str(tmp_path / "attempts"), real=WHEEL, empty=tmp_path)
-    )
+    module = wheel.format(attempts=str(tmp_path / "attempts"), real=WHEEL, empty=tmp_path)
+    write(tmp_path / "espeakng_loader.py", module)
     library = tmp_path / "libespeak-ng.so.1"
 
     with limits():
         library.write_bytes(b"no library")
         talk = make_talk(sink=sink, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
-        first = _assert_aborted_at_once(talk, words)
-        again = _assert_aborted_at_once(talk, words)
+        took = _assert_aborted_at_once(talk, words)
         library.unlink()
         _await_ready(talk)
         heard_again(talk, sink)
         talk.stop()
-        assert_within(max(first, again), AT_ONCE, "the end of a goal without an engine")
+        assert_within(took, AT_ONCE, "the end of a goal without an engine")
 
 
 def _assert_aborted_at_once(talk: Talk, words: str) -> float:
@@ -129,7 +120,7 @@ def _await_attempts(path: Path, count: int) -> list[float]:
     end = time.monotonic() + sum(BACK_OFF) + 5
     while len(times := _times(path)) < count:
         assert time.monotonic() < end, f"{len(times)} starts"
-        time.sleep(0.01)  # what another process writes is no event
+        time.sleep(0.01)  # another process writes it
     return times
 
 
@@ -138,7 +129,6 @@ def _times(path: Path) -> list[float]:
 
 
 def _await_ready(talk: Talk) -> None:
-    """Return when the engine is ready, as nobody but a client would find out."""
     end = time.monotonic() + BACK_OFF[-1] + 5
     while talk.request("status")["server"]["engine"] != "ready":
         assert time.monotonic() < end, talk.log

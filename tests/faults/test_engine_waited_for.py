@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.supervisor import BACK_OFF
+from tests.conformance.bareserve import SERVE, environment, run
 from tests.conformance.hearing import LONG, begin, engine_process, send
 from tests.faults.broken import python_path, write
 from tests.support import census
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 #: Goals that wait behind the one that loses its engine.
 WAITING = 20
-#: Descriptors that a server has, and no engine can be started with.
+#: Too few descriptors for a server to start an engine.
 TOO_FEW = 12
 #: Shortens the waits of a server whose engine can't start: no second, but tenths.
 HASTY = """
@@ -56,7 +57,7 @@ def _replaced(talk: Talk, engine: int) -> int:
     end = time.monotonic() + PATIENCE
     while not (found := set(census.descendants(talk.pid)) - {engine}):
         assert time.monotonic() < end, talk.log
-        time.sleep(0.002)  # a process that is started is no event
+        time.sleep(0.002)  # the start of a process sends no event
     (next_one,) = found
     return next_one
 
@@ -109,7 +110,7 @@ def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted
 def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(make_talk: MakeTalk) -> None:
     talk = make_talk("--player", "null")
     assert talk.run("voices").code == 0
-    for _ in range(5):
+    for _ in range(3):
         os.kill(engine_process(talk), signal.SIGKILL)
         goal = send(talk, "yes", rate=450)
         assert _ends(talk, [goal]) == [("SUCCEEDED", None)], talk.goal(goal)
@@ -144,10 +145,8 @@ def test_an_engine_that_does_not_come_for_long_costs_a_goal_each_time_it_is_trie
     assert "the engine crashed: it was killed by SIGSEGV" in talk.goal(goals[0])["message"]
 
 
-def test_a_cause_that_stays_and_then_another_that_may_pass_leave_no_goal_waiting(
-    make_talk: MakeTalk, tmp_path: Path
-) -> None:
-    """As where pyttsx3 is missing, and then half installed."""
+def test_a_lasting_cause_and_then_a_passing_one_leave_no_goal_waiting(make_talk: MakeTalk, tmp_path: Path) -> None:
+    """This happens if pyttsx3 is missing, and then half installed."""
     write(tmp_path / "sitecustomize.py", HASTY.format(patience=0.3))
     talk = make_talk(scripted=True, env=python_path(tmp_path))
     talk.script_start("fail")
@@ -165,7 +164,7 @@ def test_a_cause_that_stays_and_then_another_that_may_pass_leave_no_goal_waiting
 
 
 def test_a_goal_that_an_engine_was_given_in_its_death_has_its_time(make_talk: MakeTalk) -> None:
-    """The next one may begin with it, but no later than it says."""
+    """The next engine may begin with it, but not after its time to live."""
     talk = make_talk("--player", "null")
     assert talk.run("voices").code == 0
     with talk.connect() as wire, too_few_descriptors(talk):
@@ -176,12 +175,9 @@ def test_a_goal_that_an_engine_was_given_in_its_death_has_its_time(make_talk: Ma
 
 
 @pytest.mark.parametrize("option", [("--driver", "parrot"), ("--driver", "nsss"), ("--voice", "parrot")], ids=" ".join)
-def test_a_driver_or_a_voice_that_there_is_not_ends_the_server_before_it_is_ready(
-    make_talk: MakeTalk, option: tuple[str, str]
-) -> None:
-    talk = make_talk("--player", "null")
-    place = f"{talk.directory}/other"
-    done = talk.run("serve", "--player", "null", "--socket", place, *option)
+def test_an_unknown_driver_or_voice_ends_the_server_before_it_is_ready(tmp_path: Path, option: tuple[str, str]) -> None:
+    place = str(tmp_path / "s")
+    done = run([*SERVE, "--socket", place, *option], environment(str(tmp_path)))
     assert done.code == 2
     (words,) = done.err.splitlines()
     assert words.startswith("talk: "), words

@@ -1,7 +1,6 @@
-"""What the engine thread's watchdog must see, each as it happens to the real engine at a real sink.
+"""The faults that the engine thread's watchdog must see, each at the real engine and a real sink.
 
-The rest is elsewhere: a player that takes nothing, a drain that does not end and an end that comes too early in
-`test_player_broken`, a process that hangs in its start in `test_engine_killed`, one that ignores a stop in row 6.
+`test_player_broken` and `test_engine_killed` hold the others, row 6 an engine that ignores a stop.
 """
 
 from __future__ import annotations
@@ -19,15 +18,7 @@ from talkcli.engine.playback import GONE_WITHIN, STALLED_AFTER
 from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, STOP_LIMIT
 from tests.conformance.hearing import LONG, LOW, assert_aborted, await_word, begin, engine_process, player_process, send
 from tests.faults import trapped
-from tests.faults.broken import (
-    await_end,
-    began,
-    heard_again,
-    nothing_left,
-    python_path,
-    told,
-    write,
-)
+from tests.faults.broken import await_end, began, heard_again, nothing_left, python_path, told, write
 from tests.support import census
 from tests.support.reference import render
 from tests.support.timing import assert_within, limits
@@ -51,8 +42,7 @@ RATE = 450
 #: Seconds for which a killed player cannot be reaped here, longer than anything waits for it.
 HELD = 20.0
 
-#: A library that never comes back from a sentence with a certain word in it, and never calls back either.
-#: The server gives it up after some seconds without a sign of life.
+#: A library that never comes back from a sentence with a certain word in it, and a shorter limit for that.
 STUCK_SYNTHESIS = """
 from talkcli.engine import protocol
 protocol.HANG_AFTER = {limit}
@@ -67,7 +57,7 @@ if "talkcli.engine.main" in "".join(sys.orig_argv):
     _espeak.Synth = wait
 """
 
-#: What happens to a goal whose player cannot be reaped once it is killed; how it ends, after how many seconds.
+#: What happens to a goal whose player cannot be reaped once it is killed, and the limit for its end in seconds.
 STUCK: dict[str, tuple[Callable[[Talk], object], float]] = {
     "its engine killed": (lambda talk: os.kill(engine_process(talk), signal.SIGKILL), SILENCE_LIMIT + SLACK),
     "stopped": (lambda talk: talk.request("cancel"), CANCEL),
@@ -101,13 +91,14 @@ def test_synthesis_without_progress(make_talk: MakeTalk, sink: Sink, tmp_path: P
 def test_stop_that_is_not_confirmed(talk: Talk, sink: Sink) -> None:
     with limits():
         with nothing_left(talk), sink.record() as recording:
-            goal = begin(talk, LONG)
+            goal = begin(talk, LONG, number=1)
             following = send(talk, LOW, rate=RATE)
             os.kill(engine_process(talk), signal.SIGSTOP)
             asked = time.monotonic()
             assert talk.request("cancel", ids=[goal])["ok"]
             answered = time.monotonic()
-            assert talk.goal(goal)["state"] == "PREEMPTED"
+            ended = talk.goal(goal)
+            assert (ended["state"], ended["reason"]) == ("PREEMPTED", "canceled")
             assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
         seconds = began(recording, render([LOW], rate=RATE)[0]) - asked
         told("the next goal after a stop that was not confirmed", seconds)
@@ -132,8 +123,13 @@ def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path
         for talk in talks.values():
             idle.enter_context(nothing_left(talk))
         goals = {what: send(talk, LONG) for what, talk in talks.items()}
-        players = {what: _in_mid_sentence(talk, goals[what]) for what, talk in talks.items()}
-        hits = {what: _happens(talk, what) for what, talk in talks.items()}
+        players, hits = {}, {}
+        for what, talk in talks.items():
+            await_word(talk, goals[what])
+            players[what] = player_process(talk)
+        for what, talk in talks.items():
+            hits[what] = time.monotonic()
+            STUCK[what][0](talk)
         for what in whats:
             talk, goal, limit = talks[what], goals[what], STUCK[what][1]
             assert await_end(talk, goal, limit + 2) == "ABORTED"
@@ -149,16 +145,3 @@ def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path
         for player in players.values():
             for tracer in census.descendants(player):
                 os.kill(tracer, signal.SIGKILL)  # which lets go of it
-
-
-def _in_mid_sentence(talk: Talk, goal: str) -> int:
-    """Wait until a goal is in mid-sentence, and return its player's process id."""
-    await_word(talk, goal)
-    return player_process(talk)
-
-
-def _happens(talk: Talk, what: str) -> float:
-    """Do to a goal what there is to be done, and return when that was."""
-    hit = time.monotonic()
-    STUCK[what][0](talk)
-    return hit
