@@ -18,34 +18,29 @@ import pytest
 from talkcli.daemon import log
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.conformance.hearing import begin, engine_process, send
+from tests.faults.broken import write
 from tests.support import processes
 from tests.support.connection import Wire
-from tests.support.surroundings import MARK, assert_none_left, dying_with_parent, short_directory
+from tests.support.surroundings import MARK, assert_none_left, dying_with_parent
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
     from pathlib import Path
 
     from tests.conftest import MakeTalk
 
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
-#: At the fastest rate there is, where what is said need not be long.
+#: A server at the fastest rate there is.
 FAST = [*SERVE, "--rate", "450"]
-#: Characters of texts that make an answer long, and requests for it: more than a connection's buffers hold.
+#: Texts that make an answer long, and the number of requests for it: more than a connection's buffers hold.
 LONG = "word " * 1900
 ASKED = 12
 
 
-@pytest.fixture
-def home() -> Iterator[str]:
-    with short_directory() as path:
-        yield path
-
-
 @contextlib.contextmanager
 def stalled(path: str, count: int = 100) -> Iterator[None]:
-    """Connect clients that want much, read nothing, and leave a line unfinished; the server has done what it can."""
+    """Connect clients that ask for much, read nothing, and leave a line unfinished."""
     with contextlib.ExitStack() as stack:
         wire = stack.enter_context(Wire(path))
         wire.request("pause")
@@ -64,10 +59,8 @@ def stalled(path: str, count: int = 100) -> Iterator[None]:
 
 
 def test_sigterm_with_100_stalled_clients_ends_it_within_3_seconds(home: str) -> None:
-    path = f"{home}/s"
-
+    path, mark = f"{home}/s", uuid.uuid4().hex
     with limits():
-        mark = uuid.uuid4().hex
         with serving(environment(home, TALK_SOCKET=path, **{MARK: mark})) as server, Wire(path) as wire, stalled(path):
             wire.request("say", text="a sentence that is long enough to be in the middle of it", wait=True)
             wire.receive_event("state", state="ACTIVE")
@@ -82,58 +75,50 @@ def test_sigterm_with_100_stalled_clients_ends_it_within_3_seconds(home: str) ->
 
 
 def test_second_sigterm_with_100_stalled_clients_ends_it_at_once(home: str) -> None:
-    path = f"{home}/s"
-
+    path, mark = f"{home}/s", uuid.uuid4().hex
+    env = environment(home, TALK_SOCKET=path, **{MARK: mark})
     with limits():
-        mark = uuid.uuid4().hex
-        with serving(environment(home, TALK_SOCKET=path, **{MARK: mark}), command=SCRIPTED) as server:
-            with Wire(path) as wire, stalled(path):
-                wire.request("watch")
-                wire.request("say", text="never-ends ignore-stop words=1")  # what takes a while to end
-                wire.receive_event("word")
-                server.process.send_signal(signal.SIGTERM)
-                wire.receive_event("state", state="PREEMPTING")
-                began = time.monotonic()
-                assert server.end(signal.SIGTERM) == 143
-                assert_within(time.monotonic() - began, 0.1, "the end after a second SIGTERM")
-            assert not os.path.exists(path)
+        with serving(env, command=SCRIPTED) as server, Wire(path) as wire, stalled(path):
+            wire.request("watch")
+            wire.request("say", text="never-ends ignore-stop words=1")  # takes a while to end
+            wire.receive_event("word")
+            server.process.send_signal(signal.SIGTERM)
+            wire.receive_event("state", state="PREEMPTING")
+            began = time.monotonic()
+            assert server.end(signal.SIGTERM) == 143
+            assert_within(time.monotonic() - began, 0.1, "the end after a second SIGTERM")
+        assert not os.path.exists(path)
         assert_none_left(mark, 0.5)
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGPIPE])
-def test_storm_of_signals_is_survived(home: str, number: signal.Signals) -> None:
+def test_storm_of_signals_is_survived(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=FAST) as server, Wire(path) as wire:
         goal = wire.request("say", text="spoken to its end, whatever comes", wait=True)["goal"]
         wire.receive_event("state", state="ACTIVE")
         with limits():
-            for _ in range(5):
+            for number in [signal.SIGHUP, signal.SIGPIPE] * 3:
                 for _ in range(1000):
                     server.process.send_signal(number)
                 began = time.monotonic()
                 assert wire.request("status")["ok"]
                 assert_within(time.monotonic() - began, 0.1, "status in a storm of signals")
-        assert wire.receive_event("result", timeout=10)["goal"]["id"] == goal["id"]
-        assert wire.request("status", id=goal["id"])["goal"]["state"] == "SUCCEEDED"
+        ended = wire.receive_event("result", timeout=10)["goal"]
+        assert (ended["id"], ended["state"]) == (goal["id"], "SUCCEEDED")
 
 
-#: Whoever starts a server may have set its signals in some way.
+#: Starts a server with its signals blocked and ignored.
 STARTED_BADLY = """
 import os, signal, sys
 signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-signal.signal(signal.SIGTERM, signal.{term})
-signal.pthread_sigmask(signal.SIG_BLOCK, set(signal.Signals) - {{signal.SIGKILL, signal.SIGSTOP}})
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+signal.pthread_sigmask(signal.SIG_BLOCK, set(signal.Signals) - {signal.SIGKILL, signal.SIGSTOP})
 os.execv(sys.executable, [sys.executable, "-m", "talkcli", "serve", *sys.argv[1:]])
 """
 
 
-@pytest.mark.parametrize("term", ["SIG_DFL", "SIG_IGN"])
-def test_a_server_sets_the_signals_that_it_needs_whoever_starts_it(
-    make_talk: MakeTalk, tmp_path: Path, term: str
-) -> None:
-    program = tmp_path / "start.py"
-    program.write_text(STARTED_BADLY.format(term=term))
-    talk = make_talk("--player", "null", program=str(program))
+def test_a_server_sets_the_signals_that_it_needs_whoever_starts_it(make_talk: MakeTalk, tmp_path: Path) -> None:
+    talk = make_talk("--player", "null", program=str(write(tmp_path / "start.py", STARTED_BADLY)))
     goal = begin(talk, "a sentence that is long enough to be in the middle of it", number=1)
     os.kill(engine_process(talk), signal.SIGKILL)
     assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
@@ -144,26 +129,24 @@ def test_a_server_sets_the_signals_that_it_needs_whoever_starts_it(
 
 
 def test_too_little_memory_for_a_server_is_told_in_words_that_name_the_limit(home: str) -> None:
-    """For its imports there is enough; for the stack of a thread there isn't, or just not enough for what it needs."""
+    """It is enough for the imports, but not for the stack of a thread, or just not enough for the server."""
     kib = 22_000
     command = ["sh", "-c", f'ulimit -d {kib}; exec "$@"', "sh", *TALK, "serve", "--player", "null"]
-    env = environment(home, TALK_SOCKET=f"{home}/s")
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=20, check=False)
+    done = run(command, environment(home, TALK_SOCKET=f"{home}/s"))
     what = "(the engine's thread cannot be started|there is not enough memory for talk)"
     limit = re.escape(f"it is limited to {kib * 1024:,} bytes of memory (ulimit -d, LimitDATA=)")
-    assert (done.returncode, bool(re.fullmatch(f"talk: {what}: {limit}\n", done.stderr))) == (1, True), done.stderr
+    assert (done.code, bool(re.fullmatch(f"talk: {what}: {limit}\n", done.err))) == (1, True), done
 
 
 @contextlib.contextmanager
-def serving_with(
-    home: str, redirection: str, stderr: int | None = None
-) -> Iterator[tuple[Wire, subprocess.Popen[bytes]]]:
-    """Run a server whose log nobody reads, and assert that SIGTERM ends it well."""
+def serving_with(home: str, redirection: str, stderr: int | None = None) -> Iterator[Wire]:
+    """Run a server whose log is not read, and assert that SIGTERM ends it well."""
     path = f"{home}/s"
     command = dying_with_parent(["sh", "-c", f'exec "$@" {redirection}', "sh", *FAST])
     with subprocess.Popen(command, env=environment(home, TALK_SOCKET=path), stderr=stderr) as process:
         try:
-            yield _greeted(path, process), process
+            with _greeted(path, process) as wire:
+                yield wire
             process.send_signal(signal.SIGTERM)
             assert process.wait(5) == 0
             assert not os.path.exists(path)
@@ -181,7 +164,7 @@ def _greeted(path: str, process: subprocess.Popen[bytes]) -> Wire:
         time.sleep(0.01)  # a socket's appearance is no event
 
 
-def speaks(wire: Wire, texts: Sequence[str] = ("battery low",)) -> None:
+def speaks(wire: Wire, *texts: str) -> None:
     for text in texts:
         wire.request("say", text=text, wait=True)
         assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
@@ -189,51 +172,44 @@ def speaks(wire: Wire, texts: Sequence[str] = ("battery low",)) -> None:
 
 @pytest.mark.parametrize("redirection", ["2>&-", "<&- >&- 2>&-", "2>/dev/full"])
 def test_speech_goes_on_with_standard_error_closed(home: str, redirection: str) -> None:
-    with serving_with(home, redirection) as (wire, process), wire:
-        speaks(wire, ["one", "two"])
+    with serving_with(home, redirection) as wire:
+        speaks(wire, "one", "two")
         wire.request("cancel")
         wire.send_raw(b"nonsense\n")
-        assert process.poll() is None
 
 
-def test_speech_goes_on_while_nobody_reads_a_full_standard_error(home: str) -> None:
-    reading, writing = os.pipe()
-    try:
-        os.set_blocking(writing, False)
+def _drain(reading: int) -> None:
+    os.set_blocking(reading, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.read(reading, 65536)
+    os.set_blocking(reading, True)
+
+
+def _fill(writing: int) -> None:
+    os.set_blocking(writing, False)
+    for size in (4096, 1):
         with contextlib.suppress(BlockingIOError):
             while True:
-                os.write(writing, b"." * 4096)
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                os.write(writing, b".")
-        os.set_blocking(writing, True)
-        with serving_with(home, "", writing) as (wire, _), wire:
-            os.close(writing)
-            writing = -1
-            speaks(wire, ["one", "two", "three"])
-            os.set_blocking(reading, False)
-            with contextlib.suppress(BlockingIOError):
-                while True:
-                    os.read(reading, 65536)
-            os.set_blocking(reading, True)
-            speaks(wire, ["four"])
-            said = ""
-            while '"four"' not in said:
-                said += os.read(reading, 65536).decode()
-        # What was lost is told as soon as there is room.
-        assert "lines before this one could not be written)" in said.splitlines()[0]
-    finally:
-        os.close(reading)
-        if writing >= 0:
-            os.close(writing)
+                os.write(writing, b"." * size)
+    os.set_blocking(writing, True)
 
 
-def test_speech_goes_on_when_whoever_read_standard_error_is_gone(home: str) -> None:
+def test_speech_goes_on_while_nobody_reads_a_full_standard_error_and_when_its_reader_is_gone(home: str) -> None:
     reading, writing = os.pipe()
-    with serving_with(home, "", writing) as (wire, _), wire:
+    _fill(writing)
+    with serving_with(home, "", writing) as wire:
         os.close(writing)
+        speaks(wire, "one", "two", "three")
+        _drain(reading)
+        speaks(wire, "four")
+        said = ""
+        while '"four"' not in said:
+            said += os.read(reading, 65536).decode()
+        # The loss is told as soon as there is room.
+        assert "lines before this one could not be written)" in said.splitlines()[0]
         os.close(reading)
-        speaks(wire, ["one", "two"])
+        speaks(wire, "five", "six")
 
 
 def test_lines_of_the_log_are_whole_and_one_each(home: str) -> None:
@@ -247,11 +223,10 @@ def test_lines_of_the_log_are_whole_and_one_each(home: str) -> None:
 
 
 def test_sigint_that_a_shell_had_ignored_stays_so(home: str) -> None:
-    path = f"{home}/s"
-    command = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", *SCRIPTED]
-    with serving(environment(home, TALK_SOCKET=path), command=command) as server:
+    env = environment(home, TALK_SOCKET=f"{home}/s")
+    with serving(env, command=["sh", "-c", "trap '' INT; exec \"$@\"", "sh", *SCRIPTED]) as server:
         server.process.send_signal(signal.SIGINT)
-        assert run([*TALK, "say", "--wait", "length=0"], environment(home, TALK_SOCKET=path)).code == 0
+        assert run([*TALK, "say", "--wait", "length=0"], env).code == 0
         assert server.process.poll() is None
 
 
