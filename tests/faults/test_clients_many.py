@@ -1,4 +1,4 @@
-"""Clients by the hundred: turned away and taken later, frozen, killed; nobody else is harmed and nothing is left."""
+"""Clients by the hundred: turned away and taken later, frozen, killed. Others are not harmed, and nothing is left."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
-#: Seconds of `status` for somebody else, whatever these clients do.
+#: Seconds in which another client gets the `status`.
 STATUS = 0.1
-#: So many words, less a few, go to those who follow a goal: as many as the longest text has.
+#: As many words as the longest text has, less a few.
 WORDS = "a " * 4_990
-#: kB that a waiter which is frozen may cost: it gets what is never dropped, a goal's text three times, 30 kB, and
-#: buffers grow by eighths.
+#: kB that a frozen waiter may cost: a goal's text is never dropped and sent three times, 30 kB, and buffers grow by
+#: eighths.
 FROZEN = 8 * 1024 // 50
 
-#: A process with many connections, each of which sends a line, says when all have been answered, and sleeps.
+#: A process with many connections, each of which sends a line. It tells when all have been answered, and sleeps.
 _CROWD = """
 import socket, sys
 path, count, line = sys.argv[1], int(sys.argv[2]), sys.argv[3].encode()
@@ -49,8 +49,8 @@ print("ready", flush=True)
 sys.stdin.read()
 """
 
-#: A process that says when it is let in, asks for the status all the time, and says at last how long the longest took:
-#: in a process of its own, so that what the tests do meanwhile is not timed.
+#: A process that asks for the status all the time, and tells at last how long the longest answer took. It is a process
+#: of its own so that the tests themselves are not timed.
 _ASKER = """
 import select, socket, sys, time
 wire = socket.socket(socket.AF_UNIX)
@@ -71,7 +71,7 @@ print(longest)
 
 @contextlib.contextmanager
 def asking(talk: Talk) -> Iterator[list[float]]:
-    """Ask for the status all the time; gives at the end how many seconds the longest took."""
+    """Ask for the status all the time; gives the seconds of the longest answer at the end."""
     command = [sys.executable, "-S", "-c", _ASKER, talk.socket]
     longest: list[float] = []
     with subprocess.Popen(command, env=talk.env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
@@ -120,13 +120,13 @@ def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(
         lines = [each.receive_lines(1) for each in clients]
         greeted = [client for client, said in zip(clients, lines, strict=True) if "error" not in said[0]]
         busy = [said[0] for said in lines if "error" in said[0]]
-        # The watcher of this test is one of 256.
+        # The watcher of this test is one client of 256.
         assert (len(greeted), len(busy)) == (255, 45)
         assert all((each["talk"], each["error"]) == (1, "busy") for each in busy)
         assert all(each.receive_lines(2)[1] == {"seq": 1, "ok": True} for each in greeted)
         full = scripted.run("--json", "say", "--wait", *patience, "length=0")
         assert (full.code, json.loads(full.err)["error"]["code"]) == (5, "busy")
-        assert scripted.run("status").code == 0  # places are kept for those who want to know, and to silence it
+        assert scripted.run("status").code == 0  # places are kept for `status` and `cancel`
         late = scripted.start("say", "--wait", "length=0")
         greeted[0].socket.close()
         assert scripted.finish(late).code == 0  # it tries again
@@ -135,7 +135,7 @@ def test_300_clients_at_once_are_served_or_told_that_the_server_is_busy(
 
 @pytest.fixture
 def many_files() -> Iterator[None]:
-    """Let the tests open more files than a backlog has places: a user's limit is often as low as that."""
+    """Let the tests open more files than a backlog has places: a user's limit is often lower."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     yield
@@ -153,7 +153,7 @@ def many_files() -> Iterator[None]:
     ],
 )
 def test_500_say_processes_at_once(make_talk: MakeTalk, processes: int, max_queue: int) -> None:
-    """With room for all none is lost; without, those that were accepted are spoken, and the others know."""
+    """With room for all none is lost. Otherwise the accepted goals are spoken, and the other clients know."""
     talk = make_talk("--max-queue", str(max_queue), scripted=True)
     first = talk.run("say", "never-ends").id
     clients = [talk.start("say", "--", f"length=0 number {number}") for number in range(processes)]
@@ -186,8 +186,7 @@ def test_50_waiters_that_are_frozen_take_no_memory_while_10000_words_pass(
                 speak_words(talk, seconds)
                 before = census.settled(talk.pid, lambda now: now.descriptors <= idle.descriptors)
                 speak_words(talk, seconds)
-                # All words that clients are owed at most are there after the first 5,000. The next 5,000 are 840 kB
-                # for each.
+                # After 5,000 words the server owes clients as many as it ever does. The next 5,000 are 840 kB for each.
                 census.assert_as_before(talk.pid, before, memory=waiters * FROZEN)
             frozen.send_signal(signal.SIGCONT)
         assert_within(longest[0], STATUS, "status for another client")
@@ -206,22 +205,18 @@ def speak_words(talk: Talk, seconds: int) -> None:
     ids=["with a word now and then", "in silence"],
 )
 def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_talk: MakeTalk, text: str) -> None:
-    """That one is gone is known when it is told something: a word, or every 5 s that the server is alive."""
+    """The server notices at the next message: a word, or every 5 s the sign that it is alive."""
     talk = make_talk("--max-clients", "600", scripted=True)
     goal = talk.run("say", text).id
     talk.watcher.wait_for_word(goal)
     line = json.dumps({"seq": 1, "request": "wait", "ids": [goal], "feedback": True})
-
-    def killed() -> None:
+    before = census.count(talk.pid)
+    for _ in range(2):
         with contextlib.ExitStack() as stack:
             crowds = [stack.enter_context(crowd(talk, 50, line)) for _ in range(10)]
             assert census.count(talk.pid).descriptors >= 500
             for each in crowds:
                 os.kill(each.pid, signal.SIGKILL)
-
-    before = census.count(talk.pid)
-    for _ in range(3):
-        killed()
         census.assert_as_before(talk.pid, before, memory=8 * 1024)
     assert talk.goal(goal)["state"] == "ACTIVE"
     began = time.monotonic()
@@ -240,7 +235,7 @@ def test_500_waiters_that_are_killed_leave_nothing_and_their_goal_goes_on(make_t
     ids=["its own patience", "the usual 5 s"],
 )
 def test_server_that_takes_no_connection_at_all_holds_no_client(scripted: Talk, commands: list[list[str]]) -> None:
-    """Frozen, with its backlog full: nobody accepts, and `connect` itself would wait."""
+    """Frozen, with its backlog full, so that `connect` itself would wait."""
     scripted.freeze()
     try:
         with contextlib.ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""File descriptors used up: by clients, who can't have the engine's, and by whatever else there may be."""
+"""File descriptors used up: by clients, which can't take the engine's, and by anything else."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support import processes
 from tests.support.connection import Wire
 from tests.support.processes import children
-from tests.support.surroundings import short_directory
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
@@ -29,14 +28,6 @@ CLIENTS = 60
 SOON = 5.0
 
 
-@pytest.fixture
-def home() -> Iterator[str]:
-    if not os.path.isdir("/proc/self/fd"):
-        pytest.skip("no /proc")
-    with short_directory() as path:
-        yield path
-
-
 def limited(files: int, command: list[str]) -> list[str]:
     return ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command]
 
@@ -45,25 +36,16 @@ def descriptors(pid: int) -> int:
     return len(os.listdir(f"/proc/{pid}/fd"))
 
 
-def engine_of(pid: int) -> int | None:
-    """Return the process id of a server's engine, if it has one now."""
-    return next(iter(children(pid)), None)
-
-
-def kill_engine(pid: int) -> None:
-    """Kill a server's engine, and wait until it has another one."""
-    engine = engine_of(pid)
-    assert engine
+def kill_engine(pid: int) -> int:
+    """Kill a server's engine, and return its former process id."""
+    (engine,) = children(pid)
     os.kill(engine, signal.SIGKILL)
-    end = time.monotonic() + SOON
-    while engine_of(pid) in {engine, None}:
-        assert time.monotonic() < end, "there is no new engine"
-        time.sleep(0.01)
+    return engine
 
 
 @contextlib.contextmanager
 def crowd(path: str) -> Iterator[list[socket.socket]]:
-    """Connect 60 clients at once, each of which says hello and keeps its connection."""
+    """Connect 60 clients at once."""
     with contextlib.ExitStack() as stack:
         clients = [stack.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(CLIENTS)]
         for each in clients:
@@ -73,7 +55,7 @@ def crowd(path: str) -> Iterator[list[socket.socket]]:
 
 
 def receive(client: socket.socket) -> dict[str, Any]:
-    """Return the next line's object, and take no more than that."""
+    """Return the object of the next line, without reading further."""
     data = bytearray()
     while not data.endswith(b"\n"):
         byte = client.recv(1)
@@ -84,7 +66,7 @@ def receive(client: socket.socket) -> dict[str, Any]:
 
 
 def greeted(clients: list[socket.socket]) -> list[socket.socket]:
-    """Return the clients that were let in; assert that the others were told that descriptors are missing."""
+    """Return the clients that were let in; the others must have been told that descriptors are missing."""
     inside = []
     for each in clients:
         greeting = receive(each)
@@ -97,13 +79,14 @@ def greeted(clients: list[socket.socket]) -> list[socket.socket]:
     return inside
 
 
-def status_over(client: socket.socket) -> float:
-    """Return the seconds in which a client that is in gets the status."""
-    began = time.monotonic()
-    client.sendall(b'{"seq": 7, "request": "status"}\n')
-    while receive(client).get("seq") != 7:
-        pass
-    return time.monotonic() - began
+def assert_status(client: socket.socket) -> None:
+    """Assert that a client that was let in gets the status in time."""
+    with limits():
+        began = time.monotonic()
+        client.sendall(b'{"seq": 7, "request": "status"}\n')
+        while receive(client).get("seq") != 7:
+            pass
+        assert_within(time.monotonic() - began, 0.1, "status without descriptors")
 
 
 def wait_for_descriptors(pid: int, count: int) -> None:
@@ -124,9 +107,8 @@ def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) ->
         with crowd(path) as clients:
             inside = greeted(clients)
             assert 5 <= len(inside) < CLIENTS
-            with limits():
-                assert_within(status_over(inside[0]), 0.1, "status while it is full")
-            # One that comes now tries again, as long as a client does, and gets in when others leave.
+            assert_status(inside[0])
+            # A client that comes now tries again, and gets in when others leave.
             with processes.start_talk(["say", "--wait", "late"], env) as late:
                 time.sleep(0.5)
                 assert late.poll() is None
@@ -136,7 +118,11 @@ def test_limit_of_40_and_60_clients_leave_the_engine_what_it_needs(home: str) ->
         wait_for_descriptors(pid, before)
         with crowd(path) as clients:
             inside = greeted(clients)
-            kill_engine(pid)  # so that a new one must find descriptors
+            engine = kill_engine(pid)  # so that a new one must find descriptors
+            end = time.monotonic() + SOON
+            while children(pid) in ([], [engine]):
+                assert time.monotonic() < end, "there is no new engine"
+                time.sleep(0.01)
             inside[0].sendall(b'{"seq": 8, "request": "say", "text": "again", "wait": true}\n')
             while (line := receive(inside[0])).get("event") != "result":
                 pass
@@ -158,19 +144,19 @@ def test_descriptors_that_something_else_has_used_up(home: str) -> None:
         assert run([*TALK, "say", "--wait", "length=0"], env).code == 0
         before = descriptors(pid)
         most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-        resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, most))  # it has more: there is no new one to be had
-        began = server.log.count("\n")
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, most))  # it has more, and gets no new one
+        lines = server.log.count("\n")
         with crowd(path) as clients:
-            engine = engine_of(pid)
-            assert engine
-            os.kill(engine, signal.SIGKILL)
+            kill_engine(pid)
             time.sleep(2)  # twice as long as it waits to look again; and four starts of the engine
             with limits():
-                assert_within(_status(wire), 0.1, "status without descriptors")
+                began = time.monotonic()
+                assert wire.request("status")["ok"]
+                assert_within(time.monotonic() - began, 0.1, "status without descriptors")
             goal = wire.request("say", text="length=0", wait=True)["goal"]
             assert goal["state"] == "PENDING"
             assert "cannot be started" in wire.request("status")["server"]["engine"]
-            assert server.log.count("\n") - began < 8, server.log
+            assert server.log.count("\n") - lines < 8, server.log
             resource.prlimit(pid, resource.RLIMIT_NOFILE, (most, most))
             assert len(greeted(clients)) == CLIENTS  # those that waited are let in, all of them
             ended = wire.receive_event("result", timeout=15)["goal"]  # the longest pause before a start is 10 s
@@ -178,12 +164,6 @@ def test_descriptors_that_something_else_has_used_up(home: str) -> None:
         wait_for_descriptors(pid, before)
         assert "Traceback" not in server.log
         assert "bug" not in server.log
-
-
-def _status(wire: Wire) -> float:
-    began = time.monotonic()
-    assert wire.request("status")["ok"]
-    return time.monotonic() - began
 
 
 def test_more_clients_than_a_process_usually_has_descriptors(home: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import os
 import shutil
 import signal
@@ -16,12 +18,13 @@ import pytest
 
 from talkcli.server.run import LOOK_EVERY
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
-from tests.support import processes
+from tests.support import census, processes
 from tests.support.connection import Wire
-from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
+
+    from tests.support.processes import Process
 
 HASTY = [sys.executable, os.path.join(os.path.dirname(os.path.abspath(__file__)), "hasty_serve.py")]
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
@@ -39,27 +42,24 @@ time.sleep(60)
 """
 
 
-@pytest.fixture
-def home() -> Iterator[str]:
-    with short_directory() as path:
-        yield path
+def await_true(condition: Callable[[], object]) -> None:
+    """Wait for something in the file system or in /proc, which sends no event."""
+    end = time.monotonic() + SOON
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 def found_again(path: str, pid: int) -> None:
     """Wait until clients reach the server of this process."""
-    end = time.monotonic() + SOON
-    while True:
-        try:
-            with Wire(path) as wire:
-                assert wire.greeting["pid"] == pid
-                return
-        except OSError:
-            assert time.monotonic() < end, f"nobody answers at {path}"
-            time.sleep(0.01)  # a socket's appearance is no event
 
+    def greeted() -> bool:
+        with contextlib.suppress(OSError), Wire(path) as wire:
+            assert wire.greeting["pid"] == pid
+            return True
+        return False
 
-def unlink(path: str) -> None:
-    os.unlink(path)
+    await_true(greeted)
 
 
 def unlink_both(path: str) -> None:
@@ -87,9 +87,7 @@ def test_it_is_looked_at_well_within_the_30_seconds_that_are_promised() -> None:
 
 
 @pytest.mark.parametrize(
-    "fault",
-    [unlink, unlink_both, remove_directory, replace_by_stale_socket, move_directory],
-    ids=lambda each: each.__name__,
+    "fault", [unlink_both, remove_directory, replace_by_stale_socket, move_directory], ids=lambda each: each.__name__
 )
 def test_socket_that_was_removed_or_replaced_is_bound_again(home: str, fault: Callable[[str], None]) -> None:
     path = f"{home}/talk/s"
@@ -101,11 +99,11 @@ def test_socket_that_was_removed_or_replaced_is_bound_again(home: str, fault: Ca
         found_again(path, server.process.pid)
         assert stat.S_IMODE(os.stat(path).st_mode) == 0o660
         assert stat.S_IMODE(os.stat(os.path.dirname(path)).st_mode) == 0o700
-        # What was there lives on, and what comes finds it.
+        # Its connections live on, and new clients find it.
         assert run([*TALK, "cancel"], env).out.split() == [goal["id"]]
         assert old.receive_event("result")["goal"]["state"] == "PREEMPTED"
         assert old.request("status")["server"]["socket"] == path
-        # Still one server, whose lock is the one by this name.
+        # There is still one server, which holds the lock of this name.
         second = run([*SCRIPTED], env)
         assert second.code == 11, second
         assert f"pid {server.process.pid}" in second.err
@@ -119,7 +117,7 @@ def test_socket_that_was_removed_or_replaced_is_bound_again(home: str, fault: Ca
 
 
 def test_socket_named_from_the_working_directory_is_bound_again_where_that_was(home: str) -> None:
-    """The directory is gone when it is, and with it the place from which its name was to be read."""
+    """The directory from which its name was to be read is gone."""
     path = f"{home}/here/s"
     os.mkdir(f"{home}/here", 0o700)
     command = ["sh", "-c", 'cd "$0" && exec "$@"', f"{home}/here", *HASTY]
@@ -131,33 +129,20 @@ def test_socket_named_from_the_working_directory_is_bound_again_where_that_was(h
     assert "a bug" not in server.log
 
 
-def test_lock_alone_that_was_removed_is_made_again(home: str) -> None:
+def test_lock_alone_that_was_removed_is_made_again_and_no_descriptor_is_left_open(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
+        found_again(path, server.process.pid)
+        before = len(census.descriptors(server.process.pid))
         socket_file = os.stat(path).st_ino
         os.unlink(f"{path}.lock")
-        end = time.monotonic() + SOON
-        while not os.path.exists(f"{path}.lock"):
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        await_true(lambda: os.path.exists(f"{path}.lock"))
         found_again(path, server.process.pid)
         assert os.stat(path).st_ino == socket_file
-
-
-def test_descriptors_are_the_same_after_many_times(home: str) -> None:
-    path = f"{home}/s"
-    if not os.path.isdir("/proc/self/fd"):
-        pytest.skip("no /proc")
-    with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
-        found_again(path, server.process.pid)
-        before = len(os.listdir(f"/proc/{server.process.pid}/fd"))
         for _ in range(5):
             unlink_both(path)
             found_again(path, server.process.pid)
-        end = time.monotonic() + SOON
-        while len(os.listdir(f"/proc/{server.process.pid}/fd")) > before:  # the last client may not be gone yet
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        await_true(lambda: len(census.descriptors(server.process.pid)) <= before)  # the last client takes its time
 
 
 def ends_with_11(server: BareServe, words: str) -> None:
@@ -184,23 +169,24 @@ def test_server_whose_place_another_one_took_ends_for_its_supervisor(home: str) 
             found_again(path, second.process.pid)  # which lost nothing
 
 
+def any_ended(*each: Process) -> bool:
+    return any(process.poll() is not None for process in each)
+
+
 def test_two_servers_whose_files_were_removed_together_are_one_in_the_end(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
-    for _ in range(3):
+    for _ in range(2):
         with serving(env, command=HASTY) as first:
             os.kill(first.process.pid, signal.SIGSTOP)
             unlink_both(path)
             with serving(env, command=HASTY) as second:
                 unlink_both(path)
                 os.kill(first.process.pid, signal.SIGCONT)
-                end = time.monotonic() + SOON
-                while None not in (codes := [first.process.poll(), second.process.poll()]) or codes == [None, None]:
-                    assert time.monotonic() < end, codes
-                    time.sleep(0.01)
-                assert sorted(codes, key=str) == [11, None]
-                winner = first if codes[0] is None else second
-                found_again(path, winner.process.pid)
+                both = (first.process, second.process)
+                await_true(functools.partial(any_ended, *both))
+                assert sorted([each.poll() for each in both], key=str) == [11, None]
+                found_again(path, next(each.pid for each in both if each.poll() is None))
 
 
 def test_program_that_listens_in_its_place_keeps_its_socket(home: str) -> None:
@@ -251,10 +237,7 @@ def test_file_of_a_passed_socket_is_missed_but_not_made(home: str) -> None:
         with serving(environment(home, LISTEN_FDS="1"), command=command, pass_fds=[listening.fileno()]) as server:
             with Wire(path) as wire:
                 os.unlink(path)
-                end = time.monotonic() + SOON
-                while "systemctl restart talk.socket" not in server.log:
-                    assert time.monotonic() < end, server.log
-                    time.sleep(0.01)
+                await_true(lambda: "systemctl restart talk.socket" in server.log)
                 time.sleep(0.2)
                 assert wire.request("status")["ok"]
             assert not os.path.exists(path)

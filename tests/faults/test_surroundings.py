@@ -1,4 +1,4 @@
-"""A machine that lacks what is taken for granted: room in TMPDIR, a home, a path, a language, a runtime directory."""
+"""A machine without room in TMPDIR, a home, a path, a language or a runtime directory."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
+from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
+from tests.faults.broken import write
 from tests.support.processes import children
-from tests.support.surroundings import needs, short_directory
+from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -22,16 +24,10 @@ if TYPE_CHECKING:
 
     from tests.support.sink import Sink
 
-#: At the fastest rate there is: what is said is not the subject.
+#: Servers at the fastest rate there is.
 AUDIBLE = [*TALK, "serve", "--rate", "450"]
 QUIET = [*SERVE, "--rate", "450"]
 VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR")
-
-
-@pytest.fixture
-def home() -> Iterator[str]:
-    with short_directory() as path:
-        yield path
 
 
 @contextlib.contextmanager
@@ -65,10 +61,8 @@ def full(directory: str) -> Iterator[None]:
         yield
 
 
-@contextlib.contextmanager
-def read_only(directory: str) -> Iterator[None]:
-    with mounted(directory, "size=64k,ro"):
-        yield
+def read_only(directory: str) -> AbstractContextManager[None]:
+    return mounted(directory, "size=64k,ro")
 
 
 def speaks(env: dict[str, str]) -> None:
@@ -84,7 +78,7 @@ def test_speech_goes_on_with_a_temporary_directory_that_takes_nothing(
         env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s", "TMPDIR": f"{home}/tmp"})
         with serving(env, command=AUDIBLE) as server:
             speaks(env)
-            os.kill(_engine(server), signal.SIGKILL)  # the next one, too, finds what it needs
+            os.kill(children(server.process.pid)[0], signal.SIGKILL)  # the next engine, too, needs no room
             speaks(env)
 
 
@@ -100,45 +94,38 @@ def test_socket_in_a_full_directory_is_served_and_its_lock_holds(home: str) -> N
             speaks(env)
 
 
-def test_socket_in_a_directory_that_is_read_only_is_a_clear_error(home: str) -> None:
+def test_no_directory_or_a_read_only_one_for_the_socket_is_a_clear_error(home: str) -> None:
     with read_only(f"{home}/tmp"):
         done = run(SERVE, environment(home, TALK_SOCKET=f"{home}/tmp/s"))
         assert done.code == 11
         assert done.err == f"talk: the lock {home}/tmp/s.lock can't be opened: Read-only file system\n"
-
-
-def test_no_directory_at_all_for_the_socket_is_a_clear_error(home: str) -> None:
     os.mkdir(f"{home}/file", 0o700)
-    with open(f"{home}/file/talk", "w", encoding="utf-8"):
-        pass
+    write(Path(home, "file", "talk"), "")
     done = run(SERVE, environment(home, XDG_RUNTIME_DIR=f"{home}/file"))
-    assert done.code == 11, done
-    assert f"{home}/file/talk" in done.err
-    assert "Traceback" not in done.err
+    assert (done.code, f"{home}/file/talk" in done.err, "Traceback" in done.err) == (11, True, False), done
 
 
 @pytest.mark.parametrize(
     "missing",
-    [("HOME",), *(pytest.param((each,), marks=pytest.mark.slow) for each in VARIABLES if each != "HOME"), VARIABLES],
+    [VARIABLES, *(pytest.param((each,), marks=pytest.mark.slow) for each in VARIABLES if each != "HOME")],
     ids="-".join,
 )
 def test_speech_goes_on_without_a_variable(home: str, sink: Sink, missing: tuple[str, ...]) -> None:
     env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s"})
-    assert "XDG_RUNTIME_DIR" not in env  # what it means that this one is missing: `test_servers_places`
+    assert "XDG_RUNTIME_DIR" not in env  # `test_servers_places` tests that it is missing
     for name in missing:
         env.pop(name, None)
     if "PATH" in missing and not any(os.access(f"/{place}/pacat", os.X_OK) for place in ("bin", "usr/bin")):
-        pytest.skip("the player is not where programs are looked for without PATH")
-    # Where there is no home, aplay's settings for this sink aren't found either.
+        pytest.skip("the player is in no directory that is searched without PATH")
+    # Without a home, aplay's settings for this sink aren't found either.
     with serving(env, *(["--player", "pacat"] if "HOME" in missing else []), command=AUDIBLE) as server:
         speaks(env)
         assert run([*TALK, "say", "--wait", "--", "größer 二"], env).code == 0
         assert "engine ready" in server.log
 
 
-@pytest.mark.parametrize("path", ["", "/nowhere"])
-def test_path_without_players_is_a_clear_error_and_no_silence(home: str, path: str) -> None:
-    env = environment(home, TALK_SOCKET=f"{home}/s", PATH=path)
+def test_path_without_players_is_a_clear_error_and_no_silence(home: str) -> None:
+    env = environment(home, TALK_SOCKET=f"{home}/s", PATH="")
     with serving(env, command=AUDIBLE):
         began = time.monotonic()
         done = run([*TALK, "say", "--wait", "--", "battery low"], env)
@@ -148,7 +135,7 @@ def test_path_without_players_is_a_clear_error_and_no_silence(home: str, path: s
         assert run([*TALK, "status"], env).code == 0
 
 
-@pytest.mark.parametrize("place", ["/nonexistent", "/proc", ""])
+@pytest.mark.parametrize("place", ["/proc", ""])
 def test_speech_goes_on_with_a_home_that_is_not_there(home: str, sink: Sink, place: str) -> None:
     env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s", "HOME": place})
     with serving(env, "--player", "pacat", command=AUDIBLE):
@@ -162,10 +149,6 @@ def test_clients_in_an_empty_environment_reach_the_server(home: str) -> None:
             kept = {name: env[name] for name in ("PYTHONPATH",) if name in env}
             done = run([*TALK, "--socket", f"{home}/s", *words], kept)
             assert (done.code, done.err) == (0, ""), done
-
-
-def _engine(server: BareServe) -> int:
-    return children(server.process.pid)[0]
 
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mounts and /proc as Linux has them")

@@ -1,4 +1,4 @@
-"""Several users of one machine: who gets in, what each of them may do, and what none of them can do to another."""
+"""Several users of one machine: which of them get in, and what they can do to each other."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ import talkcli
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support import processes
 from tests.support.connection import Wire
-from tests.support.surroundings import needs, short_directory
+from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
 NOBODY = 65534
-#: A group that the server gets, and some of the strangers.
+#: The group of the server, and of some of the strangers.
 GROUP = 4242
 HOSTILE = "\x1b]0;owned\x07\x1b[2Jred\u202egnp.exe\r\ntalk: forged"
-#: A client for users who may be able to read neither this checkout nor its interpreter. It sends lines, prints all
-#: that comes back, and calls itself something that would do harm on a terminal.
+#: A client for users that may be able to read neither this checkout nor its interpreter. It sends lines and prints the
+#: answers. Its name would do harm on a terminal.
 STRANGER = r"""
 import socket, sys
 open("/proc/self/comm", "w").write("\x1b[31m\n\x07evil")
@@ -46,7 +46,7 @@ try:
         s.sendall(line.encode() + b"\n")
     s.shutdown(socket.SHUT_WR)
 except OSError:
-    pass  # it was closed before that; why, it has said
+    pass  # closed before that, with the reason
 try:
     while data := s.recv(65536):
         sys.stdout.buffer.write(data)
@@ -58,7 +58,7 @@ PARENT = r"""
 import subprocess, sys
 sys.exit(subprocess.call([sys.executable, *sys.argv[2:]]))
 """
-#: A server of another user's, who says what ours would.
+#: A server of another user's, with the greeting of ours.
 IMPOSTOR = r"""
 import os, socket, sys
 s = socket.socket(socket.AF_UNIX)
@@ -85,11 +85,9 @@ pytestmark = [
 ]
 
 
-@pytest.fixture
-def home() -> Iterator[str]:
-    with short_directory() as path:
-        os.chmod(path, 0o755)  # others can get at what is inside, as far as that lets them
-        yield path
+@pytest.fixture(autouse=True)
+def _readable(home: str) -> None:
+    os.chmod(home, 0o755)
 
 
 def as_user(uid: int, *groups: int) -> list[str]:
@@ -105,7 +103,7 @@ def stranger(path: str, *requests: dict[str, object], groups: Sequence[int] = ()
 
 @contextlib.contextmanager
 def impostor(path: str) -> Iterator[Callable[[], bytes]]:
-    """Run another user's server there; gives what waits for a client and returns what it said, as Python shows it."""
+    """Run another user's server there; gives a function that waits for a client and returns its first bytes."""
     command = [*as_user(NOBODY), PYTHON, "-u", "-c", IMPOSTOR, path]
     with subprocess.Popen(command, cwd="/", stdout=subprocess.PIPE) as theirs:
         try:
@@ -126,8 +124,9 @@ def group_server() -> list[str]:
 
 
 def test_members_of_the_group_are_let_in_by_the_socket_s_mode_and_others_are_not(home: str) -> None:
+    """A member may silence everybody, and the log tells the user."""
     path = f"{home}/s"
-    with serving(environment(home, TALK_SOCKET=path), command=group_server()):
+    with serving(environment(home, TALK_SOCKET=path), command=group_server()) as server, Wire(path) as wire:
         status = os.stat(path)
         assert (status.st_uid, status.st_gid, stat.S_IMODE(status.st_mode)) == (0, GROUP, 0o660)
         assert stranger(path).stderr.strip() == "PermissionError"
@@ -135,11 +134,6 @@ def test_members_of_the_group_are_let_in_by_the_socket_s_mode_and_others_are_not
         told = replies(stranger(path, {"seq": 1, "request": "say", "text": "length=0", "wait": True}, groups=[GROUP]))
         assert told[-1]["goal"]["state"] == "SUCCEEDED"
         assert told[-1]["goal"]["client"]["uid"] == NOBODY
-
-
-def test_whoever_may_connect_may_silence_everybody_and_the_log_says_who(home: str) -> None:
-    path = f"{home}/s"
-    with serving(environment(home, TALK_SOCKET=path), command=group_server()) as server, Wire(path) as wire:
         goal = wire.request("say", text="never-ends", wait=True)["goal"]
         wire.receive_event("state", state="ACTIVE")
         pending = wire.request("say", text="waits")["goal"]
@@ -147,8 +141,9 @@ def test_whoever_may_connect_may_silence_everybody_and_the_log_says_who(home: st
         assert {each["canceled"]["id"] for each in told if "canceled" in each} == {goal["id"], pending["id"]}
         ended = wire.receive_event("result")["goal"]
         assert (ended["state"], ended["by"]["client"]["uid"]) == ("PREEMPTED", NOBODY)
-        for request in ({"request": "pause"}, {"request": "resume"}, {"request": "set", "rate": 150}):
-            assert replies(stranger(path, {"seq": 1, **request}, groups=[GROUP]))[-1]["ok"]
+        others: list[dict[str, object]] = [{"request": "pause"}, {"request": "resume"}, {"request": "set", "rate": 150}]
+        told = replies(stranger(path, *({"seq": 1, **each} for each in others), groups=[GROUP]))
+        assert [each["ok"] for each in told if "ok" in each] == [True] * 3
         assert server.end(signal.SIGTERM) == 0
     line = next(each for each in server.log.splitlines() if f"{goal['id']} PREEMPTED" in each)
     assert f"(canceled by uid {NOBODY}, pid " in line
@@ -169,7 +164,6 @@ def test_nothing_that_another_user_sends_reaches_a_terminal_raw(home: str) -> No
         assert "\x1b]0;owned" in goal["client"]["parent"]  # a program gets it as it is
         bad = replies(stranger(path, {"request": "say", "text": "x", "id": HOSTILE}, groups=[GROUP]))[-1]
         assert not bad.get("ok") or bad["goal"]["state"] == "REJECTED"
-        # One that is being spoken, and one that waits.
         wire.request("say", text=f"never-ends {HOSTILE}", key=HOSTILE)
         wire.request("say", text=f"waits {HOSTILE}")
         shown = [run([*TALK, *words], env).out for words in (["status"], ["status", goal["id"]], ["log"], ["set"])]
@@ -186,7 +180,7 @@ def test_nothing_that_another_user_sends_reaches_a_terminal_raw(home: str) -> No
 def test_another_user_is_refused_before_a_request_is_read_whatever_the_file_says(home: str) -> None:
     path = f"{home}/s"
     with serving(environment(home, TALK_SOCKET=path), command=SCRIPTED) as server, Wire(path) as wire:
-        os.chmod(path, 0o666)  # somebody else's doing: the server was not told to let others in
+        os.chmod(path, 0o666)  # the server was not told to let others in
         (told,) = replies(stranger(path, {"request": "say", "text": "somebody else"}))
         assert told["error"] == "permission_denied"
         assert "--socket-mode" in told["message"]
@@ -205,14 +199,14 @@ def test_client_tells_nothing_to_a_server_of_another_user_except_where_it_was_na
         done = run([*TALK, "say", "a secret"], env)
         assert done.code == 10, done
         assert f"belongs to uid {NOBODY}" in done.err
-        assert heard() == b"b''\n"  # it hung up without a word
+        assert heard() == b"b''\n"  # it closed the connection without a word
         run([*TALK, "--socket", path, "status"], env)
-        assert b'"hello"' in heard()  # it is named: that is the user's own trust
+        assert b'"hello"' in heard()  # the user named it, and trusts it
 
 
 @pytest.mark.usefixtures("nobody_serves")
 def test_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
-    """As the system's service: its user is neither root nor the client's."""
+    """The user of the system's service is neither root nor the client's."""
     script = f"""
         set -e
         mount -t tmpfs tmpfs /run
@@ -235,7 +229,7 @@ def test_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
 
 
 def test_user_s_server_lets_root_in_and_no_third_user(home: str) -> None:
-    needs("/usr/bin/python3")  # theirs: they may be able to read neither this checkout nor its interpreter
+    needs("/usr/bin/python3")  # they may be able to read neither this checkout nor its interpreter
     for package in (talkcli, click):
         folder = os.path.dirname(str(package.__file__))
         shutil.copytree(folder, f"{home}/lib/{package.__name__}", ignore=shutil.ignore_patterns("__pycache__"))
