@@ -1,9 +1,10 @@
-"""Sentences that are spoken: the sound is that of libespeak-ng, in the order in which the goals were sent."""
+"""Sentences that are spoken, with the sound of libespeak-ng; and goals without a player or a device (row 41)."""
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import wave
 from typing import TYPE_CHECKING
 
@@ -11,17 +12,30 @@ import numpy as np
 import pytest
 
 from talkcli.engine.players.choice import MOST
-from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_same, heard, quick_talk, render_quick, send
+from tests.conformance import stopped
+from tests.conformance.hearing import (
+    HELP,
+    HOME,
+    LONG,
+    LOW,
+    assert_aborted,
+    assert_same,
+    heard,
+    quick_talk,
+    render_quick,
+    send,
+)
 from tests.conformance.voices import Joe, with_both
 from tests.support.compare import assert_heard, assert_silent, extent
 from tests.support.reference import RATE, played, render
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     import pathlib
 
     from tests.conformance.voices import Voice
     from tests.conftest import MakeTalk
-    from tests.support.processes import Talk
+    from tests.support.processes import Finished, Talk
     from tests.support.sink import Sink
 
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
@@ -146,3 +160,61 @@ def test_a_file_gets_every_sample_and_nothing_is_heard(make_talk: MakeTalk, sink
         written = np.frombuffer(file.readframes(file.getnframes()), "<i2")
     assert np.array_equal(written, np.concatenate(render_quick([LONG, LOW])))
     assert_silent(heard(talk))
+
+
+#: Settings of ALSA for a card that there is not.
+NO_CARD = "pcm.!default { type hw card 31 }\nctl.!default { type hw card 31 }\n"
+
+
+def test_row_41_without_a_player_a_goal_is_aborted_until_one_is_installed(
+    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, voice: Voice
+) -> None:
+    env = {"PATH": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"}  # aplay does not use it here
+    talk = voice.serve(make_talk, sink, env=env)
+    _assert_aborted(talk, "no_player", "no player found: install alsa-utils (aplay)", "pulseaudio-utils (pacat)")
+    aplay = shutil.which("aplay")
+    assert aplay
+    (tmp_path / "aplay").symlink_to(aplay)
+    assert talk.run("say", "--wait", "--", HOME).code == 0
+    stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False, voice=voice)
+
+
+def test_row_41_without_a_device_the_players_line_is_told_within_a_second(
+    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, voice: Voice
+) -> None:
+    configuration = tmp_path / ".asoundrc"
+
+    with limits():
+        configuration.write_text(NO_CARD)
+        env = {"HOME": str(tmp_path), "PULSE_SERVER": f"unix:{tmp_path}/none"}
+        talk = voice.serve(make_talk, sink, env=env)
+        done = _assert_aborted(talk, "audio_device", "aplay: audio open error: No such file or directory")
+        shutil.copy(os.path.join(sink.directory, ".asoundrc"), configuration)
+        assert talk.run("say", "--wait", "--", HOME).code == 0
+        stopped.assert_heard_after_stop(heard(talk), LOW, [HOME], begun=False, voice=voice)
+        assert_within(done.seconds, 1, "`say --wait` without a device")
+
+
+@pytest.mark.parametrize(
+    ("player", "line"),
+    [
+        ("aplay", "aplay: audio open error: No such file or directory"),
+        ("pacat", "No such entity"),
+        ("pulse", 'the sound server has no sink "nonesuch": see pactl list short sinks'),
+    ],
+)
+def test_row_41_a_device_of_another_name_is_told(make_talk: MakeTalk, sink: Sink, player: str, line: str) -> None:
+    talk = make_talk("--player", player, "--device", "nonesuch", sink=sink)
+    _assert_aborted(talk, "audio_device", line)
+    assert_silent(heard(talk))
+
+
+def _assert_aborted(talk: Talk, reason: str, *words: str) -> Finished:
+    """Assert that a goal is ABORTED before anything is heard, and that its client says so."""
+    done = talk.run("say", "--wait", "--", LOW)
+    goal = talk.goal(done.id)
+    assert (done.code, talk.watcher.states(done.id)) == (4, ["PENDING", "ACTIVE", "ABORTED"]), done
+    assert goal["message"] in done.err, done
+    assert_aborted(goal, reason, *words)
+    assert goal["spoken"] == ""
+    return done

@@ -1,12 +1,15 @@
-"""The engine cannot start, as pyttsx3 or libespeak-ng is missing: goals end at once, until it is installed.
+"""The engine cannot start: goals end at once if it stays so, and wait if it may pass.
 
 A module or a library in the environment of a real server shadows the installed one.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
+import resource
+import signal
 import time
 from typing import TYPE_CHECKING
 
@@ -14,14 +17,19 @@ import espeakng_loader
 import pytest
 
 from talkcli.engine.supervisor import BACK_OFF
-from tests.conformance.hearing import LOW, assert_aborted, send
+from tests.conformance.bareserve import SERVE, environment, run
+from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
 from tests.faults.broken import assert_answers, heard_again, python_path, told, write
+from tests.support import census
+from tests.support.connection import PATIENCE
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from tests.conftest import MakeTalk
+    from tests.support.connection import Wire
     from tests.support.processes import Talk
     from tests.support.sink import Sink
 
@@ -133,3 +141,170 @@ def _await_ready(talk: Talk) -> None:
     while talk.request("status")["server"]["engine"] != "ready":
         assert time.monotonic() < end, talk.log
         time.sleep(0.05)  # it publishes nothing when it is ready
+
+
+#: Goals that wait behind the one that loses its engine.
+WAITING = 20
+#: Too few descriptors for a server to start an engine.
+TOO_FEW = 12
+#: Shortens the waits of a server whose engine can't start: no second, but tenths.
+HASTY = """
+from talkcli.engine import supervisor
+supervisor.BACK_OFF, supervisor.PATIENCE = (0.0, 0.05, 0.1), {patience}
+"""
+
+
+@contextlib.contextmanager
+def too_few_descriptors(talk: Talk) -> Iterator[None]:
+    allowed = resource.prlimit(talk.pid, resource.RLIMIT_NOFILE)
+    resource.prlimit(talk.pid, resource.RLIMIT_NOFILE, (TOO_FEW, allowed[1]))
+    yield
+    resource.prlimit(talk.pid, resource.RLIMIT_NOFILE, allowed)
+
+
+def _scripted_engine(talk: Talk) -> int:
+    (engine,) = census.descendants(talk.pid)
+    return engine
+
+
+def _replaced(talk: Talk, engine: int) -> int:
+    """Kill the engine process, and return the next one, once it is there."""
+    os.kill(engine, signal.SIGKILL)
+    end = time.monotonic() + PATIENCE
+    while not (found := set(census.descendants(talk.pid)) - {engine}):
+        assert time.monotonic() < end, talk.log
+        time.sleep(0.002)  # the start of a process sends no event
+    (next_one,) = found
+    return next_one
+
+
+def _ends(talk: Talk, goals: list[str]) -> list[tuple[str, str | None]]:
+    for each in goals:
+        talk.watcher.wait_for_terminal(each)
+    return [(goal["state"], goal["reason"]) for goal in map(talk.goal, goals)]
+
+
+def _await_engine(wire: Wire, words: str) -> None:
+    end = time.monotonic() + 10
+    while (told := wire.request("status")["server"]["engine"]) != words:
+        assert time.monotonic() < end, told
+        time.sleep(0.005)  # how the engine is, is published to nobody
+
+
+def test_a_moment_without_descriptors_costs_the_goal_whose_engine_was_killed_and_no_other(make_talk: MakeTalk) -> None:
+    talk = make_talk("--player", "null")
+    assert talk.run("voices").code == 0
+    first = begin(talk, LONG, number=1)
+    goals = [send(talk, "yes", rate=450, volume=0) for _ in range(3)]
+    brief = send(talk, "too late", ttl=0.3)
+    with talk.connect() as wire:  # connected before: a new client would need a descriptor
+        with too_few_descriptors(talk):
+            os.kill(engine_process(talk), signal.SIGKILL)
+            assert talk.watcher.wait_for_terminal(first) == "ABORTED"
+            _await_engine(wire, "the engine process cannot be started: Too many open files")
+            assert talk.watcher.wait_for_terminal(brief) == "RECALLED"  # a goal that waits for an engine has its time
+            assert [wire.request("status", id=each)["goal"]["state"] for each in goals] == ["PENDING"] * len(goals)
+        assert _ends(talk, goals) == [("SUCCEEDED", None)] * len(goals)
+    assert (talk.goal(first)["reason"], talk.goal(brief)["reason"]) == ("engine_crashed", "expired")
+    assert talk.log.count("cannot be started") == 1, talk.log
+
+
+def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted: Talk) -> None:
+    talk = scripted
+    first = begin(talk, "never-ends", number=1)
+    goals = [send(talk, "length=0.01") for _ in range(WAITING)]
+    talk.script_start("hang")  # so that each start can be met in its middle
+    engine = _scripted_engine(talk)
+    for _ in range(3):
+        engine = _replaced(talk, engine)
+    talk.script_start("")
+    os.kill(engine, signal.SIGKILL)
+    assert _ends(talk, [first]) == [("ABORTED", "engine_crashed")]
+    assert _ends(talk, goals) == [("SUCCEEDED", None)] * WAITING
+
+
+def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(make_talk: MakeTalk) -> None:
+    talk = make_talk("--player", "null")
+    assert talk.run("voices").code == 0
+    for _ in range(3):
+        os.kill(engine_process(talk), signal.SIGKILL)
+        goal = send(talk, "yes", rate=450)
+        assert _ends(talk, [goal]) == [("SUCCEEDED", None)], talk.goal(goal)
+
+
+def test_engines_that_have_spoken_and_are_killed_while_idle_are_replaced_at_once(scripted: Talk) -> None:
+    assert BACK_OFF[-1] > PATIENCE, "a goal that has to wait so long is not awaited"
+    engine = _scripted_engine(scripted)
+    for _ in range(2 * len(BACK_OFF)):
+        engine = _replaced(scripted, engine)
+        assert _ends(scripted, [send(scripted, "length=0")]) == [("SUCCEEDED", None)]
+
+
+def test_an_engine_that_does_not_come_for_long_costs_a_goal_each_time_it_is_tried(
+    make_talk: MakeTalk, tmp_path: Path
+) -> None:
+    write(tmp_path / "sitecustomize.py", HASTY.format(patience=0.5))
+    talk = make_talk(scripted=True, env=python_path(tmp_path))
+    assert talk.run("voices").code == 0
+    talk.script_start("crash")
+    began = time.monotonic()
+    os.kill(_scripted_engine(talk), signal.SIGKILL)
+    goals = [send(talk, "length=0.5") for _ in range(4)]
+    talk.watcher.wait_for_terminal(goals[1])
+    waited = time.monotonic() - began
+    talk.script_start("")
+    assert waited >= 0.4, "it is waited for first"
+    ends = _ends(talk, goals)
+    assert (ends[:2], ends[-1]) == ([("ABORTED", "engine_failed")] * 2, ("SUCCEEDED", None))
+    times = [talk.goal(each)["ended_at"] for each in goals[:2]]
+    assert times[1] - times[0] >= 0.09, "one goal for one start"
+    assert "the engine crashed: it was killed by SIGSEGV" in talk.goal(goals[0])["message"]
+
+
+def test_a_lasting_cause_and_then_a_passing_one_leave_no_goal_waiting(make_talk: MakeTalk, tmp_path: Path) -> None:
+    """This happens if pyttsx3 is missing, and then half installed."""
+    write(tmp_path / "sitecustomize.py", HASTY.format(patience=0.3))
+    talk = make_talk(scripted=True, env=python_path(tmp_path))
+    talk.script_start("fail")
+    os.kill(_scripted_engine(talk), signal.SIGKILL)
+    with talk.connect() as wire:
+        _await_engine(wire, "scripted start failure")
+        wire.request("say", text="length=0", wait=True)
+        assert wire.receive_event("result")["goal"]["reason"] == "engine_failed"
+        talk.script_start("crash")
+        _await_engine(wire, "the engine crashed: it was killed by SIGSEGV")
+        goal = wire.request("say", text="length=0", wait=True)["goal"]["id"]
+        ended = wire.receive_event("result")["goal"]
+        assert (ended["id"], ended["state"], ended["reason"]) == (goal, "ABORTED", "engine_failed")
+    talk.script_start("")
+
+
+def test_a_goal_that_an_engine_was_given_in_its_death_has_its_time(make_talk: MakeTalk) -> None:
+    """The next engine may begin with it, but not after its time to live."""
+    talk = make_talk("--player", "null")
+    assert talk.run("voices").code == 0
+    with talk.connect() as wire, too_few_descriptors(talk):
+        os.kill(engine_process(talk), signal.SIGKILL)
+        goal = wire.request("say", text="too late", ttl=0.3)["goal"]["id"]
+        assert talk.watcher.wait_for_terminal(goal) in {"RECALLED", "PREEMPTED"}
+        assert wire.request("status", id=goal)["goal"]["reason"] == "expired"
+
+
+@pytest.mark.parametrize("option", [("--driver", "parrot"), ("--driver", "nsss"), ("--voice", "parrot")], ids=" ".join)
+def test_an_unknown_driver_or_voice_ends_the_server_before_it_is_ready(tmp_path: Path, option: tuple[str, str]) -> None:
+    place = str(tmp_path / "s")
+    done = run([*SERVE, "--socket", place, *option], environment(str(tmp_path)))
+    assert done.code == 2
+    (words,) = done.err.splitlines()
+    assert words.startswith("talk: "), words
+    assert f'"{option[1]}"' in words or f"'{option[1]}'" in words, words
+    assert not os.path.exists(place)
+
+
+def test_a_server_that_awaits_its_engine_ends_when_it_is_told_to(make_talk: MakeTalk) -> None:
+    talk = make_talk("--voice", "en", scripted=True, env={"SCRIPTED_START": "hang"})
+    with limits():
+        began = time.monotonic()
+        talk.stop()
+        assert_within(time.monotonic() - began, 1, "the end of a server whose engine hangs in its start")
+    assert "ready on" not in talk.log

@@ -1,4 +1,4 @@
-"""The socket's file, its lock or its directory is removed or replaced while a server serves."""
+"""The socket's file, its lock or its directory is removed or replaced, or was made by another user beforehand."""
 
 from __future__ import annotations
 
@@ -242,3 +242,81 @@ def test_file_of_a_passed_socket_is_missed_but_not_made(home: str) -> None:
                 assert wire.request("status")["ok"]
             assert not os.path.exists(path)
             assert server.log.count("systemctl restart") == 1  # said once, not at every look
+
+
+NOBODY = 65534
+
+
+@pytest.fixture
+def _as_tmp(home: str) -> None:
+    """Share the home with all users, as /tmp is; skip the test if the usual place for a socket is elsewhere."""
+    if sys.platform == "darwin" or os.path.isdir(f"/run/user/{os.getuid()}"):
+        pytest.skip("this user has a runtime directory, or the place is in the user's home")
+    os.chmod(home, 0o1777)
+
+
+def place(home: str) -> str:
+    return f"{home}/runtime-{os.getuid()}"
+
+
+def link(home: str) -> None:
+    os.mkdir(f"{home}/elsewhere", 0o700)
+    os.symlink("elsewhere", place(home))
+
+
+def link_inside(home: str) -> None:
+    link(home)
+    os.unlink(place(home))
+    os.mkdir(place(home), 0o700)
+    os.symlink("../elsewhere", f"{place(home)}/talk")
+
+
+def open_inside(home: str) -> None:
+    os.mkdir(place(home), 0o700)
+    os.mkdir(f"{place(home)}/talk")
+    os.chmod(f"{place(home)}/talk", 0o777)
+
+
+def open_to_all(home: str) -> None:
+    open_inside(home)
+    os.chmod(place(home), 0o777)
+
+
+def a_file(home: str) -> None:
+    with open(place(home), "w", encoding="utf-8"):
+        pass
+
+
+@pytest.mark.usefixtures("_as_tmp")
+@pytest.mark.parametrize(
+    "fault", [link, link_inside, open_to_all, open_inside, a_file], ids=lambda each: str(each.__name__)
+)
+def test_place_that_somebody_prepared_is_refused_with_the_reason(home: str, fault: Callable[[str], None]) -> None:
+    fault(home)
+    done = run(SERVE, environment(home))
+    assert (done.code, done.out) == (11, ""), done
+    assert place(home) in done.err
+    assert "Traceback" not in done.err
+    assert not os.path.exists(f"{home}/elsewhere") or os.listdir(f"{home}/elsewhere") == []
+
+
+@pytest.mark.usefixtures("_as_tmp")
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can make what is another user's")
+@pytest.mark.parametrize("theirs", [["talk"], [""]], ids=["inside", "whole"])
+def test_place_that_another_user_made_is_refused(home: str, theirs: list[str]) -> None:
+    for name in theirs:
+        os.makedirs(f"{place(home)}/{name}", 0o700)
+        os.chown(f"{place(home)}/{name}", NOBODY, NOBODY)
+    done = run(SERVE, environment(home))
+    assert (done.code, done.out) == (11, ""), done
+    assert place(home) in done.err
+
+
+@pytest.mark.usefixtures("_as_tmp", "nobody_serves")
+def test_place_that_is_made_by_the_server_is_nobody_else_s(home: str) -> None:
+    env = environment(home)
+    with serving(env, command=["sh", "-c", 'umask 0; exec "$@"', "sh", *SERVE]):
+        for path in (place(home), f"{place(home)}/talk"):
+            assert stat.S_IMODE(os.lstat(path).st_mode) == 0o700
+            assert os.lstat(path).st_uid == os.getuid()
+        assert run([*TALK, "status"], env).code == 0

@@ -55,7 +55,7 @@ def test_every_row_names_tests_that_exist(folder: Path) -> None:
 def test_every_module_of_faults_is_named() -> None:
     """The tests of systemd units and sd_notify are no rows."""
     shown = {path.name for row in rows(HERE) for path, _ in named(HERE, row)}
-    others = {"test_table.py", "test_service_supervised.py", "test_service_units.py"}
+    others = {"test_table.py", "test_service_units.py"}
     assert {each.name for each in HERE.glob("test_*.py")} - others == {
         each for each in shown if (HERE / each).is_file()
     }

@@ -44,7 +44,7 @@ class Finished:
 
     @property
     def id(self) -> str:
-        """The goal's id, where the client printed one and nothing else."""
+        """The goal's id, if the client printed nothing else."""
         return self.out.strip()
 
 
@@ -57,7 +57,7 @@ def children(pid: int) -> list[int]:
             for thread in threads:
                 with open(f"/proc/{pid}/task/{thread}/children", encoding="ascii") as file:
                     found += map(int, file.read().split())
-        # Where a thread has ended meanwhile, its children are another's now, which may have been looked at before.
+        # If a thread has ended meanwhile, its children belong to another one, which may have been read before.
         if set(threads) <= set(os.listdir(f"/proc/{pid}/task")):
             return found
 
@@ -78,7 +78,7 @@ def start_talk(words: Sequence[str], env: Mapping[str, str], stdin: int = subpro
 
 
 def run_talk(words: Sequence[str], env: Mapping[str, str], timeout: float) -> tuple[int, str, str]:
-    """Run `talk` to its end; return its exit code and what it wrote. One that takes longer is killed."""
+    """Run `talk` to its end; return its exit code and its output. A process that takes longer is killed."""
     process = start_talk(words, env)
     try:
         out, err = process.communicate(timeout=timeout)
@@ -90,19 +90,17 @@ def run_talk(words: Sequence[str], env: Mapping[str, str], timeout: float) -> tu
 
 
 class Clients:
-    """Runs clients for a test, in the environment `env`; `log` is what is told of one that goes wrong."""
+    """Runs clients for a test, in the environment `env`; `log` is added to the message if one goes wrong."""
 
     def __init__(self) -> None:
         self._clients: list[Process] = []
 
     @property
     def env(self) -> dict[str, str]:
-        """The environment of the clients."""
         raise NotImplementedError
 
     @property
     def log(self) -> str:
-        """What else tells why a client did what it did."""
         raise NotImplementedError
 
     def start(self, *words: str, stdin: int = subprocess.DEVNULL) -> Process:
@@ -112,7 +110,7 @@ class Clients:
         return client
 
     def finish(self, client: Process, timeout: float = 20, stdin: str | None = None) -> Finished:
-        """Wait for a client to end; seconds are counted from this call. It never may show a traceback."""
+        """Wait for a client to end without a traceback; the seconds count from this call."""
         began = time.monotonic()
         assert isinstance(client.args, list)
         command = tuple(str(each) for each in client.args[2:])
@@ -147,9 +145,9 @@ class Clients:
 
 
 class Talk(Clients):
-    """A server, started, greeted and watched from before its first goal; `stop()` ends it and asserts that all is well.
+    """A server, greeted and watched from before its first goal; `stop()` ends it and asserts that all is well.
 
-    `unfinished`: ids of goals that may have no terminal event when the watcher is checked (True: any).
+    `unfinished`: the goals that may have no terminal event when the watcher is checked (True: any).
     """
 
     def __init__(
@@ -164,7 +162,7 @@ class Talk(Clients):
         watched: bool = True,
         forked: bool = True,
     ) -> None:
-        """`program` serves in the place of `talk serve`; one that is not `forked` shows in /proc what it is."""
+        """Start the server; `program` replaces `talk serve`, and a server not `forked` has its own command line."""
         super().__init__()
         self.unfinished: Collection[str] | bool = False
         self._mark = uuid.uuid4().hex
@@ -188,35 +186,32 @@ class Talk(Clients):
 
     @property
     def pid(self) -> int:
-        """Process id of the server, also of one that has ended."""
+        """The server's process id, even after its end."""
         assert self._server
         return self._server.pid
 
     @property
     def env(self) -> dict[str, str]:
-        """The environment of this test's clients."""
         return self._environment(f"{self._mark}-client")
 
     @property
     def log(self) -> str:
-        """What the server wrote to standard error so far."""
+        """The server's standard error so far."""
         with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as file:
             return file.read()
 
     @property
     def running(self) -> bool:
-        """Whether the server's process runs."""
         return self._server is not None and self._server.poll() is None
 
     @property
     def recording(self) -> Recording:
-        """What the server's sink has played since the server was started."""
+        """The sound that the sink has played since the server was started."""
         assert self._recording, "this server has no sink"
         return self._recording
 
     @property
     def watcher(self) -> Watcher:
-        """The watcher from before the first goal."""
         assert self._watcher, "this server is not watched"
         return self._watcher
 
@@ -246,17 +241,15 @@ class Talk(Clients):
             self.unfinished = False
         self._watcher = Watcher(self.socket) if self._watched else None
         if self._program == SCRIPTED and "SCRIPTED_START" not in self._extra:
-            self.request(
-                "voices"
-            )  # so that the first goal is ACTIVE at once, as it is on a robot but for its first moment
+            self.request("voices")  # so that the engine is ready, and the first goal ACTIVE at once
 
     def script_start(self, behaviour: str) -> None:
-        """Tell the scripted engine how each of its next starts goes: see `script`; "" for a plain one."""
+        """Tell the scripted engine how each of its next starts goes, see `script`; "" for a good one."""
         with open(f"{self.directory}/start", "w", encoding="utf-8") as file:
             file.write(behaviour)
 
     def status(self) -> float:
-        """Return the seconds that `talk status` takes: on an idle server the control of `limits`."""
+        """Return the seconds that `talk status` takes: for an idle server a control of `limits`."""
         done = self.run("status")
         assert done.code == 0, done
         return done.seconds
@@ -286,7 +279,7 @@ class Talk(Clients):
         os.kill(self.pid, signal.SIGCONT)
 
     def kill(self) -> float:
-        """Kill the server outright; return the seconds until nothing of it is left. Its goals have no end then."""
+        """Kill the server outright; return the seconds until nothing of it is left. Its goals have no end."""
         assert self._server
         killed = time.monotonic()
         self._server.kill()
@@ -298,7 +291,7 @@ class Talk(Clients):
         return gone
 
     def stop(self, *, timeout: float = STOP_LIMIT, gone_within: float = 2.0) -> None:
-        """End the server by SIGTERM; assert exit 0, its socket gone, no process left, and what the watcher saw."""
+        """End the server by SIGTERM; assert exit 0, no socket, no process, and one end of each goal."""
         assert self._server
         if self.running:
             self._server.send_signal(signal.SIGCONT)
@@ -313,14 +306,14 @@ class Talk(Clients):
         self.check()
 
     def check(self) -> None:
-        """Assert of an ended server: no traceback in its log, one terminal state for every goal that was watched."""
+        """Assert that an ended server's log has no traceback, and every watched goal has one terminal state."""
         assert "Traceback" not in self.log, self.log
         if self._watcher:
             self._watcher.wait_for_end()
             self._watcher.check(self.unfinished)
 
     def close(self) -> None:
-        """End everything of this test that still runs, without a word, and remove its directory."""
+        """End all processes of this test, and remove its directory."""
         self._stack.close()
 
     def _environment(self, mark: str) -> dict[str, str]:
