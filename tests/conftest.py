@@ -1,10 +1,10 @@
-"""Fixtures: sound servers, servers with the real and the scripted engine, and what must hold of each when it ends."""
+"""Fixtures: sound servers, servers with the real and the scripted engine, and the checks at the end of each."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 
@@ -14,10 +14,10 @@ from tests.support.surroundings import needs_no_server
 from tests.support.timing import calibrate, take_unmeasured
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterator, Mapping
 
 
-#: What could not be measured, in a test's reports.
+#: The name of late measurements in a test's report.
 _UNMEASURED = "not measured"
 
 
@@ -41,25 +41,25 @@ class MakeTalk(Protocol):
 
 @pytest.fixture(scope="session", autouse=True)
 def _interruptible() -> None:
-    """Start clients with signals as a terminal would: what runs the tests in its background may have these ignored."""
+    """Start clients with the signals of a terminal, which may be ignored if the tests run in the background."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture
 def nobody_serves() -> None:
-    """Skip the test on a machine where a server runs, or was left behind, at a place where clients look."""
+    """Skip the test on a machine where a server runs, or left its socket, at a place where clients look."""
     needs_no_server()
 
 
 def pytest_configure() -> None:
-    """Time the control of limits while the machine is quiet; the workers of a run know of it."""
+    """Time the control of limits while the machine is quiet; the workers of a run inherit the result."""
     calibrate()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Say in a test's report what of it was late together with its control."""
+    """Report the parts of a test that were late together with their control."""
     report = yield
     if report.when == "call":
         found = take_unmeasured()
@@ -69,14 +69,14 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
 
 
 def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, str] | None:
-    """Count what was not measured as neither passed nor failed."""
+    """Count tests that were not measured as neither passed nor failed."""
     if report.when == "call" and report.passed and _UNMEASURED in dict(report.user_properties):
         return _UNMEASURED, "m", _UNMEASURED.upper()
     return None
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Name what was not measured."""
+    """List the tests that were not measured."""
     reports = terminalreporter.getreports(_UNMEASURED)
     if reports:
         terminalreporter.write_sep("-", "not measured: late, and so was the control")
@@ -100,41 +100,23 @@ def private_sink() -> Iterator[Callable[[], Sink]]:
 
 @pytest.fixture
 def make_talk() -> Iterator[MakeTalk]:
-    """Starts servers; each is stopped at the end, if the test did not end it, and what was watched is checked."""
+    """Starts servers; each is stopped at the end, if the test did not end it, and its watcher is checked."""
     servers: list[Talk] = []
 
-    def make(
-        *options: str,
-        scripted: bool = False,
-        program: str | None = None,
-        sink: Sink | None = None,
-        driver: str | None = None,
-        env: Mapping[str, str] | None = None,
-        watched: bool = True,
-        forked: bool = True,
-    ) -> Talk:
-        talk = Talk(
-            options,
-            scripted=scripted,
-            program=program,
-            sink=sink,
-            driver=driver,
-            env=env,
-            watched=watched,
-            forked=forked,
-        )
-        servers.append(talk)
-        return talk
+    def make(*options: str, **how: Any) -> Talk:
+        servers.append(Talk(options, **how))
+        return servers[-1]
 
-    with contextlib.ExitStack() as stack:
-        # Entered before the first server and left in reverse: all are closed, whichever fails its check.
-        stack.callback(_close, servers)
+    try:
         yield make
         for talk in servers:
             if talk.running:
                 talk.stop()
             else:
                 talk.check()
+    finally:  # whichever of them fails its check
+        for talk in servers:
+            talk.close()
 
 
 @pytest.fixture
@@ -145,10 +127,5 @@ def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
 
 @pytest.fixture
 def scripted(make_talk: MakeTalk) -> Talk:
-    """A server with the scripted engine, without sound: goals say what it does, see `tests.support.script`."""
+    """A server with the scripted engine, without sound: goals say how it behaves, see `tests.support.script`."""
     return make_talk(scripted=True)
-
-
-def _close(servers: Sequence[Talk]) -> None:
-    for talk in servers:
-        talk.close()

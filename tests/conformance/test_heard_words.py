@@ -13,8 +13,8 @@ import pytest
 from tests.conformance.hearing import LONG, await_word, heard, send
 from tests.conformance.voices import ESPEAK
 from tests.support.compare import assert_begun, compare, extent, time_heard
-from tests.support.distant_sink import DistantSink
 from tests.support.reference import RATE, Rendering, Sentence, played
+from tests.support.sink import DistantSink
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:

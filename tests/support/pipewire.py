@@ -1,6 +1,6 @@
-"""A private PipeWire with its pulse server and a session manager, without a card; nothing of the user's is touched.
+"""A private PipeWire with its pulse server and a session manager, without a card, apart from the user's.
 
-Without a card all that it has is its dummy output. `load` adds a sink that counts as a device.
+Without a card its only output is a dummy. `load` adds a sink that counts as a device.
 """
 
 from __future__ import annotations
@@ -18,16 +18,14 @@ from tests.support.surroundings import clean_environment, dying_with_parent, nee
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-#: What a machine needs for it; wireplumber ends without a message bus.
+#: The programs that it needs; wireplumber ends without a message bus.
 PROGRAMS = ("pipewire", "pipewire-pulse", "wireplumber", "dbus-daemon", "pactl")
-#: Seconds in which it must have started, or followed.
+#: Seconds in which it must have started, or changed its default sink.
 _START = 20.0
-#: The sink that it has where there is no other.
-DUMMY = "auto_null"
 
 
 class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
-    """A running PipeWire; `with` ends all that it started and removes its directory."""
+    """A running PipeWire; `with` ends all its processes and removes its directory."""
 
     def __init__(self) -> None:
         needs(*PROGRAMS)
@@ -35,69 +33,46 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
         with contextlib.ExitStack() as stack:
             self.directory = stack.enter_context(short_directory("pipewire-"))
             self.socket = f"{self.directory}/pulse/native"
+            bus = f"{self.directory}/bus"
+            self.env = {
+                "HOME": self.directory,
+                "XDG_RUNTIME_DIR": self.directory,
+                "PIPEWIRE_RUNTIME_DIR": self.directory,
+                "PULSE_RUNTIME_PATH": f"{self.directory}/pulse",
+                "PULSE_SERVER": f"unix:{self.socket}",
+                "DBUS_SESSION_BUS_ADDRESS": f"unix:path={bus}",
+            }
             stack.callback(self._end)
-            self._start("dbus-daemon", "--session", "--nofork", "--nopidfile", f"--address=unix:path={self._bus}")
-            self._await("its message bus", lambda: os.path.exists(self._bus))
+            self._start("dbus-daemon", "--session", "--nofork", "--nopidfile", f"--address=unix:path={bus}")
+            self._await("its message bus", lambda: os.path.exists(bus))
             self._start("pipewire")
             self._await("its socket", lambda: os.path.exists(f"{self.directory}/pipewire-0"))
             self._start("wireplumber")
-            self.start_server()
+            self._start("pipewire-pulse")
+            self._await("a sink", lambda: os.path.exists(self.socket) and self._default() not in {"", "@DEFAULT_SINK@"})
             self._stack = stack.pop_all()
 
     def __exit__(self, *_error: object) -> None:
         self._stack.close()
 
-    @property
-    def env(self) -> dict[str, str]:
-        """The variables with which a child plays to it."""
-        return {
-            "HOME": self.directory,
-            "XDG_RUNTIME_DIR": self.directory,
-            "PIPEWIRE_RUNTIME_DIR": self.directory,
-            "PULSE_RUNTIME_PATH": f"{self.directory}/pulse",
-            "PULSE_SERVER": f"unix:{self.socket}",
-            "DBUS_SESSION_BUS_ADDRESS": f"unix:path={self._bus}",
-        }
-
     def load(self, name: str) -> str:
-        """Add a sink that is no dummy; it is the default once this returns. Returns what `unload` takes."""
+        """Add a sink that is no dummy, wait until it is the default, and return its module."""
         module = self.pactl("load-module", "module-null-sink", f"sink_name={name}", "rate=22050", "channels=1").strip()
         self.pactl("set-default-sink", name)
         self._await(f"the sink {name}", lambda: self._default() == name)
         return module
 
-    def unload(self, module: str) -> None:
-        """Take a sink away, as if a device were unplugged."""
-        self.pactl("unload-module", module)
-
     def freeze(self, part: str = "pipewire-pulse") -> None:
-        """Stop its pulse server as it is, or another part; it has stopped when this returns, with all its threads."""
+        """Stop one of its processes; all its threads have stopped when this returns."""
         stop_child(self._running[part].pid)
 
     def thaw(self, part: str = "pipewire-pulse") -> None:
         """Let it go on."""
         self._running[part].send_signal(signal.SIGCONT)
 
-    def kill_server(self) -> None:
-        """Kill its pulse server, as if that had crashed."""
-        server = self._running.pop("pipewire-pulse")
-        server.kill()
-        server.wait()
-
-    def start_server(self) -> None:
-        """Start its pulse server; again after `kill_server`."""
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(self.socket)
-        self._start("pipewire-pulse")
-        self._await("a sink", lambda: os.path.exists(self.socket) and self._default() not in {"", "@DEFAULT_SINK@"})
-
     def pactl(self, *words: str) -> str:
-        """Run pactl and return what it printed."""
-        return pactl(self._child(), *words)
-
-    @property
-    def _bus(self) -> str:
-        return f"{self.directory}/bus"
+        """Run pactl and return its output."""
+        return pactl(clean_environment(self.directory, self.env), *words)
 
     def _default(self) -> str:
         with contextlib.suppress(AssertionError):
@@ -106,13 +81,11 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
                     return line.removeprefix("Default Sink: ")
         return ""
 
-    def _child(self) -> dict[str, str]:
-        return clean_environment(self.directory, self.env)
-
     def _start(self, *command: str) -> None:
+        env = clean_environment(self.directory, self.env)
         with open(f"{self.directory}/log", "ab") as log:
             self._running[command[0]] = subprocess.Popen(
-                dying_with_parent(list(command)), env=self._child(), stdin=subprocess.DEVNULL, stdout=log, stderr=log
+                dying_with_parent(list(command)), env=env, stdin=subprocess.DEVNULL, stdout=log, stderr=log
             )
 
     def _await(self, what: str, there: Callable[[], bool]) -> None:
@@ -121,7 +94,7 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
             if time.monotonic() > end or any(each.poll() is not None for each in self._running.values()):
                 with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as log:
                     raise AssertionError(f"PipeWire does not get {what}: {log.read()}")
-            time.sleep(0.02)  # none of it says when
+            time.sleep(0.02)  # it sends no event
 
     def _end(self) -> None:
         for each in reversed(self._running.values()):
