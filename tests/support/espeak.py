@@ -1,10 +1,10 @@
-"""Renders sentences with libespeak-ng itself and nothing of talk's: a program that `reference` runs in a fresh process.
+"""Renders sentences with libespeak-ng itself, without talk: a program that `reference` runs in a fresh process.
 
 Reads a JSON list of `{"text", "rate", "volume", "voice", "pitch"}` on standard input; writes for each a line of JSON,
 `{"samples": NUMBER, "words": [[START, END, SECONDS], …]}`, then the samples, 16 bit little endian.
 
 The calls and their order are those of the program `espeak-ng -w`, so that the first sentence is the same bit for bit.
-It must stay free of anything but the standard library: what it renders would not change, but its start would be slow.
+It uses nothing but the standard library, so that its start is quick.
 """
 
 from __future__ import annotations
@@ -13,11 +13,17 @@ import ctypes
 import json
 import sys
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    #: A word: offset of its first character in the text, the offset after its last, and its seconds into the samples.
+    Word = tuple[int, int, float]
+
 RATE = 22050
 _SYNCHRONOUS = 2
 _DONT_EXIT = 0x8000
-_CHARS_UTF8 = 1
-_ENDPAUSE = 0x1000
+_UTF8_AND_END_PAUSE = 0x1001
 _EVENT_WORD = 1
 _PARAMETER_RATE, _PARAMETER_VOLUME, _PARAMETER_PITCH = 1, 2, 3
 
@@ -39,7 +45,7 @@ _Callback = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_short), ctype
 
 
 def load() -> tuple[ctypes.CDLL, bytes | None]:
-    """Return the library and where its data is: the system's, else the wheel's."""
+    """Return the library and the path of its data: the system's, else the wheel's."""
     try:
         return ctypes.CDLL("libespeak-ng.so.1"), None
     except OSError:
@@ -48,37 +54,53 @@ def load() -> tuple[ctypes.CDLL, bytes | None]:
         return ctypes.CDLL(espeakng_loader.get_library_path()), espeakng_loader.get_data_path().encode()
 
 
+class Library:
+    """The library with a function that takes its sound, piece by piece, with its words, and may stop it."""
+
+    def __init__(self, take: Callable[[bytes, list[Word]], bool]) -> None:
+        self._library, data = load()
+        if self._library.espeak_Initialize(_SYNCHRONOUS, 0, data, _DONT_EXIT) <= 0:
+            sys.exit("libespeak-ng cannot be initialised: its data is missing")
+
+        def called(wav: ctypes._Pointer[ctypes.c_short], count: int, events: ctypes._Pointer[_Event]) -> int:
+            words: list[Word] = []
+            for event in iter(events):
+                if event.type == 0:
+                    break
+                if event.type == _EVENT_WORD:
+                    start = event.text_position - 1
+                    words.append((start, start + event.length, event.audio_position / 1000))
+            return int(take(ctypes.string_at(wav, count * 2) if wav and count > 0 else b"", words))
+
+        self._callback = _Callback(called)  # kept for as long as the library may call it
+        self._library.espeak_SetSynthCallback(self._callback)
+
+    def speak(self, text: str, *, rate: int, volume: float = 1.0, voice: str = "en", pitch: int = 50) -> None:
+        """Make the sound of a text."""
+        if self._library.espeak_SetVoiceByName(voice.encode()) != 0:
+            sys.exit(f"libespeak-ng has no voice {voice!r}")
+        self._library.espeak_SetParameter(_PARAMETER_RATE, rate, 0)
+        self._library.espeak_SetParameter(_PARAMETER_VOLUME, round(volume * 100), 0)
+        self._library.espeak_SetParameter(_PARAMETER_PITCH, pitch, 0)
+        data = text.encode()
+        size = ctypes.c_size_t(len(data) + 1)
+        if self._library.espeak_Synth(data, size, 0, 0, 0, _UTF8_AND_END_PAUSE, None, None) != 0:
+            sys.exit(f"libespeak-ng cannot render {text!r}")
+
+
 def main() -> None:
-    """Render what standard input asks for."""
-    library, data = load()
-    if library.espeak_Initialize(_SYNCHRONOUS, 0, data, _DONT_EXIT) <= 0:
-        sys.exit("libespeak-ng cannot be initialised: its data is missing")
+    """Render the sentences of standard input."""
     samples = bytearray()
-    words: list[tuple[int, int, float]] = []
+    words: list[Word] = []
 
-    def take(wav: ctypes._Pointer[ctypes.c_short], count: int, events: ctypes._Pointer[_Event]) -> int:
-        if wav and count > 0:
-            samples.extend(ctypes.string_at(wav, count * 2))
-        for event in iter(events):
-            if event.type == 0:
-                break
-            if event.type == _EVENT_WORD:
-                start = event.text_position - 1
-                words.append((start, start + event.length, event.audio_position / 1000))
-        return 0
+    def take(sound: bytes, told: list[Word]) -> bool:
+        samples.extend(sound)
+        words.extend(told)
+        return False
 
-    callback = _Callback(take)  # kept for as long as the library may call it
-    library.espeak_SetSynthCallback(callback)
+    library = Library(take)
     for sentence in json.load(sys.stdin.buffer):
-        if library.espeak_SetVoiceByName(sentence["voice"].encode()) != 0:
-            sys.exit(f"libespeak-ng has no voice {sentence['voice']!r}")
-        library.espeak_SetParameter(_PARAMETER_RATE, sentence["rate"], 0)
-        library.espeak_SetParameter(_PARAMETER_VOLUME, round(sentence["volume"] * 100), 0)
-        library.espeak_SetParameter(_PARAMETER_PITCH, sentence["pitch"], 0)
-        text = sentence["text"].encode()
-        size = ctypes.c_size_t(len(text) + 1)
-        if library.espeak_Synth(text, size, 0, 0, 0, _CHARS_UTF8 | _ENDPAUSE, None, None) != 0:
-            sys.exit(f"libespeak-ng cannot render {sentence['text']!r}")
+        library.speak(**sentence)
         head = json.dumps({"samples": len(samples) // 2, "words": words})
         sys.stdout.buffer.write(head.encode() + b"\n" + samples)
         samples.clear()

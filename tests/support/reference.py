@@ -1,4 +1,4 @@
-"""Reference renderings: what sentences sound like, by libespeak-ng itself, never by talk.
+"""Reference renderings: the sound of sentences by libespeak-ng itself, never by talk.
 
 libespeak-ng does not repeat itself within a process, but a fresh process makes the same samples each time. So a
 reference is the same texts, in the same order, with the same settings, in one fresh process.
@@ -45,11 +45,10 @@ class Sentence:
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
-    """What a sentence sounds like, and where its words are in that sound."""
+    """The sound of a sentence, and the places of its words."""
 
     samples: Samples
-    #: of each word that libespeak-ng tells: offset of its first character in the text, the one after its last, and its
-    #: seconds into the samples; neighbours that it merges are one
+    #: start and end of each word in the text, and its seconds into the samples; some neighbours are one word
     words: tuple[tuple[int, int, float], ...]
 
 
@@ -72,7 +71,7 @@ def render(
 
 
 def played(samples: Samples) -> Samples:
-    """Return a sentence as it is played where none was spoken before it: from the first sample on that is not zero."""
+    """Return the first sentence of a server as it is played: from the first sample on that is not zero."""
     return samples[np.argmax(samples != 0) :]
 
 
@@ -83,25 +82,24 @@ def render_with_words(sentences: Sequence[str | Sentence], *, timeout: float = 3
 
 @functools.cache
 def _rendered(asked: tuple[Sentence, ...], timeout: float) -> tuple[Rendering, ...]:
-    """A fresh process makes the same samples each time, so one for all tests is enough; nobody may change them."""
-    done = subprocess.run(
-        [sys.executable, _PROGRAM],
-        input=json.dumps([asdict(each) for each in asked]).encode(),
-        capture_output=True,
-        timeout=timeout,
-        env=clean_environment(tempfile.gettempdir()),
-        check=False,
-    )
-    if done.returncode != 0:
-        raise AssertionError(f"no reference rendering: {done.stderr.decode(errors='replace').strip()}")
     result: list[Rendering] = []
-    rest = done.stdout
+    rest = run([_PROGRAM], json.dumps([asdict(each) for each in asked]), timeout)
     for _ in asked:
         line, _newline, rest = rest.partition(b"\n")
         head = json.loads(line)
         end = head["samples"] * 2
         samples = np.frombuffer(rest[:end], dtype="<i2").astype(np.int16)
-        samples.flags.writeable = False
+        samples.flags.writeable = False  # all tests share it
         result.append(Rendering(samples, tuple((start, stop, at) for start, stop, at in head["words"])))
         rest = rest[end:]
     return tuple(result)
+
+
+def run(program: Sequence[str], asked: str, timeout: float) -> bytes:
+    """Run a Python program that renders sentences, and return its output."""
+    env = clean_environment(tempfile.gettempdir())
+    done = subprocess.run(
+        [sys.executable, *program], input=asked.encode(), capture_output=True, timeout=timeout, env=env, check=False
+    )
+    assert done.returncode == 0, f"no reference rendering: {done.stderr.decode(errors='replace').strip()}"
+    return done.stdout
