@@ -1,4 +1,4 @@
-"""What the tests of broken engines, players and sound servers share: the server meanwhile, the next goal as heard."""
+"""Shared by the tests of faults: the server meanwhile, and the sound of the next goal."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import talkcli
-from tests.conformance.hearing import HOME
+from tests.conformance.hearing import HOME, QUICK, render_quick
 from tests.conformance.stopped import DROPPED
 from tests.support import census
 from tests.support.compare import assert_heard, compare, extent
-from tests.support.reference import RATE, render
+from tests.support.reference import RATE
 from tests.support.timing import assert_within
 
 if TYPE_CHECKING:
@@ -28,17 +28,14 @@ if TYPE_CHECKING:
 
 #: Seconds within which `status` is answered, whatever is broken.
 ANSWER = 0.1
-#: Words per minute of the goal that is heard again, the fastest there are.
-RATE_AGAIN = 450
-#: Seconds by which that may be longer or shorter than a fresh engine's.
+#: Seconds by which the goal that is heard again may be longer or shorter than a fresh engine's.
 ALIKE = 0.05
-#: Samples that are zero before a sentence, at least; and those by which one may be longer whose player ran dry.
+#: Zero samples before a sentence, at least; and samples by which it is longer if its player ran dry.
 SILENCE, RUN_DRY = RATE // 50, RATE // 5
-#: kB by which a server may have grown after a fault: what it keeps of one goal and its log is a few.
+#: kB by which a server may have grown after a fault; a goal and its log take a few.
 GROWTH = 4096
 
-#: Keeps an engine process in its start for as long as a file is there; for `PYTHONPATH`, as the server's environment
-#: is the engine's. Its argument is the file.
+#: A sitecustomize.py that keeps an engine process in its start as long as a file exists.
 SLOW_START = """
 import os, sys, time
 while "talkcli.engine.main" in "".join(sys.orig_argv) and os.path.exists({flag!r}):
@@ -55,7 +52,7 @@ def assert_answers(talk: Talk) -> None:
 
 
 def await_end(talk: Talk, goal_id: str, within: float) -> str:
-    """Return the state in which a goal ended; the server was asked for its status meanwhile, again and again."""
+    """Return the state in which a goal ended; the server must answer its status meanwhile."""
     end = time.monotonic() + within
     while True:
         with contextlib.suppress(AssertionError):  # not yet
@@ -77,35 +74,34 @@ def began(recording: Recording, whole: Samples) -> float:
     """Assert that a sentence was heard whole, and last; return when its sound began."""
     samples = recording.samples
     offset = compare(samples, whole).offset
-    # Where the player ran dry in it, what is most like it is a later part: it begins behind one of the silences before.
-    for start in _behind_silence(samples, offset - RUN_DRY, offset):
-        with contextlib.suppress(AssertionError):
-            (found,) = assert_heard(samples[start:], [whole])
-            return recording.time_of(start + found.offset)
-    start = max(0, offset - DROPPED)
-    (found,) = assert_heard(samples[start:], [whole])
-    return recording.time_of(start + found.offset)
-
-
-def _behind_silence(samples: Samples, first: int, last: int) -> list[int]:
-    """Return where something begins between two samples, behind a silence, each with some samples before it."""
+    # If the player ran dry in it, the likeliest place is a later part: it begins behind one of the silences before.
     loud = np.flatnonzero(samples)
     begins = loud[np.diff(loud, prepend=-SILENCE - 1) > SILENCE]
-    return [max(0, int(each) - DROPPED) for each in begins if first <= each <= last + DROPPED]
+    places = [int(each) for each in begins if offset - RUN_DRY <= each <= offset + DROPPED]
+    wrong: AssertionError | None = None
+    for place in [*places, offset]:
+        start = max(0, place - DROPPED)
+        try:
+            (found,) = assert_heard(samples[start:], [whole])
+            return recording.time_of(start + found.offset)
+        except AssertionError as error:
+            wrong = error
+    assert wrong
+    raise wrong
 
 
 def heard_again(talk: Talk, sink: Sink) -> float:
     """Assert that a goal that is sent now is heard whole, and return when its sound began.
 
-    After a sentence that was stopped in its middle the library makes something else of the next, so only its length is
-    compared, without the zeros of a player that ran dry.
+    After a stopped sentence the library makes other samples of the next one, so only its length is compared, without
+    the zeros of a player that ran dry.
     """
     with sink.record() as recording:
-        recording.wait_until_quiet(0.2)  # what a frozen sound server had is heard when it goes on
+        recording.wait_until_quiet(0.2)  # a frozen sound server plays its buffer when it goes on
         start = len(recording)
-        assert talk.run("say", "--wait", "--rate", str(RATE_AGAIN), "--", HOME).code == 0
+        assert talk.run("say", "--wait", "--rate", str(QUICK), "--", HOME).code == 0
         recording.wait_until_quiet(0.2)
-    heard, expected = recording.samples[start:], render([HOME], rate=RATE_AGAIN)[0]
+    heard, expected = recording.samples[start:], render_quick([HOME])[0]
     found = extent(heard)
     assert found
     seconds, usual = (np.count_nonzero(each) / RATE for each in (heard, expected))
@@ -114,12 +110,12 @@ def heard_again(talk: Talk, sink: Sink) -> float:
 
 
 def told(what: str, seconds: float) -> None:
-    """Leave a measured time where `pytest -s` shows it."""
+    """Print a measured time, for `pytest -s`."""
     print(f"measured: {what}: {seconds:.3f} s")
 
 
 def python_path(first: Path) -> dict[str, str]:
-    """Return a server's environment with a directory that is searched before all others, talk's own behind it."""
+    """Return an environment in which Python searches a directory before talk's own."""
     return {"PYTHONPATH": os.pathsep.join([str(first), os.path.dirname(os.path.dirname(talkcli.__file__))])}
 
 

@@ -1,4 +1,4 @@
-"""A supervisor for tests: the other end of sd_notify(3), which hears what a server tells."""
+"""A supervisor for tests: the other end of sd_notify(3), which receives the messages of a server."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import socket
 import time
 
-#: Seconds in which whatever is told must have come.
+#: Seconds in which a message must have come.
 PATIENCE = 10.0
 
 
@@ -16,7 +16,7 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
 
     def __init__(self, address: str) -> None:
         self.address = address
-        #: all that was told so far, in its order: names with values, and when
+        #: all messages so far: name, value, time
         self.told: list[tuple[str, str, float]] = []
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(f"\0{address[1:]}" if address.startswith("@") else address)
@@ -27,7 +27,7 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
             os.unlink(self.address)
 
     def wait_for(self, name: str, containing: str = "", since: float = 0.0) -> float:
-        """Return when it was told something of this name, after a time; fail if it is not."""
+        """Return the time of a message of this name that came after a time."""
         end = time.monotonic() + PATIENCE
         while True:
             for each, value, at in self.told:
@@ -49,7 +49,7 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
         return True
 
     def fill(self) -> None:
-        """Have it hold as much unread as it can, so that whoever tells it something more would wait."""
+        """Fill the socket, so that a sender of one more message would wait."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
             other.setblocking(False)
             with contextlib.suppress(BlockingIOError):
@@ -57,6 +57,6 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
                     other.sendto(b"NOISE=1\n", self._socket.getsockname())
 
     def drain(self) -> None:
-        """Take what has come already."""
+        """Take the messages that have come already."""
         while self.hear(0):
             pass

@@ -1,7 +1,7 @@
-"""Runs a program that cannot be reaped for some seconds after it was killed, as one that hangs in a device's driver.
+"""Runs a program that cannot be reaped for some seconds after it was killed, as if it hung in a device's driver.
 
-`python trapped.py SECONDS PROGRAM ARGUMENT…`. It is really so: a tracer that asked for that is what the kernel waits
-for before it takes away what a killed process has. Nothing is changed for a program that ends by itself.
+`python trapped.py SECONDS PROGRAM ARGUMENT…`. The kernel waits for a tracer before it takes the resources of a killed
+process away. A program that ends by itself is not held.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _KILLED = 0.2
 
 @functools.cache
 def is_possible() -> bool:
-    """Whether this system lets a process be held like this: some sandboxes don't."""
+    """Return whether this system lets a process be held like this; some sandboxes don't."""
     program = ["sh", "-c", "echo ready; exec sleep 10"]
     process = subprocess.Popen([sys.executable, "-S", __file__, "1", *program], stdout=subprocess.PIPE)
     assert process.stdout
@@ -56,23 +56,19 @@ def main() -> None:
 
 
 def _trace(libc: ctypes.CDLL, player: int, tell: int, seconds: float) -> None:
-    """Hold the player in its end, where it was killed; it has nothing of the player's open itself."""
+    """Hold the player in its end if it was killed, without any of the player's descriptors."""
     os.setsid()
     nothing = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
         os.dup2(nothing, descriptor)
-    for name in os.listdir("/proc/self/fd"):
-        if int(name) > 2 and int(name) != tell:
-            try:
-                os.close(int(name))
-            except OSError:
-                continue  # what the list was read from
+    os.closerange(3, tell)
+    os.closerange(tell + 1, 1024)
     libc.ptrace(_SEIZE, player, 0, _TRACE_EXIT)
     os.close(tell)
     while True:
         try:
             _, status = os.waitpid(player, _ALL_CHILDREN)
-        except ChildProcessError:  # it may not be traced
+        except ChildProcessError:  # tracing is not allowed
             os._exit(1)
         if not os.WIFSTOPPED(status):
             os._exit(0)

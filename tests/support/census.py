@@ -1,4 +1,4 @@
-"""What a server and all that it started take of the machine, counted from outside: from /proc, on Linux alone."""
+"""The resources of a server and its processes, counted from outside: from /proc, on Linux alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.surroundings import command_line
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-#: Seconds in which what ended has been cleared away.
+#: Seconds in which ended processes have been cleared away.
 _SETTLED = 5.0
 
 
@@ -24,14 +24,14 @@ class Census:
     processes: int  # the server and all below it
     descriptors: int  # of the server
     threads: int  # of the server
-    memory: int  # kB of all of them that each has written to and shares with nobody
+    memory: int  # kB that each of them has written to and does not share
 
     def __str__(self) -> str:
         return ", ".join(f"{each.name} {getattr(self, each.name)}" for each in fields(self))
 
 
 def count(pid: int) -> Census:
-    """Count a server that runs."""
+    """Count a running server."""
     family = descendants(pid)
     return Census(
         processes=1 + len(family),
@@ -42,23 +42,27 @@ def count(pid: int) -> Census:
 
 
 def settled(pid: int, wanted: Callable[[Census], bool], within: float = _SETTLED) -> Census:
-    """Return the first count that is as wanted, or the last one: what is closed goes in its own time."""
+    """Return the first count that is as wanted, or the last one within these seconds."""
     end = time.monotonic() + within
     while not wanted(found := count(pid)) and time.monotonic() < end:
-        time.sleep(0.05)  # that a process or a connection is gone is no event for others
+        time.sleep(0.05)  # the end of a connection sends no event to others
     return found
 
 
 def assert_as_before(pid: int, before: Census, memory: int) -> Census:
-    """Assert that a server has no more processes, descriptors and threads than before, and so many kB more at most."""
-    found = settled(pid, lambda now: _fits(now, before))
-    assert _fits(found, before), f"before: {before}; now: {found}; {told(pid)}"
+    """Assert that a server has no more processes, descriptors and threads than before, and at most so many kB more."""
+
+    def fits(now: Census) -> bool:
+        return all(getattr(now, each) <= getattr(before, each) for each in ("processes", "descriptors", "threads"))
+
+    found = settled(pid, fits)
+    assert fits(found), f"before: {before}; now: {found}; {told(pid)}"
     assert found.memory <= before.memory + memory, f"before: {before}; now: {found}"
     return found
 
 
 def descriptors(pid: int) -> dict[int, str]:
-    """Return what a process has open, but for what it closes meanwhile."""
+    """Return the open descriptors of a process with their targets."""
     folder = f"/proc/{pid}/fd"
     found = {}
     for name in os.listdir(folder):
@@ -73,7 +77,7 @@ def descendants(pid: int) -> list[int]:
     for name in os.listdir("/proc"):
         if name.isdigit():
             with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
-                # The name in brackets may hold anything, brackets too.
+                # The name in brackets may hold any character, even brackets.
                 parents.setdefault(int(file.read().rpartition(b")")[2].split()[1]), []).append(int(name))
     found, due = [], [pid]
     while due:
@@ -83,10 +87,6 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
-def _fits(now: Census, before: Census) -> bool:
-    return now.processes <= before.processes and now.descriptors <= before.descriptors and now.threads <= before.threads
-
-
 def _own(pid: int) -> int:
     with contextlib.suppress(OSError), open(f"/proc/{pid}/smaps_rollup", encoding="utf-8") as file:
         return next((int(each.split()[1]) for each in file if each.startswith("Private_Dirty:")), 0)
@@ -94,6 +94,6 @@ def _own(pid: int) -> int:
 
 
 def told(pid: int) -> str:
-    """Return what a process has, for messages."""
+    """Return the descendants and descriptors of a process, for messages."""
     targets = [f"{number} → {target}" for number, target in descriptors(pid).items()]
     return "; ".join([*(command_line(each) for each in descendants(pid)), *sorted(targets)])

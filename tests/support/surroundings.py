@@ -1,4 +1,4 @@
-"""Where and in what environment tests start programs: short private directories, clean environments, no leftovers."""
+"""The surroundings of the programs that tests start: short private directories, clean environments, no leftovers."""
 
 from __future__ import annotations
 
@@ -23,54 +23,48 @@ from talkcli import paths
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-#: A Unix socket's path has at most 107 bytes: a temporary directory above this length leaves no room for its own.
-LONGEST_TEMPORARY = 50
-#: The variable that marks a test's processes, so that what is left of them is found whoever their parent is now.
+#: The longest path of a temporary directory in bytes that leaves room for a Unix socket's, which has at most 107.
+_LONGEST_TEMPORARY = 50
+#: The variable that marks a test's processes, so that leftovers are found whichever process is their parent now.
 MARK = "TALK_TEST_ID"
-#: What a child may take from the environment of the tests; the user's audio, runtime directory and settings stay out.
+#: The variables that a child inherits; the user's audio, runtime directory and settings stay out.
 _KEPT = ("PATH", "TMPDIR", "SYSTEMROOT", "LD_LIBRARY_PATH", "COVERAGE_PROCESS_START")
-
-#: Where programs are that run for all of a machine.
+#: Directories of programs that serve a whole machine.
 _SYSTEM = "/usr/local/sbin:/usr/sbin:/sbin"
 #: Seconds in which a killed process must be gone.
 _KILL_LIMIT = 2.0
 
 
 def needs(*programs: str) -> None:
-    """Skip the test if one of the programs is missing; where CI is set, fail it: there nothing may be skipped."""
+    """Skip the test if a program is missing; in CI, where nothing may be skipped, fail it."""
     _skip_without([each for each in programs if find_program(each) is None])
 
 
 def find_program(name: str) -> str | None:
-    """Return the path of a program, one also of one that a user's PATH does not name, as Debian's mosquitto."""
+    """Return the path of a program, also if a user's PATH lacks its directory, as for Debian's mosquitto."""
     return shutil.which(name) or shutil.which(name, path=_SYSTEM)
 
 
 def needs_packages(*names: str) -> None:
-    """Skip the test if one of the Python packages is missing, by its name for `import`; where CI is set, fail it."""
+    """Skip the test if a Python package is missing, by its name for `import`; in CI, fail it."""
     _skip_without([each for each in names if find_spec(each) is None])
 
 
 def needs_no_server() -> None:
-    """Skip the test if there is a server at any place where clients look, or was; where CI is set, fail it.
+    """Skip the test if there is or was a server at a place where clients look; in CI, fail it.
 
-    A client that names no socket would find it, and have it say aloud what the test says; a server that names none
-    would not start beside it.
+    A client that names no socket would have that server say the texts of the test aloud.
     """
     for place in [*paths.client_sockets(None), *glob.glob(f"/run/user/*/talk/{paths.SOCKET}")]:
-        found = _at(place)
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.settimeout(1)
+            try:
+                probe.connect(place)
+                found = "there is one"
+            except OSError as error:
+                found = paths.found_at(place, error)
         if found != paths.ABSENT:
             _skip(f"needs a machine on which no talk server runs; {place}: {found}")
-
-
-def _at(place: str) -> str:
-    with socket.socket(socket.AF_UNIX) as probe:
-        probe.settimeout(1)
-        try:
-            probe.connect(place)
-        except OSError as error:
-            return paths.found_at(place, error)
-    return "there is one"
 
 
 def _skip_without(missing: list[str]) -> None:
@@ -88,7 +82,7 @@ def _skip(reason: str) -> NoReturn:
 def short_directory(prefix: str = "talk-") -> Iterator[str]:
     """Give a private directory with a path short enough for sockets, removed at the end."""
     base = tempfile.gettempdir()
-    if len(os.fsencode(base)) > LONGEST_TEMPORARY:
+    if len(os.fsencode(base)) > _LONGEST_TEMPORARY:
         base = "/tmp"
     path = os.path.realpath(tempfile.mkdtemp(prefix=prefix, dir=base))
     try:
@@ -98,7 +92,7 @@ def short_directory(prefix: str = "talk-") -> Iterator[str]:
 
 
 def clean_environment(home: str, extra: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return an environment for a child: its home, UTF-8, this checkout's talkcli, no sound of the user's, `extra`."""
+    """Return an environment for a child: its home, UTF-8, this checkout's talkcli, no user's sound server, `extra`."""
     result = {name: os.environ[name] for name in _KEPT if name in os.environ}
     result |= {
         "HOME": home,
@@ -114,7 +108,7 @@ def clean_environment(home: str, extra: Mapping[str, str] | None = None) -> dict
 
 
 def dying_with_parent(command: list[str]) -> list[str]:
-    """Return the command so that it is killed with the thread that starts it: killed tests leave nothing running."""
+    """Return the command so that it is killed with the thread that starts it, as a killed test leaves nothing."""
     if sys.platform != "linux":
         return command
     needs("setpriv")
@@ -122,13 +116,13 @@ def dying_with_parent(command: list[str]) -> list[str]:
 
 
 def stop_child(pid: int) -> None:
-    """Stop a child of this process as it is (SIGSTOP); it has stopped when this returns, or has ended."""
+    """Stop a child of this process (SIGSTOP); it has stopped or ended when this returns."""
     os.kill(pid, signal.SIGSTOP)
     os.waitid(os.P_PID, pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
 
 
 def marked(mark: str) -> list[int]:
-    """Return the ids of the living processes whose environment has this mark (none where there is no /proc)."""
+    """Return the ids of the living processes whose environment has this mark (none without /proc)."""
     wanted = f"{MARK}={mark}".encode()
     found = []
     for name in os.listdir("/proc") if os.path.isdir("/proc") else []:
@@ -153,7 +147,7 @@ def command_line(pid: int) -> str:
 
 
 def assert_none_left(mark: str, within: float) -> None:
-    """Assert that all processes with this mark end within some seconds; those that don't are killed, and gone then."""
+    """Assert that all processes with this mark end within some seconds; the others are killed."""
     left = _left(mark, within)
     if not left:
         return
@@ -168,5 +162,5 @@ def assert_none_left(mark: str, within: float) -> None:
 def _left(mark: str, within: float) -> list[int]:
     end = time.monotonic() + within
     while (left := marked(mark)) and time.monotonic() < end:
-        time.sleep(0.01)  # the end of a process that is no child of ours is no event
+        time.sleep(0.01)  # only a child's end is an event
     return left

@@ -1,10 +1,9 @@
 """Limits that are promises, on machines that are sometimes late themselves.
 
-A limit is asserted as written, and nothing is tried again. What was late is judged against a control, something that
-has nothing to do with what is tested, timed beside it over and over: bare process starts. The control is late where one
-of these took twice as long as they do on this machine when it is quiet, or longer. What was later than its limit by no
-more than that explains counts as not measured: the test goes on, and is listed at the end of the run. Anything else
-that is late fails.
+A limit is asserted as written, and nothing is tried again. A control, a bare process start, is timed beside the test
+over and over. The control is late if it once took at least twice as long as on this machine when quiet. A result that
+is late by no more than that explains counts as not measured: the test goes on, and is listed at the end of the run. Any
+other late result fails.
 """
 
 from __future__ import annotations
@@ -28,13 +27,12 @@ if TYPE_CHECKING:
 _EVERY = 0.25
 #: Times its usual duration from which a control is late.
 _LATE = 2.0
-#: Process starts, at most, of which what has a limit consists: a sentence after a crash waits for about so much work.
-_WORK = 10
-#: … and at least: what has a limit of milliseconds goes through as many processes, each of which waits for its turn.
-_LEAST_WORK = 3
-#: Controls that tell how long one takes when the machine is quiet: the shortest of them.
+#: The most process starts that a result consists of, as a sentence after a crash does; and the least, as a result of
+#: milliseconds goes through some processes, each of which waits for its turn.
+_WORK, _LEAST_WORK = 10, 3
+#: Number of controls of which the shortest is the time on a quiet machine.
 _FIRST = 5
-#: The variable that tells the workers of a run how long a process start took before they began.
+#: The variable by which the workers of a run inherit that time.
 _QUIET = "TALK_TEST_PROCESS_START"
 
 
@@ -44,35 +42,32 @@ class Watched:
 
     control: Callable[[], float]
     controls: list[float] = field(default_factory=list)
-    late: list[tuple[str, float, float]] = field(default_factory=list)  # what, how long it took, its limit
+    late: list[tuple[str, float, float]] = field(default_factory=list)  # name, seconds, limit
     failure: BaseException | None = None  # of the control
 
 
-#: The shortest that each control has taken in this run, and what could not be measured since `take_unmeasured`.
+#: The shortest time of each control in this run, and the results not measured since `take_unmeasured`.
 _usual: dict[Callable[[], float], float] = {}
 _unmeasured: list[str] = []
 _watched: list[Watched] = []
 
 
 def process_start() -> float:
-    """Return the seconds that a bare process start takes, about 10 ms where nothing else runs."""
+    """Return the seconds that a bare process start takes, about 10 ms on a quiet machine."""
     began = time.monotonic()
     subprocess.run([sys.executable, "-S", "-E", "-c", "pass"], env=clean_environment(tempfile.gettempdir()), check=True)
     return time.monotonic() - began
 
 
 def calibrate() -> None:
-    """Find out how long a process start takes, before tests make the machine busy."""
+    """Time a process start before tests make the machine busy."""
     if _QUIET not in os.environ:
         os.environ[_QUIET] = str(min(process_start() for _ in range(_FIRST)))
 
 
 @contextlib.contextmanager
 def limits(control: Callable[[], float] = process_start) -> Iterator[None]:
-    """Time the control beside the block, and judge against it what `assert_within` finds late there.
-
-    AssertionError at the end of the block if something was later than the control explains.
-    """
+    """Time the control beside the block, and fail at its end if a result was later than the control explains."""
     watched = Watched(control)
     if control is process_start:
         _usual.setdefault(control, float(os.environ[_QUIET]))
@@ -92,7 +87,7 @@ def limits(control: Callable[[], float] = process_start) -> Iterator[None]:
 
 
 def assert_within(seconds: float, limit: float, what: str) -> None:
-    """Assert that something took no longer than its limit; inside `limits`, at the end of the block."""
+    """Assert that a result took no longer than its limit; inside `limits`, at the end of the block."""
     if seconds <= limit:
         return
     assert _watched, f"{what} took {seconds:.3f} s, the limit is {limit} s"
@@ -100,7 +95,7 @@ def assert_within(seconds: float, limit: float, what: str) -> None:
 
 
 def take_unmeasured() -> list[str]:
-    """Return what could not be measured since this was called the last time."""
+    """Return the results that were not measured since the last call."""
     found = _unmeasured.copy()
     _unmeasured.clear()
     return found
