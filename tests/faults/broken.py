@@ -35,13 +35,6 @@ SILENCE, RUN_DRY = RATE // 50, RATE // 5
 #: kB by which a server may have grown after a fault; a goal and its log take a few.
 GROWTH = 4096
 
-#: A sitecustomize.py that keeps an engine process in its start as long as a file exists.
-SLOW_START = """
-import os, sys, time
-while "talkcli.engine.main" in "".join(sys.orig_argv) and os.path.exists({flag!r}):
-    time.sleep(0.001)
-"""
-
 
 def assert_answers(talk: Talk) -> None:
     """Assert that the server answers in time, whatever is broken."""

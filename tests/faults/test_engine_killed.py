@@ -1,17 +1,31 @@
-"""The engine process is killed, crashes or is frozen, whatever it does: its goal ends truly, the next is heard."""
+"""The engine process is killed, crashes, freezes or stands still: its goal ends truly, and the next is heard."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import sys
 import time
 from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.protocol import START_LIMIT
-from tests.conformance.hearing import LONG, LOW, PRECISION, assert_aborted, begin, engine_process, player_process, send
-from tests.faults.broken import SLOW_START, await_end, began, nothing_left, python_path, told, write
+from talkcli.engine.playback import GONE_WITHIN, STALLED_AFTER
+from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
+from tests.conformance.hearing import (
+    LONG,
+    LOW,
+    PRECISION,
+    assert_aborted,
+    await_word,
+    begin,
+    engine_process,
+    player_process,
+    send,
+)
+from tests.faults import trapped
+from tests.faults.broken import await_end, began, heard_again, nothing_left, python_path, told, write
 from tests.support import census
 from tests.support.compare import assert_begun, extent
 from tests.support.reference import render
@@ -19,6 +33,7 @@ from tests.support.surroundings import MARK, command_line, needs, short_director
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from tests.conftest import MakeTalk
@@ -26,6 +41,7 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
     from tests.support.recording import Recording
     from tests.support.sink import Sink
+
 
 KILL, SEGV, STOP = signal.SIGKILL, signal.SIGSEGV, signal.SIGSTOP
 #: Seconds from the signal to the first sample of the next goal.
@@ -46,8 +62,11 @@ ALL = [(activity, number) for activity in PLAYERS for number in SIGNALS]
 
 #: Words per minute of the next goal, the fastest there are.
 RATE = 450
-#: Shortens the time in which an engine must be ready; behind `SLOW_START`.
-IMPATIENT = """
+#: Keeps an engine process in its start as long as a file exists, and shortens the limit of that.
+SLOW_START = """
+import os, sys, time
+while "talkcli.engine.main" in "".join(sys.orig_argv) and os.path.exists({flag!r}):
+    time.sleep(0.001)
 from talkcli.engine import protocol
 protocol.START_LIMIT = {limit}
 """
@@ -108,29 +127,27 @@ def _bring_to(talk: Talk, activity: str, recording: Recording) -> str | None:
     return goal
 
 
-@pytest.mark.parametrize("number", [KILL, pytest.param(SEGV, marks=pytest.mark.slow)])
-def test_engine_process_signalled_in_its_start(
-    make_talk: MakeTalk, sink: Sink, tmp_path: Path, number: signal.Signals
-) -> None:
-    with limits():
-        talk = make_talk(sink=sink, env=_slow_start(tmp_path))
-        with nothing_left(talk), sink.record() as recording:
-            goal = begin(talk, LONG, number=1)
-            following, hit = _signal_the_next(talk, goal, tmp_path, number)
-            # It was not given to the process that never got ready, so nothing of it was lost.
-            assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
-        talk.stop()
-        _assert_next(recording, hit, CRASH, f"{number.name} in its start")
-
-
 @pytest.mark.parametrize("limit", [2.0, pytest.param(START_LIMIT, marks=pytest.mark.slow)])
 def test_engine_process_frozen_in_its_start(make_talk: MakeTalk, sink: Sink, tmp_path: Path, limit: float) -> None:
     with limits():
-        talk = make_talk(sink=sink, env=_slow_start(tmp_path, IMPATIENT.format(limit=limit)))
+        flag = tmp_path / "starting"
+        write(tmp_path / "sitecustomize.py", SLOW_START.format(flag=str(flag), limit=limit))
+        talk = make_talk(sink=sink, env=python_path(tmp_path))
         with nothing_left(talk), sink.record() as recording:
             goal = begin(talk, LONG, number=1)
             before = time.monotonic()  # it starts after this and before it is hit, and the limit counts from its start
-            following, hit = _signal_the_next(talk, goal, tmp_path, STOP)
+            flag.touch()
+            os.kill(engine_process(talk), KILL)
+            assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
+            following = send(talk, LOW, rate=RATE)
+            census.settled(talk.pid, lambda now: now.processes == 2)
+            (starting,) = census.descendants(talk.pid)
+            while "talkcli.engine" not in command_line(starting):
+                assert command_line(starting) != "ended"
+                time.sleep(0.001)  # after the fork, the start of the program sends no event
+            hit = time.monotonic()
+            os.kill(starting, STOP)
+            flag.unlink()
             recording.wait_until_quiet(0.1)  # the rest of the lost sentence is heard
             lost = len(recording)
             assert await_end(talk, following, limit + HANG) == "SUCCEEDED"
@@ -213,29 +230,6 @@ def test_complaints_of_the_engine_are_logged_fit_for_a_terminal(make_talk: MakeT
     assert r"talk: engine: cannot say \x1b[31myes" in talk.log
 
 
-def _slow_start(folder: Path, more: str = "") -> dict[str, str]:
-    write(folder / "sitecustomize.py", SLOW_START.format(flag=str(folder / "starting")) + more)
-    return python_path(folder)
-
-
-def _signal_the_next(talk: Talk, goal: str, folder: Path, number: signal.Signals) -> tuple[str, float]:
-    """Kill the engine and signal the next one while it starts; return the goal that waits for it, and the time."""
-    flag = folder / "starting"
-    flag.touch()
-    os.kill(engine_process(talk), KILL)
-    assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
-    following = send(talk, LOW, rate=RATE)
-    census.settled(talk.pid, lambda now: now.processes == 2)
-    (starting,) = census.descendants(talk.pid)
-    while "talkcli.engine" not in command_line(starting):
-        assert command_line(starting) != "ended"
-        time.sleep(0.001)  # after the fork, the start of the program sends no event
-    hit = time.monotonic()
-    os.kill(starting, number)
-    flag.unlink()
-    return following, hit
-
-
 def _feeding(talk: Talk, player: int) -> bool:
     """Return whether the engine still has samples for the player: it holds the other end of its standard input."""
     pipe = os.readlink(f"/proc/{player}/fd/0")
@@ -257,3 +251,119 @@ def _assert_next(recording: Recording, hit: float, limit: float, what: str) -> f
     told(f"the next goal after {what}", moment - hit)
     assert_within(moment - hit, limit, f"the next goal after {what}")
     return moment
+
+
+#: Seconds in which the thread acts and the watcher is told.
+SLACK = 0.5
+#: Seconds from a kill to the first sample of the next goal, the messages before included.
+RESTART = 0.7
+#: Seconds in which `cancel` is answered, whatever happens.
+CANCEL = 2.0
+#: Words per minute of the next goal, the fastest there are.
+RATE = 450
+#: Seconds for which a killed player cannot be reaped here, longer than anything waits for it.
+HELD = 20.0
+
+#: A library that never comes back from a sentence with a certain word in it, and a shorter limit for that.
+STUCK_SYNTHESIS = """
+from talkcli.engine import protocol
+protocol.HANG_AFTER = {limit}
+import sys, time
+if "talkcli.engine.main" in "".join(sys.orig_argv):
+    from pyttsx3.drivers import _espeak
+    speak = _espeak.Synth
+    def wait(text, *rest, **options):
+        while b"forever" in text:
+            time.sleep(1)
+        return speak(text, *rest, **options)
+    _espeak.Synth = wait
+"""
+
+#: What happens to a goal whose player cannot be reaped once it is killed, and the limit for its end in seconds.
+STUCK: dict[str, tuple[Callable[[Talk], object], float]] = {
+    "its engine killed": (lambda talk: os.kill(engine_process(talk), signal.SIGKILL), SILENCE_LIMIT + SLACK),
+    "stopped": (lambda talk: talk.request("cancel"), CANCEL),
+    "its player killed": (
+        lambda talk: os.kill(player_process(talk), signal.SIGKILL),
+        STALLED_AFTER + GONE_WITHIN + SILENCE_LIMIT + SLACK,
+    ),
+}
+
+
+@pytest.mark.parametrize("limit", [1.5, pytest.param(HANG_AFTER, marks=pytest.mark.slow)])
+def test_synthesis_without_progress(make_talk: MakeTalk, sink: Sink, tmp_path: Path, limit: float) -> None:
+    write(tmp_path / "sitecustomize.py", STUCK_SYNTHESIS.format(limit=limit))
+
+    with limits():
+        talk = make_talk(sink=sink, env=python_path(tmp_path))
+        with nothing_left(talk), sink.record() as recording:
+            asked = time.monotonic()
+            goal = send(talk, "this takes forever")
+            following = send(talk, LOW, rate=RATE)
+            assert await_end(talk, goal, limit + SLACK + 2) == "ABORTED"
+            assert_aborted(talk.goal(goal), "engine_hung", f"the engine gave no sign of life for {limit:g} s")
+            assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
+        talk.stop()
+        seconds = began(recording, render([LOW], rate=RATE)[0]) - asked
+        told("the next goal after a synthesis without progress", seconds)
+        assert seconds > limit
+        assert_within(seconds, limit + RESTART, "the next goal after a synthesis without progress")
+
+
+def test_stop_that_is_not_confirmed(talk: Talk, sink: Sink) -> None:
+    with limits():
+        with nothing_left(talk), sink.record() as recording:
+            goal = begin(talk, LONG, number=1)
+            following = send(talk, LOW, rate=RATE)
+            os.kill(engine_process(talk), signal.SIGSTOP)
+            asked = time.monotonic()
+            assert talk.request("cancel", ids=[goal])["ok"]
+            answered = time.monotonic()
+            ended = talk.goal(goal)
+            assert (ended["state"], ended["reason"]) == ("PREEMPTED", "canceled")
+            assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
+        seconds = began(recording, render([LOW], rate=RATE)[0]) - asked
+        told("the next goal after a stop that was not confirmed", seconds)
+        assert_within(answered - asked, CANCEL, "`cancel`")
+        assert_within(seconds, STOP_LIMIT + RESTART, "the next goal after a stop that was not confirmed")
+
+
+@pytest.mark.parametrize(
+    "whats",
+    [["its engine killed", "stopped"], pytest.param(["its player killed"], marks=pytest.mark.slow)],
+    ids=" and ".join,
+)
+def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path: Path, whats: list[str]) -> None:
+    if not trapped.is_possible():
+        pytest.skip("this system does not let a killed process be held: ptrace is forbidden")
+    play = "aplay -q -t raw -f S16_LE -r 22050 -c 1 --buffer-time=60000"
+    program = f"#!/bin/sh\nexec {sys.executable} -S {trapped.__file__} {HELD} {play}\n"
+    command = str(write(tmp_path / "player", program, 0o755))
+
+    with limits(), contextlib.ExitStack() as idle:
+        talks = {what: make_talk("--player", command, sink=sink) for what in whats}
+        for talk in talks.values():
+            idle.enter_context(nothing_left(talk))
+        goals = {what: send(talk, LONG) for what, talk in talks.items()}
+        players, hits = {}, {}
+        for what, talk in talks.items():
+            await_word(talk, goals[what])
+            players[what] = player_process(talk)
+        for what, talk in talks.items():
+            hits[what] = time.monotonic()
+            STUCK[what][0](talk)
+        for what in whats:
+            talk, goal, limit = talks[what], goals[what], STUCK[what][1]
+            assert await_end(talk, goal, limit + 2) == "ABORTED"
+            ended = talk.watcher.arrived(talk.watcher.wait_for(goal, "ABORTED")) - hits[what]
+            assert_aborted(talk.goal(goal), "not_silent", "could not be")
+            told(f"the end of a goal that was {what}, with a player that cannot be reaped", ended)
+            assert_within(ended, limit, f"the end of a goal that was {what}")
+        for what, talk in talks.items():
+            player = players[what]
+            assert os.path.exists(f"/proc/{player}"), "it could be reaped, so nothing was tested"
+            heard_again(talk, sink)
+            assert os.path.exists(f"/proc/{player}"), "the next goal waited for it"
+        for player in players.values():
+            for tracer in census.descendants(player):
+                os.kill(tracer, signal.SIGKILL)  # which lets go of it

@@ -6,7 +6,6 @@ A module or a library in the environment of a real server shadows the installed 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import resource
 import signal
@@ -19,7 +18,7 @@ import pytest
 from talkcli.engine.supervisor import BACK_OFF
 from tests.conformance.bareserve import SERVE, environment, run
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
-from tests.faults.broken import assert_answers, heard_again, python_path, told, write
+from tests.faults.broken import assert_answers, heard_again, python_path, write
 from tests.support import census
 from tests.support.connection import PATIENCE
 from tests.support.timing import assert_within, limits
@@ -35,14 +34,9 @@ if TYPE_CHECKING:
 
 #: Seconds in which a goal is ABORTED that waits for nothing.
 AT_ONCE = 0.1
-#: Seconds that a start takes on a busy machine, above the wait before it.
-START = 1.0
 
-#: A module that cannot be imported; each attempt leaves a line with its time.
-MISSING = """
-import time
-with open({attempts!r}, "a") as file:
-    file.write(f"{{time.monotonic()}}\\n")
+#: A module that cannot be imported.
+ABSENT = """
 raise ModuleNotFoundError("No module named " + repr(__name__), name=__name__)
 """
 #: The wheel without its data.
@@ -53,57 +47,33 @@ def get_data_path():
     return "{empty}"
 """
 WHEEL = os.path.dirname(espeakng_loader.__file__)
-#: What else is missing: the module in the place of the wheel, and the words that say what to install.
-WITHOUT = {
-    "wheel": (MISSING, "libespeak-ng is missing ("),
-    "data": (EMPTY, "there is no espeak-ng data: sudo apt-get install -y libespeak-ng1 espeak-ng-data"),
+#: The module that is replaced, by which one, and words that say what to install. The system's library is missing, too.
+MISSING = {
+    "pyttsx3": ("pyttsx3", ABSENT, "pyttsx3 is missing ("),
+    "wheel": ("espeakng_loader", ABSENT, "libespeak-ng is missing ("),
+    "data": (
+        "espeakng_loader",
+        EMPTY,
+        "there is no espeak-ng data: sudo apt-get install -y libespeak-ng1 espeak-ng-data",
+    ),
 }
 
 
-@pytest.mark.slow
-def test_without_pyttsx3_goals_end_at_once_and_it_is_tried_again_at_longer_and_longer_intervals(
-    make_talk: MakeTalk, sink: Sink, tmp_path: Path
-) -> None:
-    attempts = tmp_path / "attempts"
-
-    with limits():
-        attempts.write_text("")
-        shadow = write(tmp_path / "pyttsx3.py", MISSING.format(attempts=str(attempts)))
-        talk = make_talk(sink=sink, env=python_path(tmp_path))
-        _await_attempts(attempts, 2)
-        took = _assert_aborted_at_once(talk, "pyttsx3 is missing (")
-        times = _await_attempts(attempts, len(BACK_OFF))
-        assert_answers(talk)
-        shadow.unlink()
-        back = time.monotonic()
-        _await_ready(talk)
-        told("ready again after pyttsx3 is there", time.monotonic() - back)
-        heard_again(talk, sink)
-        assert talk.log.count("pyttsx3 is missing") == 3, f"once for the engine, once for each goal: {talk.log}"
-        talk.stop()
-        assert len(_times(attempts)) == len(BACK_OFF), "it was tried more often than it should have been"
-        assert_within(took, AT_ONCE, "the end of a goal without an engine")
-        for (first, second), wait in zip(itertools.pairwise(times), BACK_OFF, strict=False):
-            assert second - first >= wait
-            assert_within(second - first, wait + START, f"the start after {wait} s")
-        assert_within(time.monotonic() - back, BACK_OFF[-1] + START + 2, "speaking again")
-
-
-@pytest.mark.parametrize("what", WITHOUT)
-def test_without_libespeak_ng_or_its_data_goals_end_at_once_until_it_is_installed(
+@pytest.mark.parametrize("what", MISSING)
+def test_without_a_part_of_the_engine_goals_end_at_once_until_it_is_installed(
     make_talk: MakeTalk, sink: Sink, tmp_path: Path, what: str
 ) -> None:
-    wheel, words = WITHOUT[what]
-    module = wheel.format(attempts=str(tmp_path / "attempts"), real=WHEEL, empty=tmp_path)
-    write(tmp_path / "espeakng_loader.py", module)
-    library = tmp_path / "libespeak-ng.so.1"
-
+    name, module, words = MISSING[what]
     with limits():
-        library.write_bytes(b"no library")
+        shadow = write(tmp_path / f"{name}.py", module.format(real=WHEEL, empty=tmp_path))
+        library = write(tmp_path / "libespeak-ng.so.1", "no library")
         talk = make_talk(sink=sink, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
         took = _assert_aborted_at_once(talk, words)
-        library.unlink()
-        _await_ready(talk)
+        assert talk.log.count(words) == 3, f"once for the engine, once for each goal: {talk.log}"
+        assert_answers(talk)
+        (shadow if what == "pyttsx3" else library).unlink()
+        with talk.connect() as wire:
+            _await_engine(wire, "ready")
         heard_again(talk, sink)
         talk.stop()
         assert_within(took, AT_ONCE, "the end of a goal without an engine")
@@ -122,25 +92,6 @@ def _assert_aborted_at_once(talk: Talk, words: str) -> float:
         assert_aborted(goal, "engine_failed", words)
         assert goal["spoken"] == ""
     return ended - asked
-
-
-def _await_attempts(path: Path, count: int) -> list[float]:
-    end = time.monotonic() + sum(BACK_OFF) + 5
-    while len(times := _times(path)) < count:
-        assert time.monotonic() < end, f"{len(times)} starts"
-        time.sleep(0.01)  # another process writes it
-    return times
-
-
-def _times(path: Path) -> list[float]:
-    return [float(line) for line in path.read_text().splitlines()]
-
-
-def _await_ready(talk: Talk) -> None:
-    end = time.monotonic() + BACK_OFF[-1] + 5
-    while talk.request("status")["server"]["engine"] != "ready":
-        assert time.monotonic() < end, talk.log
-        time.sleep(0.05)  # it publishes nothing when it is ready
 
 
 #: Goals that wait behind the one that loses its engine.
@@ -277,17 +228,6 @@ def test_a_lasting_cause_and_then_a_passing_one_leave_no_goal_waiting(make_talk:
         ended = wire.receive_event("result")["goal"]
         assert (ended["id"], ended["state"], ended["reason"]) == (goal, "ABORTED", "engine_failed")
     talk.script_start("")
-
-
-def test_a_goal_that_an_engine_was_given_in_its_death_has_its_time(make_talk: MakeTalk) -> None:
-    """The next engine may begin with it, but not after its time to live."""
-    talk = make_talk("--player", "null")
-    assert talk.run("voices").code == 0
-    with talk.connect() as wire, too_few_descriptors(talk):
-        os.kill(engine_process(talk), signal.SIGKILL)
-        goal = wire.request("say", text="too late", ttl=0.3)["goal"]["id"]
-        assert talk.watcher.wait_for_terminal(goal) in {"RECALLED", "PREEMPTED"}
-        assert wire.request("status", id=goal)["goal"]["reason"] == "expired"
 
 
 @pytest.mark.parametrize("option", [("--driver", "parrot"), ("--driver", "nsss"), ("--voice", "parrot")], ids=" ".join)

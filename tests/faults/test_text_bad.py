@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import subprocess
 import sys
 import time
@@ -15,7 +16,7 @@ import pytest
 
 from talkcli.engine.render import render
 from talkcli.goals.text import fault
-from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, send
+from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, begin, send
 from tests.faults.broken import assert_answers
 from tests.faults.fuzz_texts import list_voices, speak_all
 from tests.faults.fuzz_texts_generator import SENTENCES, Case
@@ -173,7 +174,9 @@ def test_a_server_survives_bad_texts_and_speaks_the_next_one(talk: Talk) -> None
     assert talk.run("say", "--wait", "--rate", "450", "--", LOW).code == 0
 
 
-HOSTILE = "a\x1b[31mred\x07\x9b2J\u202egnp.exe\nfake line"
+#: Starts the client from a program whose command line would do harm, too.
+PARENT = "import subprocess, sys; sys.exit(subprocess.call(sys.argv[2:]))"
+HOSTILE = "a\x1b[31mred\x07\x9b2J\u202egnp.exe\r\nfake line"
 #: A client that needs nothing but a socket, so that its program can have any name.
 CLIENT = """
 import socket, sys
@@ -198,14 +201,18 @@ def test_terminal_escapes_in_texts_ids_keys_and_names_are_shown_escaped(scripted
     assert failed.code == 4
     evil = f"{scripted.directory}/ev\x1b[31m\u202e"
     os.symlink(sys.executable, evil)
-    subprocess.run([evil, "-c", CLIENT, scripted.socket], env=scripted.env, timeout=20, check=True)
-    shown = [scripted.run(*words) for words in (["status"], ["log"], ["status", goal], ["cancel", "\x1b[31m"])]
+    command = [sys.executable, "-c", PARENT, HOSTILE, evil, "-c", CLIENT, scripted.socket]
+    subprocess.run(command, env=scripted.env, timeout=20, check=True)
+    active = begin(scripted, f"never-ends {HOSTILE}", number=1, key=HOSTILE)
+    send(scripted, f"waits {HOSTILE}")
+    commands = (["status"], ["log"], ["status", goal], ["status", active], ["cancel", "\x1b[31m"], ["set"], ["cancel"])
+    shown = [scripted.run(*words) for words in commands]
     scripted.stop()
     out, err = watch.communicate(timeout=10)
     for text in [out, err, scripted.log, failed.err, own.err, *(each.out + each.err for each in shown)]:
-        assert not set(text) & {"\x1b", "\x07", "\x9b", "\u202e"}, ascii(text)
+        assert not re.search("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e]", text), ascii(text)
         assert "\nfake line" not in text
-    assert r"\x1b[31mred\x07\x9b2J\u202egnp.exe\nfake line" in out
+    assert r"\x1b[31mred\x07\x9b2J\u202egnp.exe\r\nfake line" in out
     assert r"\x1b[31mred" in shown[0].out
     assert r"\x1b[31mred" in shown[1].out
     assert r"ev\x1b[31m" in out + scripted.log + shown[0].out + shown[1].out

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import shutil
 import signal
 import stat
@@ -29,12 +28,10 @@ SCRIPTED = [SERVE[0], processes.SCRIPTED]
 NOBODY = 65534
 #: The group of the server, and of some of the strangers.
 GROUP = 4242
-HOSTILE = "\x1b]0;owned\x07\x1b[2Jred\u202egnp.exe\r\ntalk: forged"
 #: A client for users that may be able to read neither this checkout nor its interpreter. It sends lines and prints the
-#: answers. Its name would do harm on a terminal.
+#: answers.
 STRANGER = r"""
 import socket, sys
-open("/proc/self/comm", "w").write("\x1b[31m\n\x07evil")
 s = socket.socket(socket.AF_UNIX)
 s.settimeout(5)
 try:
@@ -52,11 +49,6 @@ try:
         sys.stdout.buffer.write(data)
 except ConnectionResetError:
     pass  # it closed without reading what was sent
-"""
-#: Starts the stranger from a program whose command line would do harm, too.
-PARENT = r"""
-import subprocess, sys
-sys.exit(subprocess.call([sys.executable, *sys.argv[2:]]))
 """
 #: A server of another user's, with the greeting of ours.
 IMPOSTOR = r"""
@@ -96,8 +88,7 @@ def as_user(uid: int, *groups: int) -> list[str]:
 
 
 def stranger(path: str, *requests: dict[str, object], groups: Sequence[int] = ()) -> subprocess.CompletedProcess[str]:
-    words = [*as_user(NOBODY, *groups), PYTHON, "-c", PARENT, HOSTILE, "-c", STRANGER, path]
-    words += [json.dumps(each) for each in requests]
+    words = [*as_user(NOBODY, *groups), PYTHON, "-c", STRANGER, path, *map(json.dumps, requests)]
     return subprocess.run(words, cwd="/", capture_output=True, text=True, timeout=20, check=False)
 
 
@@ -147,34 +138,6 @@ def test_members_of_the_group_are_let_in_by_the_socket_s_mode_and_others_are_not
         assert server.end(signal.SIGTERM) == 0
     line = next(each for each in server.log.splitlines() if f"{goal['id']} PREEMPTED" in each)
     assert f"(canceled by uid {NOBODY}, pid " in line
-
-
-def test_nothing_that_another_user_sends_reaches_a_terminal_raw(home: str) -> None:
-    path = f"{home}/s"
-    env = environment(home, TALK_SOCKET=path)
-    with serving(env, command=group_server()) as server, Wire(path) as wire:
-        watch = subprocess.Popen([*TALK, "watch"], env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-        assert watch.stdout
-        snapshot = watch.stdout.readline()
-        say = {"request": "say", "text": f"length=0 {HOSTILE}", "key": HOSTILE, "wait": True}
-        told = replies(stranger(path, {"request": "hello", "name": HOSTILE}, say, groups=[GROUP]))
-        goal = told[-1]["goal"]
-        assert (goal["state"], goal["client"]["name"]) == ("SUCCEEDED", HOSTILE), told
-        assert "\x1b[31m" in goal["client"]["command"]
-        assert "\x1b]0;owned" in goal["client"]["parent"]  # a program gets it as it is
-        bad = replies(stranger(path, {"request": "say", "text": "x", "id": HOSTILE}, groups=[GROUP]))[-1]
-        assert not bad.get("ok") or bad["goal"]["state"] == "REJECTED"
-        wire.request("say", text=f"never-ends {HOSTILE}", key=HOSTILE)
-        wire.request("say", text=f"waits {HOSTILE}")
-        shown = [run([*TALK, *words], env).out for words in (["status"], ["status", goal["id"]], ["log"], ["set"])]
-        shown.append(run([*TALK, "cancel"], env).out)
-        assert "".join(shown).count("owned") >= 4  # it is shown
-        assert server.end(signal.SIGTERM) == 0
-        everything, _ = watch.communicate(timeout=10)
-        shown += [snapshot.decode() + everything.decode(), server.log]
-    for each in shown:
-        assert not re.search("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e]", each), each
-        assert "talk: forged" not in each.splitlines()
 
 
 def test_another_user_is_refused_before_a_request_is_read_whatever_the_file_says(home: str) -> None:
