@@ -259,8 +259,6 @@ SLACK = 0.5
 RESTART = 0.7
 #: Seconds in which `cancel` is answered, whatever happens.
 CANCEL = 2.0
-#: Words per minute of the next goal, the fastest there are.
-RATE = 450
 #: Seconds for which a killed player cannot be reaped here, longer than anything waits for it.
 HELD = 20.0
 

@@ -1,11 +1,10 @@
-"""Compares what was heard with reference renderings, sample by sample, ends included.
+"""Compares recorded sound with reference renderings, sample by sample, including the ends.
 
-Three traps decide how. A correlation over a whole sentence hardly sees a short last word that was cut, so that the
-worst of its tenths of a second counts as well, and where the sound ends. The monitor drops samples where a stream
-starts, so that each tenth may sit a little beside its place. And on a busy machine a player runs dry now and then: the
-sink puts zeros between two samples of the sentence, and the monitor drops some of what follows, of a sentence that is
-whole all the same. So what was heard is first followed sample by sample, which forgives just these, and what is not
-the same then is judged by its correlation.
+Three traps decide how. A correlation over a whole sentence hardly shows a short last word that was cut, so the worst of
+its tenths of a second counts as well, and the place where the sound ends. The monitor drops samples at the start of a
+stream, so each tenth may sit a little beside its place. On a busy machine a player sometimes runs dry: the sink puts
+zeros between two samples of the sentence, and the monitor drops some of those behind, although the sentence is whole.
+So the sound is first followed sample by sample, which forgives just these, and otherwise judged by its correlation.
 """
 
 from __future__ import annotations
@@ -30,34 +29,33 @@ if TYPE_CHECKING:
 SAME = 0.95
 #: The worst tenth of a second of the right sentence has 1.0; of one with a word cut or changed, less than this.
 SAME_PART = 0.8
-#: Seconds by which the extent of the right sound may differ: what the monitor drops, and a block of silence.
+#: Seconds by which the extent of the right sound may differ: the monitor's loss and a block of silence.
 EXTENT = 0.02
 _PART = RATE // 10
 #: Samples by which a part may sit beside the place of the one before it.
 _SLACK = 48
-#: Samples that are the same in a row where the sentence goes on after a player ran dry, and zeros that say that it did.
+#: Samples in a row that are the same when the sentence goes on after a player ran dry, and zeros that show that it did.
 _RUN = 32
-#: Samples by which a quarter of a second may come later, where a player ran dry before it.
+#: Samples by which a quarter of a second may come later, if a player ran dry before it.
 _NEARBY = RATE // 20
 #: Samples of silence that players that ran dry may put into one sentence.
 _DRY = RATE // 2
-#: Samples that the monitor may lose where a stream starts, and where a player ran dry: up to 217 were seen to be. And
-#: those that it may lose once in a sentence without a sign of that: up to 110 were, on a machine that kept the engine
-#: waiting for 48 ms. The sound server says then that it ran dry, there, and 0.3 ms later that it goes on: what it has
-#: rendered it takes back, and in the monitor are neither the zeros nor the first of what replaces them.
+#: Samples that the monitor may lose at the start of a stream, and when a player ran dry: up to 217 were seen. And those
+#: that it may lose once in a sentence without any zeros: up to 110 were seen, when a busy machine kept the engine
+#: waiting for 48 ms. The sound server ran dry for 0.3 ms, and took back the sound that it had rendered.
 _LOST, _LOST_ONCE = 256, 128
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """How a sound that was heard resembles a reference."""
+    """How a recorded sound resembles a reference."""
 
     correlation: float  # normalised, over all of the reference; 1.0 is the same
     worst: float  # the same of its worst tenth of a second that is sound
     offset: int  # sample of the recording at which the reference's first sound is
     heard: float  # seconds from the first to the last sample that is sound
     expected: float  # the same of the reference
-    #: samples of the recording and of the reference's sound that were compared, where zeros were left out of both
+    #: the compared samples of the recording and of the reference's sound, if zeros were left out of both
     places: tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]] | None = None
 
     @property
@@ -72,11 +70,15 @@ class Comparison:
 
     @property
     def gaps(self) -> list[float]:
-        """The seconds of each silence that is not the reference's own."""
+        """The seconds of each silence that the reference lacks."""
         if self.places is None:
             return []
         longer = np.diff(self.places[0]) - np.diff(self.places[1])
         return [float(each) / RATE for each in longer[longer > 0]]
+
+
+def _samples(heard: Recording | Samples) -> Samples:
+    return heard.samples if isinstance(heard, Recording) else heard
 
 
 def extent(samples: Samples, loud: int = LOUD) -> tuple[int, int] | None:
@@ -87,7 +89,7 @@ def extent(samples: Samples, loud: int = LOUD) -> tuple[int, int] | None:
 
 def compare(heard: Recording | Samples, reference: Samples) -> Comparison:
     """Compare all that was heard with one reference, aligned where they resemble each other most."""
-    samples = heard.samples if isinstance(heard, Recording) else heard
+    samples = _samples(heard)
     wanted = _sound(reference)
     found = extent(samples)
     if found is None:
@@ -100,11 +102,11 @@ def compare(heard: Recording | Samples, reference: Samples) -> Comparison:
 
 
 def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> list[Comparison]:
-    """Assert that these references were heard whole, in order, each once, with nothing but silence beside them.
+    """Assert that these references were heard whole, in order, once each, with only silence beside them.
 
-    Returns how each compares. A pause that ends a sentence may have been cut short, never a sample that is sound.
+    Returns how each compares. A pause at the end of a sentence may be shorter.
     """
-    samples = heard.samples if isinstance(heard, Recording) else heard
+    samples = _samples(heard)
     result: list[Comparison] = []
     cursor = 0
     for number, reference in enumerate(references, 1):
@@ -126,7 +128,7 @@ def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> l
 
 
 def _next(samples: Samples, wanted: Samples, start: int) -> Comparison:
-    """Compare what begins with the sound at `start`: before it there is silence, so a sentence begins there."""
+    """Compare the sentence that begins with the sound at `start`, behind silence."""
     exact = _exact(samples, wanted, start)
     if exact:
         return exact
@@ -138,9 +140,9 @@ def _next(samples: Samples, wanted: Samples, start: int) -> Comparison:
 
 
 def _exact(samples: Samples, wanted: Samples, start: int) -> Comparison | None:
-    """Compare what begins with the sound at `start`, sample by sample; None if it is not that, and whole.
+    """Compare the sound at `start` sample by sample; None if it is not the whole sentence.
 
-    A player may have run dry: there zeros were put in, and the monitor may have lost some of what followed.
+    If a player ran dry, zeros were put in, and the monitor may have lost some samples behind them.
     """
     runs = _walk(samples, wanted, start)
     if not runs or not _nearly_whole(runs, wanted):
@@ -150,10 +152,10 @@ def _exact(samples: Samples, wanted: Samples, start: int) -> Comparison | None:
 
 
 def _walk(samples: Samples, wanted: Samples, place: int, ahead: int = 0) -> list[tuple[int, int, int]]:
-    """Return the runs in which both are the same: where each begins in the one and the other, and its length.
+    """Return the runs in which both are the same: the place of each in the samples, its own place, and its length.
 
-    Between two of them there are but zeros in the samples, and no more than was lost is left out of what is wanted.
-    The first run may begin `ahead` samples later in that.
+    Between two of them there are only zeros in the samples, and at most the lost samples are left out of those wanted.
+    The first run may begin `ahead` samples later in the latter.
     """
     runs: list[tuple[int, int, int]] = []
     own = 0
@@ -171,12 +173,12 @@ def _walk(samples: Samples, wanted: Samples, place: int, ahead: int = 0) -> list
 
 
 def _nearly_whole(runs: Sequence[tuple[int, int, int]], wanted: Samples) -> bool:
-    """Return whether what was lost and what was put in are what a busy machine does to a sentence, and no more."""
+    """Return whether no more was lost and put in than a busy machine does to a sentence."""
     reached = [0, *(own + length for _, own, length in runs)]
     begins = [*(own for _, own, _ in runs), len(wanted)]
     lost = [int(np.count_nonzero(wanted[a:b])) for a, b in zip(reached, begins, strict=True)]
     longer = runs[-1][0] - runs[0][0] - (runs[-1][1] - runs[0][1])
-    # Where no zeros are, samples are missing: none of a player that ran dry, and few of a monitor.
+    # Without zeros between them, samples are missing that the player had: few, which the monitor lost.
     wet = [
         missing
         for missing, before, after in zip(lost[1:-1], runs, runs[1:], strict=False)
@@ -191,7 +193,7 @@ def _leading_zeros(samples: Samples) -> int:
 
 
 def _find(piece: Samples, wanted: Samples, last: int) -> int | None:
-    """Return the first place, up to the last one, at which the piece is in `wanted`, at whose end it may be shorter."""
+    """Return the first place, up to `last`, of the piece in `wanted`, at whose end it may be shorter."""
     for place in np.flatnonzero(wanted[: last + 1] == piece[0]) if len(piece) else ():
         rest = wanted[place : place + len(piece)]
         if np.array_equal(piece[: len(rest)], rest):
@@ -212,11 +214,8 @@ def _places(runs: Sequence[tuple[int, int, int]]) -> tuple[npt.NDArray[np.intp],
 
 
 def assert_begun(heard: Recording | Samples, reference: Samples, shortest: float = 0.1) -> float:
-    """Assert that a beginning of the reference was heard, and nothing else; return its seconds.
-
-    For a sentence that was stopped: what was heard of it, at least `shortest` seconds, is the same as the reference.
-    """
-    samples = heard.samples if isinstance(heard, Recording) else heard
+    """Assert that only a beginning of the reference was heard, at least `shortest` seconds; return its seconds."""
+    samples = _samples(heard)
     found = extent(samples)
     assert found is not None, "nothing was heard"
     wanted = _sound(reference)
@@ -242,13 +241,12 @@ def same_until(samples: Samples, reference: Samples) -> int:
 def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float, twice: float = 0.0) -> float:
     """Assert that the reference was heard whole, held once in its middle for at least `pause` seconds.
 
-    Nothing of it may be missing, and at most `twice` seconds may have been said again after the pause. Returns for how
-    many seconds it was held.
+    At most `twice` seconds may have been said again after the pause. Returns the seconds of the pause.
     """
-    samples = heard.samples if isinstance(heard, Recording) else heard
+    samples = _samples(heard)
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
     assert len(loud) > 1, f"no sentence was heard: {_told(samples, [])}"
-    # What is quiet beside the pause is the sentence's own: where it is held there are but zeros.
+    # A pause is only zeros; other quiet samples belong to the sentence.
     sound = loud[0] + np.flatnonzero(samples[loud[0] : loud[-1] + 1])
     gap = int(np.argmax(np.diff(sound)))
     end, again = int(sound[gap]) + 1, int(sound[gap + 1])
@@ -259,7 +257,7 @@ def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float,
     try:
         _assert_parts(first, second, wanted, twice)
     except AssertionError as error:
-        # Zeros of the sentence's own, where it was held at them, can't be told from those of the pause.
+        # Zeros of the sentence beside the pause look like the pause.
         if not _ran_dry(first, samples[end : loud[-1] + 1], wanted, round(twice * RATE)):
             runs = [_walk(each, wanted, 0, ahead=len(wanted)) for each in (first, second)]
             told = f"parts of {len(first)} and {len(second)} samples, sample by sample (heard at, its own, so many)"
@@ -268,10 +266,9 @@ def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float,
 
 
 def follow(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[int, int] | None:
-    """Return from where to where in a sentence's sound a part of it goes, sample by sample; None where it is none.
+    """Return the places in a sentence's sound where a part of it begins and ends; None if it is no part.
 
-    But for what a busy machine does to it. `reached`: samples that were heard before, of which it may say the last
-    `back` again.
+    `reached`: samples that were heard before, of which it may say the last `back` again.
     """
     begins = max(0, reached - back)
     runs = _walk(part, wanted[begins:], 0, ahead=reached - begins)
@@ -281,7 +278,7 @@ def follow(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[int
 
 
 def _ran_dry(first: Samples, second: Samples, wanted: Samples, twice: int) -> bool:
-    """Return whether these are the two parts of a sentence, in which a player ran dry: see `_exact`."""
+    """Return whether these are the two parts of a sentence in which a player ran dry, see `_exact`."""
     runs = _walk(first, wanted, 0)
     if not runs or runs[-1][0] + runs[-1][2] < len(first):
         return False
@@ -290,14 +287,14 @@ def _ran_dry(first: Samples, second: Samples, wanted: Samples, twice: int) -> bo
     rest = _walk(second, wanted[reached - back :], 0, ahead=back)
     if not rest or len(wanted) - (reached - back + rest[-1][1] + rest[-1][2]) > _LOST:
         return False
-    # A stream that goes on loses nothing where it was held; one that was started again, or ran dry, may.
+    # A stream that goes on loses nothing at the pause; a stream that was started again or ran dry may.
     between = int(np.count_nonzero(wanted[reached : reached - back + rest[0][1]]))
     return between <= (_LOST if twice or len(runs) + len(rest) > 2 else 2 * _SLACK)
 
 
 def _assert_parts(first: Samples, second: Samples, wanted: Samples, twice: float) -> None:
     assert max(len(first), len(second)) <= len(wanted), "more was heard than the sentence"
-    # What the monitor has dropped of the beginning: a sentence begins with sound at once.
+    # The monitor may have dropped the first samples.
     lost = next((own for _, own, _ in _walk(first, wanted, 0)), 0)
     reached = lost + len(first)
     assert_heard(first, [wanted[lost:reached]])
@@ -320,13 +317,13 @@ def time_heard(recording: Recording, compared: Comparison, reference: Samples, p
 
 
 def alike(heard: Recording | Samples, reference: Samples) -> float:
-    """Return how a sound resembles a reference quarter second by quarter second, each where it resembles most nearby.
+    """Return how a sound resembles a reference by quarter seconds, each at the best place nearby; 0.0 for silence.
 
-    For what can't be the same: a library that has spoken already does not repeat itself, and a player that ran dry for
-    a moment plays the rest later. At 450 words a minute a sentence again has 0.35 to 1.0, another one 0.27 at most (250
-    of each, with a gap of 10 to 40 ms somewhere in it); at 200 another one reached 0.31. 0.0 where nothing was heard.
+    This is for sound that can't be the same: a library that has spoken already does not repeat itself, and a player
+    that ran dry plays the rest later. At 450 words a minute the same sentence has 0.35 to 1.0, another one 0.27 at most
+    (250 of each, with a gap of 10 to 40 ms somewhere in it); at 200 another one reached 0.31.
     """
-    samples = heard.samples if isinstance(heard, Recording) else heard
+    samples = _samples(heard)
     wanted = _sound(reference)
     if extent(samples) is None:
         return 0.0
@@ -346,7 +343,7 @@ def alike(heard: Recording | Samples, reference: Samples) -> float:
 
 def assert_silent(heard: Recording | Samples) -> None:
     """Assert that nothing was heard."""
-    samples = heard.samples if isinstance(heard, Recording) else heard
+    samples = _samples(heard)
     assert len(samples), "nothing was recorded, not even silence"
     assert extent(samples) is None, f"sound where silence should be: {_told(samples, [])}"
 
@@ -387,13 +384,13 @@ def _at(samples: Samples, wanted: Samples, offset: int, heard: float) -> Compari
         energies += energy
         if own > len(part) * LOUD**2:
             worst = min(worst, product / float(np.sqrt(own * max(energy, 1.0))))
-            place += min(0, beside - _SLACK)  # what was lost is never found again
+            place += min(0, beside - _SLACK)  # lost samples never come back
     whole = float(np.sqrt(float(reference @ reference) * max(energies, 1.0)))
     return Comparison(dots / whole, worst, offset, heard, len(wanted) / RATE)
 
 
 def _around(samples: Samples | Floats, offset: int, length: int, slack: int) -> Floats:
-    """Return the samples from an offset on, with `slack` of them on either side; zeros where there are none."""
+    """Return the samples from an offset on, with `slack` of them on either side, filled up with zeros."""
     padded = np.zeros(length + 2 * slack)
     begin = max(0, offset - slack)
     piece = samples[begin : offset + length + slack]
@@ -402,7 +399,7 @@ def _around(samples: Samples | Floats, offset: int, length: int, slack: int) -> 
 
 
 def _best(around: Floats, part: Floats) -> tuple[float, float, int]:
-    """Return the product with a part where that resembles most, the energy of what it resembles there, and where."""
+    """Return the product with a part at the best place, the energy of the samples there, and that place."""
     products = np.correlate(around, part, "valid")
     squares = np.concatenate([[0.0], np.cumsum(around**2)])
     energy = squares[len(part) :] - squares[: -len(part)]
@@ -411,7 +408,7 @@ def _best(around: Floats, part: Floats) -> tuple[float, float, int]:
 
 
 def _best_in_two(around: Floats, part: Floats) -> tuple[float, float, int]:
-    """As `_best`, of a part in whose middle the monitor may have dropped some samples."""
+    """Return the same as `_best` for a part in whose middle the monitor may have dropped samples."""
     found = []
     for cut in range(max(1, len(part) // 8), len(part), max(1, len(part) // 8)):
         first = _best(around[: cut + 2 * _SLACK], part[:cut])

@@ -1,16 +1,16 @@
 """Forks processes that run `talk`, all of it imported already: the program behind `tests.support.forking`.
 
-It reads requests from the socket whose number is its argument: eight bytes of length, with the descriptors that become
-standard input, output and error and one that is told how the child ended; then so many bytes of JSON. It answers with
-the child's id. It ends with its socket, and each child with it.
+It reads requests from the socket whose number is its argument: eight bytes of length, with the descriptors for standard
+input, output and error and one for the child's exit status; then so many bytes of JSON. It answers with the child's id.
+It ends with its socket, and each child with it.
 
-A child leaves `_serve` and runs to the end of this file as if it had been started for that alone, so that it ends as
-any interpreter does. No thread is started here: a fork would leave it behind.
+A child leaves `_serve` and runs to the end of this file, so that it ends as any interpreter does. No thread is started
+here, as a fork would leave it behind.
 """
 
 from __future__ import annotations
 
-import array
+import contextlib
 import ctypes
 import gc
 import importlib
@@ -26,7 +26,7 @@ import sys
 from typing import Any
 
 _KILLED_WITH_PARENT = 1  # PR_SET_PDEATHSIG
-#: What belongs to the engine process alone, or writes files when it is run: no client and no server imports it.
+#: Modules that no client and no server imports.
 _LEFT_OUT = {f"talkcli.{each}" for each in ("__main__", "engine.main")}
 _PACKAGES = (
     *("cli", "client", "daemon", "doctor", "engine", "engine.players", "fleet", "goals", "protocol", "server"),
@@ -45,7 +45,7 @@ def _import_talk() -> None:
 def _serve(channel: socket.socket) -> dict[str, Any]:
     """Fork a child for each request; return the request in the child, and never in the parent."""
     own = os.getpid()
-    ended: dict[int, tuple[int, int]] = {}  # by the child's pidfd: its id, and who is told of its end
+    ended: dict[int, tuple[int, int]] = {}  # by the child's pidfd: its id, and the descriptor for its exit status
     poll = select.poll()
     poll.register(channel, select.POLLIN)
     while True:
@@ -71,36 +71,25 @@ def _serve(channel: socket.socket) -> dict[str, Any]:
 
 
 def _receive(channel: socket.socket) -> tuple[dict[str, Any], list[int]]:
-    given = array.array("i")
-    head, ancillary, _, _ = channel.recvmsg(8, socket.CMSG_SPACE(4 * given.itemsize))
-    if not head:
+    head, given, _, _ = socket.recv_fds(channel, 8, 4)
+    length = struct.unpack("<q", head)[0] if head else 0
+    text = channel.recv(length, socket.MSG_WAITALL)
+    if not text or len(text) < length:
         os._exit(0)  # the tests are over
-    for _, _, data in ancillary:
-        given.frombytes(data)
-    length = struct.unpack("<q", head)[0]
-    text = b""
-    while len(text) < length:
-        more = channel.recv(length - len(text))
-        if not more:
-            os._exit(0)
-        text += more
-    assert len(given) == 4
-    return json.loads(text), list(given)
+    return json.loads(text), given
 
 
 def _tell(told: int, status: int) -> None:
-    try:
+    with contextlib.suppress(BrokenPipeError):  # nobody waits for it any more
         os.write(told, struct.pack("<i", status))
-    except BrokenPipeError:
-        pass  # nobody waits for it any more
     os.close(told)
 
 
 def _become(asked: dict[str, Any], given: list[int], parent: int) -> None:
-    """Make this child what a process is that was started with these words, environment, directory and descriptors."""
+    """Give this child the words, environment, directory and descriptors of a process of its own."""
     ctypes.CDLL(None).prctl(_KILLED_WITH_PARENT, signal.SIGKILL)
     if os.getppid() != parent:
-        os._exit(0)  # which had ended before
+        os._exit(0)  # the parent had ended before
     if asked["session"]:
         os.setsid()
     for number, each in enumerate(given[:3]):
@@ -111,7 +100,7 @@ def _become(asked: dict[str, Any], given: list[int], parent: int) -> None:
     os.environ.clear()
     os.environ.update(asked["env"])
     os.chdir(asked["directory"])
-    # As Python opens them where the locale is C.UTF-8; `__stdout__` and the like stay as they were, and are not used.
+    # As Python opens them if the locale is C.UTF-8; `__stdout__` and the like stay as they were, and are not used.
     sys.stdin, sys.stdout = _stream(0, "r", "surrogateescape"), _stream(1, "w", "surrogateescape")
     sys.stderr = _stream(2, "w", "backslashreplace")
     sys.stderr.reconfigure(line_buffering=True)
@@ -130,7 +119,7 @@ def _stream(descriptor: int, mode: str, errors: str) -> io.TextIOWrapper:
 if __name__ == "__main__":
     _import_talk()
     gc.collect()
-    gc.freeze()  # so that no child copies what none of them frees
+    gc.freeze()  # so that no child copies objects that none of them frees
     # Python forgets, in the child, the signals that came during a fork: this one waits until the child is itself.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     request = _serve(socket.socket(fileno=int(sys.argv[1])))

@@ -1,14 +1,12 @@
 """Starts `talk` as a fork of a process that has imported it: a few ms of processor instead of 45, or 90 for a server.
 
-What runs is a process all the same, with its own environment, descriptors and session, killed with the tests, ended as
-Python ends. It differs in what can be seen of it from outside, its command line and first environment in /proc, and in
-what it no longer has to import. A test of these, of signals or limits at a start, of streams that are closed or of
-another interpreter starts a program of its own; `forks()` tells what may be forked at all.
+It is a process with its own environment, descriptors and session, killed with the tests, ended as Python ends. Only its
+command line and first environment in /proc are different, and it has nothing to import. A test of these, of signals or
+limits at a start, of closed streams or of another interpreter starts a program of its own; see also `forks()`.
 """
 
 from __future__ import annotations
 
-import array
 import atexit
 import contextlib
 import json
@@ -28,12 +26,12 @@ from tests.support.surroundings import clean_environment
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-#: What a forked process can't have of its own: the interpreter's settings, libraries, the locale.
+#: Variables that a forked process can't have of its own: the interpreter's settings, libraries, the locale.
 _INTERPRETER = ("PYTHON", "LD_", "LC_", "LANG", "COVERAGE")
 
 
 class Forked:
-    """A process, with as much of `subprocess.Popen`'s interface as tests use."""
+    """A process with the part of `subprocess.Popen`'s interface that tests use."""
 
     def __init__(
         self,
@@ -46,7 +44,7 @@ class Forked:
         stderr: int = subprocess.DEVNULL,
         start_new_session: bool = False,
     ) -> None:
-        """Descriptors are as in `Popen`: a number, PIPE, DEVNULL or STDOUT; pipes are text."""
+        """Start it; streams are as in `Popen`: a number, PIPE, DEVNULL or STDOUT; pipes are text."""
         self.args = [sys.executable, "-m", "talkcli", *words]
         self.returncode: int | None = None
         self.stdin: IO[str] | None = None
@@ -91,7 +89,7 @@ class Forked:
         return self._wait(0)
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for the end, and return the exit code; `subprocess.TimeoutExpired` where it takes longer."""
+        """Wait for the end, and return the exit code; `subprocess.TimeoutExpired` if it takes longer."""
         code = self._wait(timeout)
         if code is None:
             assert timeout is not None
@@ -100,14 +98,14 @@ class Forked:
 
     def communicate(self, input: str | None = None, timeout: float | None = None) -> tuple[str, str]:  # noqa: A002
         """Send input, read all output, wait for the end."""
-        if not self._readers:  # else this is called again, after it had timed out
+        if not self._readers:  # otherwise this is called again after a timeout
             for number, file in enumerate((self.stdout, self.stderr)):
                 if file:
                     reader = threading.Thread(target=self._read, args=(number, file), daemon=True)
                     self._readers.append(reader)
                     reader.start()
             if self.stdin:
-                with contextlib.suppress(BrokenPipeError):  # it did not want it
+                with contextlib.suppress(BrokenPipeError):  # it closed its input
                     self.stdin.write(input or "")
                     self.stdin.flush()
                 with contextlib.suppress(BrokenPipeError):
@@ -115,7 +113,7 @@ class Forked:
         self.wait(timeout)
         for each in self._readers:
             each.join(timeout)
-            if each.is_alive():  # a child of its own has the pipe
+            if each.is_alive():  # a child of the process has the pipe
                 raise subprocess.TimeoutExpired(self.args, timeout or 0)
         for file in (self.stdout, self.stderr):
             if file:
@@ -140,12 +138,7 @@ class Forked:
 
     def _open(self, number: int, descriptor: int) -> None:
         file = os.fdopen(descriptor, "r" if number else "w", encoding="utf-8", errors="replace")
-        if number == 0:
-            self.stdin = file
-        elif number == 1:
-            self.stdout = file
-        else:
-            self.stderr = file
+        setattr(self, ("stdin", "stdout", "stderr")[number], file)
 
     def _wait(self, timeout: float | None) -> int | None:
         if self.returncode is None:
@@ -156,14 +149,14 @@ class Forked:
             with self._lock:
                 if self.returncode is None:  # no other thread was sooner
                     status = os.read(self._ended, 4)
-                    assert status, "what forks processes has ended"
+                    assert status, "the forking process has ended"
                     os.close(self._ended)
                     self.returncode = os.waitstatus_to_exitcode(struct.unpack("<i", status)[0])
         return self.returncode
 
 
 def forks(env: Mapping[str, str]) -> bool:
-    """Return whether a process with this environment may be forked: what the interpreter is told is as ever."""
+    """Return whether a process with this environment may be forked: it changes nothing for the interpreter."""
     return hasattr(os, "pidfd_open") and _told(env) == _told(clean_environment("/"))
 
 
@@ -172,7 +165,7 @@ def _told(env: Mapping[str, str]) -> dict[str, str]:
 
 
 class _Server:
-    """The process that forks, started by the first who asks it; it ends when its socket is closed, here or with us."""
+    """The process that forks, started by the first request; it ends when its socket is closed, or with us."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -185,11 +178,10 @@ class _Server:
             channel = self._channel or self._start()
             asked["directory"] = os.getcwd()
             text = json.dumps(asked).encode()
-            rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", descriptors))]
-            channel.sendmsg([struct.pack("<q", len(text))], rights)
+            socket.send_fds(channel, [struct.pack("<q", len(text))], descriptors)
             channel.sendall(text)
             answer = channel.recv(8)
-            assert answer, "what forks processes has ended"
+            assert answer, "the forking process has ended"
             child: int = struct.unpack("<q", answer)[0]
             return child
 
