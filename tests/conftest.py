@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -14,29 +15,15 @@ from tests.support.surroundings import needs_no_server
 from tests.support.timing import calibrate, take_unmeasured
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Mapping
+    from collections.abc import Generator, Iterator
 
 
 #: The name of late measurements in a test's report.
 _UNMEASURED = "not measured"
 
 
-class MakeTalk(Protocol):
-    """Starts a server for a test: `make_talk("--preempt", sink=sink)`; see `Talk`."""
-
-    def __call__(
-        self,
-        *options: str,
-        scripted: bool = False,
-        program: str | None = None,
-        sink: Sink | None = None,
-        driver: str | None = None,
-        env: Mapping[str, str] | None = None,
-        watched: bool = True,
-        forked: bool = True,
-    ) -> Talk:
-        """Return the server, greeted and watched."""
-        ...
+#: Starts a server for a test, greeted and watched: `make_talk("--preempt", sink=sink)`; see `Talk` for its parameters.
+MakeTalk = Callable[..., Talk]
 
 
 @pytest.fixture(scope="session", autouse=True)

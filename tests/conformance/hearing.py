@@ -15,12 +15,10 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from tests.conftest import MakeTalk
     from tests.support.compare import Comparison
     from tests.support.connection import Message
     from tests.support.processes import Process, Talk
     from tests.support.reference import Sentence
-    from tests.support.sink import Sink
 
     Samples = npt.NDArray[np.int16]
 
@@ -40,13 +38,8 @@ PRECISION = 0.03
 _PATIENCE = 5.0
 
 
-def quick_talk(make_talk: MakeTalk, sink: Sink, *options: str) -> Talk:
-    """Start a server with the real engine at a recorded sink that speaks at that rate."""
-    return make_talk("--rate", str(QUICK), *options, sink=sink)
-
-
 def render_quick(sentences: Sequence[str | Sentence]) -> list[Samples]:
-    """Return the samples of each sentence as such a server speaks them."""
+    """Return the samples of each sentence as a server at that rate speaks them."""
     return render(sentences, rate=QUICK)
 
 

@@ -14,7 +14,6 @@ from tests.conformance.told import assert_recalled, assert_told_in_order, submit
 from tests.conformance.voices import with_both
 from tests.support.compare import (
     SAME,
-    assert_begun,
     assert_heard,
     assert_resumed,
     assert_silent,
@@ -219,16 +218,6 @@ def test_row_43_the_watchdog_leaves_a_sentence_alone_that_is_held_for_longer_tha
     resume(talk)
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
     assert_resumed(heard(talk), voice.render([LONG])[0], pause=5, twice=TWICE)
-
-
-def test_a_server_that_is_terminated_while_paused_ends_all(talk: Talk, voice: Voice) -> None:
-    held = begin(talk, LONG)
-    pause(talk)
-    waiting = send(talk, LOW)
-    talk.stop(timeout=2)
-    assert talk.watcher.states(held) == STOPPED
-    assert talk.watcher.states(waiting) == ["PENDING", "RECALLED"]
-    assert_begun(heard(talk), voice.render([LONG])[0])
 
 
 def _assert_held_twice(samples: Samples, reference: Samples) -> None:

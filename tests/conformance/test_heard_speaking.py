@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import wave
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
 from talkcli.engine.players.choice import MOST
@@ -21,8 +19,6 @@ from tests.conformance.hearing import (
     assert_aborted,
     assert_same,
     heard,
-    quick_talk,
-    render_quick,
     send,
 )
 from tests.conformance.voices import Joe, with_both
@@ -148,18 +144,6 @@ def test_only_silence_is_left_out_between_queued_sentences_and_never_too_much(ta
         whole = len(references[number]) / RATE
         assert whole - MOST <= talk.goal(goals[number])["duration"] <= whole + 0.001
     assert abs(talk.goal(goals[-1])["duration"] - len(references[-1]) / RATE) < 0.001
-
-
-def test_a_file_gets_every_sample_and_nothing_is_heard(make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path) -> None:
-    path = tmp_path / "speech.wav"
-    talk = quick_talk(make_talk, sink, "--player", f"file:{path}")
-    for text in (LONG, LOW):
-        assert talk.run("say", "--wait", "--", text).code == 0
-    with wave.open(str(path)) as file:
-        assert (file.getframerate(), file.getnchannels(), file.getsampwidth()) == (RATE, 1, 2)
-        written = np.frombuffer(file.readframes(file.getnframes()), "<i2")
-    assert np.array_equal(written, np.concatenate(render_quick([LONG, LOW])))
-    assert_silent(heard(talk))
 
 
 #: Settings of ALSA for a card that there is not.

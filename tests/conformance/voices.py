@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import wave
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -44,39 +44,21 @@ _BLOCK, _PAUSE, _SILENT = 0.01, 8, 50
 _PATIENCE = 30.0
 
 
-class Voice(Protocol):
-    """A voice that servers speak with."""
-
-    @property
-    def repeats(self) -> bool:
-        """Whether a sentence is the same each time, whatever was said before it."""
-        ...
-
-    def serve(self, make_talk: MakeTalk, sink: Sink, *options: str, rate: int = QUICK, env: Environment = None) -> Talk:
-        """Start a server that speaks with this voice at a recorded sink."""
-        ...
-
-    def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
-        """Return the samples of each sentence, as the first ones of a server; the voice of a `Sentence` is this."""
-        ...
-
-    def render_with_words(self, sentence: Sentence) -> Rendering:
-        """Return the samples of a server's first sentence, with its English words."""
-        ...
-
-
 class Espeak:
-    """The voice of libespeak-ng."""
+    """The voice of libespeak-ng, which does not repeat a sentence to the sample."""
 
     repeats = False
 
     def serve(self, make_talk: MakeTalk, sink: Sink, *options: str, rate: int = QUICK, env: Environment = None) -> Talk:
+        """Start a server that speaks with this voice at a recorded sink."""
         return make_talk("--rate", str(rate), *options, sink=sink, env=env)
 
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
+        """Return the samples of each sentence, as the first ones of a server."""
         return render(sentences, rate=rate)
 
     def render_with_words(self, sentence: Sentence) -> Rendering:
+        """Return the samples of a server's first sentence, with its English words."""
         return render_with_words([sentence])[0]
 
 
@@ -122,6 +104,9 @@ class Joe:
             samples = np.frombuffer(file.readframes(file.getnframes()), "<i2").astype(np.int16)
         samples.flags.writeable = False
         return samples
+
+
+Voice = Espeak | Joe
 
 
 def _behind_a_pause(samples: Samples, begin: float, end: float) -> float:

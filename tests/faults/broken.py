@@ -11,9 +11,9 @@ import numpy as np
 
 import talkcli
 from tests.conformance.hearing import HOME, QUICK, render_quick
-from tests.conformance.stopped import DROPPED
+from tests.conformance.stopped import likeliest
 from tests.support import census
-from tests.support.compare import assert_heard, compare, extent
+from tests.support.compare import assert_heard, extent
 from tests.support.reference import RATE
 from tests.support.timing import assert_within
 
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 ANSWER = 0.1
 #: Seconds by which the goal that is heard again may be longer or shorter than a fresh engine's.
 ALIKE = 0.05
-#: Zero samples before a sentence, at least; and samples by which it is longer if its player ran dry.
-SILENCE, RUN_DRY = RATE // 50, RATE // 5
 #: kB by which a server may have grown after a fault; a goal and its log take a few.
 GROWTH = 4096
 
@@ -66,21 +64,9 @@ def nothing_left(talk: Talk) -> Iterator[None]:
 def began(recording: Recording, whole: Samples) -> float:
     """Assert that a sentence was heard whole, and last; return when its sound began."""
     samples = recording.samples
-    offset = compare(samples, whole).offset
-    # If the player ran dry in it, the likeliest place is a later part: it begins behind one of the silences before.
-    loud = np.flatnonzero(samples)
-    begins = loud[np.diff(loud, prepend=-SILENCE - 1) > SILENCE]
-    places = [int(each) for each in begins if offset - RUN_DRY <= each <= offset + DROPPED]
-    wrong: AssertionError | None = None
-    for place in [*places, offset]:
-        start = max(0, place - DROPPED)
-        try:
-            (found,) = assert_heard(samples[start:], [whole])
-            return recording.time_of(start + found.offset)
-        except AssertionError as error:
-            wrong = error
-    assert wrong
-    raise wrong
+    start, _ = next(likeliest(samples, [[whole]]), (0, [whole]))
+    (found,) = assert_heard(samples[start:], [whole])
+    return recording.time_of(start + found.offset)
 
 
 def heard_again(talk: Talk, sink: Sink) -> float:

@@ -1,12 +1,15 @@
-"""The engine process is killed, crashes, freezes or stands still: its goal ends truly, and the next is heard."""
+"""The engine or the server is killed, crashes, freezes or stands still: its goal ends, and the next is heard."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import random
 import signal
+import statistics
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -34,14 +37,12 @@ from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
     from tests.support.processes import Talk
     from tests.support.recording import Recording
     from tests.support.sink import Sink
-
 
 KILL, SEGV, STOP = signal.SIGKILL, signal.SIGSEGV, signal.SIGSTOP
 #: Seconds from the signal to the first sample of the next goal.
@@ -332,8 +333,6 @@ def test_stop_that_is_not_confirmed(talk: Talk, sink: Sink) -> None:
     ids=" and ".join,
 )
 def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path: Path, whats: list[str]) -> None:
-    if not trapped.is_possible():
-        pytest.skip("this system does not let a killed process be held: ptrace is forbidden")
     play = "aplay -q -t raw -f S16_LE -r 22050 -c 1 --buffer-time=60000"
     program = f"#!/bin/sh\nexec {sys.executable} -S {trapped.__file__} {HELD} {play}\n"
     command = str(write(tmp_path / "player", program, 0o755))
@@ -347,6 +346,8 @@ def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path
         for what, talk in talks.items():
             await_word(talk, goals[what])
             players[what] = player_process(talk)
+            if "TracerPid:\t0\n" in Path(f"/proc/{players[what]}/status").read_text():
+                pytest.skip("this system does not let a killed process be held: ptrace is forbidden")
         for what, talk in talks.items():
             hits[what] = time.monotonic()
             STUCK[what][0](talk)
@@ -365,3 +366,41 @@ def test_process_that_cannot_be_reaped(make_talk: MakeTalk, sink: Sink, tmp_path
         for player in players.values():
             for tracer in census.descendants(player):
                 os.kill(tracer, signal.SIGKILL)  # which lets go of it
+
+
+#: By hand: `TALK_TEST_KILLS=1000 pytest -s -m slow -k server_is_killed tests/faults/test_engine_killed.py`.
+FEW, KILLS = 3, int(os.environ.get("TALK_TEST_KILLS", "20"))
+#: Seconds from the kill to the last sound and to the end of the last process; from a start to its greeting.
+SILENT, SERVES = 0.3, 1.0
+#: Between which words of LONG it is killed: before the second, nothing loud may have been heard.
+WORDS = (2, 5)
+
+
+@pytest.mark.timeout(60 + 10 * KILLS)
+@pytest.mark.parametrize("kills", [FEW, pytest.param(KILLS, marks=pytest.mark.slow)])
+def test_server_is_killed_in_mid_sentence(make_talk: MakeTalk, sink: Sink, kills: int) -> None:
+    talk = make_talk(sink=sink, forked=False)  # its start is timed
+    chance = random.Random(kills)
+    files = set(os.listdir(talk.directory))
+    silences: list[float] = []
+    starts: list[float] = []
+
+    with limits():
+        for _ in range(kills):
+            with sink.record() as recording:
+                await_word(talk, send(talk, LONG), chance.randint(*WORDS))
+                killed = time.monotonic()
+                gone = talk.kill()
+                last = recording.wait_until_quiet(0.2)
+            assert last is not None
+            began = time.monotonic()
+            talk.start_server()
+            starts.append(time.monotonic() - began)
+            silences.append(last - killed)
+            assert_within(gone, SILENT, "the end of all processes after the server was killed")
+            assert_within(silences[-1], SILENT, "the silence after the server was killed")
+            assert_within(starts[-1], SERVES, "the start after the server was killed")
+    for what, times in (("silent after", silences), ("serves after", starts)):
+        told(f"{len(times)} kills, {what} at most {max(times):.3f} s, median", statistics.median(times))
+    heard_again(talk, sink)
+    assert set(os.listdir(talk.directory)) == files

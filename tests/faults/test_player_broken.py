@@ -6,15 +6,13 @@ Each player is a shell script that misbehaves in its own way while a file is the
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import time
 from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
 from talkcli.engine.playback import DRAIN_WITHIN, FIRST_WITHIN, STALLED_AFTER
-from tests.conformance.hearing import HOME, LONG, LOW, assert_aborted, begin, player_process, send
+from tests.conformance.hearing import HOME, LOW, assert_aborted, send
 from tests.faults.broken import await_end, heard_again, nothing_left, write
 from tests.support.compare import assert_heard
 from tests.support.reference import render
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Seconds above a limit of the engine in which a goal's end is told.
 SLACK = 0.5
-#: … of LOW.
+#: Seconds of LOW.
 LENGTH = 1.2
 
 PLAY = "aplay -q -t raw -f S16_LE -c 1 -r 22050 --buffer-time=60000"
@@ -50,6 +48,9 @@ BROKEN = {
         "audio_device",
         "player: audio open error: No such device",
         0,
+    ),
+    "is killed in mid-sentence": Player(
+        f"(sleep 0.6; kill -KILL $$) & exec {PLAY}", "audio_lost", "player was killed by SIGKILL", LENGTH
     ),
     "exits 0 too early": Player("cat > /dev/null", "audio_lost", " s before the sound did", 0),
     "never reads": Player("exec sleep 100", "audio_stalled", "player took no sound for 5 s", FIRST_WITHIN),
@@ -91,34 +92,6 @@ def test_player_is_broken(make_talk: MakeTalk, sink: Sink, tmp_path: Path, whats
                 heard_again(talk, sink)
             else:
                 assert talk.run("say", "--wait", "--rate", "450", "--", LOW).code == 0
-
-
-@pytest.mark.parametrize(
-    ("number", "reason", "words", "within"),
-    [
-        (signal.SIGKILL, "audio_lost", "player was killed by SIGKILL", 0.0),
-        pytest.param(
-            *(signal.SIGSTOP, "audio_stalled", "player took no sound for 3 s", STALLED_AFTER), marks=pytest.mark.slow
-        ),
-    ],
-    ids=["SIGKILL", "SIGSTOP"],
-)
-def test_player_is_signalled_in_mid_sentence(
-    make_talk: MakeTalk, sink: Sink, tmp_path: Path, number: signal.Signals, reason: str, words: str, within: float
-) -> None:
-    program = _script(tmp_path, "")
-
-    with limits():
-        talk = make_talk("--player", str(program), sink=sink)
-        with nothing_left(talk):
-            goal = begin(talk, LONG)
-            hit = time.monotonic()
-            os.kill(player_process(talk), number)
-            ended = _aborted(talk, goal, reason, words) - hit
-            assert talk.goal(goal)["spoken"].startswith("two three")
-            heard_again(talk, sink)
-        talk.stop()
-        assert_within(ended, within + SLACK, f"the end of a goal whose player got {number.name}")
 
 
 def test_player_that_writes_underrun_and_goes_on_is_no_error(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:

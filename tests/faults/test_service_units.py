@@ -303,18 +303,14 @@ def test_socket_that_cannot_be_served_is_refused_in_words(home: str) -> None:
             assert "has no file" in refused(passed)
 
 
-def test_named_socket_wins_over_a_socket_that_is_passed_for_another_place(home: str) -> None:
+def test_named_socket_wins_and_descriptors_of_another_process_are_not_taken(home: str) -> None:
     with listening_at(f"{home}/passed") as passed:
-        for place in ("own", "passed"):
-            env = environment(home, LISTEN_FDS="1", TALK_SOCKET=f"{home}/{place}")
-            with serving(env, command=passing(passed), pass_fds=[passed.fileno()]), Wire(f"{home}/{place}"):
-                assert os.path.exists(f"{home}/{place}.lock") == (place == "own")
-
-
-def test_descriptors_of_another_process_are_not_taken(home: str) -> None:
-    env = environment(home, LISTEN_FDS="1", LISTEN_PID="1", TALK_SOCKET=f"{home}/s")
-    with serving(env, command=SCRIPTED), Wire(f"{home}/s") as wire:
-        assert wire.request("status")["server"]["socket"] == f"{home}/s"
+        for place, pid in (("own", {}), ("passed", {}), ("third", {"LISTEN_PID": "1"})):
+            env = environment(home, LISTEN_FDS="1", TALK_SOCKET=f"{home}/{place}", **pid)
+            command = SCRIPTED if pid else passing(passed)
+            with serving(env, command=command, pass_fds=[passed.fileno()]), Wire(f"{home}/{place}") as wire:
+                assert wire.request("status")["server"]["socket"] == f"{home}/{place}"
+                assert os.path.exists(f"{home}/{place}.lock") == (place != "passed")
 
 
 def supervised(home: str, supervisor: Supervisor, **extra: str) -> dict[str, str]:
@@ -397,7 +393,7 @@ def test_watchdog_that_watches_this_process_is_fed_at_an_abstract_address(home: 
             supervisor.wait_for("WATCHDOG", since=supervisor.wait_for("WATCHDOG"))
 
 
-@pytest.mark.parametrize("address", ["", "relative", "/nowhere/at/all"])
+@pytest.mark.parametrize("address", ["relative", "/nowhere/at/all"])
 def test_supervisor_that_is_not_there_is_no_obstacle(home: str, address: str) -> None:
     env = environment(home, TALK_SOCKET=f"{home}/s", NOTIFY_SOCKET=address, WATCHDOG_USEC="100000")
     with serving(env, command=SCRIPTED) as server, Wire(f"{home}/s") as wire:

@@ -189,41 +189,54 @@ def test_two_servers_whose_files_were_removed_together_are_one_in_the_end(home: 
                 found_again(path, next(each.pid for each in both if each.poll() is None))
 
 
+def listen_at(path: str) -> subprocess.Popen[bytes]:
+    """Have another program listen in the place of the socket."""
+    program = subprocess.Popen([sys.executable, "-S", "-c", OTHER, path], stdout=subprocess.PIPE)
+    assert program.stdout
+    assert program.stdout.readline()
+    return program
+
+
 def test_program_that_listens_in_its_place_keeps_its_socket(home: str) -> None:
     path = f"{home}/s"
-    program = [sys.executable, "-S", "-c", OTHER, path]
-    with (
-        serving(environment(home, TALK_SOCKET=path), command=HASTY) as server,
-        subprocess.Popen(program, stdout=subprocess.PIPE) as other,
-    ):
-        try:
-            assert other.stdout
-            assert other.stdout.readline()
-            ends_with_11(server, f"another program listens at {path}")
-            with socket.socket(socket.AF_UNIX) as client:
-                client.connect(path)
-        finally:
-            other.kill()
+    with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server, listen_at(path) as other:
+        ends_with_11(server, f"another program listens at {path}")
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(path)
+        other.kill()
 
 
-def test_file_or_link_in_its_place_is_not_removed(home: str) -> None:
-    for make in (lambda path: os.symlink("/etc/passwd", path), os.mkdir):
-        path = f"{home}/s"
-        with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
-            os.rename(path, f"{path}.old")
-            make(path)
-            ends_with_11(server, f"{path} exists and is no socket")
-        assert os.path.lexists(path)
-        os.rename(path, f"{path}.{time.monotonic()}")
+def link_in_its_place(path: str) -> None:
+    os.unlink(path)
+    os.symlink("/etc/passwd", path)
 
 
-def test_directory_that_is_no_longer_safe_ends_it(home: str) -> None:
+def directory_in_its_place(path: str) -> None:
+    os.unlink(path)
+    os.mkdir(path)
+
+
+def open_directory(path: str) -> None:
+    move_directory(path)
+    os.chmod(os.path.dirname(path), 0o777)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (link_in_its_place, "talk/s exists and is no socket"),
+        (directory_in_its_place, "talk/s exists and is no socket"),
+        (open_directory, "chmod go-w "),
+    ],
+)
+def test_place_that_is_no_longer_the_server_s_ends_it_and_is_left(
+    home: str, fault: Callable[[str], None], words: str
+) -> None:
     path = f"{home}/talk/s"
     with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server:
-        move_directory(path)
-        os.chmod(f"{home}/talk", 0o777)
-        ends_with_11(server, f"chmod go-w {home}/talk")
-    assert os.listdir(f"{home}/talk") == []
+        fault(path)
+        ends_with_11(server, words)
+    assert os.path.lexists(path) == (fault is not open_directory)
 
 
 def test_file_of_a_passed_socket_is_missed_but_not_made(home: str) -> None:

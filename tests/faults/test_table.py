@@ -1,4 +1,4 @@
-"""The tables of faults name tests that exist, and the table of this folder names all its test modules."""
+"""The tables of faults name tests that exist."""
 
 from __future__ import annotations
 
@@ -50,12 +50,3 @@ def test_every_row_names_tests_that_exist(folder: Path) -> None:
             assert path.is_file(), f"{path} does not exist: {row}"
             assert function is None or function in functions(path), f"{path.name} has no {function}: {row}"
             assert function is None or function.startswith("test_"), f"{function} is no test"
-
-
-def test_every_module_of_faults_is_named() -> None:
-    """The tests of systemd units and sd_notify are no rows."""
-    shown = {path.name for row in rows(HERE) for path, _ in named(HERE, row)}
-    others = {"test_table.py", "test_service_units.py"}
-    assert {each.name for each in HERE.glob("test_*.py")} - others == {
-        each for each in shown if (HERE / each).is_file()
-    }

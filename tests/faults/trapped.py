@@ -7,10 +7,8 @@ process away. A program that ends by itself is not held.
 from __future__ import annotations
 
 import ctypes
-import functools
 import os
 import signal
-import subprocess
 import sys
 import time
 
@@ -18,25 +16,6 @@ _SEIZE, _CONTINUE, _EVENT_MESSAGE = 0x4206, 7, 0x4201
 _TRACE_EXIT, _EXIT_EVENT = 0x40, 6
 _SET_PTRACER, _ANY = 0x59616D61, 2**64 - 1
 _ALL_CHILDREN = 0x40000000
-#: Seconds after which a process that was killed is gone, unless it is held.
-_KILLED = 0.2
-
-
-@functools.cache
-def is_possible() -> bool:
-    """Return whether this system lets a process be held like this; some sandboxes don't."""
-    program = ["sh", "-c", "echo ready; exec sleep 10"]
-    process = subprocess.Popen([sys.executable, "-S", __file__, "1", *program], stdout=subprocess.PIPE)
-    assert process.stdout
-    with process.stdout:
-        process.stdout.readline()
-    process.kill()
-    try:
-        process.wait(_KILLED)
-    except subprocess.TimeoutExpired:
-        process.wait()
-        return True
-    return False
 
 
 def main() -> None:

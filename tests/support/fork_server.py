@@ -25,21 +25,17 @@ import struct
 import sys
 from typing import Any
 
+import talkcli
+
 _KILLED_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 #: Modules that no client and no server imports.
-_LEFT_OUT = {f"talkcli.{each}" for each in ("__main__", "engine.main")}
-_PACKAGES = (
-    *("cli", "client", "daemon", "doctor", "engine", "engine.players", "fleet", "goals", "protocol", "server"),
-    "terminal",
-)
+_LEFT_OUT = ("talkcli.__main__", "talkcli.engine.main", "talkcli.engine.synthesizers")
 
 
 def _import_talk() -> None:
-    for package in ("talkcli", *(f"talkcli.{each}" for each in _PACKAGES)):
-        for each in pkgutil.iter_modules(importlib.import_module(package).__path__):
-            name = f"{package}.{each.name}"
-            if name not in _LEFT_OUT:
-                importlib.import_module(name)
+    for each in pkgutil.walk_packages(talkcli.__path__, "talkcli."):
+        if not each.name.startswith(_LEFT_OUT):
+            importlib.import_module(each.name)
 
 
 def _serve(channel: socket.socket) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from tests.support.connection import PATIENCE, Message, Wire
@@ -130,8 +130,7 @@ class Clients:
         """Run a client to its end: `talk.run("say", "--wait", "--", "battery low")`."""
         began = time.monotonic()
         client = self.start(*words, stdin=subprocess.DEVNULL if stdin is None else subprocess.PIPE)
-        done = self.finish(client, timeout, stdin)
-        return Finished(done.command, done.code, done.out, done.err, time.monotonic() - began)
+        return replace(self.finish(client, timeout, stdin), seconds=time.monotonic() - began)
 
     def _end_clients(self) -> None:
         for client in self._clients:
@@ -247,12 +246,6 @@ class Talk(Clients):
         """Tell the scripted engine how each of its next starts goes, see `script`; "" for a good one."""
         with open(f"{self.directory}/start", "w", encoding="utf-8") as file:
             file.write(behaviour)
-
-    def status(self) -> float:
-        """Return the seconds that `talk status` takes: for an idle server a control of `limits`."""
-        done = self.run("status")
-        assert done.code == 0, done
-        return done.seconds
 
     def connect(self) -> Wire:
         """Return a raw connection."""
