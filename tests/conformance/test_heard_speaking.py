@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,7 @@ from tests.conformance.hearing import (
     heard,
     send,
 )
-from tests.conformance.voices import Joe, with_both
+from tests.conformance.voices import with_both
 from tests.support.compare import assert_heard, assert_silent, extent
 from tests.support.reference import RATE, played, render
 from tests.support.timing import assert_within, limits
@@ -39,25 +38,16 @@ SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
 LOST = 0.012
 
 
-@with_both
-def test_row_01_a_goal_is_spoken_and_its_end_is_told(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
-    talk = voice.serve(make_talk, sink, rate=200)
+def test_row_01_a_goal_is_spoken_and_its_end_is_told(talk: Talk) -> None:
     done = talk.run("say", "--wait", "--", LOW)
     assert (done.code, done.err) == (0, "")
     goal = talk.goal(done.id)
-    assert goal["state"] == "SUCCEEDED"
-    # A machine that is busy with other tests may be too slow for a neural voice: then the message says so.
-    gaps = r"(, but with (\d) gaps? of \d\.\d s in all: .*)?" if isinstance(voice, Joe) else "()()"
-    told = re.fullmatch(f"Talk completed successfully{gaps}", goal["message"])
-    assert told, goal
+    assert (goal["state"], goal["message"]) == ("SUCCEEDED", "Talk completed successfully")
     assert (goal["reason"], goal["spoken"]) == (None, LOW)
     assert talk.watcher.states(done.id) == SPOKEN
-    (reference,) = voice.render([LOW], 200)
+    (reference,) = render([LOW])
     assert goal["duration"] == pytest.approx(len(played(reference)) / RATE, abs=0.001)
-    (compared,) = assert_heard(heard(talk), [reference])
-    # From 50 ms of silence on it is a gap; the heard silence is longer, as the sound server first fills 60 ms again.
-    least, most = (sum(each > seconds for each in compared.gaps) for seconds in (0.12, 0.03))
-    assert least <= int(told[2] or 0) <= most, (goal["message"], compared.gaps)
+    assert_heard(heard(talk), [reference])
 
 
 @with_both

@@ -88,11 +88,6 @@ def heard_again(talk: Talk, sink: Sink) -> float:
     return recording.time_of(start + found[0])
 
 
-def told(what: str, seconds: float) -> None:
-    """Print a measured time, for `pytest -s`."""
-    print(f"measured: {what}: {seconds:.3f} s")
-
-
 def python_path(first: Path) -> dict[str, str]:
     """Return an environment in which Python searches a directory before talk's own."""
     return {"PYTHONPATH": os.pathsep.join([str(first), os.path.dirname(os.path.dirname(talkcli.__file__))])}

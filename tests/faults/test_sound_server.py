@@ -1,8 +1,10 @@
-"""The sink is suspended or unloaded, the sound server frozen or killed: goals end in time, and are heard again.
+"""The sound is lost: goals end in time, none SUCCEEDED unheard, and the next ones are heard when it is back.
 
-By `aplay`, by `pacat` and by the player "pulse". A goal is in mid-sentence at the fault, the next one comes while there
-is no sound, and the third is sent when there is sound again. Most of it is waiting, so all faults happen side by side,
-each at a sound server of its own. These are also row 41 of the conformance.
+The sink is suspended or unloaded, the sound server frozen or killed: these are also row 41 of the conformance. A goal
+is in mid-sentence at the fault, the next one comes while there is no sound, and the third is sent when there is sound
+again. Most of it is waiting, so all faults happen side by side, each at a sound server of its own.
+
+Or a player is broken: a shell script that misbehaves while a file exists, and plays with `aplay` after that.
 """
 
 from __future__ import annotations
@@ -16,11 +18,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from talkcli.engine.playback import FIRST_WITHIN, LOOK_EVERY, STALLED_AFTER
+from talkcli.engine.playback import DRAIN_WITHIN, FIRST_WITHIN, LOOK_EVERY, STALLED_AFTER
 from talkcli.engine.players.pulse import READY_WITHIN, SUSPENDED_FOR
-from tests.conformance.hearing import LONG, LOW, assert_aborted, assert_same, begin, heard, render_quick, send
-from tests.faults.broken import await_end, heard_again, nothing_left, told
-from tests.support.compare import assert_begun
+from tests.conformance.hearing import HOME, LONG, LOW, assert_aborted, assert_same, begin, heard, render_quick, send
+from tests.faults.broken import await_end, heard_again, nothing_left, write
+from tests.support.compare import assert_begun, assert_heard
 from tests.support.reference import render
 from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
@@ -110,7 +112,6 @@ def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: str) -> None
         for what, player, talk, (lost, meanwhile, again) in zip(FAULTS, PLAYERS[players], talks, times, strict=True):
             talk.stop()
             ends, case = _ends(FAULTS[what], player), f"{what}, {player}"
-            told(f"{case}: lost after, ended meanwhile after {lost:.3f}, {meanwhile:.3f} s; heard again", again)
             assert_within(lost, ends[0].within, f"the end of a goal, {case}")
             assert_within(meanwhile, ends[1].within, f"the end of a goal meanwhile, {case}")
             assert_within(again, AGAIN, f"the next goal, {case}")
@@ -174,3 +175,79 @@ def test_a_sound_server_that_takes_no_stream_is_no_reason_for_silence(
         assert (done.code, goal["output"]) == (0, None)
         assert_same(heard(talk), render_quick([LOW])[0])
         assert_within(took - goal["duration"], READY_WITHIN * hangs + TOLD, "a sentence by the next player")
+
+
+#: Seconds above a limit of the engine in which a goal's end is told.
+SLACK = 0.5
+#: Seconds of LOW.
+LENGTH = 1.2
+
+PLAY = "aplay -q -t raw -f S16_LE -c 1 -r 22050 --buffer-time=60000"
+
+
+#: Broken players, and the ends of their goals.
+BROKEN = {
+    "exits 1 at once": (
+        "echo 'player: main:831: audio open error: No such device' >&2; exit 1",
+        End("audio_device", SLACK, "player: audio open error: No such device"),
+    ),
+    "is killed in mid-sentence": (
+        f"(sleep 0.6; kill -KILL $$) & exec {PLAY}",
+        End("audio_lost", LENGTH + SLACK, "player was killed by SIGKILL"),
+    ),
+    "exits 0 too early": ("cat > /dev/null", End("audio_lost", SLACK, " s before the sound did")),
+    "never reads": ("exec sleep 100", End("audio_stalled", FIRST_WITHIN + SLACK, "player took no sound for 5 s")),
+    "reads a byte at a time": (
+        "while dd bs=1 count=1 of=/dev/null; do sleep 0.3; done 2> /dev/null",
+        End("audio_stalled", STALLED_AFTER + SLACK, "player took no sound for 3 s"),
+    ),
+    "hangs in drain": (
+        f"{PLAY}; exec sleep 100",
+        End("audio_stalled", LENGTH + DRAIN_WITHIN + SLACK, "player did not end 3 s after the sound"),
+    ),
+}
+#: The slowest of the players. The others are tested side by side, as the engine waits for some until a limit.
+LONGEST = "never reads"
+OTHERS = [each for each in BROKEN if each != LONGEST]
+
+
+@pytest.mark.parametrize("whats", [OTHERS, pytest.param([LONGEST], marks=pytest.mark.slow)], ids=" and ".join)
+def test_player_is_broken(make_talk: MakeTalk, sink: Sink, tmp_path: Path, whats: list[str]) -> None:
+    program = {what: _script(tmp_path / what.replace(" ", "-"), BROKEN[what][0]) for what in whats}
+
+    with limits(), contextlib.ExitStack() as idle:
+        for each in program.values():
+            (each.parent / "broken").touch()
+        talks = {what: make_talk("--player", str(program[what]), sink=sink) for what in whats}
+        for talk in talks.values():
+            idle.enter_context(nothing_left(talk))
+        goals = {what: (time.monotonic(), send(talk, LOW)) for what, talk in talks.items()}
+        for what, talk in talks.items():
+            (_, end), (began, goal) = BROKEN[what], goals[what]
+            assert_within(_assert_ended(talk, goal, end, began), end.within, f"the end of a goal whose player {what}")
+        for what, talk in talks.items():
+            (program[what].parent / "broken").unlink()
+            if what == whats[0]:
+                heard_again(talk, sink)
+            else:
+                assert talk.run("say", "--wait", "--rate", "450", "--", LOW).code == 0
+
+
+def test_player_that_writes_underrun_and_goes_on_is_no_error(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
+    complains = "while echo 'underrun!!! (at least 1.234 ms long)'; do sleep 0.02; done"
+    program = _script(tmp_path, f"({complains}) >&2 & sleep 100 & exec {PLAY}")
+    (tmp_path / "broken").touch()
+    talk = make_talk("--player", str(program), "--rate", "450", sink=sink)
+    with nothing_left(talk):
+        for text in (LOW, HOME):
+            assert talk.run("say", "--wait", "--", text).code == 0
+    talk.recording.wait_until_quiet(0.2)
+    assert_heard(talk.recording, render([LOW, HOME], rate=450))
+    talk.stop(gone_within=0.1)  # what the player had started went with it
+
+
+def _script(folder: Path, does: str) -> Path:
+    """Write a player that does something while the file "broken" is there, and plays otherwise."""
+    folder.mkdir(exist_ok=True)
+    text = f"#!/bin/sh\nif [ -e {folder}/broken ]; then\n:\n{does}\nexit\nfi\nexec {PLAY}\n"
+    return write(folder / "player", text, 0o755)
