@@ -11,7 +11,7 @@ import os
 import signal
 import socket
 import time
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
@@ -25,7 +25,7 @@ from tests.support.sink import Sink
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
@@ -40,14 +40,7 @@ OTHER = "other"
 _NAMES = (f"card{number}" for number in itertools.count())
 
 
-class Server(Protocol):
-    """A sound server: PulseAudio's or PipeWire's."""
-
-    socket: str
-
-    @property
-    def env(self) -> Mapping[str, str]: ...
-    def pactl(self, *words: str) -> str: ...
+Server = Sink | PipeWire
 
 
 @pytest.fixture(scope="module", params=[Sink, PipeWire], ids=["PulseAudio", "PipeWire"])

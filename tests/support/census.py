@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tests.support.surroundings import command_line
@@ -25,9 +25,6 @@ class Census:
     descriptors: int  # of the server
     threads: int  # of the server
     memory: int  # kB that each of them has written to and does not share
-
-    def __str__(self) -> str:
-        return ", ".join(f"{each.name} {getattr(self, each.name)}" for each in fields(self))
 
 
 def count(pid: int) -> Census:
