@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.playback import GONE_WITHIN, STALLED_AFTER
-from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
+from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, STOP_LIMIT
 from tests.conformance.hearing import (
     LONG,
     LOW,
@@ -29,7 +29,7 @@ from tests.conformance.hearing import (
 from tests.faults import trapped
 from tests.faults.broken import await_end, began, heard_again, nothing_left, python_path, write
 from tests.support import census
-from tests.support.compare import assert_begun, extent
+from tests.support.compare import assert_begun
 from tests.support.reference import render
 from tests.support.surroundings import MARK, command_line, needs, short_directory
 from tests.support.timing import assert_within, limits
@@ -62,14 +62,6 @@ ALL = [(activity, number) for activity in PLAYERS for number in SIGNALS]
 
 #: Words per minute of the next goal, the fastest there are.
 RATE = 450
-#: Keeps an engine process in its start as long as a file exists, and shortens the limit of that.
-SLOW_START = """
-import os, sys, time
-while "talkcli.engine.main" in "".join(sys.orig_argv) and os.path.exists({flag!r}):
-    time.sleep(0.001)
-from talkcli.engine import protocol
-protocol.START_LIMIT = {limit}
-"""
 
 
 @pytest.mark.parametrize(
@@ -125,38 +117,6 @@ def _bring_to(talk: Talk, activity: str, recording: Recording) -> str | None:
     else:
         assert _feeding(talk, player_process(talk)), "the synthesis goes on until the sentence is nearly over"
     return goal
-
-
-@pytest.mark.parametrize("limit", [2.0, pytest.param(START_LIMIT, marks=pytest.mark.slow)])
-def test_engine_process_frozen_in_its_start(make_talk: MakeTalk, sink: Sink, tmp_path: Path, limit: float) -> None:
-    with limits():
-        flag = tmp_path / "starting"
-        write(tmp_path / "sitecustomize.py", SLOW_START.format(flag=str(flag), limit=limit))
-        talk = make_talk(sink=sink, env=python_path(tmp_path))
-        with nothing_left(talk), sink.record() as recording:
-            goal = begin(talk, LONG, number=1)
-            before = time.monotonic()  # it starts after this and before it is hit, and the limit counts from its start
-            flag.touch()
-            os.kill(engine_process(talk), KILL)
-            assert talk.watcher.wait_for_terminal(goal) == "ABORTED"
-            following = send(talk, LOW, rate=RATE)
-            census.settled(talk.pid, lambda now: now.processes == 2)
-            (starting,) = census.descendants(talk.pid)
-            while "talkcli.engine" not in command_line(starting):
-                assert command_line(starting) != "ended"
-                time.sleep(0.001)  # after the fork, the start of the program sends no event
-            hit = time.monotonic()
-            os.kill(starting, STOP)
-            flag.unlink()
-            recording.wait_until_quiet(0.1)  # the rest of the lost sentence is heard
-            lost = len(recording)
-            assert await_end(talk, following, limit + HANG) == "SUCCEEDED"
-            first = extent(recording.samples[lost:])
-        talk.stop()
-        assert first
-        spoken = recording.time_of(lost + first[0])
-        assert spoken - before > limit
-        assert_within(spoken - hit, limit + 2 * CRASH, "the next goal after SIGSTOP in its start")
 
 
 #: A player whose sound is made by a process in a session of its own.
