@@ -295,15 +295,8 @@ def open_to_all(home: str) -> None:
     os.chmod(place(home), 0o777)
 
 
-def a_file(home: str) -> None:
-    with open(place(home), "w", encoding="utf-8"):
-        pass
-
-
 @pytest.mark.usefixtures("_as_tmp")
-@pytest.mark.parametrize(
-    "fault", [link, link_inside, open_to_all, open_inside, a_file], ids=lambda each: str(each.__name__)
-)
+@pytest.mark.parametrize("fault", [link, link_inside, open_to_all, open_inside], ids=lambda each: str(each.__name__))
 def test_place_that_somebody_prepared_is_refused_with_the_reason(home: str, fault: Callable[[str], None]) -> None:
     fault(home)
     done = run(SERVE, environment(home))

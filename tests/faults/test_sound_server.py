@@ -91,25 +91,21 @@ FAULTS = {
         (End("audio_lost", TOLD, GONE), End("no_player", TOLD)),
     ),
 }
-#: The player of each fault; the other way round shows no more of the programs, and takes as long.
-PLAYERS = {
-    "one each": ("pacat", "aplay", "aplay", "pacat"),
-    "the other": ("aplay", "pacat", "pacat", "aplay"),
-    "pulse": ("pulse",) * 4,
-}
+#: The player of each fault: programs, or the engine's own connection.
+PLAYERS = [("pacat", "aplay", "aplay", "pacat"), ("pulse",) * len(FAULTS)]
 
 
-@pytest.mark.parametrize("players", ["one each", "pulse", pytest.param("the other", marks=pytest.mark.slow)])
-def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: str) -> None:
+@pytest.mark.parametrize("players", PLAYERS, ids=["programs", "pulse"])
+def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: tuple[str, ...]) -> None:
     with limits(), contextlib.ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(len(FAULTS)))
         sinks = list(pool.map(lambda _: stack.enter_context(Sink()), FAULTS))
-        talks = [make_talk("--player", player, sink=sink) for player, sink in zip(PLAYERS[players], sinks, strict=True)]
+        talks = [make_talk("--player", player, sink=sink) for player, sink in zip(players, sinks, strict=True)]
         with contextlib.ExitStack() as idle:  # counted together: they share memory
             for talk in talks:
                 idle.enter_context(nothing_left(talk))
-            times = list(pool.map(_lose, FAULTS.values(), PLAYERS[players], talks, sinks))
-        for what, player, talk, (lost, meanwhile, again) in zip(FAULTS, PLAYERS[players], talks, times, strict=True):
+            times = list(pool.map(_lose, FAULTS.values(), players, talks, sinks))
+        for what, player, talk, (lost, meanwhile, again) in zip(FAULTS, players, talks, times, strict=True):
             talk.stop()
             ends, case = _ends(FAULTS[what], player), f"{what}, {player}"
             assert_within(lost, ends[0].within, f"the end of a goal, {case}")
