@@ -9,7 +9,18 @@ import numpy as np
 import pytest
 
 from tests.conformance import stopped
-from tests.conformance.hearing import HELP, HOME, LONG, LOW, PRECISION, await_word, begin, heard, send
+from tests.conformance.hearing import (
+    HELP,
+    HOME,
+    LONG,
+    LOW,
+    PRECISION,
+    await_word,
+    begin,
+    begin_with_client,
+    heard,
+    send,
+)
 from tests.conformance.told import assert_recalled, assert_told_in_order, submit
 from tests.conformance.voices import with_both
 from tests.support.compare import (
@@ -175,11 +186,8 @@ def test_row_43_the_timeout_of_a_client_runs_out_while_paused(talk: Talk) -> Non
     """The client owns the goal: that is cancelled, and the client ends at its time."""
 
     with limits():
-        known = {None, *talk.watcher.goals()}
         began = time.monotonic()
-        client = talk.start("say", "--wait", "--timeout", "1", "--", LONG)
-        goal = str(talk.watcher.wait_until(lambda each: each.get("id") not in known)["id"])
-        await_word(talk, goal)
+        goal, client = begin_with_client(talk, LONG, "--timeout", "1")
         pause(talk)
         done = talk.finish(client)
         took = time.monotonic() - began

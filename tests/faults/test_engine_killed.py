@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.playback import GONE_WITHIN, STALLED_AFTER
-from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, STOP_LIMIT
+from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT
 from tests.conformance.hearing import (
     LONG,
     LOW,
@@ -263,23 +263,6 @@ def test_synthesis_without_progress(make_talk: MakeTalk, sink: Sink, tmp_path: P
         seconds = began(recording, render([LOW], rate=RATE)[0]) - asked
         assert seconds > limit
         assert_within(seconds, limit + RESTART, "the next goal after a synthesis without progress")
-
-
-def test_stop_that_is_not_confirmed(talk: Talk, sink: Sink) -> None:
-    with limits():
-        with nothing_left(talk), sink.record() as recording:
-            goal = begin(talk, LONG, number=1)
-            following = send(talk, LOW, rate=RATE)
-            os.kill(engine_process(talk), signal.SIGSTOP)
-            asked = time.monotonic()
-            assert talk.request("cancel", ids=[goal])["ok"]
-            answered = time.monotonic()
-            ended = talk.goal(goal)
-            assert (ended["state"], ended["reason"]) == ("PREEMPTED", "canceled")
-            assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
-        seconds = began(recording, render([LOW], rate=RATE)[0]) - asked
-        assert_within(answered - asked, CANCEL, "`cancel`")
-        assert_within(seconds, STOP_LIMIT + RESTART, "the next goal after a stop that was not confirmed")
 
 
 @pytest.mark.parametrize(

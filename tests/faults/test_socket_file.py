@@ -9,7 +9,6 @@ import shutil
 import signal
 import socket
 import stat
-import subprocess
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -30,16 +29,6 @@ HASTY = [sys.executable, os.path.join(os.path.dirname(os.path.abspath(__file__))
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
 #: Seconds in which a server that looks every 0.05 s is found again.
 SOON = 5.0
-#: Listens at a path, as another program would, and says so.
-OTHER = """
-import os, socket, sys, time
-s = socket.socket(socket.AF_UNIX)
-s.bind(sys.argv[1] + "new")
-s.listen()
-os.rename(sys.argv[1] + "new", sys.argv[1])
-print(flush=True)
-time.sleep(60)
-"""
 
 
 def await_true(condition: Callable[[], object]) -> None:
@@ -189,21 +178,15 @@ def test_two_servers_whose_files_were_removed_together_are_one_in_the_end(home: 
                 found_again(path, next(each.pid for each in both if each.poll() is None))
 
 
-def listen_at(path: str) -> subprocess.Popen[bytes]:
-    """Have another program listen in the place of the socket."""
-    program = subprocess.Popen([sys.executable, "-S", "-c", OTHER, path], stdout=subprocess.PIPE)
-    assert program.stdout
-    assert program.stdout.readline()
-    return program
-
-
 def test_program_that_listens_in_its_place_keeps_its_socket(home: str) -> None:
     path = f"{home}/s"
-    with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server, listen_at(path) as other:
+    with serving(environment(home, TALK_SOCKET=path), command=HASTY) as server, socket.socket(socket.AF_UNIX) as other:
+        other.bind(f"{path}new")
+        other.listen()
+        os.rename(f"{path}new", path)
         ends_with_11(server, f"another program listens at {path}")
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(path)
-        other.kill()
 
 
 def link_in_its_place(path: str) -> None:
