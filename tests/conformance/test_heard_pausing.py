@@ -23,15 +23,7 @@ from tests.conformance.hearing import (
 )
 from tests.conformance.told import assert_recalled, assert_told_in_order, submit
 from tests.conformance.voices import with_both
-from tests.support.compare import (
-    SAME,
-    assert_heard,
-    assert_resumed,
-    assert_silent,
-    compare,
-    extent,
-    follow,
-)
+from tests.support.compare import SAME, assert_heard, assert_resumed, assert_silent, compare, extent, follow
 from tests.support.recording import LOUD
 from tests.support.reference import RATE
 from tests.support.timing import assert_within, limits

@@ -17,17 +17,7 @@ import pytest
 
 from talkcli.engine.players.choice import MOST
 from tests.conformance import stopped
-from tests.conformance.hearing import (
-    HELP,
-    HOME,
-    LONG,
-    LOW,
-    assert_aborted,
-    assert_same,
-    await_word,
-    heard,
-    send,
-)
+from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_aborted, assert_same, await_word, heard, send
 from tests.conformance.voices import ESPEAK, with_both
 from tests.support.compare import assert_begun, assert_heard, assert_silent, compare, extent, time_heard
 from tests.support.reference import RATE, Rendering, Sentence, played, render

@@ -274,8 +274,7 @@ def test_crash_loop_of_100_texts(make_talk: MakeTalk, sink: Sink, texts: int) ->
 
 
 @pytest.mark.parametrize(
-    "voice",
-    ["gmw/en", *(pytest.param(each, marks=pytest.mark.slow) for each in ("gmq/da", "zls/mk", "aav/vi"))],
+    "voice", ["gmw/en", *(pytest.param(each, marks=pytest.mark.slow) for each in ("gmq/da", "zls/mk", "aav/vi"))]
 )
 def test_with_the_guard_known_crashing_texts_are_spoken(voice: str) -> None:
     texts = [

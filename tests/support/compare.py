@@ -68,14 +68,6 @@ class Comparison:
         """The sample of the recording after the last that was compared."""
         return int(self.places[0][-1]) + 1 if self.places else self.offset + round(self.expected * RATE)
 
-    @property
-    def gaps(self) -> list[float]:
-        """The seconds of each silence that the reference lacks."""
-        if self.places is None:
-            return []
-        longer = np.diff(self.places[0]) - np.diff(self.places[1])
-        return [float(each) / RATE for each in longer[longer > 0]]
-
 
 def _samples(heard: Recording | Samples) -> Samples:
     return heard.samples if isinstance(heard, Recording) else heard
