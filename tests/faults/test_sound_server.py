@@ -59,9 +59,12 @@ class Fault:
 
     breaks: Callable[[Sink], None]
     mends: Callable[[Sink], None]
-    ends: tuple[End, End]
+    programs: tuple[End, End]
     #: the same by the player "pulse", which the server tells more
     pulse: tuple[End, End]
+
+    def ends(self, player: str) -> tuple[End, End]:
+        return self.pulse if player == "pulse" else self.programs
 
 
 GONE = "the sound server ended the stream"
@@ -107,19 +110,15 @@ def test_sound_is_lost_and_comes_back(make_talk: MakeTalk, players: tuple[str, .
             times = list(pool.map(_lose, FAULTS.values(), players, talks, sinks))
         for what, player, talk, (lost, meanwhile, again) in zip(FAULTS, players, talks, times, strict=True):
             talk.stop()
-            ends, case = _ends(FAULTS[what], player), f"{what}, {player}"
+            ends, case = FAULTS[what].ends(player), f"{what}, {player}"
             assert_within(lost, ends[0].within, f"the end of a goal, {case}")
             assert_within(meanwhile, ends[1].within, f"the end of a goal meanwhile, {case}")
             assert_within(again, AGAIN, f"the next goal, {case}")
 
 
-def _ends(fault: Fault, player: str) -> tuple[End, End]:
-    return fault.pulse if player == "pulse" else fault.ends
-
-
 def _lose(fault: Fault, player: str, talk: Talk, sink: Sink) -> tuple[float, float, float]:
     """Have a fault and mend it; return the seconds in which two goals ended, and one was heard again."""
-    first, second = _ends(fault, player)
+    first, second = fault.ends(player)
     goal = begin(talk, LONG)
     broken = time.monotonic()
     fault.breaks(sink)
