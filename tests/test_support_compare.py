@@ -12,11 +12,11 @@ import pytest
 from tests.conformance import stopped
 from tests.conformance.hearing import LONG, QUICK
 from tests.conformance.hearing import LOW as BATTERY
-from tests.faults.soak_clients import ALIKE
 from tests.support.compare import alike, assert_begun, assert_heard, assert_resumed, assert_silent, compare, extent
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, Sentence, render
 from tests.support.surroundings import clean_environment, needs
+from tests.tools.soak_clients import ALIKE
 
 if TYPE_CHECKING:
     import pathlib

@@ -17,9 +17,9 @@ import pytest
 
 from talkcli.engine import protocol
 from tests.engine.spawned import Spawned
-from tests.faults.fuzz_texts_generator import made
 from tests.faults.test_text_bad import ENDLESS, LONGEST_WORDS, MARKUP, RIGHT_TO_LEFT
 from tests.support.real_voice import REAL_VOICE
+from tests.tools.fuzz_texts import made
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

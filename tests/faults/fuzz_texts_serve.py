@@ -1,4 +1,4 @@
-"""Runs the real `talk serve` without the guard before the library; arguments as of `serve`."""
+"""Run `talk serve` without the guard before the library, with the arguments of `serve`."""
 
 from __future__ import annotations
 
@@ -7,18 +7,12 @@ import sys
 
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
 
-from talkcli.cli import main as run_talk
+from talkcli.cli import main
 from talkcli.engine import process
-from tests.faults.fuzz_texts import engine_command
+from tests.tools.fuzz_texts import engine_command
 
-
-def main() -> None:
-    """Run `talk serve`."""
+if __name__ == "__main__":
     unguarded = engine_command(guarded=False)
     process.engine_command = lambda: unguarded
     sys.argv = ["talk", "serve", *sys.argv[1:]]
-    run_talk()
-
-
-if __name__ == "__main__":
     main()

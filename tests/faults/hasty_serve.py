@@ -1,4 +1,4 @@
-"""Runs `talk serve` with the scripted engine, looking after its socket's file every 0.05 s; arguments as of `serve`."""
+"""Run `talk serve` with the scripted engine, and have it check its socket's file every 0.05 s."""
 
 from __future__ import annotations
 

@@ -20,11 +20,11 @@ import pytest
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.conformance.rawsocket import Raw
 from tests.faults.broken import assert_answers
-from tests.faults.soak_witness import Witness
 from tests.support import census, processes
 from tests.support.connection import Wire
 from tests.support.processes import children
 from tests.support.timing import assert_within, limits
+from tests.tools.witness import Witness
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -18,12 +18,11 @@ from talkcli.engine.render import render
 from talkcli.goals.text import fault
 from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, begin, send
 from tests.faults.broken import assert_answers
-from tests.faults.fuzz_texts import list_voices, speak_all
-from tests.faults.fuzz_texts_generator import SENTENCES, Case
 from tests.support.compare import assert_heard
 from tests.support.reference import Sentence
 from tests.support.reference import render as reference
 from tests.support.timing import assert_within, limits
+from tests.tools.fuzz_texts import SENTENCES, Case, list_voices, speak_all
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

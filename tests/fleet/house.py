@@ -1,4 +1,4 @@
-"""The askers of a robot without a broker: what comes is handed to them, and what they publish is kept."""
+"""The askers of a robot without a broker: the test hands over requests, and looks at what is published."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 
 
 class House:
-    """The askers of anna, in the event loop that runs."""
+    """The askers of anna, in the running event loop."""
 
     def __init__(self, socket: str, room: int = 200_000) -> None:
-        """`socket`: the server's; `room`: bytes that the broker takes in one payload."""
+        """`socket`: the server's; `room`: bytes of the largest payload."""
         needs_packages("paho")
         from talkcli.fleet.askers import Askers
 
-        #: what was published: the topic, and the lines
+        #: the topic and the lines of each message
         self.published: list[tuple[str, list[dict[str, Any]]]] = []
         self._more = asyncio.Event()
         self._policy = policy.Policy("anna", policy.ASKABLE)
         self.askers: Askers = Askers("anna", socket, self._publish, lambda: room, lambda: None)
 
     def post(self, fields: object, session: str = "s1", *, correlation: bytes | None = None) -> None:
-        """Have bob ask for something; bytes as they stand, and b"" is a goodbye."""
+        """Send a request of bob, an object or bytes. b"" is a goodbye."""
         payload = fields if isinstance(fields, bytes) else json.dumps(fields).encode()
         topic, response = "talk/robot/anna/request/bob", f"talk/reply/bob/{session}"
         asked = topics.asked(topic)
@@ -46,19 +46,16 @@ class House:
             self.askers.ask(found)
 
     def lines(self, session: str = "s1") -> list[dict[str, Any]]:
-        """Return all that one of bob's sessions was told so far."""
         return [each for topic, lines in self.published if topic == f"talk/reply/bob/{session}/anna" for each in lines]
 
     async def line(self, wanted: Callable[[dict[str, Any]], bool], session: str = "s1") -> dict[str, Any]:
-        """Return the first line, of those that came and will, that is wanted."""
+        """Return the first wanted line, also of those that came before."""
 
         async def find() -> dict[str, Any]:
-            while True:
-                for each in self.lines(session):
-                    if wanted(each):
-                        return each
+            while not (found := list(filter(wanted, self.lines(session)))):
                 self._more.clear()
                 await self._more.wait()
+            return found[0]
 
         try:
             return await asyncio.wait_for(find(), PATIENCE)
@@ -66,7 +63,7 @@ class House:
             raise AssertionError(f"no such line within {PATIENCE} s: {self.published}") from None
 
     async def ask(self, fields: dict[str, Any], session: str = "s1") -> dict[str, Any]:
-        """Have bob ask for something, and return the reply; `fields` has a number of its own."""
+        """Send a request of bob, and return its reply."""
         self.post(fields, session)
         return await self.line(lambda each: each.get("seq") == fields["seq"] and "ok" in each, session)
 

@@ -1,4 +1,4 @@
-"""Many robots at one broker, as tests have them: real ones that are started together, and simulated by the hundred."""
+"""Many robots at one broker: real ones, and hundreds of simulated ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import sys
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -28,65 +27,60 @@ if TYPE_CHECKING:
     from tests.support.mqtt import Message
     from tests.support.processes import Clients, Finished
 
-#: Seconds in which robots are there that were just started: some have to share two processors.
+#: Seconds in which started robots are online, even if they share two processors.
 THERE_LIMIT = 30.0
-#: Robots that are started, or ended, at the same time.
+#: Robots that start or end at the same time.
 _AT_ONCE = 8
 _ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 
-class Roll(contextlib.AbstractContextManager["Roll"]):
-    """Who is there, as the broker tells it on one connection, until that ends."""
+class Roll(Listener):
+    """A listener to the presences of all robots."""
 
     def __init__(self, broker: Broker) -> None:
-        self._listener = Listener(broker, "talk/robot/+/presence")
+        super().__init__(broker, "talk/robot/+/presence")
 
-    def __exit__(self, *_error: object) -> None:
-        self._listener.close()
+    def __enter__(self) -> Roll:
+        return self
 
     def await_there(self, names: Iterable[str], within: float = THERE_LIMIT) -> float:
-        """Wait until all of these are online, each with a server; return the monotonic time at which the last was."""
-        wanted = set(names)
-        missing = set(wanted)
+        """Wait until these robots are online with a server, and return the monotonic time of the last one."""
+        missing = wanted = set(names)
 
         def complete(message: Message) -> bool:
-            name = message.topic.split("/")[2]
+            nonlocal missing
+            name = {message.topic.split("/")[2]}
             told = message.json if message.payload else {}
-            if told.get("online") and told.get("server"):
-                missing.discard(name)
-            elif name in wanted:
-                missing.add(name)
+            missing = missing - name if told.get("online") and told.get("server") else missing | (name & wanted)
             return not missing
 
-        found = self._listener.find(complete, within)
-        assert found, f"{len(missing)} are not there within {within} s: {sorted(missing)[:10]}"
+        found = self.find(complete, within)
+        assert found, f"{len(missing)} are not online within {within} s: {sorted(missing)[:10]}"
         return found.arrived
 
     def await_gone(self, name: str, within: float = THERE_LIMIT) -> None:
-        """Wait until a robot is offline."""
-        self._listener.await_message(
+        self.await_message(
             lambda each: each.topic.split("/")[2] == name and bool(each.payload) and each.json.get("online") is False,
             within,
         )
 
 
 class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
-    """Robots that speak by a script, each a server and a bridge of its own, all online; `with` ends them.
+    """Robots with a scripted engine, each with a server and a bridge of its own, all online.
 
-    What is still there at the end of a block that went well is ended in peace, and must have gone well, too.
+    After a block without an exception, all robots are ended by SIGTERM and checked.
     """
 
     def __init__(
         self, broker: Broker, names: Sequence[str], groups: Sequence[str] = (), options: Sequence[str] = ()
     ) -> None:
-        """`groups` and `options` are those of each bridge."""
+        """Start the robots. `groups` and `options` are for each bridge."""
         self.broker = broker
         self._groups, self._options = groups, options
         self._by_name: dict[str, Robot] = {}
         with contextlib.ExitStack() as stack:
             self._stack = stack.enter_context(contextlib.ExitStack())
-            for each in _together(self._start, names):
-                self._by_name[each.name] = each
+            _together(self.add, names)
             with Roll(broker) as roll:
                 roll.await_there(names)
             stack.pop_all()
@@ -101,28 +95,22 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
 
     @property
     def names(self) -> list[str]:
-        """All names, sorted."""
         return sorted(self._by_name)
 
     def add(self, name: str) -> Robot:
-        """Start another robot, and return it, started."""
-        self._by_name[name] = robot = self._start(name)
+        # Both are forks of a process that outlives this thread. A process that dies with its parent would end with it.
+        talk = self._stack.enter_context(contextlib.closing(Talk(scripted=True)))
+        bridge = self._stack.enter_context(Bridge(talk, self.broker, name, *self._options, groups=self._groups))
+        self._by_name[name] = robot = Robot(talk, self.broker, bridge)
         return robot
 
     def each(self, action: Callable[[Robot], Any]) -> list[Any]:
-        """Return what comes of an action for each robot, by their names' order; several are done at once."""
+        """Return the results of an action for each robot, sorted by their names."""
         return _together(action, [self._by_name[each] for each in self.names])
 
     def spoken(self) -> dict[str, list[str]]:
-        """Return the texts that each has begun to speak, in their order."""
+        """Return the texts that each robot has begun to speak."""
         return dict(zip(self.names, self.each(lambda each: each.spoken), strict=True))
-
-    def _start(self, name: str) -> Robot:
-        # Both are forks of a process that lives as long as the tests; one that dies with the thread that has started it
-        # would be gone with this.
-        talk = self._stack.enter_context(contextlib.closing(Talk(scripted=True)))
-        bridge = self._stack.enter_context(Bridge(talk, self.broker, name, *self._options, groups=self._groups))
-        return Robot(talk, self.broker, bridge)
 
 
 def _end(robot: Robot) -> None:
@@ -135,100 +123,81 @@ def _end(robot: Robot) -> None:
 
 
 def _together(action: Callable[[Any], Any], those: Collection[Any]) -> list[Any]:
-    """Return what comes of an action for each; all are done, before what went wrong with the first is raised."""
+    """Return the results of an action that is done for several at once; raise the first error when all are done."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         done = [pool.submit(action, each) for each in those]
         wait(done)
     return [each.result() for each in done]
 
 
-@dataclass(frozen=True, slots=True)
-class Spoken:
-    """A sentence that a simulated robot has begun to speak."""
-
-    robot: str
-    id: str
-    text: str
-    at: float  # monotonic time
-
-
 class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
-    """Simulated robots in processes of their own, started; `with` kills them, unless they were ended before."""
+    """Simulated robots in processes of their own, started; see `tests.tools.simulated`."""
 
-    def __init__(self, broker: Broker, count: int, *, processes: int = 1, groups: Sequence[str] = ()) -> None:
-        from tests.fleet.simulated import name_of
-
-        #: their names, in their order
-        self.names = [name_of(each + 1) for each in range(count)]
+    def __init__(self, broker: Broker, count: int, *, processes: int = 1) -> None:
+        self.names = [f"sim-{number + 1:04d}" for number in range(count)]
         self._processes: list[subprocess.Popen[str]] = []
         with contextlib.ExitStack() as stack:
             self._directory = stack.enter_context(short_directory("sim-"))
             stack.callback(self._kill)
-            bounds = [count * each // processes for each in range(processes + 1)]
-            for first, behind in pairwise(bounds):
-                words = ["--robots", str(behind - first), "--first", str(first + 1), "--broker", broker.url]
-                words += [word for each in groups for word in ("--group", each)]
-                self._processes.append(self._start(words))
+            for first, end in pairwise(count * each // processes for each in range(processes + 1)):
+                self._start(["--robots", str(end - first), "--first", str(first + 1), "--broker", broker.url])
             self._stack = stack.pop_all()
 
     def __exit__(self, *_error: object) -> None:
         self._stack.close()
 
     @property
-    def pids(self) -> list[int]:
-        """The processes that they share."""
-        return [each.pid for each in self._processes]
-
-    @property
     def log(self) -> str:
-        """What bridges and servers wrote so far."""
         with open(f"{self._directory}/log", encoding="utf-8", errors="replace") as file:
             return file.read()
 
-    @property
-    def spoken(self) -> list[Spoken]:
-        """What was begun to be spoken so far, by its time."""
+    def spoken(self, goal_id: str) -> dict[str, float]:
+        """Return when each robot began to speak a goal (monotonic time). No robot may have begun it twice."""
         with open(f"{self._directory}/spoken", encoding="utf-8") as file:
-            *lines, _ = file.read().split("\n")  # the last of them may be in the middle of being written
-        return sorted((Spoken(**json.loads(line)) for line in lines), key=lambda each: each.at)
+            *lines, _unfinished = file.read().split("\n")
+        found = [each for each in map(json.loads, lines) if each["id"] == goal_id]
+        result = {each["robot"]: each["at"] for each in found}
+        assert len(result) == len(found), (
+            f"{goal_id} was spoken more than once: {Counter(each['robot'] for each in found)}"
+        )
+        return result
 
     def await_there(self, within: float = THERE_LIMIT) -> None:
-        """Wait until all can be asked for the first time."""
+        """Wait until all robots are online for the first time."""
         end = time.monotonic() + within
         for each in self._processes:
             assert each.stdout
             found, _, _ = select.select([each.stdout], [], [], max(0.0, end - time.monotonic()))
-            assert found, f"simulated robots are not there within {within} s: {self.log[-2000:]}"
-            assert "there" in each.stdout.readline(), self.log[-2000:]
+            assert found, f"simulated robots are not online within {within} s: {self.log[-2000:]}"
+            assert "online" in each.stdout.readline(), self.log[-2000:]
 
     def await_spoken(self, goal_id: str, within: float = THERE_LIMIT) -> None:
-        """Wait until all have begun to speak a goal."""
+        """Wait until all robots have begun to speak a goal."""
         end = time.monotonic() + within
-        while (begun := sum(each.id == goal_id for each in self.spoken)) < len(self.names):
+        while (begun := len(self.spoken(goal_id))) < len(self.names):
             assert time.monotonic() < end, f"{begun} of {len(self.names)} speak {goal_id} within {within} s"
-            time.sleep(0.05)  # that a file grows is no event here
+            time.sleep(0.05)  # nothing tells when a file grows
 
-    def assert_spoken_once(self, goal_id: str, names: Collection[str] | None = None) -> list[Spoken]:
-        """Assert that this goal was begun once on each of these robots, all if none are named, and on no other."""
-        found = [each for each in self.spoken if each.id == goal_id]
-        counts, wanted = Counter(each.robot for each in found), Counter(self.names if names is None else names)
-        assert counts == wanted, f"not once each: too often {counts - wanted}, lacking {wanted - counts}"
-        return found
+    def assert_spoken_once(self, goal_id: str) -> float:
+        """Assert that every robot has begun a goal once, and return the monotonic time of the last one."""
+        spoken = self.spoken(goal_id)
+        assert spoken.keys() == set(self.names), f"not spoken by {set(self.names) - spoken.keys()}"
+        return max(spoken.values())
 
     def stop(self) -> None:
-        """End them in peace; each process must have gone well."""
+        """End the processes by SIGTERM, and check them."""
         for each in self._processes:
             each.terminate()
         for each in self._processes:
             code = each.wait(STOP_LIMIT + len(self.names) / 100)
             assert code == 0, f"simulated robots ended with {code}: {self.log[-2000:]}"
-        assert "Traceback" not in self.log, self.log[-2000:]
-        assert "a bug" not in self.log, self.log[-2000:]
+        for words in ("Traceback", "a bug"):
+            assert words not in self.log, self.log[-2000:]
 
-    def _start(self, words: Sequence[str]) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "tests.fleet.simulated", *words, "--spoken", f"{self._directory}/spoken"]
+    def _start(self, words: Sequence[str]) -> None:
+        command = [sys.executable, "-m", "tests.tools.simulated", *words, "--spoken", f"{self._directory}/spoken"]
         with open(f"{self._directory}/log", "ab") as log:
-            return subprocess.Popen(
+            process = subprocess.Popen(
                 dying_with_parent(command),
                 cwd=_ROOT,
                 env=clean_environment(self._directory),
@@ -237,6 +206,7 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
                 stderr=log,
                 text=True,
             )
+        self._processes.append(process)
 
     def _kill(self) -> None:
         for each in self._processes:
@@ -247,18 +217,17 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
 
 
 def request(robots: RealRobots, name: str, **fields: Any) -> None:
-    """Ask the server of each for something, at the robot."""
     for reply in robots.each(lambda each: each.talk.request(name, **fields)):
         assert reply["ok"], reply
 
 
 def at_once(clients: Clients, *lines: Sequence[str]) -> list[Finished]:
-    """Run these commands beside each other: each waits, most of its time, for what the broker may still tell."""
+    """Run several commands at the same time."""
     return [clients.finish(each) for each in [clients.start(*line) for line in lines]]
 
 
 def told(done: Finished) -> dict[str, tuple[str, str, int]]:
-    """Return what a desk was told of each robot: id, state, code; each is told of once."""
+    """Return the id, the state and the code that a desk printed for each robot."""
     lines = [line.split() for line in done.out.splitlines()]
     found = {robot: (goal_id, state, int(code)) for robot, goal_id, state, code in lines}
     assert len(found) == len(lines), f"a robot twice: {done.out}"
@@ -266,16 +235,16 @@ def told(done: Finished) -> dict[str, tuple[str, str, int]]:
 
 
 def objects(done: Finished) -> dict[str, dict[str, Any]]:
-    """Return what a desk was told of each robot, for programs."""
+    """Return the object that a desk printed for each robot."""
     return {each["robot"]: each for each in map(json.loads, done.out.splitlines())}
 
 
 def alike(names: Sequence[str], goal_id: str, state: str, code: int) -> dict[str, tuple[str, str, int]]:
-    """Return what a desk is told where all of these end alike."""
+    """Return what a desk prints if all robots end alike."""
     return dict.fromkeys(names, (goal_id, state, code))
 
 
 def assert_told(done: Finished, code: int, wanted: Mapping[str, tuple[str, str, int]], summary: str) -> None:
-    """Assert what a desk was told of each robot, its exit code, and how many did as they were asked."""
+    """Assert what a desk printed for each robot, its exit code, and its summary."""
     assert told(done) == wanted, done
     assert (done.code, done.err.splitlines()[-1:]) == (code, [f"talk: {summary}"]), done

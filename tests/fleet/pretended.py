@@ -1,4 +1,4 @@
-"""A robot that a test makes up: it is there for all who look, and answers what it is asked as the test has it."""
+"""A robot without bridge and server: it answers requests as a test wants it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,10 @@ if TYPE_CHECKING:
     from paho.mqtt.client import MQTTMessage
 
     from tests.support.broker import Broker
-    from tests.support.mqtt import Message
 
 
 class Pretended(Listener):
-    """A robot at a broker, of the group of all and of one of its own; once it is closed nothing of it is kept.
-
-    It has no server, and so no schedule: what it answers is all that there is to it.
-    """
+    """A robot at a broker, online until it is closed."""
 
     def __init__(
         self,
@@ -30,7 +26,8 @@ class Pretended(Listener):
         answer: Callable[[dict[str, Any]], Sequence[dict[str, Any]]],
         groups: Sequence[str] = (),
     ) -> None:
-        self._robot, self._answering = name, answer
+        """`answer` returns the lines of the answer to a request."""
+        self._robot, self._answer_to = name, answer
         topics = [f"talk/robot/{name}/request/+", *(f"talk/group/{each}/request/+" for each in ("all", *groups))]
         super().__init__(broker, *topics)
         told.presence(self, name, groups=groups)
@@ -39,22 +36,17 @@ class Pretended(Listener):
         return self
 
     def close(self) -> None:
-        """Go, and have the broker forget it; a second time is nothing."""
+        """Have the broker forget the robot, and end the connection."""
         if self.ended is None:
             self.publish(f"talk/robot/{self._robot}/presence", b"", retain=True)
         super().close()
 
     def _take(self, message: MQTTMessage) -> None:
         super()._take(message)
-        self._reply(self.messages[-1])
-
-    def _reply(self, message: Message) -> None:
-        if not message.payload or message.response is None:  # somebody hangs up
+        request = self.messages[-1]
+        if not request.payload or request.response is None:  # a goodbye
             return
-        asked = message.json
-        topic = (
-            message.response if message.response.endswith(f"/{self._robot}") else f"{message.response}/{self._robot}"
-        )
-        for line in self._answering(asked):
-            # By the thread that reads: it can wait for no acknowledgement.
-            self._client.publish(topic, json.dumps({"seq": asked.get("seq"), **line}) + "\n", 1)
+        topic = f"{request.response.removesuffix(f'/{self._robot}')}/{self._robot}"
+        for line in self._answer_to(request.json):
+            # This thread reads the acknowledgements, so it can't wait for one.
+            self._client.publish(topic, json.dumps({"seq": request.json.get("seq"), **line}) + "\n", 1)

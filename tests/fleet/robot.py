@@ -1,4 +1,4 @@
-"""A robot of a fleet, as tests have it: its server, its bridge, and the broker where both can be reached."""
+"""A robot of a fleet: its server, its bridge, and their broker."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from tests.support.mqtt import Message
     from tests.support.processes import Finished, Talk
 
-#: What a robot that speaks by a script says until it is stopped.
+#: A text that the scripted engine speaks until it is stopped.
 LONG = "never-ends until it is stopped"
 
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A robot, online."""
+    """A robot that is online."""
 
     talk: Talk
     broker: Broker
@@ -28,25 +28,23 @@ class Robot:
 
     @property
     def name(self) -> str:
-        """Its name at the broker."""
         return self.bridge.name
 
     @property
     def presence(self) -> str:
-        """The topic of its presence."""
         return f"talk/robot/{self.name}/presence"
 
     @property
     def spoken(self) -> list[str]:
-        """The texts that it has begun to speak since its server was started, in their order, whoever sent them."""
+        """The texts that it has begun to speak since the start of its server."""
         return self.talk.watcher.texts("ACTIVE")
 
     def desk(self, *words: str, timeout: float = 20) -> Finished:
-        """Run one command at a desk to its end: `robot.desk("say", "--wait", "--", "battery low")`."""
+        """Run one command at a desk: `robot.desk("say", "--wait", "--", "battery low")`."""
         return desk(self.broker, self.name, *words, timeout=timeout)
 
     def listen(self, *topics: str) -> Listener:
-        """Return a listener to its presence, which has come already, and to what else is named under its name."""
+        """Return a listener to its presence, which has come already, and to other topics under its name."""
         listener = Listener(self.broker, self.presence, *(f"talk/robot/{self.name}/{each}" for each in topics))
         try:
             listener.await_message(self.is_online)
@@ -56,16 +54,13 @@ class Robot:
         return listener
 
     def is_online(self, message: Message) -> bool:
-        """Whether a message says that it is online, with a server."""
         told = self._told(message)
         return bool(told.get("online") and told["server"])
 
     def is_offline(self, message: Message) -> bool:
-        """Whether a message says that it is offline."""
         return self._told(message).get("online") is False
 
     def is_without_server(self, message: Message) -> bool:
-        """Whether a message says that it is online, and has no server."""
         told = self._told(message)
         return bool(told.get("online") and told["server"] is None)
 

@@ -1,4 +1,4 @@
-"""Robots that are told of alone: what a bridge would publish, by a client of a test's own."""
+"""What a bridge publishes for a robot, published by a test."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def presence(
     groups: Sequence[str] = (),
     server: dict[str, Any] | None = SERVER,
 ) -> None:
-    """Say that a robot is there, with a server or without (None), or that it is gone."""
+    """Publish that a robot is online, or that it has gone."""
     said: dict[str, Any] = {"talk": 1, "online": online, "session": session, "groups": ["all", *groups]}
     if online:
         said |= {"version": "0.1.0", "since": time.time() - 7200, "allow": ["say"], "server": server}
@@ -40,14 +40,14 @@ def status(
     pending: int = 0,
     paused: bool = False,
 ) -> None:
-    """Say what a robot speaks: the goal `active` with a text; and that `last` has ended, an hour ago."""
+    """Publish the goal that a robot speaks, and the last goal, which ended an hour ago."""
     ended = {"id": last, "state": state, "reason": None, "text": "said before", "at": time.time() - 3600}
     said = {"active": active, "text": text, "pending": pending, "paused": paused, "last": ended if last else None}
     publisher.publish(f"talk/robot/{name}/status", said, retain=True)
 
 
 def event(publisher: Listener, name: str, goal: str, state: str, text: str | None = None) -> None:
-    """Say that a goal of a robot's is in another state; with a text, the whole goal is told."""
+    """Publish a state of a goal, with the whole goal if there is a text."""
     said: dict[str, Any] = {"event": "state", "id": goal, "state": state, "n": 1, "at": time.time()}
     if text is not None:
         said["goal"] = {"id": goal, "state": state, "text": text}

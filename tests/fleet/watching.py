@@ -1,4 +1,4 @@
-"""A `talk fleet watch` at a desk, as tests have it."""
+"""A running `talk fleet watch`."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ if TYPE_CHECKING:
 
 
 class Watching:
-    """A `talk fleet watch` that has begun, and what it has written so far."""
+    """A `talk fleet watch` that has printed its first line."""
 
-    def __init__(self, somebody: Desk, *words: str) -> None:
-        self._desk = somebody
-        self.process: Process = somebody.start(*words, "fleet", "watch")
+    def __init__(self, desk: Desk, *words: str) -> None:
+        self._desk = desk
+        self.process: Process = desk.start(*words, "fleet", "watch")
         self.lines: list[str] = []
         self.until("")
 
     def until(self, words: str) -> str:
-        """Read lines until one has these words, and return it."""
+        """Return the next line with these words."""
         assert self.process.stdout
         for line in self.process.stdout:
             self.lines.append(line.rstrip("\n"))
@@ -29,6 +29,5 @@ class Watching:
         raise AssertionError(f"it ended without '{words}': {self.lines}")
 
     def end(self) -> Finished:
-        """Press Ctrl-C, and return how it ended."""
         self.process.send_signal(signal.SIGINT)
         return self._desk.finish(self.process)

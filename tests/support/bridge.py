@@ -1,4 +1,4 @@
-"""A robot's way to a broker, `talk bridge`, as a process of a test's own; and the desk at the other end."""
+"""A robot's `talk bridge` and a desk, as processes of a test."""
 
 from __future__ import annotations
 
@@ -14,13 +14,7 @@ from typing import TYPE_CHECKING, Any
 from tests.support.forking import Forked, forks
 from tests.support.mqtt import Listener
 from tests.support.processes import Clients, Finished
-from tests.support.surroundings import (
-    MARK,
-    assert_none_left,
-    clean_environment,
-    dying_with_parent,
-    short_directory,
-)
+from tests.support.surroundings import MARK, assert_none_left, clean_environment, dying_with_parent, short_directory
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -29,17 +23,17 @@ if TYPE_CHECKING:
     from tests.support.mqtt import Message
     from tests.support.processes import Process, Talk
 
-#: Seconds in which a bridge that has been started must be there: it may have to ask who else has its name.
+#: Seconds in which a started bridge is online: it may have to ask whether another one has its name.
 ONLINE_LIMIT = 10.0
-#: Seconds in which it must have ended after SIGTERM.
+#: Seconds in which it ends after SIGTERM.
 STOP_LIMIT = 5.0
 
 
 class Bridge(contextlib.AbstractContextManager["Bridge"]):
-    """A `talk bridge`, started; `close()` or `with` kills it. It is online after `await_online()`.
+    """A `talk bridge`, started. It is online after `await_online()`, and killed by `close()` or `with`.
 
-    `user`, `password` and `cert`: as whom it logs in, as in `Broker.env`; `observer`: as whom the test looks at its
-    presence. `port`: that of a proxy before the broker.
+    The user, the password and the certificate are as in `Broker.env`. The test looks at the robot's presence as the
+    user `observer`. The port is that of a proxy before the broker.
     """
 
     def __init__(
@@ -57,14 +51,13 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         env: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
-        self._broker = broker
-        self._observer = observer
+        self._broker, self._observer = broker, observer
         self._mark = uuid.uuid4().hex
         self._words = ["bridge", "--name", name, *(["--group", ",".join(groups)] if groups else []), *options]
         to = {"TALK_BROKER": broker.url_at(port)} if port else {}
         self._env = talk.env | broker.env(user, password, cert) | to | dict(env or {}) | {MARK: self._mark}
         self._process: Process | None = None
-        #: the sessions that were seen to be online, and those of them that were before the last start
+        #: the sessions that were seen online, and those of them from before the last start
         self._sessions: set[str] = set()
         self._earlier: set[str] = set()
         with contextlib.ExitStack() as stack:
@@ -77,27 +70,22 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         self.close()
 
     def close(self) -> None:
-        """Kill it, without a word; a second time is nothing."""
         self._stack.close()
 
     @property
     def pid(self) -> int:
-        """Process id, also of one that has ended."""
         return self._started().pid
 
     @property
     def running(self) -> bool:
-        """Whether the process runs."""
         return self._process is not None and self._process.poll() is None
 
     @property
     def log(self) -> str:
-        """What it wrote so far, to standard output and error."""
         with open(f"{self._directory}/log", encoding="utf-8", errors="replace") as file:
             return file.read()
 
     def start(self) -> None:
-        """Start it; again after it has ended."""
         assert not self.running, f"the bridge {self.name} runs"
         self._earlier = set(self._sessions)
         with open(f"{self._directory}/log", "ab") as log:
@@ -111,32 +99,39 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
                 )
 
     def await_online(self, within: float = ONLINE_LIMIT) -> dict[str, Any]:
-        """Wait until the broker keeps that it is online, with a server, since its last start; return its presence."""
+        """Wait until the robot is online with a server after the last start, and return its presence."""
+        end = time.monotonic() + within
+
+        def online(message: Message) -> bool:
+            told = message.json if message.payload else {}
+            return bool(told.get("online") and told.get("server") and told["session"] not in self._earlier)
+
         with Listener(self._broker, f"talk/robot/{self.name}/presence", user=self._observer) as listener:
-            found = self._await(listener, within)
-        self._sessions.add(found["session"])
-        return found
+            # The broker doesn't tell that the process has ended.
+            while not (found := listener.find(online, 0.1)):
+                code = self._started().poll()
+                assert code is None, f"the bridge {self.name} ended with {code}: {self.log}"
+                told = f"{self.log}{listener.messages}"
+                assert time.monotonic() < end, f"{self.name} is not online within {within} s: {told}"
+        self._sessions.add(found.json["session"])
+        return found.json
 
     def await_log(self, words: str, within: float = ONLINE_LIMIT) -> str:
-        """Wait for a line of its log with these words, and return it."""
+        """Return the first line of the log with these words."""
         end = time.monotonic() + within
-        while True:
-            log = self.log
-            found = next((each for each in log.splitlines() if words in each), None)
-            if found:
-                return found
-            assert time.monotonic() < end, f"no '{words}' of the bridge {self.name} within {within} s: {log}"
-            time.sleep(0.01)  # what a process writes to a file is no event
+        while not (found := [each for each in self.log.splitlines() if words in each]):
+            assert time.monotonic() < end, f"no '{words}' of the bridge {self.name} within {within} s: {self.log}"
+            time.sleep(0.01)  # nothing tells when a file grows
+        return found[0]
 
     def wait(self, timeout: float = STOP_LIMIT) -> int:
-        """Wait for its end, and return the exit code; negative for a signal that killed it."""
         try:
             return self._started().wait(timeout)
         except subprocess.TimeoutExpired:
             raise AssertionError(f"the bridge {self.name} did not end within {timeout} s: {self.log}") from None
 
     def terminate(self) -> int:
-        """End it by SIGTERM, and return the exit code; nothing of it may be left, and no traceback in its log."""
+        """End the bridge by SIGTERM, check that nothing is left of it, and return the exit code."""
         self._started().terminate()
         code = self.wait()
         assert_none_left(self._mark, STOP_LIMIT)
@@ -144,18 +139,16 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         return code
 
     def kill(self) -> None:
-        """Kill it outright."""
         self._started().kill()
         self._started().wait()
 
     def stop_process(self) -> None:
-        """Stop its process as it is (SIGSTOP), as a robot that suspends; it has stopped when this returns."""
+        """Stop the process (SIGSTOP), and wait until it has stopped."""
         os.kill(self.pid, signal.SIGSTOP)
         while self._state() not in "TZ":
-            time.sleep(0.001)  # the kernel tells a parent alone, which the test may not be
+            time.sleep(0.001)  # the kernel tells only the parent
 
     def go_on(self) -> None:
-        """Let one that was stopped go on (SIGCONT)."""
         os.kill(self.pid, signal.SIGCONT)
 
     def _state(self) -> str:
@@ -166,23 +159,6 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         assert self._process
         return self._process
 
-    def _await(self, listener: Listener, within: float) -> dict[str, Any]:
-        end = time.monotonic() + within
-
-        def online(message: Message) -> bool:
-            told = message.json if message.payload else {}
-            return bool(told.get("online") and told.get("server") and told["session"] not in self._earlier)
-
-        while True:
-            left = end - time.monotonic()
-            # The broker doesn't tell that a process has ended.
-            found = listener.find(online, min(max(left, 0.0), 0.1))
-            if found:
-                return found.json
-            code = self._started().poll()
-            assert code is None, f"the bridge {self.name} ended with {code}: {self.log}"
-            assert left > 0, f"{self.name} is not online within {within} s: {self.log}{listener.messages}"
-
     def _end(self) -> None:
         if self.running:
             self.kill()
@@ -190,7 +166,7 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
 
 
 class Desk(Clients, contextlib.AbstractContextManager["Desk"]):
-    """Somebody with a broker and no server; `close()` or `with` ends the clients that still run."""
+    """Clients with a broker and without a server. `close()` or `with` ends those that still run."""
 
     def __init__(
         self,
@@ -216,21 +192,18 @@ class Desk(Clients, contextlib.AbstractContextManager["Desk"]):
         self.close()
 
     def close(self) -> None:
-        """End what still runs."""
         self._stack.close()
 
     @property
     def env(self) -> dict[str, str]:
-        """The environment of the desk's clients."""
         return self._env
 
     @property
     def log(self) -> str:
-        """What the broker wrote."""
         return self._broker.log
 
 
 def desk(broker: Broker, robot: str, *words: str, user: str | None = None, timeout: float = 20) -> Finished:
-    """Run one command at a desk to its end: `desk(broker, "anna", "say", "--wait", "--", "battery low")`."""
+    """Run one command at a desk: `desk(broker, "anna", "say", "--wait", "--", "battery low")`."""
     with Desk(broker, user=user) as somebody:
         return somebody.run("--robot", robot, *words, timeout=timeout)

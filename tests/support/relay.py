@@ -1,6 +1,6 @@
-"""A sound server's socket with a relay before it: what it answers comes late, in pieces, as an error, or not at all.
+"""A relay before the socket of a PulseAudio that delays, cuts or changes the answers of the server.
 
-Behind it is a real PulseAudio. Nothing in here waits: `pump` hands on what has come, and no more than the test lets it.
+Nothing in it waits: `pump` forwards what has come, and no more than the test allows.
 """
 
 from __future__ import annotations
@@ -10,27 +10,27 @@ import select
 import socket
 import struct
 
-#: What a frame of PulseAudio's native protocol begins with: length, channel, two halves of an offset, flags.
+#: The header of a frame: length, channel, two halves of an offset, flags.
 _HEADER = struct.Struct(">5I")
-#: The channel of what is no sound.
+#: The channel of messages.
 _CONTROL = 0xFFFFFFFF
-#: A 32 bit number in a message, and the commands that are its first.
+#: A 32 bit number in a message, and the commands, which are the first number.
 _NUMBER = struct.Struct(">cI")
 _ERROR, _REPLY = 0, 2
 
 
 class Relay(contextlib.AbstractContextManager["Relay"]):
-    """Takes one client for the server whose socket is at `server`, at a socket of its own, `path`."""
+    """Listens at the socket `path`, and relays one client to the server at `server`."""
 
     def __init__(self, path: str, server: str) -> None:
-        #: bytes that are handed on at once, to either side
+        #: bytes that are forwarded at once
         self.piece = 65536
-        #: bytes of the server's after which the connection is cut, or says nothing any more
+        #: bytes from the server after which the connection is cut, or becomes silent
         self.cut_at: int | None = None
         self.hushed_at: int | None = None
-        #: the number, from 0, of the answer that becomes an error, and the error's number
+        #: the number, from 0, of the reply that becomes an error, and the code of the error
         self.error: tuple[int, int] | None = None
-        #: bytes of the server's that were handed on, and answers that were
+        #: bytes from the server that were forwarded, and replies
         self.handed_on = self.answers = 0
         self._server = server
         self._listening = socket.socket(socket.AF_UNIX)
@@ -46,7 +46,7 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
         self._hang_up()
 
     def pump(self) -> None:
-        """Hand on, to each side, what has come from the other, as far as it may."""
+        """Forward data in both directions, as far as it is allowed."""
         if self._client is None:
             self._accept()
         if self._client is None or self._up is None:
@@ -54,33 +54,22 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
         try:
             self._to_server += _read(self._client)
             self._frames += _read(self._up)
-        except ConnectionError:
-            self._hang_up()
-            return
-        self._take_frames()
-        _write(self._up, self._to_server, self.piece)
-        room = self.piece
-        for limit in (self.cut_at, self.hushed_at):
-            if limit is not None:
-                room = min(room, max(0, limit - self.handed_on))
-        try:
-            self.handed_on += _write(self._client, self._to_client, room)
+            self._take_frames()
+            _write(self._up, self._to_server, self.piece)
+            limits = [each - self.handed_on for each in (self.cut_at, self.hushed_at) if each is not None]
+            self.handed_on += _write(self._client, self._to_client, max(0, min([self.piece, *limits])))
         except ConnectionError:
             self._hang_up()
         if self.cut_at is not None and self.handed_on >= self.cut_at:
             self._hang_up()
 
     def register(self, poll: select.poll) -> None:
-        """Have the poll wake for what could be handed on."""
-        if self._client is None or self._up is None:
-            poll.register(self._listening, select.POLLIN)
-            return
-        poll.register(self._up, select.POLLIN)
-        poll.register(self._client, select.POLLIN)
+        """Register the sockets on which data may come."""
+        for each in (self._listening,) if self._client is None or self._up is None else (self._up, self._client):
+            poll.register(each, select.POLLIN)
 
     @property
     def waiting(self) -> int:
-        """Bytes that were not handed on yet."""
         return len(self._to_client) + len(self._to_server)
 
     def _accept(self) -> None:
@@ -92,7 +81,7 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
             self._up.setblocking(False)
 
     def _take_frames(self) -> None:
-        """Take whole frames of the server's; one of its answers may become an error."""
+        """Take whole frames of the server, and change a reply into an error if the test asks for it."""
         while len(self._frames) >= _HEADER.size:
             length, channel, *_ = _HEADER.unpack_from(self._frames)
             end = _HEADER.size + length
@@ -100,9 +89,7 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
                 return
             frame = bytes(self._frames[:end])
             del self._frames[:end]
-            if channel == _CONTROL:
-                frame = self._change(frame)
-            self._to_client += frame
+            self._to_client += self._change(frame) if channel == _CONTROL else frame
 
     def _change(self, frame: bytes) -> bytes:
         (_, command), (_, tag) = _NUMBER.iter_unpack(frame[_HEADER.size : _HEADER.size + 2 * _NUMBER.size])
@@ -123,12 +110,13 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
 
 
 def _read(source: socket.socket) -> bytes:
-    with contextlib.suppress(BlockingIOError):
+    try:
         data = source.recv(65536)
-        if not data:
-            raise ConnectionResetError
-        return data
-    return b""
+    except BlockingIOError:
+        return b""
+    if not data:
+        raise ConnectionResetError
+    return data
 
 
 def _write(target: socket.socket, data: bytearray, most: int) -> int:

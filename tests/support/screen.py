@@ -1,7 +1,7 @@
-"""A terminal for a test: a program runs in it, what it writes is drawn, and what can be seen is asked for.
+"""A terminal for a test: it runs a program, draws what that writes, and tells what can be seen.
 
-It draws what a real one would: characters that take two columns, marks over others, lines that are wrapped, and the
-few control sequences that `talk` may use. Any other is an error of the test.
+It draws wide characters, combining marks, wrapped lines, and the few control sequences that `talk` may use. All other
+control sequences are errors.
 """
 
 from __future__ import annotations
@@ -32,67 +32,64 @@ _IN_A_TERMINAL = (
 
 
 class Screen:
-    """What is drawn. A cell is a character and its attributes; a wide character is followed by an empty cell."""
+    """A drawing. A cell is a character and its attributes, and an empty cell follows a wide character."""
 
     def __init__(self, columns: int) -> None:
         self.columns = columns
         self.rows: list[list[tuple[str, str]]] = [[]]
-        #: how often a line was continued on the next row because it was too long
+        #: the number of lines that were too long for a row
         self.wraps = 0
         self.column = 0
         self.attributes = ""
 
     def draw(self, text: str) -> None:
-        """Draw what a program has written; control sequences must be whole."""
+        """Draw a text with whole control sequences."""
         place = 0
         while place < len(text):
-            control = _CONTROL.match(text, place)
-            if control:
+            if control := _CONTROL.match(text, place):
                 self._control(control["letter"], control["numbers"])
                 place = control.end()
-                continue
-            self._character(text[place])
-            place += 1
+            else:
+                self._character(text[place])
+                place += 1
 
     @property
     def lines(self) -> list[str]:
-        """The rows as text, without blanks at their ends."""
+        """The rows as text, without trailing blanks."""
         return ["".join(each for each, _ in row).rstrip() for row in self.rows]
 
     @property
     def last(self) -> str:
-        """The row with the cursor, as text."""
         return self.lines[-1]
 
     def marked(self, attribute: str, row: int = -1) -> str:
-        """Return the characters of a row that have an attribute: "7" is reversed, "2" is dim."""
+        """Return the characters of a row with an attribute: "7" is reversed, "2" is dim."""
         return "".join(each for each, has in self.rows[row] if attribute in has.split(";"))
 
     def _character(self, character: str) -> None:
+        row = self.rows[-1]
         if character == "\r":
             self.column = 0
         elif character == "\n":
-            self.rows.append([])
-            self.column = 0
+            self._next_row()
         elif unicodedata.category(character) in {"Mn", "Me"}:
-            self._over(character)
+            place = max((each for each in range(min(self.column, len(row))) if row[each][0]), default=None)
+            if place is not None:
+                row[place] = (row[place][0] + character, row[place][1])
         else:
             assert character.isprintable(), f"{character!r} reached the terminal"
             wide = 2 if unicodedata.east_asian_width(character) in "WF" else 1
             if self.column + wide > self.columns:
                 self.wraps += 1
-                self.rows.append([])
-                self.column = 0
-            row = self.rows[-1]
+                row = self._next_row()
             row.extend([(" ", "")] * (self.column - len(row)))
             row[self.column : self.column + wide] = [(character, self.attributes)] + [("", "")] * (wide - 1)
             self.column += wide
 
-    def _over(self, character: str) -> None:
-        row = self.rows[-1]
-        place = max((each for each in range(min(self.column, len(row))) if row[each][0]), default=None)
-        if place is not None:
-            row[place] = (row[place][0] + character, row[place][1])
+    def _next_row(self) -> list[tuple[str, str]]:
+        self.rows.append([])
+        self.column = 0
+        return self.rows[-1]
 
     def _control(self, letter: str, numbers: str) -> None:
         if letter == "m":
@@ -104,14 +101,13 @@ class Screen:
 
 
 class Terminal:
-    """A program in a terminal of its own, which is its standard output and error."""
+    """A program whose input, output and error are a terminal."""
 
     def __init__(self, command: Sequence[str], env: Mapping[str, str], columns: int = 80) -> None:
         self._changed = threading.Condition()
         self._ours, theirs = os.openpty()
         self._resize(columns)
         self.raw = b""
-        self._drawn = 0
         self.screen = Screen(columns)
         self._failure: Exception | None = None
         self.process = subprocess.Popen(
@@ -135,17 +131,15 @@ class Terminal:
                 self._changed.wait(left)
 
     def resize(self, columns: int) -> None:
-        """Make it wider or narrower; the program gets SIGWINCH."""
         with self._changed:
             self.screen.columns = columns
         self._resize(columns)
 
     def type(self, keys: bytes) -> None:
-        """Press keys; ^C is a signal."""
         os.write(self._ours, keys)
 
     def finish(self, timeout: float = 20) -> int:
-        """Wait for the program's end, and until all is drawn; return its exit code."""
+        """Wait until the program has ended and everything is drawn, and return the exit code."""
         try:
             code = self.process.wait(timeout)
         finally:
@@ -155,7 +149,6 @@ class Terminal:
         return code
 
     def close(self) -> None:
-        """End the program, however it is."""
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
@@ -167,27 +160,24 @@ class Terminal:
         fcntl.ioctl(self._ours, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
 
     def _read(self) -> None:
-        pending = b""
-        while True:
-            try:
+        rest = b""
+        with contextlib.suppress(OSError):  # nobody has the other end any more
+            while True:
                 data = os.read(self._ours, 65536)
-            except OSError:  # nobody has the other end any more
-                return
-            with self._changed:
-                self.raw += data
-                pending = self._draw(pending + data)
-                self._changed.notify_all()
+                with self._changed:
+                    self.raw += data
+                    rest = self._draw(rest + data)
+                    self._changed.notify_all()
 
     def _draw(self, data: bytes) -> bytes:
-        """Draw all that is whole; return the rest: half a character, or half a control sequence."""
-        whole = len(data)
+        """Draw whole characters and control sequences, and return the rest."""
+        end = len(data)
         escape = data.rfind(b"\x1b")
         if escape >= 0 and not _CONTROL.match(data[escape:].decode(errors="ignore")):
-            whole = escape
-        text = data[:whole].decode(errors="ignore")
-        rest = data[len(text.encode()) :]
+            end = escape
+        text = data[:end].decode(errors="ignore")
         try:
             self.screen.draw(text)
         except AssertionError as error:
             self._failure = self._failure or error
-        return rest
+        return data[len(text.encode()) :]

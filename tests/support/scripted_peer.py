@@ -1,6 +1,6 @@
-"""A server of one client that follows a script, on a socket of its own: what only a slow or a broken server does.
+"""A server of one client that follows a script, for what only a slow or a broken server does.
 
-The script is a function that is given the server's end of the connection, greeted already.
+A script is a function with the server's end of the connection, which has greeted already.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 GREETING = b'{"talk": 1, "version": "0", "pid": 1, "boot": "fake", "features": []}\n'
-#: What a reply to `watch` or `status` says.
+#: The fields of a reply to `watch` or `status`.
 OVERVIEW: dict[str, Any] = {"server": {"pid": 1}, "active": None}
 
 
@@ -36,19 +36,20 @@ def result(state: str = "SUCCEEDED") -> dict[str, Any]:
 
 
 class Peer:
-    """A server's end of a connection, whose client has been greeted and has said hello."""
+    """The server's end of a connection, after the greeting and the hello."""
 
     def __init__(self, connected: socket.socket) -> None:
         self._socket = connected
         self._socket.settimeout(PATIENCE)
         self._file = connected.makefile("rb")
         self._events = itertools.count(1)
+        #: bytes of the longest request
         self.longest = 0
 
     def receive(self, kind: str | None = None) -> dict[str, Any]:
         """Return the next request, which must be of this kind."""
         line = self._file.readline()
-        assert line, f"the client hung up where {kind} was due"
+        assert line, f"the client hung up instead of a {kind}"
         self.longest = max(self.longest, len(line))
         request: dict[str, Any] = json.loads(line)
         assert kind is None or request["request"] == kind, request
@@ -58,11 +59,10 @@ class Peer:
         self._socket.sendall(b"".join(json.dumps(each).encode() + b"\n" for each in messages))
 
     def accept(self, *, state: str = "PENDING") -> None:
-        """Accept the goal that comes next, as `g`."""
-        self.send({"seq": self.receive("say")["seq"], "ok": True, "goal": goal(state)})
+        """Accept the next goal, as `g`."""
+        self.reply("say", goal=goal(state))
 
     def reply(self, kind: str, **fields: object) -> None:
-        """Say yes to the request that comes next."""
         self.send({"seq": self.receive(kind)["seq"], "ok": True, **fields})
 
     def hang_up(self) -> None:
@@ -71,18 +71,16 @@ class Peer:
         self._socket.close()
 
     def state(self, state: str, **fields: object) -> dict[str, Any]:
-        """Return a state event of `g`."""
         return {"event": "state", "id": "g", "state": state, "n": next(self._events), "at": 1.5, **fields}
 
     def word(self, number: int = 1) -> dict[str, Any]:
-        """Return a word event of `g`."""
         place = {"start": 0, "end": 1, "number": number, "time": 0.25}
         return {"event": "word", "id": "g", "word": "a", **place, "n": next(self._events), "at": 2.5}
 
 
 @contextlib.contextmanager
 def serving(play: Callable[[Peer], None]) -> Iterator[str]:
-    """Serve one client by this script until it hangs up; the path of the socket. What fails in the script is raised."""
+    """Serve one client by a script, and give the path of the socket. At the end, raise what the script has raised."""
     failures: list[BaseException] = []
 
     def serve() -> None:
@@ -96,7 +94,7 @@ def serving(play: Callable[[Peer], None]) -> Iterator[str]:
                 with contextlib.suppress(OSError):
                     while connected.recv(65536):
                         pass
-        except BaseException as error:  # noqa: BLE001 - raised in the test's own thread
+        except BaseException as error:  # noqa: BLE001 - raised in the thread of the test
             failures.append(error)
 
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:

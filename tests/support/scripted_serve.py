@@ -1,4 +1,4 @@
-"""Runs the real `talk serve`, with the scripted engine in the place of the engine process; arguments as of `serve`."""
+"""Run `talk serve` with the scripted engine, with the arguments of `serve`."""
 
 from __future__ import annotations
 
@@ -11,18 +11,12 @@ from talkcli.engine import process
 _ENGINE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "scripted_engine.py")
 
 
-def engine_command() -> list[str]:
-    """Return the command line of the scripted engine process."""
-    return [sys.executable, _ENGINE]
-
-
 def replace_engine() -> None:
     """Have this process start the scripted engine."""
-    process.engine_command = engine_command
+    process.engine_command = lambda: [sys.executable, _ENGINE]
 
 
 def main() -> None:
-    """Run `talk serve`."""
     replace_engine()
     sys.argv = ["talk", "serve", *sys.argv[1:]]
     run_talk()

@@ -1,0 +1,132 @@
+"""Send mutated requests to a server, and check that each gets one reply.
+
+python -m tests.tools.fuzz_lines [--count 100000 | --seconds 3600] [--seed N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import random
+import threading
+import time
+from collections import Counter
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from tests.conformance.rawsocket import Raw
+from tests.support import census
+from tests.support.processes import Talk
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+LINES = [
+    '{"request": "hello", "name": "patrol", "urgent": false}',
+    '{"request": "say", "text": "length=0 one two", "wait": true, "preempt": true, "format": "text"}',
+    '{"request": "say", "text": "length=0 é 😀 \\ud83d", "data": {"a": [1, -2.5e3, null, "b"]}}',
+    '{"request": "say", "text": "length=0", "key": "eta", "throttle": 0.5, "ttl": 2, "priority": -3, "flush": true}',
+    '{"request": "say", "text": "length=0", "id": "dock17", "rate": 300, "volume": 0.25, "pitch": 70, "voice": "en"}',
+    '{"request": "wait", "ids": ["1b2d-1", "7"], "feedback": true}',
+    '{"request": "cancel", "ids": ["1b2d-1"], "current": true, "before": null, "key": "eta"}',
+    '{"request": "cancel"}',
+    '{"request": "status", "id": "1b2d-1"}',
+    '{"request": "status"}',
+    '{"request": "voices"}',
+    '{"request": "watch"}',
+    '{"request": "log", "count": 3}',
+    '{"request": "set", "rate": 200, "volume": 1.0, "voice": "default", "pitch": 50, "preempt": false, "ttl": 0}',
+    '{"request": "pause"}',
+    '{"request": "resume"}',
+]
+_INSERTED = (b'"', b"{", b"}", b"[", b",", b"null", b"1e999", b"-", b"\\u0000")
+#: Lines on one connection. A hello follows each, because ten bad lines in a row end a connection.
+BATCH = 1_000
+_HELLO = b'{"request": "hello"}\n'
+#: The server keeps texts, and events that its clients haven't read yet.
+_GROWTH_LIMIT_KB = 24 * 1024
+_REPLY_LIMIT_S = 60
+
+
+def mutated(source: random.Random) -> Iterator[bytes]:
+    """Yield requests with some bytes changed, lost, doubled or taken from other requests."""
+    whole = [each.encode() for each in LINES]
+    while True:
+        line = bytearray(source.choice(whole))
+        for _ in range(source.choice((0, 1, 1, 1, 2, 4, 16))):
+            place = source.randrange(len(line) + 1)
+            kind = source.randrange(5)
+            if kind == 0:
+                line[place : place + 1] = bytes([source.randrange(256)])
+            elif kind == 1:
+                del line[place : place + source.randrange(1, 8)]
+            elif kind == 2:
+                line[place:place] = line[place : place + source.randrange(1, 20)]
+            elif kind == 3:
+                other = source.choice(whole)
+                line[place:] = other[source.randrange(len(other)) :]
+            else:
+                line[place:place] = source.choice(_INSERTED)
+        yield bytes(line).replace(b"\n", b" ") + b"\n"
+
+
+def fuzz(seed: int, *, count: float = float("inf"), seconds: float = float("inf")) -> Counter[str]:
+    """Send mutated lines to a server until the count or the time is reached, and count the replies by error code."""
+    replies: Counter[str] = Counter()
+    lines = mutated(random.Random(seed))
+    with contextlib.closing(Talk(scripted=True, watched=False)) as talk:
+        end = time.monotonic() + seconds
+        _speak(talk, "length=0")
+        before = census.count(talk.pid)  # with a running engine
+        while replies.total() < 2 * count and time.monotonic() < end:
+            _send_batch(talk, list(islice(lines, BATCH)), replies)
+        assert talk.request("resume")["ok"]
+        assert talk.request("cancel")["ok"]
+        _speak(talk, "still here")
+        census.assert_as_before(talk.pid, before, memory=_GROWTH_LIMIT_KB)
+        talk.stop()
+        assert "a bug" not in talk.log, talk.log[-2000:]
+    return replies
+
+
+def _speak(talk: Talk, text: str) -> None:
+    with talk.connect() as wire:
+        assert wire.request("say", text=text, wait=True)["ok"]
+        assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+
+
+def _send_batch(talk: Talk, batch: list[bytes], replies: Counter[str]) -> None:
+    wanted = replies.total() + 2 * len(batch)
+    with Raw(talk.socket) as raw:
+        raw.socket.settimeout(_REPLY_LIMIT_S)
+        sender = threading.Thread(target=raw.send, args=(b"".join(each + _HELLO for each in batch),))
+        sender.start()
+        rest = b""
+        while replies.total() < wanted and (data := raw.receive(_REPLY_LIMIT_S)):
+            raw.received.clear()
+            *lines, rest = (rest + data).split(b"\n")
+            for line in lines:
+                message = json.loads(line)
+                if "ok" in message:
+                    code = "no error" if message["ok"] else message["error"]["code"]
+                    replies[code] += 1
+                    assert code != "internal_error", line
+        sender.join()
+    assert replies.total() == wanted, f"{wanted - replies.total()} of {2 * len(batch)} lines have no reply"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Check that each mutated request gets one reply.")
+    limit = parser.add_mutually_exclusive_group()
+    limit.add_argument("--count", type=float, default=100_000)
+    limit.add_argument("--seconds", type=float)
+    parser.add_argument("--seed", type=int, default=int(time.time()))
+    options = parser.parse_args()
+    limits = {"seconds": options.seconds} if options.seconds else {"count": options.count}
+    print(f"seed {options.seed}", flush=True)
+    print(fuzz(options.seed, **limits))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,362 @@
+"""Speak mutated texts with all voices in engine processes, as `say -o` does, and count how often a process dies.
+
+    python -m tests.tools.fuzz_texts --count 20000 [--seed N | --seed today] [--seconds N] [--no-guard]
+
+It prints each text that killed a process as a Python literal. The exit code is 1 if a goal didn't have exactly one end,
+if a process hung or left a traceback, or if the guard let a text through that overflows a buffer. The texts depend on
+the seed alone. They must not depend on the guard.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime as dt
+import itertools
+import os
+import random
+import sys
+import tempfile
+import time
+import unicodedata
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cache
+from typing import TYPE_CHECKING
+from unittest import mock
+
+from talkcli.engine import process, protocol
+from talkcli.engine.process import Conversation, EngineFailed
+from talkcli.goals.text import fault
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+#: Words per minute: the fastest rate makes the fewest samples.
+_RATE = 450
+#: Far above what the longest text takes, so that a busy machine is no failure.
+_START_LIMIT_S, _HANG_LIMIT_S = 20.0, 60.0
+#: How a process dies that wrote past the end of a buffer. The guard prevents that.
+OVERFLOW = "SIGABRT"
+_WITHOUT_GUARD = "from talkcli.engine.synthesizers import guard; guard.guarded = lambda text, voice: text; "
+SENTENCES = (
+    "Battery low, returning to the docking station.",
+    "It's 10:30 on 2024-05-01; the U.S.A. and e.g. Mr. Smith's well-known e-mail: a.b@example.org (see http://x.y/z?a=1).",
+    "Die Tür zum Wohnzimmer ist geöffnet, bitte schließen Sie sie z. B. bis 17:45 Uhr.",
+    "L’homme est là, n'est-ce pas ? C’est « très bien ».",
+    "El robot llegó a la cocina. ¿Qué quiere usted? ¡Ay, niño!",
+    "Dell'acqua c'è, però l'ho già bevuta.",
+    "A bateria está fraca; não há ninguém em casa às 8h.",
+    "Bateria jest słaba, wracam do stacji dokującej. Źdźbło, gżegżółka.",
+    "Příliš žluťoučký kůň úpěl ďábelské ódy.",
+    "Батарея разряжена, возвращаюсь на станцию: т.е. к 5-му ч.",
+    "Η μπαταρία είναι χαμηλή, επιστρέφω στη βάση.",
+    "البطارية منخفضة، سأعود إلى القاعدة ٣ مرات.",
+    "הסוללה חלשה, אני חוזר לבסיס.",
+    "बैटरी कम है, मैं वापस जा रहा हूँ।",
+    "ব্যাটারি কম, আমি ফিরে যাচ্ছি।",
+    "பேட்டரி குறைவாக உள்ளது.",
+    "బ్యాటరీ తక్కువగా ఉంది.",
+    "ബാറ്ററി കുറവാണ്, ഞാൻ മടങ്ങുന്നു.",
+    "แบตเตอรี่อ่อน กำลังกลับฐาน",
+    "电池电量低，正在返回充电站。",
+    "バッテリー残量が少ないです。充電に戻ります。",
+    "배터리가 부족합니다. 충전소로 돌아갑니다.",
+    "Pin yếu, tôi đang trở về trạm sạc.",
+    "Pil zayıf, İstanbul'a dönüyorum.",
+    "ბატარეა დაბალია, ვბრუნდები.",
+    "Մարտկոցը ցածր է։ Վերադառնում եմ՞",
+    "ባትሪው ዝቅተኛ ነው።",
+    "Donaudampfschifffahrtselektrizitätenhauptbetriebswerkbauunterbeamtengesellschaft",
+    "lentokonesuihkuturbiinimoottoriapumekaanikkoaliupseerioppilas",
+    "1,234,567.89 € + 50% = 3/4 ≈ ½ × 10⁻³ °C, № 5 & §7",
+    "👩‍🚀 🤖 👨‍👩‍👧‍👦 🏳️‍🌈 ok",
+    "MMXXIV XLIV iv II. ABCs NASA's iPhone fooBar foo_bar",
+)
+#: Texts that crash some version of libespeak-ng, and texts that look like commands to it.
+CRASHERS = (
+    "a." * 85,
+    "e.g. " * 60,
+    "http://" + "x." * 100,
+    "\x01s\x01100A\x01VX \x01B1",
+    "<speak><audio src='x'/><voice name='de'>hallo</voice></speak>",
+    "[[h@'loU]] [[_^_de]]",
+    "e\u0301" * 90 + "\u0301" * 90,
+    "a" * 170 + "ing",
+    "1" * 130 + "," + "1," * 40,
+    "\u0530\u0557\ue000\ue028",
+)
+_PIECES = (
+    *(".", ",", "'", "-", "_", "^", "…", "!?", "。", "՞", "\u2019", "\n", "\n\n", "\t", " ", "  ", "«", "("),
+    *('"', "/", "*", "\x01", "\x01+10S", "\x01V", "\x02", "\x7f", "\x85", "\xa0", "\xad", "\u200b", "\u200d"),
+    *("\ufe0f", "\u202e", "\ufeff", "\u0301", "\u0327", "\u064b", "\u0e49", "\u0530", "\u0557", "\ue000"),
+    *("\ufffd", "\uffff", "\U0001f3fb", "\U0010ffff", "a.", "I.", "1.", "x@", "://", "0", "000", "1,000", "½"),
+    *("²", "IV", "Mr.", "'s", "ß", "ſ", "ı", "İ", "ﬁ", "㎏", "Ⅷ", "&#x41;", "<a>"),
+)
+_BLANKS = (".", ",", "", "-", ". ", " . ", "'", "\u00a0", "_", "\n")
+#: Most texts are short: a long one takes a hundred times as long to speak, and few crashes need one.
+_SHORT_CHARS, _MEDIUM_CHARS, _LONG_CHARS = 24, 220, 1500
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A text, and the voice that speaks it."""
+
+    voice: str
+    text: str
+
+
+def today() -> int:
+    """Return a seed that is new each day."""
+    return dt.datetime.now(dt.timezone.utc).date().toordinal()
+
+
+def cases(seed: int, voices: Sequence[str]) -> Iterator[Case]:
+    """Yield valid texts for all voices in turn, twenty for each."""
+    source = random.Random(seed)
+    while True:
+        for voice in source.sample(voices, len(voices)):
+            for _ in range(20):
+                while fault(text := made(source)) is not None:
+                    pass
+                yield Case(voice, text)
+
+
+def made(source: random.Random) -> str:
+    """Return one mutated text."""
+    longest = source.choices((_SHORT_CHARS, _MEDIUM_CHARS, _LONG_CHARS), (78, 20, 2))[0]
+    text = source.choice(_ORIGINS)(source)[:longest]
+    for _ in range(source.choice((0, 1, 1, 2, 3, 5, 8))):
+        if not text:
+            break
+        text = source.choice(_MUTATIONS)(source, text)[:longest]
+    return text
+
+
+def crashers(source: random.Random) -> Iterator[tuple[str | None, str]]:
+    """Yield texts that crash an unguarded library, each kind in turn, with the voice if the crash needs one."""
+    while True:
+        between = source.choice((".", ". ", ".,", " . ", "..", ".՞", ".;"))
+        before = source.choice(("", "Hello, ", "http://", "5 ", "« "))
+        yield None, before + "".join(_letter(source) + between for _ in range(source.randrange(95, 180)))
+        yield None, before + f"{_letter(source)}.{_letter(source) * source.randrange(165, 300)}"
+        ending = source.choice(("ing", "s", "er", "en", "erne"))
+        yield "gmq/da", before + source.choice("abdeoåø") * source.randrange(165, 400) + ending
+        sign = source.choice(("'", "…", "°", "_", "₤", "–"))
+        yield source.choice(("aav/vi", "gmq/da")), source.choice(("", "xin! ", " ")) + f"{sign}-{source.choice('oaie')}"
+        yield "gmw/en", before + _letter(source) + "'s" * source.randrange(80, 200)
+
+
+def _letter(source: random.Random) -> str:
+    return source.choice("abcdefghijklmnopqrstuvwxyzéßжшλ")
+
+
+# -- the texts to begin with
+
+
+def _sentence(source: random.Random) -> str:
+    return source.choice(SENTENCES)
+
+
+def _words_of_several_languages(source: random.Random) -> str:
+    words = [source.choice(_sentence(source).split()) for _ in range(source.randrange(1, 12))]
+    return source.choice((" ", " ", ".", "", "-", ", ")).join(words)
+
+
+def _neighbouring_characters(source: random.Random) -> str:
+    assigned = _assigned()
+    start = source.randrange(len(assigned))
+    block = assigned[start : start + source.choice((3, 20, 100))]
+    letters = [source.choice(block) for _ in range(source.randrange(1, 150))]
+    for place in range(source.randrange(2, 12), len(letters), source.randrange(2, 12)):
+        letters[place] = source.choice(" .,-")
+    return "".join(letters)
+
+
+def _any_characters(source: random.Random) -> str:
+    return "".join(source.choice(_assigned()) for _ in range(source.randrange(1, 60)))
+
+
+def _pieces(source: random.Random) -> str:
+    return "".join(source.choice(_PIECES) for _ in range(source.randrange(1, 40)))
+
+
+def _repeated(source: random.Random) -> str:
+    """Repeat a few characters until they fill a table or a buffer."""
+    motif = source.choice((_pieces, _any_characters, _sentence, _words_of_several_languages))(source)
+    start = source.randrange(len(motif) + 1)
+    motif = motif[start : start + source.randrange(1, 6)] + source.choice(_BLANKS) * source.randrange(2)
+    return motif * source.choice((5, 30, 90, 130, 220)) if motif else "a"
+
+
+@cache
+def _assigned() -> str:
+    """Return all assigned characters, but only some of the 90,000 Chinese and Korean ones."""
+    found = []
+    for code in range(1, sys.maxunicode + 1):
+        category = unicodedata.category(chr(code))
+        if category in {"Cn", "Cs", "Co"} or (0x3400 <= code < 0xA000 or 0x17000 <= code < 0x19000 or code > 0x1FFFF):
+            if category == "Lo" and code % 97 == 0:
+                found.append(chr(code))
+        elif not (0xAC00 <= code < 0xD7A4 and code % 31):
+            found.append(chr(code))
+    return "".join(found)
+
+
+# -- the mutations
+
+
+def _double(source: random.Random, text: str) -> str:
+    place = source.randrange(len(text))
+    piece = text[place : place + source.randrange(1, 8)]
+    return text[:place] + piece * source.choice((2, 3, 10, 50, 100)) + text[place:]
+
+
+def _cut(source: random.Random, text: str) -> str:
+    place = source.randrange(len(text))
+    return text[:place] + text[place + source.randrange(1, 12) :]
+
+
+def _insert(source: random.Random, text: str) -> str:
+    place = source.randrange(len(text) + 1)
+    return text[:place] + source.choice(_PIECES) * source.choice((1, 1, 1, 3, 40)) + text[place:]
+
+
+def _splice(source: random.Random, text: str) -> str:
+    other = source.choice(_ORIGINS)(source)
+    return text[: source.randrange(len(text) + 1)] + other[source.randrange(len(other) + 1) :]
+
+
+def _intersperse(source: random.Random, text: str) -> str:
+    piece, every = source.choice(_PIECES), source.randrange(1, 9)
+    return piece.join(text[at : at + every] for at in range(0, len(text), every))
+
+
+def _change_letters(source: random.Random, text: str) -> str:
+    letters = list(text)
+    for _ in range(source.choice((1, 2, 8))):
+        other = source.choice((source.choice(_assigned()), chr(source.randrange(1, 0x250))))
+        letters[source.randrange(len(letters))] = other
+    return "".join(letters)
+
+
+_ORIGINS: tuple[Callable[[random.Random], str], ...] = (
+    *(
+        _sentence,
+        _sentence,
+        lambda source: source.choice(CRASHERS),
+        _words_of_several_languages,
+        _neighbouring_characters,
+        _any_characters,
+        _pieces,
+    ),
+    _repeated,
+)
+_MUTATIONS: tuple[Callable[[random.Random, str], str], ...] = (
+    *(_double, _cut, _insert, _insert, _splice),
+    lambda source, text: text.replace(" ", source.choice(_BLANKS)),
+    lambda source, text: source.choice((".", " ", ". ", "-", "'", "\u0301", "\u200d", ",", "_")).join(text),
+    _intersperse,
+    lambda source, text: source.choice((str.upper, str.title, str.swapcase, str.lower))(text),
+    lambda source, text: unicodedata.normalize(source.choice(("NFD", "NFKD", "NFC")), text),
+    lambda _source, text: text[::-1],
+    _change_letters,
+)
+
+
+# -- speaking them
+
+
+@dataclass(slots=True)
+class Tally:
+    """Results of a run."""
+
+    texts: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    deaths: list[str] = field(default_factory=list)  # each with the voice and the text
+    faults: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        ended = ", ".join(f"{count} {name}" for name, count in self.outcomes.most_common())
+        return f"{self.texts} texts: {ended}; {len(self.deaths)} deaths of the engine process"
+
+    @property
+    def overflows(self) -> list[str]:
+        """The deaths by a kind of error that the guard knows."""
+        return [each for each in self.deaths if OVERFLOW in each]
+
+
+def engine_command(guarded: bool) -> list[str]:
+    """Return the command line of an engine process, with or without the guard before the library."""
+    *program, code = process.engine_command()
+    return [*program, code if guarded else code.replace("from talkcli", f"{_WITHOUT_GUARD}from talkcli", 1)]
+
+
+def speak_all(texts: Iterable[Case], *, guarded: bool, seconds: float = float("inf")) -> Tally:
+    """Speak the texts until they or the time are used up."""
+    tally = Tally()
+    command = engine_command(guarded)
+    left = iter(texts)
+    end = time.monotonic() + seconds
+    with (
+        tempfile.TemporaryDirectory(prefix="talk-") as directory,
+        mock.patch.multiple(
+            process, engine_command=lambda: command, START_LIMIT=_START_LIMIT_S, HANG_AFTER=_HANG_LIMIT_S
+        ),
+    ):
+        while _speak_until_death(left, end, f"{directory}/spoken.wav", tally):
+            pass
+    return tally
+
+
+def _speak_until_death(texts: Iterator[Case], end: float, path: str, tally: Tally) -> bool:
+    """Speak texts in one engine process; return whether it died."""
+    with Conversation(protocol.Configure(os.getpid(), None, f"file:{path}", None, None)) as engine:
+        engine.until(protocol.Ready)
+        # The first text is spoken even if the start took all the time.
+        for number, case in enumerate(texts):
+            tally.texts += 1
+            goal = f"f{number}"
+            try:
+                engine.say(protocol.Say(goal, case.text, _RATE, 1.0, case.voice, 50))
+                ended = engine.until(protocol.Ended)
+            except EngineFailed as error:
+                death = f"{error}: {case.voice} {case.text!a}"
+                tally.deaths.append(death)
+                if error.reason != "engine_crashed" or "Traceback" in str(error) or "exited" in str(error):
+                    tally.faults.append(death)
+                return True
+            outcome = ended.reason or ended.outcome
+            tally.outcomes[outcome] += 1
+            if ended.id != goal or outcome == "engine_failed":
+                tally.faults.append(f"{ended}: {case.voice} {case.text!a}")
+            with contextlib.suppress(FileNotFoundError):  # there was nothing to say
+                os.unlink(path)
+            if time.monotonic() >= end:
+                break
+    return False
+
+
+def list_voices() -> list[str]:
+    configure = protocol.Configure(os.getpid(), None, "null", None, None, list_voices=True)
+    with Conversation(configure) as engine:
+        return [each.id for each in engine.until(protocol.Voices).voices if not each.id.startswith("+")]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=20_000)
+    parser.add_argument("--seconds", type=float, default=float("inf"))
+    parser.add_argument("--seed", default="1", help='a number, or "today"')
+    parser.add_argument("--no-guard", action="store_true")
+    asked = parser.parse_args()
+    seed = today() if asked.seed == "today" else int(asked.seed)
+    texts = itertools.islice(cases(seed, list_voices()), asked.count)
+    tally = speak_all(texts, guarded=not asked.no_guard, seconds=asked.seconds)
+    print(*tally.deaths, *map("fault: {}".format, tally.faults), sep="\n")
+    print(f"seed {seed}: {tally}, {len(tally.overflows)} overflows")
+    return 1 if tally.faults or (tally.overflows and not asked.no_guard) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,182 @@
+"""Hundreds of robots in one process: real bridges and real servers, but an engine that makes no sound.
+
+    python -m tests.tools.simulated --robots 250 --first 1 --broker mqtt://127.0.0.1:1883
+
+The robots are sim-0001 and so on. A sentence takes one second, or the SECONDS of `length=SECONDS` in its text. A line
+on standard output tells when all robots are online. Each sentence that begins is a JSON line in the file of `--spoken`:
+the robot, the id, the text, and the monotonic time. SIGTERM ends the robots.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import gc
+import json
+import os
+import random
+import re
+import signal
+import socket
+import string
+import tempfile
+import time
+from typing import TYPE_CHECKING, Any, cast
+
+from talkcli import __version__
+from talkcli.daemon import log
+from talkcli.engine import protocol
+from talkcli.fleet.bridge import Bridge, Settings
+from talkcli.fleet.broker import from_environment
+from talkcli.fleet.policy import ASKABLE
+from talkcli.goals.goal import Sender
+from talkcli.goals.options import as_shown
+from talkcli.goals.scheduler import Scheduler
+from talkcli.protocol.events import greeting
+from talkcli.protocol.lines import encode
+from talkcli.server.connection import Connection
+from talkcli.server.requests import Requests
+from talkcli.server.speech import Speech
+from talkcli.server.stream import Acceptor, make_room
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import TextIO
+
+    from talkcli.goals.goal import JsonObject
+
+_USUAL_LENGTH_S = 1.0
+_LENGTH = re.compile(r"\blength=(\d+(?:\.\d+)?)")
+#: Descriptors of a robot: its socket, three connections with two ends each, the broker's, and those of paho.
+_DESCRIPTORS = 12
+_LOOK_EVERY_S = 0.05
+
+
+class SilentEngine:
+    """Takes the time of a sentence. It replaces a server's `Supervisor`, without a thread and a process."""
+
+    def __init__(self, report: Callable[[Any], None], begun: Callable[[str, str], None]) -> None:
+        """`begun` is called with the id and the text of each goal that begins."""
+        self._report, self._begun = report, begun
+        self._goal = ""
+
+    def say(self, say: protocol.Say) -> None:
+        self._begun(say.id, say.text)
+        found = _LENGTH.search(say.text)
+        length = float(found.group(1)) if found else _USUAL_LENGTH_S
+        self._goal = say.id
+        asyncio.get_running_loop().call_later(length, self._end, say.id, protocol.COMPLETED, length)
+
+    def stop(self, goal_id: str) -> None:
+        self._end(goal_id, protocol.STOPPED, None)
+
+    def follow(self, goal_id: str, followed: bool, by_neural: bool) -> None:
+        pass
+
+    def _end(self, goal_id: str, outcome: str, length: float | None) -> None:
+        if goal_id == self._goal:
+            self._goal = ""
+            self._report(protocol.Ended(goal_id, outcome, duration=length))
+
+
+class Server:
+    """A robot's server, listening. It handles its connections and admits everybody."""
+
+    def __init__(self, path: str, begun: Callable[[str, str], None], descriptors: int) -> None:
+        boot = "".join(random.choice(each) for each in (string.digits, string.ascii_lowercase) * 2)
+        self._path = path
+        self._scheduler = Scheduler(boot, max_queue=100)
+        self._speech = speech = Speech(self._scheduler)
+        speech.engine = cast("Any", SilentEngine(speech.report, begun))
+        speech.report(protocol.Ready("simulated", None, "none"))
+        speech.report(protocol.Voices((protocol.Voice("en", "en", "simulated"),)))
+        self._requests = Requests(speech, self._describe)
+        self.handle, self.owes, self.left = self._requests.handle, self._requests.owes, self._requests.left
+        self.greeting = encode(greeting(__version__, os.getpid(), boot))
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.setblocking(False)
+        self._socket.bind(path)
+        self._socket.listen()
+        loop = asyncio.get_running_loop()
+        self._acceptor = Acceptor(loop, lambda each: Connection(self, speech.streams, each).begin(), descriptors)
+        self._acceptor.open(self._socket)
+
+    def joined(self, connection: Connection) -> None:
+        connection.sender = Sender()
+        connection.admit()
+
+    def close(self) -> None:
+        self._acceptor.close()
+        self._socket.close()
+
+    def _describe(self) -> JsonObject:
+        scheduler = self._scheduler
+        return {
+            "pid": os.getpid(),
+            "version": __version__,
+            "boot": scheduler.boot,
+            "socket": self._path,
+            "engine": self._speech.engine_words,
+            **as_shown(scheduler.settings),
+            "paused": scheduler.paused,
+            "pending": scheduler.pending_count,
+        }
+
+
+async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO) -> None:
+    """Run robots until SIGTERM."""
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(log.loop_bug)
+    descriptors = make_room(_DESCRIPTORS * len(names))
+    broker = from_environment({"TALK_BROKER": broker_url})
+
+    def note(robot: str, goal_id: str, text: str) -> None:
+        spoken.write(json.dumps({"robot": robot, "id": goal_id, "text": text, "at": time.monotonic()}) + "\n")
+
+    servers = [Server(f"{directory}/{name}", lambda *goal, name=name: note(name, *goal), descriptors) for name in names]
+    bridges = [Bridge(Settings(name, broker, ASKABLE, (), f"{directory}/{name}"), lambda: broker) for name in names]
+
+    look: asyncio.TimerHandle | None = None
+
+    def tell_ready() -> None:
+        nonlocal look
+        if not all(each.ready for each in bridges):
+            look = loop.call_later(_LOOK_EVERY_S, tell_ready)
+            return
+        # A garbage collection of everything would delay hundreds of robots.
+        gc.collect()
+        gc.freeze()
+        print(f"{len(bridges)} robots are online", flush=True)
+
+    def end() -> None:
+        for each in bridges:
+            each.end()
+
+    tell_ready()
+    loop.add_signal_handler(signal.SIGTERM, end)
+    try:
+        await asyncio.gather(*(each.run() for each in bridges))
+    finally:
+        if look:
+            look.cancel()
+        for server in servers:
+            server.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--robots", type=int, default=100, help="how many (%(default)s)")
+    parser.add_argument("--first", type=int, default=1, help="the number of the first robot (%(default)s)")
+    parser.add_argument("--broker", required=True, metavar="URL")
+    parser.add_argument("--spoken", default=os.devnull, metavar="FILE", help="for the sentences that begin")
+    asked = parser.parse_args()
+    names = [f"sim-{number:04d}" for number in range(asked.first, asked.first + asked.robots)]
+    with contextlib.ExitStack() as stack:
+        directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="sim-"))
+        spoken = stack.enter_context(open(asked.spoken, "a", 1, encoding="utf-8"))  # line by line
+        asyncio.run(run(names, asked.broker, directory, spoken))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""Random goals from many clients with a fault every few seconds, for as long as one likes.
+
+    python -m tests.tools.soak --seconds 1800 [--seed N] [--every SECONDS | --kills] [--player aplay|pacat]
+
+Every goal must have exactly one end, each goal that SUCCEEDED must have been heard, and the server must not take more
+of the machine at the end than at the beginning. With `--kills` the only fault is a killed engine, up to twice a second,
+and each kill may cost one goal at most. An error raises an exception.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import random
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+from tests.support import census
+from tests.support.processes import Talk
+from tests.support.sink import Sink
+from tests.support.surroundings import short_directory
+from tests.tools.soak_clients import Narrator, Workers, send_goals
+from tests.tools.soak_faults import Faults
+from tests.tools.witness import Witness
+
+_CLIENTS = 8
+#: Goals before the first census: then most of the history is full, and everything was used once.
+_WARM_UP_GOALS = 1_200
+_WARM_UP_LIMIT_S = 300.0
+_GROWTH_LIMIT_KB = 8 * 1024
+#: Reasons of goals that were lost with their engine.
+_LOST = frozenset({"engine_crashed", "engine_hung", "engine_failed", "not_silent"})
+#: Lines that a fault may add to the log, besides one for each goal.
+_LOG_LINES_PER_FAULT = 6
+
+
+@dataclass(slots=True)
+class Report:
+    """Results of a soak."""
+
+    ends: Counter[tuple[str, str | None]]  # by state and reason
+    faults: Counter[str]
+    heard_whole: int  # sentences
+
+
+class Soak:
+    """A server at a sink, with its clients and its witness."""
+
+    def __init__(self, seed: int, player: str, stack: contextlib.ExitStack) -> None:
+        self._seed, self._player = seed, player
+        self._sink = stack.enter_context(Sink())
+        self._temporary = stack.enter_context(short_directory())
+        options = ("--player", player, "--max-queue", "20")
+        self._talk = Talk(options, sink=self._sink, env={"TMPDIR": self._temporary}, watched=False)
+        stack.callback(self._talk.close)
+        self._witness = stack.enter_context(contextlib.closing(Witness(self._talk.socket)))
+
+    def run(self, seconds: float, every: float | None, least: int) -> Report:
+        """Warm up, inject faults, and check what is left of them."""
+        talk, witness = self._talk, self._witness
+        senders = self._start_senders("warm-up")
+        assert witness.wait_for(_WARM_UP_GOALS, _WARM_UP_LIMIT_S), f"only {witness.ended} goals in the warm-up"
+        senders.stop()
+        self._settle()
+        before, files, known = census.count(talk.pid), self._files(), Counter(witness.ends)
+        report = self._disturb(seconds, every, least)
+        report.ends = witness.ends - known
+        lost = sum(count for (state, reason), count in report.ends.items() if state == "ABORTED" and reason in _LOST)
+        assert every is not None or lost <= report.faults.total(), f"{report.faults} cost {lost} goals"
+        self._settle()
+        census.assert_as_before(talk.pid, before, memory=_GROWTH_LIMIT_KB)
+        left = self._files()
+        assert len(left) <= len(files), f"files are left: {left - files}"
+        lines, limit = talk.log.count("\n"), witness.ended + _LOG_LINES_PER_FAULT * report.faults.total() + 10
+        assert lines <= limit, f"{lines} lines in the log for {witness.ended} goals"
+        assert not witness.closed, f"the server let its watcher go: {talk.log[-2000:]}"
+        talk.stop()
+        assert "a bug" not in talk.log, talk.log[-2000:]
+        return report
+
+    def _disturb(self, seconds: float, every: float | None, least: int) -> Report:
+        faults = Faults(self._talk, self._sink, self._player, random.Random(f"{self._seed} faults"))
+        clients = self._start_senders("")
+        narrator = Narrator(self._talk, self._sink, faults.calm_since)
+        clients.start("narrator", narrator.run)
+        end = time.monotonic() + seconds
+
+        def over() -> bool:
+            done = time.monotonic() >= end and faults.done.total() >= least
+            return done or bool(clients.failures) or not self._talk.running
+
+        try:
+            if every is None:
+                faults.kill_engines(over)
+            else:
+                faults.run(every, over)
+        finally:
+            clients.stop(f"after {faults.done}, the last was {faults.last}")
+        return Report(Counter(), faults.done, narrator.heard_whole)
+
+    def _start_senders(self, phase: str) -> Workers:
+        workers = Workers()
+        for number in range(_CLIENTS):
+            chance = random.Random(f"{self._seed} {phase} {number}")
+            workers.start(f"client {number}", lambda over, chance=chance: send_goals(self._talk, chance, over))  # type: ignore[misc]
+        return workers
+
+    def _settle(self) -> None:
+        """Wait until all goals have ended, and speak once more."""
+        assert self._talk.request("cancel")["ok"]
+        left = self._witness.wait_until_all_have_ended()
+        assert not left, f"goals without an end: {left}"
+        with self._talk.connect() as wire:
+            assert wire.request("say", text="all is well", rate=450, wait=True)["ok"]
+            last = wire.receive_event("result", timeout=30)["goal"]
+        assert last["state"] == "SUCCEEDED", last
+        assert not self._witness.faults, self._witness.faults
+
+    def _files(self) -> set[str]:
+        directories = (self._talk.directory, self._temporary)
+        return {f"{at}/{name}" for each in directories for at, below, files in os.walk(each) for name in below + files}
+
+
+def soak(seconds: float, seed: int, every: float | None = 5.0, player: str = "aplay", least: int = 0) -> Report:
+    """Run a soak.
+
+    It takes longer if there were not `least` faults yet. If `every` is None, the only fault is a killed engine.
+    """
+    print(f"seed {seed}", flush=True)
+    with contextlib.ExitStack() as stack:
+        return Soak(seed, player, stack).run(seconds, every, least)
+
+
+def parser(every: float) -> argparse.ArgumentParser:
+    """Return a parser with the options of every soak."""
+    result = argparse.ArgumentParser()
+    result.add_argument("--seconds", type=float, default=1800)
+    result.add_argument("--seed", type=int, default=int(time.time()))
+    result.add_argument("--every", type=float, default=every, help="seconds between two faults, on average")
+    return result
+
+
+def main() -> None:
+    options = parser(every=5.0)
+    options.add_argument("--kills", action="store_true", help="only kill the engine, again and again")
+    options.add_argument("--player", choices=("aplay", "pacat"), default="aplay")
+    asked = options.parse_args()
+    print(soak(asked.seconds, asked.seed, None if asked.kills else asked.every, asked.player))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,150 @@
+"""The faults of the soak, each with the way back."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import time
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from tests.conformance.rawsocket import Raw
+from tests.faults.test_clients_many import crowd
+from tests.support.census import descendants
+from tests.support.surroundings import command_line
+
+if TYPE_CHECKING:
+    import random
+    from collections.abc import Callable, Mapping
+
+    from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+#: Seconds after which a disturbed sink plays and is recorded as before.
+_WARM_S = 3.0
+_SIGNAL_LIMIT_S = 20.0
+#: Seconds between two kills of an engine process, and between a kill and another one during the restart.
+_KILL_EVERY_S, _KILL_AGAIN_S = (0.12, 5.0), (0.0, 0.08)
+
+
+class FaultsInTurn:
+    """Injects faults in the calling thread, each kind as often as the others."""
+
+    def __init__(self, chance: random.Random) -> None:
+        self.chance = chance
+        self.kinds: Mapping[str, Callable[[], object]] = {}
+        self.done: Counter[str] = Counter()
+        #: the last fault, for messages
+        self.last = "none"
+
+    def run(self, every: float, over: Callable[[], bool]) -> None:
+        """Inject a fault every so many seconds on average, until it is over."""
+        left: list[str] = []
+        while True:
+            due = time.monotonic() + every * self.chance.uniform(0.5, 1.5)
+            while time.monotonic() < due:
+                time.sleep(0.1)
+                if over():
+                    return
+            left = left or self.chance.sample([*self.kinds], len(self.kinds))
+            self.inject(left.pop())
+
+    def inject(self, kind: str) -> None:
+        self.last = kind
+        self.kinds[kind]()
+        self.done[kind] += 1
+
+
+class Faults(FaultsInTurn):
+    """The faults of a robot without a fleet."""
+
+    def __init__(self, talk: Talk, sink: Sink, player: str, chance: random.Random) -> None:
+        super().__init__(chance)
+        self._talk = talk
+        self._disturbed_until = 0.0
+        self._hit = 0
+        self.kinds = {
+            "engine killed": lambda: self._signal("talkcli.engine", signal.SIGKILL),
+            "engine segfaults": lambda: self._signal("talkcli.engine", signal.SIGSEGV),
+            "engine frozen": lambda: self._signal("talkcli.engine", signal.SIGSTOP),
+            "player killed": lambda: self._signal(player, signal.SIGKILL),
+            "player frozen": lambda: self._signal(player, signal.SIGSTOP),
+            "sink suspended": lambda: self._disturb(sink.suspend, sink.resume, 5),
+            "sink unplugged": lambda: self._disturb(sink.unload, sink.reload, 3),
+            "sound server frozen": lambda: self._disturb(sink.freeze, sink.thaw, 5),
+            "sound server killed": lambda: self._disturb(sink.kill_server, sink.start_server, 3),
+            "paused": lambda: self._disturb(self._pause, lambda: self._request("resume"), 2),
+            "everything cancelled": lambda: self._request("cancel"),
+            "server hung up": self._hang_up,
+            "client killed": self._kill_client,
+            "clients frozen": self._freeze_clients,
+            "clients by the hundred": self._connect_by_the_hundred,
+            "bad lines": self._send_bad_lines,
+        }
+
+    def kill_engines(self, over: Callable[[], bool]) -> None:
+        """Kill engine processes only, also while they start."""
+        self._disturbed_until = float("inf")
+        while not over():
+            time.sleep(self.chance.uniform(*_KILL_EVERY_S))
+            self.inject("engine killed")
+            for _ in range(self.chance.choice((0, 0, 1, 2))):
+                time.sleep(self.chance.uniform(*_KILL_AGAIN_S))
+                self.inject("engine killed")
+
+    def calm_since(self, moment: float) -> bool:
+        """Whether a sentence that began at this monotonic time must have been heard whole."""
+        return self._disturbed_until + _WARM_S < moment
+
+    def _signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to the process of that name, as soon as there is one that was not signalled before."""
+        end = time.monotonic() + _SIGNAL_LIMIT_S
+        while time.monotonic() < end:
+            for pid in descendants(self._talk.pid):
+                if name in command_line(pid) and pid != self._hit:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(pid, number)
+                        self._hit = pid
+                        return
+            time.sleep(0.001)  # nothing tells when a process is started
+
+    def _disturb(self, begin: Callable[[], object], end: Callable[[], object], most: float) -> None:
+        self._disturbed_until = float("inf")
+        begin()
+        time.sleep(self.chance.uniform(0.1, most))
+        end()
+        self._disturbed_until = time.monotonic()
+
+    def _request(self, request: str) -> None:
+        assert self._talk.request(request)["ok"]
+
+    def _pause(self) -> None:
+        reply = self._talk.request("pause")
+        assert reply["ok"] or reply["error"]["code"] == "not_silent", reply  # a frozen engine doesn't confirm it
+
+    def _hang_up(self) -> None:
+        for _ in range(100):
+            os.kill(self._talk.pid, signal.SIGHUP)
+
+    def _kill_client(self) -> None:
+        client = self._talk.start("say", "--wait", "--priority", "5", "--", "nobody waits for this any more")
+        time.sleep(self.chance.uniform(0.1, 0.5))
+        client.kill()
+        client.wait()
+
+    def _freeze_clients(self) -> None:
+        with crowd(self._talk, 20, json.dumps({"seq": 1, "request": "watch"})) as clients:
+            clients.send_signal(signal.SIGSTOP)
+            time.sleep(self.chance.uniform(0.5, 3))
+
+    def _connect_by_the_hundred(self) -> None:
+        with contextlib.ExitStack() as stack:
+            for _ in range(300):
+                stack.enter_context(Raw(self._talk.socket))
+
+    def _send_bad_lines(self) -> None:
+        for data in (self.chance.randbytes(3000), b"[" * 60_000 + b"\n", b"a" * 100_000, b'{"request": "say", "te'):
+            with Raw(self._talk.socket) as raw:
+                raw.send(data)
