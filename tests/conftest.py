@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import pytest
 
 from tests.support.processes import Talk
 from tests.support.sink import Sink
-from tests.support.surroundings import needs_no_server
+from tests.support.surroundings import needs_no_server, short_directory
 from tests.support.timing import calibrate, take_unmeasured
 
 if TYPE_CHECKING:
@@ -83,6 +84,14 @@ def private_sink() -> Iterator[Callable[[], Sink]]:
     """Starts sound servers for a test that breaks them."""
     with contextlib.ExitStack() as stack:
         yield lambda: stack.enter_context(Sink())
+
+
+@pytest.fixture
+def home() -> Iterator[str]:
+    """The home of programs that a test starts: a new directory that other users may enter, short enough for sockets."""
+    with short_directory() as path:
+        os.chmod(path, 0o755)
+        yield path
 
 
 @pytest.fixture

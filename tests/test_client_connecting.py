@@ -18,7 +18,7 @@ from talkcli.errors import AccessDenied, ProtocolMismatch, ServerUnavailable, Ta
 from tests.support.connection import PATIENCE
 from tests.support.processes import start_talk
 from tests.support.scripted_peer import GREETING
-from tests.support.surroundings import clean_environment, short_directory
+from tests.support.surroundings import clean_environment
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -32,9 +32,8 @@ HANG_UP = b""
 
 
 @pytest.fixture
-def path() -> Iterator[str]:
-    with short_directory() as directory:
-        yield f"{directory}/talk/s"
+def path(home: str) -> str:
+    return f"{home}/talk/s"
 
 
 @contextlib.contextmanager

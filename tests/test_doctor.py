@@ -26,7 +26,7 @@ from tests.faults.broken import python_path, write
 from tests.support.compare import assert_silent, extent
 from tests.support.processes import Talk, run_talk
 from tests.support.real_voice import REAL_PACKAGE
-from tests.support.surroundings import clean_environment, needs, short_directory
+from tests.support.surroundings import clean_environment, needs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -72,11 +72,9 @@ def doctor(env: Mapping[str, str], *options: str, code: int = 4) -> dict[str, di
 
 
 @pytest.fixture
-def home() -> Iterator[str]:
-    with short_directory() as path:
-        os.chmod(path, 0o755)
-        os.mkdir(f"{path}/run", 0o700)
-        yield path
+def home(home: str) -> str:
+    os.mkdir(f"{home}/run", 0o700)
+    return home
 
 
 def quick(home: str) -> dict[str, str]:

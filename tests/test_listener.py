@@ -9,7 +9,6 @@ import stat
 import subprocess
 import sys
 import threading
-from typing import TYPE_CHECKING
 
 import click
 import pytest
@@ -18,10 +17,7 @@ import talkcli
 from talkcli.server import lock
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.support.connection import Wire
-from tests.support.surroundings import needs, short_directory
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from tests.support.surroundings import needs
 
 NOBODY = 65534
 #: Starts a program and passes it a socket, like systemd.
@@ -31,13 +27,6 @@ os.dup2(int(sys.argv[1]), 3)
 os.environ["LISTEN_PID"] = str(os.getpid())
 os.execv(sys.argv[2], sys.argv[2:])
 """
-
-
-@pytest.fixture
-def home() -> Iterator[str]:
-    with short_directory() as path:
-        os.chmod(path, 0o755)  # other users can reach the files in it
-        yield path
 
 
 def refused(home: str, *words: str, code: int = 11, **extra: str) -> str:

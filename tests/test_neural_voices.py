@@ -21,7 +21,7 @@ from tests.conformance.bareserve import LIMIT, SERVE, TALK, environment, run, se
 from tests.engine.test_neural import SLOW_TO_SPEAK, WITHOUT
 from tests.support import tiny_voice
 from tests.support.processes import children
-from tests.support.surroundings import needs, needs_packages, short_directory
+from tests.support.surroundings import needs, needs_packages
 from tests.test_completion import offered
 
 if TYPE_CHECKING:
@@ -62,21 +62,20 @@ sys.meta_path.insert(0, Held())
 
 
 @pytest.fixture
-def env(tmp_path: Path) -> Iterator[dict[str, str]]:
+def env(home: str, tmp_path: Path) -> dict[str, str]:
     """Return the environment of a server with two voices."""
     needs_packages(*NEEDED)
     tiny_voice.put(tmp_path / "voices", "tiny")
     tiny_voice.put(tmp_path / "voices", "broken", b"no model")
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(SITE)
-    with short_directory() as home:
-        yield environment(
-            home,
-            TALK_SOCKET=f"{home}/s",
-            TALK_VOICES=str(tmp_path / "voices"),
-            PYTHONPATH=str(tmp_path / "site"),
-            HOLD=str(tmp_path / "hold"),
-        )
+    return environment(
+        home,
+        TALK_SOCKET=f"{home}/s",
+        TALK_VOICES=str(tmp_path / "voices"),
+        PYTHONPATH=str(tmp_path / "site"),
+        HOLD=str(tmp_path / "hold"),
+    )
 
 
 @pytest.fixture

@@ -8,19 +8,15 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.conformance.bareserve import TALK, environment, run, serving
-from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from tests.conftest import MakeTalk
 
 
 @pytest.fixture
-def home() -> Iterator[str]:
-    with short_directory() as path:
-        os.mkdir(f"{path}/run", 0o700)
-        yield path
+def home(home: str) -> str:
+    os.mkdir(f"{home}/run", 0o700)
+    return home
 
 
 @pytest.mark.usefixtures("nobody_serves")

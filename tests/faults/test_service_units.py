@@ -188,7 +188,6 @@ def test_system_s_unit_warns_if_the_service_s_user_can_t_read_the_program(home: 
     private = f"{home}/private"
     os.mkdir(private, 0o700)
     script = str(write(Path(private, "talk"), SCRIPT, 0o755))
-    os.chmod(home, 0o755)
     os.mkdir(f"{home}/bin")
     os.symlink(script, f"{home}/bin/talk")  # readable for all, unlike the program
     for command in (script, f"{home}/bin/talk"):

@@ -77,11 +77,6 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def _readable(home: str) -> None:
-    os.chmod(home, 0o755)
-
-
 def as_user(uid: int, *groups: int) -> list[str]:
     member = [f"--groups={','.join(map(str, groups))}"] if groups else ["--clear-groups"]
     return ["setpriv", f"--reuid={uid}", f"--regid={uid}", *member]

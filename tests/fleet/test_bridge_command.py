@@ -18,21 +18,14 @@ from tests.faults.supervisor import Supervisor
 from tests.fleet.asker import Asker
 from tests.support.processes import run_talk
 from tests.support.spied import spied
-from tests.support.surroundings import needs, short_directory
+from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from tests.fleet.conftest import MakeBridge
     from tests.support.broker import Broker
     from tests.support.processes import Talk
-
-
-@pytest.fixture
-def home() -> Iterator[str]:
-    with short_directory() as path:
-        yield path
 
 
 def bridge(home: str, *words: str, **extra: str) -> tuple[int, str, str]:
