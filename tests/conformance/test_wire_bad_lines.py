@@ -158,7 +158,7 @@ def test_line_that_is_too_long_ends_the_connection(talk: Talk) -> None:
         assert raw.receive_lines(3)[2]["ok"]
 
 
-def test_as_many_as_stand_before_a_line_that_is_too_long_are_answered_and_none_behind_it(talk: Talk) -> None:
+def test_requests_before_an_overlong_line_are_answered_and_none_after_it(talk: Talk) -> None:
     requests = [b'{"seq": %d, "request": "resume"}\n' % number for number in range(101)]
     with Raw(talk.socket) as raw:
         raw.send(b"".join([*requests[:100], b"a" * MAX_LINE, b"\n", requests[100]]))
@@ -202,7 +202,7 @@ def test_descriptors_that_are_passed_are_not_kept(talk: Talk) -> None:
         assert [each["ok"] for each in replies] == [True] * 20
 
 
-def test_what_a_client_past_the_door_sent_before_it_closed_is_not_carried_out(make_talk: MakeTalk) -> None:
+def test_requests_of_a_refused_client_are_not_carried_out(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-clients", "1", scripted=True, watched=False)
     with contextlib.ExitStack() as stack:
         asking = stack.enter_context(talk.connect())
@@ -219,7 +219,7 @@ def test_what_a_client_past_the_door_sent_before_it_closed_is_not_carried_out(ma
     assert "a bug" not in talk.log
 
 
-def test_what_follows_ten_bad_lines_is_not_carried_out_where_the_client_has_gone_either(scripted: Talk) -> None:
+def test_request_after_ten_bad_lines_is_ignored_even_if_the_client_has_left(scripted: Talk) -> None:
     send_and_go(scripted, b"garbage\n" * 10 + b'{"request":"pause"}\n')
     assert scripted.request("status")["server"]["paused"] is False
 

@@ -219,7 +219,7 @@ def _read(path: Path) -> bytes:
         return file.readframes(file.getnframes())
 
 
-def test_sentences_are_appended_to_an_empty_file_and_behind_them_rests_of_a_crash_are_cut_off(tmp_path: Path) -> None:
+def test_sentences_are_appended_and_leftovers_of_a_crash_are_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "x.wav"
     path.touch()
     _write(path, b"one ")
