@@ -56,6 +56,7 @@ def test_row_22_a_sender_that_attached_and_leaves_ends_nothing(scripted: Talk) -
 
 def test_row_22_the_commands_take_the_id_that_ros_gives_a_goal(scripted: Talk) -> None:
     own = "/patrol/goal-1-1712.25"
+    assert scripted.run("say", "--id", own, "--", "").code == 5  # a rejected goal does not use up its id
     done = scripted.run("say", "--wait", "--id", own, "--", SHORT)
     assert (done.code, done.id) == (0, own), done
     assert scripted.request("say", text=SHORT, id=own)["attached"]

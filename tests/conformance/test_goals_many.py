@@ -120,8 +120,9 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_in_a_second_is_spoken_wh
         *others, newest = talk.watcher.goals()
         assert (len(others), newest) == (BURST - 1, last)
         assert set(ends(talk, *others)) == {1}
-        told = {each["id"]: each["state"] for each in talk.watcher.events() if each["event"] == "state"}
-        assert {told[each] for each in others} <= {"PREEMPTED", "RECALLED"}
+        told = {each["id"]: each["goal"] for each in talk.watcher.events() if each.get("goal")}
+        assert {told[each]["state"] for each in others} <= {"PREEMPTED", "RECALLED"}
+        assert {told[each]["reason"] for each in others} == {"preempted"}
         assert_told_in_order(talk)
         talk.stop()
         assert_within(seconds, 1.0, "taking a thousand goals")

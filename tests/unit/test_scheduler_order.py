@@ -175,6 +175,12 @@ a goal that has preempted the held one waits
     a; pause; b preempt; stopped a  ->  b PENDING; a PREEMPTED preempted by b
 a goal that has preempted the held one starts at resume
     a; pause; b preempt; stopped a; resume  ->  b ACTIVE; a PREEMPTED preempted by b
+flush ends the held goal and waits
+    a; b; pause; c flush; stopped a  ->  c PENDING; a PREEMPTED preempted by c; b RECALLED preempted by c
+the held goal is the current one for a cancel
+    a; b; pause; cancel current; stopped a  ->  b PENDING; a PREEMPTED canceled by door
+a cancel of all goals up to one includes the held goal
+    a; b; c; pause; cancel before=b; stopped a  ->  c PENDING; a PREEMPTED canceled by door; b RECALLED canceled by door
 a goal that is being stopped is not held
     a; b; cancel a; pause  ->  a PREEMPTING canceled by door; b PENDING
 resume starts no goal beside one that is being stopped
@@ -361,7 +367,7 @@ def test_a_rule_holds(script: str, outcome: str) -> None:
 
 @pytest.mark.parametrize(("options", "reason"), REJECTED.values(), ids=REJECTED.keys())
 def test_a_rejected_goal_does_nothing_to_others(options: str, reason: str) -> None:
-    robot = play(f"a; b queue; c flush {options}")
+    robot = play(f"a; b queue key=k; c flush key=k {options}")
     assert robot.outcome() == f"a ACTIVE; b PENDING; c REJECTED {reason}"
     assert robot.seen[-1] == "c REJECTED"
     record = robot.goals["c"]
