@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from typing import TYPE_CHECKING
 
+import platformdirs
 import pytest
 
+from talkcli import paths
 from tests.conformance.bareserve import TALK, environment, run, serving
 
 if TYPE_CHECKING:
@@ -17,6 +20,27 @@ if TYPE_CHECKING:
 def home(home: str) -> str:
     os.mkdir(f"{home}/run", 0o700)
     return home
+
+
+@pytest.mark.filterwarnings("ignore::platformdirs.RuntimeDirWarning")
+@pytest.mark.parametrize(
+    "variables",
+    [*({"XDG_RUNTIME_DIR": each} for each in ("run", "gone", "")), {"TMPDIR": "run"}, {"TMP": "run"}, {"TMPDIR": ""}],
+    ids=str,
+)
+def test_client_looks_where_platformdirs_puts_the_socket(
+    home: str, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]
+) -> None:
+    for name in ("XDG_RUNTIME_DIR", "TMPDIR", "TEMP", "TMP"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value and f"{home}/{value}")
+    monkeypatch.setattr(tempfile, "tempdir", None)  # so that it is looked for again
+    looked = paths.client_sockets(None)
+    assert f"{platformdirs.PlatformDirs('talk', appauthor=False).user_runtime_dir}/talk.sock" in looked
+    assert looked[-1] == "/run/talk/talk.sock"
+    if variables.get("XDG_RUNTIME_DIR"):
+        assert looked[0].startswith(home)
 
 
 @pytest.mark.usefixtures("nobody_serves")
