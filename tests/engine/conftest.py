@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
+    from tests.engine.spawned import Shared, Spawned
     from tests.engine.threads import Start
 
 
@@ -26,6 +27,12 @@ if TYPE_CHECKING:
 def player(tmp_path: Path) -> Player:
     """Makes player programs."""
     return Player(tmp_path)
+
+
+@pytest.fixture
+def engine(shared: Shared, request: pytest.FixtureRequest) -> Spawned:
+    """Return the idle process that the tests of a module share."""
+    return shared.take(request.session.testsfailed)
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import subprocess
@@ -13,7 +14,7 @@ from talkcli.engine import protocol
 from talkcli.engine.synthesizers.voices import is_neural
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from typing import Any
 
 _E = TypeVar("_E", bound=protocol.Event)
@@ -81,6 +82,7 @@ class Spawned:
         self._rest = b""
         self._ahead: list[protocol.Event | None] = []
         self._pauses = 0
+        self._unfinished: set[str] = set()
         self._socket, theirs = socket.socketpair()
         self._socket.settimeout(PATIENCE)
         self.liveness, inherited = os.pipe()
@@ -115,12 +117,15 @@ class Spawned:
         if self.process.stderr is not None:
             self.process.stderr.close()
 
-    def send(self, command: protocol.Command) -> None:
-        self.send_raw(protocol.encode(command))
+    @property
+    def idle(self) -> bool:
+        """Whether it runs, and all its goals have ended."""
+        return self.process.poll() is None and not self._unfinished
 
-    def send_raw(self, lines: bytes) -> None:
+    def send(self, *commands: protocol.Command) -> None:
         """Send commands in one piece, so that they are read at once."""
-        self._socket.sendall(lines)
+        self._unfinished.update(each.id for each in commands if isinstance(each, protocol.Say))
+        self._socket.sendall(b"".join(map(protocol.encode, commands)))
 
     def leave(self) -> None:
         """Send nothing more, and let the process end; its events can still be read."""
@@ -184,6 +189,8 @@ class Spawned:
         line, self._rest = self._rest.split(b"\n", 1)
         event = protocol.decode(line, protocol.EVENTS)
         self.events.append(event)
+        if isinstance(event, protocol.Ended):
+            self._unfinished.discard(event.id)
         return event
 
     def until(self, kind: type[_E]) -> _E:
@@ -196,7 +203,9 @@ class Spawned:
     def spoken(self, text: str, goal: str = "g1", **more: Any) -> protocol.Ended:
         """Say a sentence and return how it ended; `more`: as in `say`."""
         self.say(text, goal, **more)
-        return self.until(protocol.Ended)
+        ended = self.until(protocol.Ended)
+        assert ended.id == goal, ended
+        return ended
 
     def words(self, goal: str = "g1") -> list[protocol.Word]:
         return [event for event in self.events if isinstance(event, protocol.Word) and event.id == goal]
@@ -221,3 +230,24 @@ class Spawned:
             except BlockingIOError:
                 time.sleep(0.002)
         return False
+
+
+class Shared:
+    """An engine process for several tests. After a failure or an unfinished goal, the next test gets a new process."""
+
+    def __init__(self, start: Callable[[], Spawned]) -> None:
+        self._start, self._stack = start, contextlib.ExitStack()
+        self._engine: Spawned | None = None
+        self._failed = 0
+
+    def take(self, failed: int) -> Spawned:
+        """Return an idle process, without the events of the tests before. So many tests have `failed` until now."""
+        if self._engine is None or not self._engine.idle or failed != self._failed:
+            self.close()
+            self._engine, self._failed = self._stack.enter_context(self._start()), failed
+            self._engine.until(protocol.Voices)
+        self._engine.events.clear()
+        return self._engine
+
+    def close(self) -> None:
+        self._stack.close()

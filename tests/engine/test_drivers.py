@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import time
@@ -17,7 +18,7 @@ from talkcli.engine.driver import register
 from talkcli.engine.players.base import CannotSpeak
 from talkcli.engine.players.choice import Players
 from talkcli.engine.synthesizers.base import UnknownVoice
-from tests.engine.spawned import Spawned
+from tests.engine.spawned import Shared, Spawned
 from tests.engine.test_synthesizer_contract import Scripted
 from tests.support.timing import assert_within, limits
 
@@ -109,16 +110,9 @@ ctypes.CDLL = Missing
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Spawned]:
-    with Spawned(driver="dummy") as engine:
-        yield engine
-
-
-@pytest.fixture
-def dummy(shared: Spawned) -> Spawned:
-    """Return a process with pyttsx3's dummy driver that the tests share, without the events of the tests before."""
-    shared.events.clear()
-    return shared
+def shared() -> Iterator[Shared]:
+    with contextlib.closing(Shared(lambda: Spawned(driver="dummy"))) as shared:
+        yield shared
 
 
 def test_the_dummy_driver_lists_its_voices() -> None:
@@ -146,13 +140,13 @@ def test_a_driver_is_stepped_to_the_end_of_each_sentence_and_reports_words(drive
     ],
 )
 def test_an_option_that_the_driver_lacks_fails_the_goal(
-    dummy: Spawned, more: dict[str, Any], reason: str, message: str
+    engine: Spawned, more: dict[str, Any], reason: str, message: str
 ) -> None:
-    ended = dummy.spoken("yes", **more)
+    ended = engine.spoken("yes", **more)
     assert (ended.outcome, ended.reason) == (protocol.FAILED, reason)
     assert ended.message is not None
     assert message in ended.message
-    assert dummy.spoken("yes", "g2", rate=150, lead_in=0).outcome == protocol.COMPLETED
+    assert engine.spoken("yes", "g2", rate=150, lead_in=0).outcome == protocol.COMPLETED
 
 
 @limits()

@@ -23,7 +23,7 @@ from talkcli import install
 from talkcli.engine import protocol
 from talkcli.engine.synthesizers.models import NEEDED
 from tests.engine.programs import Player, without_silence
-from tests.engine.spawned import SOON, Spawned, first
+from tests.engine.spawned import SOON, Shared, Spawned, first
 from tests.support import tiny_voice
 from tests.support.espeak import RATE
 from tests.support.processes import children
@@ -64,7 +64,7 @@ NEURAL_MODULES = [
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def voices(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a directory with a voice that hums, in some milliseconds."""
     needs_packages(*NEEDED)
     path = tmp_path_factory.mktemp("neural") / "voices"
@@ -72,17 +72,19 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def shared(place: Path) -> Iterator[Spawned]:
-    with _engine(place, f"file:{place.parent / 'out.wav'}") as engine:
-        yield engine
-
-
 @pytest.fixture
-def engine(shared: Spawned) -> Spawned:
-    """Return the process that the tests share, without the events of the tests before."""
-    shared.events.clear()
-    return shared
+def place(voices: Path) -> Iterator[Path]:
+    """That directory. The voices that a test puts there are removed after it."""
+    yield voices
+    for each in voices.iterdir():
+        if not each.name.startswith("tiny."):
+            each.unlink()
+
+
+@pytest.fixture(scope="module")
+def shared(voices: Path) -> Iterator[Shared]:
+    with contextlib.closing(Shared(lambda: _engine(voices, f"file:{voices.parent / 'out.wav'}"))) as shared:
+        yield shared
 
 
 def _engine(place: Path, player: str = "null", sink: Mapping[str, str] | None = None, **more: Any) -> Spawned:

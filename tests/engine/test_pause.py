@@ -105,7 +105,7 @@ def test_resuming_before_it_is_silent_loses_nothing(player: Player) -> None:
         _say_to_word(engine)
         for _ in range(3):
             engine.until_word()
-            engine.send_raw(protocol.encode(protocol.Pause("g1", 1)) + protocol.encode(protocol.Resume("g1")))
+            engine.send(protocol.Pause("g1", 1), protocol.Resume("g1"))
         assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
     assert player.heard.read_bytes() == sound(TEXT)
 
@@ -175,8 +175,7 @@ def test_a_pause_before_the_first_sound_holds_the_whole_sentence(player: Player,
     with Spawned(player.command(NEVER_READS), alive_every=SOON) as engine:
         engine.until(protocol.Voices)
         if together:
-            say = protocol.Say("g1", TEXT, FAST, 1.0, None, 50)
-            engine.send_raw(protocol.encode(say) + protocol.encode(protocol.Pause("g1", 1)))
+            engine.send(protocol.Say("g1", TEXT, FAST, 1.0, None, 50), protocol.Pause("g1", 1))
             engine.until(protocol.Paused)
         else:
             engine.say(TEXT)
@@ -221,11 +220,11 @@ def test_no_silence_is_written_to_a_file(tmp_path: Path, held: str) -> None:
     target = tmp_path / "paused.wav"
     with Spawned(f"file:{target}", alive_every=SOON) as engine:
         engine.until(protocol.Voices)
-        pause = protocol.encode(protocol.Pause("g1", 1))
-        engine.send_raw(protocol.encode(protocol.Say("g1", text, rate, 1.0, None, 50)) + pause * (held == "before"))
+        pause = protocol.Pause("g1", 1)
+        engine.send(protocol.Say("g1", text, rate, 1.0, None, 50), *([pause] if held == "before" else []))
         if held == "within":
             engine.until_word()
-            engine.send_raw(pause)
+            engine.send(pause)
         engine.until(protocol.Paused)
         assert target.exists() == (held == "within")
         size = target.stat().st_size if target.exists() else 0

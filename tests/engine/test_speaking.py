@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import resource
@@ -12,7 +13,7 @@ import pytest
 
 from talkcli.engine import protocol
 from tests.engine.programs import NEVER_READS
-from tests.engine.spawned import FAST, Spawned
+from tests.engine.spawned import FAST, Shared, Spawned
 from tests.support.processes import children
 from tests.support.timing import assert_within, limits
 
@@ -42,23 +43,15 @@ atexit.register(lambda: sys.stderr.write(" ".join(sys.modules)))
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Spawned]:
-    with Spawned(alive_every=ALIVE_EVERY) as engine:
-        engine.until(protocol.Voices)
-        yield engine
+def shared() -> Iterator[Shared]:
+    with contextlib.closing(Shared(lambda: Spawned(alive_every=ALIVE_EVERY))) as shared:
+        yield shared
 
 
 @pytest.fixture
-def engine(shared: Spawned) -> Spawned:
-    """Return a silent process that the tests share, without the events of the tests before."""
-    shared.events.clear()
-    return shared
-
-
-@pytest.fixture(scope="module")
-def writing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Spawned]:
+def writing(tmp_path: Path) -> Iterator[Spawned]:
     """A process that writes to a file, which takes no time."""
-    with Spawned(f"file:{tmp_path_factory.mktemp('said')}/x.wav") as engine:
+    with Spawned(f"file:{tmp_path}/x.wav") as engine:
         yield engine
 
 
@@ -146,7 +139,7 @@ def test_a_goal_in_hand_is_told_to_be_alive(engine: Spawned) -> None:
 
 def test_a_text_without_anything_to_say_ends_with_nothing_to_say(engine: Spawned) -> None:
     for text in ("", "  \n", "...", "\x01\x02", "«»"):
-        ended = engine.spoken(text)
+        ended = engine.spoken(text, f"goal {text!a}")
         assert (ended.outcome, ended.reason) == (protocol.FAILED, "nothing_to_say")
     assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
 
@@ -187,8 +180,7 @@ def test_a_stop_for_another_goal_is_ignored(engine: Spawned) -> None:
 
 
 def test_a_stop_that_comes_with_the_sentence_is_obeyed(engine: Spawned) -> None:
-    say = protocol.encode(protocol.Say("g1", "one two three four five", 200, 1.0, None, 50))
-    engine.send_raw(say + protocol.encode(protocol.Stop("g1")))
+    engine.send(protocol.Say("g1", "one two three four five", 200, 1.0, None, 50), protocol.Stop("g1"))
     assert engine.until(protocol.Ended).outcome == protocol.STOPPED
     assert engine.words() == []
 
