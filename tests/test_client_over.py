@@ -10,11 +10,11 @@ import pytest
 from talkcli import Client, State
 from talkcli.client.following import Followed
 from talkcli.client.goal import GoalHandle, merged
-from talkcli.errors import ServerUnavailable
+from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Say
 from talkcli.protocol.events import Result, StateChanged
-from talkcli.protocol.requests import Log, Status, Wait
+from talkcli.protocol.requests import Log, Status, Wait, Watch
 from tests.support.scripted_peer import goal, result
 
 if TYPE_CHECKING:
@@ -117,3 +117,14 @@ def test_goals_are_followed_as_one_stream(scripted: Scripted) -> None:
     (handle,) = Client.over(scripted).follow(["g"])
     scripted.coming = [state("PREEMPTING", 1), result("PREEMPTED")]
     assert [(each, type(event)) for each, event in merged([handle])] == [(handle, StateChanged), (handle, Result)]
+
+
+def test_a_goal_and_a_watch_are_lost_if_the_connection_ends(scripted: Scripted) -> None:
+    client = Client.over(scripted)
+    handle, watch = client.say("a"), client.events()
+    next(watch)
+    assert isinstance(scripted.asked[-1], Watch)
+    assert handle.wait().state is State.LOST
+    assert "that was all" in (handle.goal.message or "")
+    with pytest.raises(Lost, match="at nowhere: that was all"):
+        next(watch)

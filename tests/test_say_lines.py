@@ -104,12 +104,14 @@ def test_options_hold_for_each_line_and_the_time_that_is_left_is_sent(scripted: 
 
 
 def test_a_line_that_is_refused_is_reported_by_its_number_and_the_rest_goes_on(scripted: Talk) -> None:
-    text = "length=0 one\n\nnul \0\nlength=0 two\n" + "x" * 10_001 + "\n" + "y" * 300_000 + "\nlength=0 three\n"
+    widest = "\N{GRINNING FACE}" * 10_000  # the most bytes that a text may have, beside the end of its line
+    lines = ["length=0 one", "", "nul \0", "length=0 two", "x" * 10_001, "y" * 300_000, "length=0 three"]
+    text = "\n".join([*lines, f"{widest}\r", f"{widest}a\r\n"])
     done = scripted.run("say", "--lines", stdin=text)
-    assert (done.code, len(done.out.split())) == (5, 3)
+    assert (done.code, len(done.out.split())) == (5, 4)
     notes = done.err.splitlines()
-    assert [each.split(":")[1] for each in notes] == [" line 3", " line 5", " line 6"]
-    for note, words in zip(notes, ("NUL", "10,001 characters", "300,000 bytes"), strict=True):
+    assert [each.split(":")[1] for each in notes] == [" line 3", " line 5", " line 6", " line 9"]
+    for note, words in zip(notes, ("NUL", "10,001 characters", "300,000 bytes", "40,002 bytes"), strict=True):
         assert words in note
     quiet = scripted.run("-q", "say", "--lines", stdin=text)
     assert (quiet.code, quiet.out, quiet.err) == (5, "", "")

@@ -6,16 +6,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.fleet import topics
 from tests.fleet.homeassistant import BIRTH, HomeAssistant
 from tests.fleet.robot import LONG, Robot
+from tests.support.broker import Broker
 from tests.support.mqtt import NO_SUBSCRIBERS
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.fleet.conftest import MakeBridge, MakeRobot
-    from tests.support.broker import Broker
 
 ANNA = "homeassistant/device/talk/anna/config"
+#: The name r2.d2 has a dot, so its topic has another form.
+DOTTED = "homeassistant/device/talk-dots/r2_dd2/config"
 
 
 @pytest.fixture
@@ -88,6 +91,22 @@ def test_a_robot_without_the_option_tells_home_assistant_nothing(robot: Robot) -
     assert "homeassistant" not in robot.broker.log  # neither published nor subscribed to
     with HomeAssistant(robot.broker) as home:
         assert home.publish(*BIRTH) == NO_SUBSCRIBERS
+
+
+def test_robots_and_home_assistant_work_by_the_printed_access_list(
+    make_talk: MakeTalk, make_bridge: MakeBridge
+) -> None:
+    users = {each: f"password of {each}" for each in ("anna", "r2.d2", "homeassistant", "olga")}
+    rules = topics.access(("olga",), homeassistant=True, name="r2.d2")
+    with Broker(users=users, acl=f"{rules}\n") as broker:
+        for name in ("anna", "r2.d2"):
+            make_bridge(make_talk(scripted=True), broker, name, "--homeassistant", user=name, observer="olga")
+        with HomeAssistant(broker, user="homeassistant") as home:
+            for topic in (ANNA, DOTTED):
+                home.await_message(lambda each: each.topic == topic)  # noqa: B023
+            device = home.device()
+            home.command(device, "say", "hello")
+            home.await_states(device, last="SUCCEEDED")
 
 
 def test_a_robot_that_may_not_announce_itself_says_so(

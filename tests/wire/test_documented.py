@@ -25,6 +25,7 @@ from tests.support.surroundings import needs_packages
 if TYPE_CHECKING:
     import pytest
 
+    from tests.support.processes import Talk
 
 ERRORS, LIMITS = tables(WIRE.section("Errors and limits"))
 
@@ -51,6 +52,11 @@ def test_keys_reasons_and_error_codes_of_the_tables_are_those_of_the_code() -> N
     sources = "".join(each.read_text(encoding="utf-8") for each in (ROOT / "talkcli").rglob("*.py"))
     for each in (*reasons, *codes, *first_column(tables(FLEET.section("What is refused"))[0])):
         assert f'"{each}"' in sources, each
+
+
+def test_server_has_the_keys_of_the_text(scripted: Talk) -> None:
+    (listed,) = re.findall(r"^`server` has (.*?)\.$", WIRE.section("Requests"), re.MULTILINE | re.DOTALL)
+    assert words(listed) == list(scripted.request("status")["server"])
 
 
 def test_numbers_of_kept_goals_are_in_the_text() -> None:

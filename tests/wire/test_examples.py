@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from typing import TYPE_CHECKING
@@ -91,6 +93,14 @@ def test_client_in_shell(scripted: Talk, shell_client: str) -> None:
     assert (done.stdout, done.returncode) == ("no result\n", 1)
 
 
+def test_client_in_shell_cancels_on_ctrl_c(scripted: Talk, shell_client: str) -> None:
+    with subprocess.Popen(["sh", shell_client, "never-ends"], env=scripted.env, start_new_session=True) as client:
+        goal = scripted.watcher.wait_for(None, "ACTIVE")["id"]
+        os.killpg(client.pid, signal.SIGINT)
+        assert client.wait(10) == 130
+    assert scripted.watcher.wait_for_terminal(goal) == "PREEMPTED"
+
+
 def test_client_in_plain_python(scripted: Talk) -> None:
     example = only(WIRE, "python", "Two clients", "socket")
     assert "talkcli" not in example
@@ -101,6 +111,9 @@ def test_client_in_plain_python(scripted: Talk) -> None:
     assert [each.split()[1] for each in told] == ["battery", "low,", "going", "home"]
     times = [float(each.split()[0]) for each in told]
     assert times == sorted(times)
+    refused = run(scripted, sys.executable, "-c", example.replace('"feedback": True', '"melody": True'))
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "melody" in refused.stderr
 
 
 def test_first_example_of_the_library(scripted: Talk) -> None:
@@ -113,3 +126,26 @@ def test_loop_of_a_robot(scripted: Talk) -> None:
     example = only(README, "python", "A tour", "robot.drives")
     done = run(scripted, sys.executable, "-c", ROBOT.format(example=example))
     assert (done.returncode, done.stdout, done.stderr) == (0, "please let me pass\n", "")
+
+
+@pytest.mark.parametrize(
+    ("on_word", "lights", "shown", "state"),
+    [
+        ("self.blocked = False", 'raise SystemExit("the goal failed")', "", "PREEMPTED"),
+        ("os.kill({pid}, signal.SIGKILL)", 'self.blocked, self.lips = False, ["lights"]', "lights", None),
+    ],
+    ids=["nobody is in the way any more", "the server is killed"],
+)
+def test_loop_of_a_robot_whose_goal_is_cut_short(
+    scripted: Talk, on_word: str, lights: str, shown: str, state: str | None
+) -> None:
+    """The loop cancels a goal that has become needless, and flashes the lights if the goal is lost."""
+    example = only(README, "python", "A tour", "robot.drives").replace("please let me pass", "never-ends")
+    robot = ROBOT.replace("self.lips.append(word)", on_word.format(pid=scripted.pid))
+    robot = robot.replace('raise SystemExit("nobody heard it")', lights)
+    done = run(scripted, sys.executable, "-c", "import os, signal\n" + robot.format(example=example))
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{shown}\n", "")
+    if state:
+        assert scripted.watcher.wait_for(None, state)["goal"]["reason"] == "canceled"
+    else:
+        scripted.unfinished = True
