@@ -49,11 +49,19 @@ LONG = "this is a sentence that takes longer than all that is looked at meanwhil
 
 
 @pytest.fixture(scope="module")
-def robot(sink: Sink) -> Iterator[Talk]:
-    """A server for all tests that leave it as it was; the doctor can read its environment."""
+def server(sink: Sink) -> Iterator[Talk]:
+    """A server for all tests that use `robot`; the doctor can read its environment."""
     with contextlib.closing(Talk(FAST, sink=sink, forked=False)) as talk:
         yield talk
         talk.stop()
+
+
+@pytest.fixture
+def robot(server: Talk) -> Iterator[Talk]:
+    """The same server, silent and at full volume again after each test."""
+    yield server
+    server.request("cancel")
+    server.request("set", volume=1.0)
 
 
 def doctor(env: Mapping[str, str], *options: str, code: int = 4) -> dict[str, dict[str, str]]:
@@ -105,7 +113,6 @@ def test_silent_makes_no_sound_and_shows_one_finding_per_line(robot: Talk, sink:
     with sink.record() as recording:
         done = robot.run("doctor", "--silent", timeout=LIMIT)
         recording.wait_until_quiet(0.2)
-    robot.run("set", "--volume", "1")
     assert_silent(recording)
     assert done.code == 0
     assert [line[9:23].strip() for line in done.out.splitlines()] == CHECKS
@@ -130,7 +137,6 @@ def test_silent_waits_for_no_goal_and_leaves_none(robot: Talk) -> None:
         status = client.status()
         assert (status.active and status.active.id, [each.id for each in status.pending]) == (first.id, [second.id])
         assert logged(robot) == before
-        client.cancel()
 
 
 def test_a_muted_sink_fails_though_the_sentence_was_played(robot: Talk, sink: Sink) -> None:

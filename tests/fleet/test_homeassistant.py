@@ -102,11 +102,13 @@ def test_robots_and_home_assistant_work_by_the_printed_access_list(
         for name in ("anna", "r2.d2"):
             make_bridge(make_talk(scripted=True), broker, name, "--homeassistant", user=name, observer="olga")
         with HomeAssistant(broker, user="homeassistant") as home:
-            for topic in (ANNA, DOTTED):
-                home.await_message(lambda each: each.topic == topic)  # noqa: B023
+            announced = home.await_message(lambda each: each.topic == DOTTED)
+            home.await_message(lambda each: each.topic == ANNA)
+            home.publish(*BIRTH)
             device = home.device()
             home.command(device, "say", "hello")
             home.await_states(device, last="SUCCEEDED")
+            home.await_message(lambda each: each.topic == DOTTED and each is not announced)
 
 
 def test_a_robot_that_may_not_announce_itself_says_so(

@@ -66,6 +66,11 @@ def test_every_document_is_tested() -> None:
     assert found == set(BY_PATH)
 
 
+def test_links_and_files_are_found() -> None:
+    assert len({link for document in DOCUMENTS for link in LINK.findall(document.prose)}) > 10
+    assert len({path for document in (HOUSE, CONTRIBUTING) for path in PATH.findall(document.text)}) > 10
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda each: each.name)
 def test_links_lead_somewhere(document: Document) -> None:
     for link in LINK.findall(document.prose):

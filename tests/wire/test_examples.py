@@ -143,9 +143,8 @@ def test_loop_of_a_robot_whose_goal_is_cut_short(
     example = only(README, "python", "A tour", "robot.drives").replace("please let me pass", "never-ends")
     robot = ROBOT.replace("self.lips.append(word)", on_word.format(pid=scripted.pid))
     robot = robot.replace('raise SystemExit("nobody heard it")', lights)
+    scripted.unfinished = state is None
     done = run(scripted, sys.executable, "-c", "import os, signal\n" + robot.format(example=example))
     assert (done.returncode, done.stdout, done.stderr) == (0, f"{shown}\n", "")
     if state:
         assert scripted.watcher.wait_for(None, state)["goal"]["reason"] == "canceled"
-    else:
-        scripted.unfinished = True
