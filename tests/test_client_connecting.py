@@ -155,7 +155,7 @@ def test_a_place_that_is_denied_does_not_end_the_waiting_for_another(
 @pytest.mark.parametrize(
     ("keep_trying", "left", "least", "most"), [(0, None, 4, 5), (1, None, 4, 5), (60, None, 50, 60), (2, 2, 1, 2)]
 )
-def test_what_is_left_of_the_time_is_for_the_greeting_and_the_replies(
+def test_greeting_and_replies_get_the_remaining_time(
     path: str, monkeypatch: pytest.MonkeyPatch, keep_trying: float, left: float | None, least: float, most: float
 ) -> None:
     waits = Waits(monkeypatch)

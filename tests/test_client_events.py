@@ -73,7 +73,7 @@ def test_event_goes_to_json_and_back(event: Event) -> None:
         {"event": "snapshot", "pending": [1]},
     ],
 )
-def test_what_is_no_event_of_its_kind_is_an_error(message: JsonObject) -> None:
+def test_malformed_event_is_an_error(message: JsonObject) -> None:
     with pytest.raises(ValueError, match=r"goal|event"):
         events.from_json(message)
 

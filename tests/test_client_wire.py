@@ -176,7 +176,7 @@ def test_goal_of_a_server_that_goes_away_is_lost(how: str) -> None:
 
 
 @pytest.mark.parametrize("word", [{"word": 1}, {"start": "0"}, {"number": True}, {"time": None}, {"id": None}])
-def test_message_that_is_none_ends_the_connection_and_hangs_nobody(word: dict[str, Any]) -> None:
+def test_malformed_message_ends_the_connection_and_blocks_no_caller(word: dict[str, Any]) -> None:
     def play(peer: Peer) -> None:
         peer.accept()
         peer.send({**peer.word(), **word})

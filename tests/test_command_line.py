@@ -16,7 +16,7 @@ import pytest
 
 from talkcli import Client, __version__, cli
 from talkcli.cli.commands import COMMANDS
-from tests.conformance.bareserve import TALK, environment, run
+from tests.conformance.bareserve import TALK, alone, run
 from tests.conformance.rawsocket import GREETING, FakeServer
 from tests.support.surroundings import clean_environment, short_directory
 from tests.support.terminal import Terminal
@@ -31,12 +31,6 @@ GOAL = {
 #: ESC, a bidi override, a line of its own, a bell, a NEL: none of these may reach a terminal.
 HOSTILE = "a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end"
 RAW = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
-
-
-def alone(*words: str, **extra: str) -> Any:
-    """Run `talk` without a server."""
-    with short_directory() as home:
-        return run([*TALK, *words], environment(home, **{"TALK_SOCKET": f"{home}/s", **extra}))
 
 
 def error_of(err: str) -> dict[str, Any]:

@@ -17,11 +17,10 @@ from talkcli.cli.click_app import ClickCommand, talk
 from talkcli.cli.command import ALL_EXIT_CODES
 from talkcli.engine.players import devices
 from talkcli.goals import states
-from tests.conformance.bareserve import TALK, environment, run
+from tests.conformance.bareserve import TALK, alone, environment, run
 from tests.golden import surface
 from tests.support.surroundings import short_directory
 from tests.support.terminal import Terminal
-from tests.test_command_line import alone
 
 if TYPE_CHECKING:
     import pathlib

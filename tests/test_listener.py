@@ -104,7 +104,7 @@ def test_server_that_is_refused_leaves_no_lock(home: str) -> None:
 
 
 @pytest.mark.parametrize("words", ["is no regular file", "is a symbolic link", "is a hard link"])
-def test_lock_that_is_none_is_told_and_not_written_to(home: str, words: str) -> None:
+def test_file_that_is_no_lock_is_reported_and_left_unchanged(home: str, words: str) -> None:
     with open(f"{home}/precious", "w", encoding="utf-8") as file:
         file.write("precious")
     if "regular" in words:

@@ -12,11 +12,11 @@ import subprocess
 import termios
 import time
 import wave
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.conformance.bareserve import TALK, environment, run
+from tests.conformance.bareserve import TALK, alone, environment, run
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
@@ -24,12 +24,6 @@ if TYPE_CHECKING:
 
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
-
-
-def alone(*words: str, **extra: str) -> Any:
-    """Run `talk` where there is no server."""
-    with short_directory() as home:
-        return run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", **extra))
 
 
 def busy(talk: Talk) -> str:

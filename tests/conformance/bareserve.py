@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from tests.support.forking import Forked, forks
 from tests.support.processes import SCRIPTED, run_talk
-from tests.support.surroundings import clean_environment, dying_with_parent
+from tests.support.surroundings import clean_environment, dying_with_parent, short_directory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -125,6 +125,12 @@ def run(command: Sequence[str], env: Mapping[str, str], **options: object) -> En
         **options,
     )
     return Ended(done.returncode, os.fsdecode(done.stdout), os.fsdecode(done.stderr))
+
+
+def alone(*words: str, **extra: str) -> Ended:
+    """Run `talk` without a server."""
+    with short_directory() as home:
+        return run([*TALK, *words], environment(home, **{"TALK_SOCKET": f"{home}/s", **extra}))
 
 
 def _forked(command: Sequence[str], env: Mapping[str, str]) -> list[str] | None:

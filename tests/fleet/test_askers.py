@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.fleet.conftest import in_loop
-from tests.fleet.house import House
+from tests.fleet.without_broker import AskersWithoutBroker
 from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
@@ -63,101 +63,101 @@ async def await_clients(talk: Talk, most: int) -> None:
 async def test_an_asker_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
     talk: Talk, pass_time: Callable[[float], None], waits: str
 ) -> None:
-    house = House(talk.socket)
+    anna = AskersWithoutBroker(talk.socket)
     if waits == "for room":
         for each in range(20):
-            await house.ask(say(each), "s2")
-        house.post(say(100, patient=True, wait=True, id="patient"))
-        await house.ask({"seq": 101, "request": "hello"})
-        assert [ask.seq for ask, _ in house.askers.waiting] == [100]
+            await anna.ask(say(each), "s2")
+        anna.post(say(100, patient=True, wait=True, id="patient"))
+        await anna.ask({"seq": 101, "request": "hello"})
+        assert [ask.seq for ask, _ in anna.askers.waiting] == [100]
     elif waits == "for a result":
-        await house.ask(say(100, wait=True))
+        await anna.ask(say(100, wait=True))
     else:
-        await house.ask({"seq": 100, "request": "watch"})
+        await anna.ask({"seq": 100, "request": "watch"})
     for _ in range(8):  # what it is told is no sign of its life
         pass_time(11)
-        house.askers.beat()
+        anna.askers.beat()
         if waits == "for events":
-            await house.ask(say(1), "s3")
-    assert not [each for each in house.lines() if each.get("event") == "gone"]
+            await anna.ask(say(1), "s3")
+    assert not [each for each in anna.lines() if each.get("event") == "gone"]
     pass_time(GONE - 88 + 0.1)
-    house.askers.beat()
-    assert "says hello every 30 s" in house.lines()[-1]["message"]
-    assert house.askers.waiting == []
-    before = len(house.lines())
-    await house.ask({"seq": 1, "request": "cancel"}, "s4")
-    assert len(house.lines()) == before
-    house.askers.hang_up_all()
+    anna.askers.beat()
+    assert "says hello every 30 s" in anna.lines()[-1]["message"]
+    assert anna.askers.waiting == []
+    before = len(anna.lines())
+    await anna.ask({"seq": 1, "request": "cancel"}, "s4")
+    assert len(anna.lines()) == before
+    anna.askers.hang_up_all()
 
 
 @in_loop
 async def test_an_asker_that_says_hello_keeps_what_it_waits_for(talk: Talk, pass_time: Callable[[float], None]) -> None:
-    house = House(talk.socket)
-    goal = await house.ask(say(1, wait=True))
+    anna = AskersWithoutBroker(talk.socket)
+    goal = await anna.ask(say(1, wait=True))
     for each in range(2, 8):
         pass_time(30)
-        house.askers.beat()
-        await house.ask({"seq": each, "request": "hello"})
-    await house.ask({"seq": 10, "request": "cancel"})
-    ended = await house.line(lambda each: each.get("event") == "result")
+        anna.askers.beat()
+        await anna.ask({"seq": each, "request": "hello"})
+    await anna.ask({"seq": 10, "request": "cancel"})
+    ended = await anna.line(lambda each: each.get("event") == "result")
     assert ended["goal"]["id"] == goal["goal"]["id"]
-    house.askers.hang_up_all()
+    anna.askers.hang_up_all()
 
 
 @in_loop
 async def test_an_asker_to_whom_nothing_is_owed_is_let_go_without_a_word(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
-    house = House(talk.socket)
+    anna = AskersWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
-    await house.ask({"seq": 1, "request": "status"})
-    told = house.lines()
+    await anna.ask({"seq": 1, "request": "status"})
+    told = anna.lines()
     pass_time(GONE + 0.1)
-    house.askers.beat()
+    anna.askers.beat()
     await await_clients(talk, before)
-    assert house.lines() == told
+    assert anna.lines() == told
 
 
 @in_loop
 async def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_for_room(talk: Talk) -> None:
     """With and without a connection to the server; an asker that comes back after its goodbye is told again."""
-    house = House(talk.socket)
+    anna = AskersWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
-    await house.ask({"seq": 1, "request": "hello"}, "s2")
+    await anna.ask({"seq": 1, "request": "hello"}, "s2")
     for session in ("s1", "s2", "s3"):
-        house.post(say(2, id=f"of-{session}"), session)
+        anna.post(say(2, id=f"of-{session}"), session)
         if session != "s2":  # which the server would take at once
-            house.post(say(3, id=f"of-{session}-patient", patient=True), session)
-        house.post(b"", session)
-    assert (await house.ask({"seq": 4, "request": "hello"}, "s3"))["ok"]
-    await house.ask(say(5, id="last"), "s3")
-    house.post(b"", "s3")
+            anna.post(say(3, id=f"of-{session}-patient", patient=True), session)
+        anna.post(b"", session)
+    assert (await anna.ask({"seq": 4, "request": "hello"}, "s3"))["ok"]
+    await anna.ask(say(5, id="last"), "s3")
+    anna.post(b"", "s3")
     await await_clients(talk, before)
     with talk.connect() as wire:
         wire.request("status")
         assert sorted(each["pending"]["id"] for each in wire.items) == ["last", "of-s1", "of-s2", "of-s3"]
-    assert house.lines("s1") == []
+    assert anna.lines("s1") == []
 
 
 @in_loop
 async def test_a_cancel_takes_the_place_of_the_asker_that_is_silent_for_longest(
     talk: Talk, pass_time: Callable[[float], None]
 ) -> None:
-    house = House(talk.socket)
+    anna = AskersWithoutBroker(talk.socket)
     for each in range(32):
-        await house.ask({"seq": 1, "request": "watch"}, f"w{each}")
+        await anna.ask({"seq": 1, "request": "watch"}, f"w{each}")
         pass_time(0.1)
-    await house.ask({"seq": 2, "request": "hello"}, "w0")
-    assert (await house.ask({"seq": 3, "request": "log"}, "another"))["error"]["code"] == "busy"
-    assert (await house.ask({"seq": 3, "request": "cancel"}, "urgent"))["ok"]
-    await house.ask(say(4), "w0")
+    await anna.ask({"seq": 2, "request": "hello"}, "w0")
+    assert (await anna.ask({"seq": 3, "request": "log"}, "another"))["error"]["code"] == "busy"
+    assert (await anna.ask({"seq": 3, "request": "cancel"}, "urgent"))["ok"]
+    await anna.ask(say(4), "w0")
     for each in range(32):
-        gone = [line for line in house.lines(f"w{each}") if line.get("event") == "gone"]
+        gone = [line for line in anna.lines(f"w{each}") if line.get("event") == "gone"]
         assert bool(gone) == (each == 1), each
-    assert (await house.ask({"seq": 4, "request": "status"}, "urgent"))["ok"]  # in the place that it has
-    assert (await house.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # to which nothing is owed now
-    await house.ask({"seq": 5, "request": "cancel"}, "w0")
-    house.askers.hang_up_all()
+    assert (await anna.ask({"seq": 4, "request": "status"}, "urgent"))["ok"]  # in the place that it has
+    assert (await anna.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # to which nothing is owed now
+    await anna.ask({"seq": 5, "request": "cancel"}, "w0")
+    anna.askers.hang_up_all()
 
 
 @in_loop
@@ -167,19 +167,19 @@ async def test_askers_that_come_and_go_at_a_server_that_hangs_take_32_threads() 
         listening.bind(f"{directory}/s")
         listening.listen(256)
         listening.settimeout(5)
-        house = House(f"{directory}/s")
+        anna = AskersWithoutBroker(f"{directory}/s")
         before = threading.active_count()
         for _ in range(100):
             for each in range(3):
-                house.post({"seq": 1, "request": "status"}, f"s{each}")
+                anna.post({"seq": 1, "request": "status"}, f"s{each}")
                 await asyncio.sleep(0)  # so that it begins
-                house.post(b"", f"s{each}")
+                anna.post(b"", f"s{each}")
         assert threading.active_count() - before == 32
         for _ in range(32):
             listening.accept()[0].close()
-        house.post({"seq": 2, "request": "status"})
+        anna.post({"seq": 2, "request": "status"})
         (await asyncio.to_thread(listening.accept))[0].close()
-        answer = await house.line(lambda each: each.get("seq") == 2)
+        answer = await anna.line(lambda each: each.get("seq") == 2)
         assert answer["error"]["code"] == "no_server"
         listening.setblocking(False)
         with pytest.raises(BlockingIOError):
@@ -188,39 +188,39 @@ async def test_askers_that_come_and_go_at_a_server_that_hangs_take_32_threads() 
 
 @in_loop
 async def test_all_askers_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Talk) -> None:
-    house = House(talk.socket)
+    anna = AskersWithoutBroker(talk.socket)
     for each in range(20):
-        await house.ask(say(each), "full")
+        await anna.ask(say(each), "full")
     long = {"text": "a", "patient": True, "data": {"more": "x" * 900}}
     blanks = b" " * 60_000
     line = json.dumps({"seq": 1, "request": "say", **long}).encode()
     refused = []
     for session in range(3):
         for _ in range(40):
-            house.post(line + blanks, f"s{session}")
-        await house.ask({"seq": 2, "request": "hello"}, f"s{session}")
-        refused.append([each for each in house.lines(f"s{session}") if each.get("ok") is False])
+            anna.post(line + blanks, f"s{session}")
+        await anna.ask({"seq": 2, "request": "hello"}, f"s{session}")
+        refused.append([each for each in anna.lines(f"s{session}") if each.get("ok") is False])
     assert [bool(each) for each in refused] == [False, True, True]
     assert {each["error"]["code"] for each in refused[1]} == {"busy"}
-    assert (4 << 20) - 61_000 < house.askers.held() <= 4 << 20
-    assert (await house.ask({"seq": 3, "request": "cancel"}, "another"))["ok"]
-    assert house.askers.held() == 0
-    house.askers.hang_up_all()
+    assert (4 << 20) - 61_000 < anna.askers.held() <= 4 << 20
+    assert (await anna.ask({"seq": 3, "request": "cancel"}, "another"))["ok"]
+    assert anna.askers.held() == 0
+    anna.askers.hang_up_all()
 
 
 @in_loop
 async def test_an_answer_that_is_too_long_for_the_broker_has_no_words_or_is_an_error(talk: Talk) -> None:
-    house = House(talk.socket, room=3_000)
+    anna = AskersWithoutBroker(talk.socket, room=3_000)
     for each in range(20):
-        await house.ask(say(each), "full")
-    goal = (await house.ask(say(1, text="long " * 1_000, wait=True)))["goal"]
+        await anna.ask(say(each), "full")
+    goal = (await anna.ask(say(1, text="long " * 1_000, wait=True)))["goal"]
     assert (goal["state"], goal["reason"], goal["text"]) == ("REJECTED", "queue_full", None)
-    ended = await house.line(lambda each: each.get("event") == "result")
+    ended = await anna.line(lambda each: each.get("event") == "result")
     assert ended["goal"] == goal
-    await house.ask({"seq": 2, "request": "cancel"})
-    house.askers.hang_up_all()
-    house = House(talk.socket, room=300)
-    reply = await house.ask({"seq": 1, "request": "status"})
+    await anna.ask({"seq": 2, "request": "cancel"})
+    anna.askers.hang_up_all()
+    anna = AskersWithoutBroker(talk.socket, room=300)
+    reply = await anna.ask({"seq": 1, "request": "status"})
     assert (reply["ok"], reply["error"]["code"]) == (False, "too_long")
-    assert (await house.ask({"seq": 2, "request": "cancel"}))["count"] == 0
-    house.askers.hang_up_all()
+    assert (await anna.ask({"seq": 2, "request": "cancel"}))["count"] == 0
+    anna.askers.hang_up_all()

@@ -171,7 +171,7 @@ async def test_without_threads_nothing_is_left_over(
 
 @pytest.mark.parametrize("said", [encode(busy_greeting()), b"220 mail\n", b""])
 @in_loop
-async def test_a_server_that_refuses_the_connection_is_none(
+async def test_a_refused_connection_raises_busy_or_unavailable(
     listening: socket.socket, said: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("talkcli.client.connect.BUSY_LIMIT", 0.3)

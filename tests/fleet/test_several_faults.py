@@ -168,7 +168,7 @@ def test_the_robots_are_lost_after_half_a_minute_without_a_broker(
 
 @pytest.mark.slow
 def test_a_desk_that_was_suspended_has_lost_nothing(pair: RealRobots, desk: Desk) -> None:
-    """What has come meanwhile counts before anybody is taken for gone."""
+    """Messages that arrived meanwhile count before a robot is reported as gone."""
     waiting = [
         desk.start("--robot", to, "say", "--wait", "--ttl", "0", "--id", f"stopped-{number}", "--", "length=4 on we go")
         for number, to in enumerate(PICKS)

@@ -1,1 +1,1 @@
-"""The surface of `talk`, word for word: what no rebuilding of the inside may change without meaning to."""
+"""Help, errors, library and replies, word for word. Refactoring must not change them."""

@@ -20,6 +20,7 @@ from tests.fleet.many import RealRobots, Roll, SimulatedRobots
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
 from tests.support.mqtt import Listener
+from tests.tools.bench.machine import megabytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,7 +43,7 @@ _COUNTS = {
 }
 
 
-class Stage:
+class MeasuredFleet:
     """A broker, its robots, and a desk that asks all of them."""
 
     def __init__(self, options: argparse.Namespace, stack: contextlib.ExitStack) -> None:
@@ -108,97 +109,92 @@ class Stage:
         return {name: values.get(topic, 0.0) for name, topic in _COUNTS.items()} | {"seconds": fresh.arrived}
 
 
-def measure_roster(stage: Stage) -> None:
-    broker, times = from_environment(stage.desk.env), []
-    for _ in stage.rounds:
+def measure_roster(fleet: MeasuredFleet) -> None:
+    broker, times = from_environment(fleet.desk.env), []
+    for _ in fleet.rounds:
         began = time.monotonic()
-        assert len(roster(broker, _LIMIT_S)) == len(stage.names)
+        assert len(roster(broker, _LIMIT_S)) == len(fleet.names)
         times.append(time.monotonic() - began)
     _print("all robots, in a program", times)
-    _print("`talk fleet status`", [stage.desk.run("fleet", "status", timeout=_LIMIT_S).seconds for _ in stage.rounds])
+    _print("`talk fleet status`", [fleet.desk.run("fleet", "status", timeout=_LIMIT_S).seconds for _ in fleet.rounds])
 
 
-def measure_idle(stage: Stage) -> None:
+def measure_idle(fleet: MeasuredFleet) -> None:
     """Measure the traffic of robots that do nothing."""
-    found = stage.traffic(lambda: time.sleep(stage.idle_s))
+    found = fleet.traffic(lambda: time.sleep(fleet.idle_s))
     for name in _COUNTS:
-        _print(f"idle: {name} for each robot", [found[name] / found["seconds"] / len(stage.names)], "/s")
+        _print(f"idle: {name} for each robot", [found[name] / found["seconds"] / len(fleet.names)], "/s")
 
 
-def measure_sentence(stage: Stage) -> None:
+def measure_sentence(fleet: MeasuredFleet) -> None:
     """Measure the traffic of a sentence."""
-    found = stage.traffic(lambda: stage.say(1))
+    found = fleet.traffic(lambda: fleet.say(1))
     for name in list(_COUNTS)[:2]:
         _print(f"a sentence: {name} for each robot", [found[name]], "")
 
 
-def measure_cancel(stage: Stage) -> None:
+def measure_cancel(fleet: MeasuredFleet) -> None:
     """Measure a cancel while all robots speak, without and with a desk that waits for their ends."""
     for options, code, name in (((), 0, ""), (("--wait",), 7, ", while another desk waits for all ends")):
         times = []
-        with Listener(stage.broker, "talk/group/all/request/+") as listener:
-            for _ in stage.rounds:
+        with Listener(fleet.broker, "talk/group/all/request/+") as listener:
+            for _ in fleet.rounds:
                 said = time.monotonic()
-                goal, speaking = stage.start_say(60, *options)
-                stage.await_spoken(goal)
+                goal, speaking = fleet.start_say(60, *options)
+                fleet.await_spoken(goal)
                 time.sleep(_REST_S)
                 began = time.monotonic()
-                cancel = stage.desk.start("cancel")
+                cancel = fleet.desk.start("cancel")
                 assert cancel.stdout
                 for _line in cancel.stdout:
                     last = time.monotonic()
-                stage.finish(cancel)
+                fleet.finish(cancel)
                 sent = listener.await_message(lambda each, began=began: each.arrived > began)  # type: ignore[misc]
-                stage.finish(speaking, code)
-                stage.check(goal, said)
+                fleet.finish(speaking, code)
+                fleet.check(goal, said)
                 times.append(last - sent.arrived)
                 time.sleep(_REST_S)
         _print(f"`talk --robot @all cancel`: message → last acknowledgement{name}", times)
 
 
-def measure_say(stage: Stage) -> None:
-    _print("`talk --robot @all say -w` of 1 s", [stage.say(1) for _ in stage.rounds])
+def measure_say(fleet: MeasuredFleet) -> None:
+    _print("`talk --robot @all say -w` of 1 s", [fleet.say(1) for _ in fleet.rounds])
 
 
-def measure_broker(stage: Stage) -> None:
+def measure_broker(fleet: MeasuredFleet) -> None:
     """Measure how soon all robots are back after the broker was killed while they spoke."""
     began = time.monotonic()
-    goal, speaking = stage.start_say(5, "--wait")
-    stage.await_spoken(goal)
-    stage.broker.kill()
+    goal, speaking = fleet.start_say(5, "--wait")
+    fleet.await_spoken(goal)
+    fleet.broker.kill()
     time.sleep(1)  # so that all robots have tried in vain
-    stage.broker.start()
+    fleet.broker.start()
     up = time.monotonic()
-    with Roll(stage.broker) as roll:
-        _print("broker back → last robot back", [roll.await_there(stage.names, _LIMIT_S) - up])
-    stage.finish(speaking)
-    stage.check(goal, began)
+    with Roll(fleet.broker) as roll:
+        _print("broker back → last robot back", [roll.await_there(fleet.names, _LIMIT_S) - up])
+    fleet.finish(speaking)
+    fleet.check(goal, began)
     time.sleep(_REST_S)
-    stage.say(1)
+    fleet.say(1)
 
 
-def measure_memory(stage: Stage) -> None:
-    goal, speaking = stage.start_say(2, "--wait")
-    stage.await_spoken(goal)
-    _print("memory of a desk that waits for all", [_megabytes(speaking.pid)], "MB")
-    stage.finish(speaking)
-    _print("memory of the broker", [_megabytes(stage.broker.pid)], "MB")
-    with Bridge(stage.real[stage.real.names[0]].talk, stage.broker, "measured", env=_STARTED) as bridge:
+def measure_memory(fleet: MeasuredFleet) -> None:
+    goal, speaking = fleet.start_say(2, "--wait")
+    fleet.await_spoken(goal)
+    _print("memory of a desk that waits for all", [megabytes(speaking.pid, "Pss")], "MB")
+    fleet.finish(speaking)
+    _print("memory of the broker", [megabytes(fleet.broker.pid, "Pss")], "MB")
+    with Bridge(fleet.real[fleet.real.names[0]].talk, fleet.broker, "measured", env=_STARTED) as bridge:
         bridge.await_online()
-        _print("memory of a bridge", [_megabytes(bridge.pid)], "MB")
+        _print("memory of a bridge", [megabytes(bridge.pid, "Pss")], "MB")
         bridge.terminate()
-
-
-def _megabytes(pid: int) -> float:
-    with open(f"/proc/{pid}/smaps_rollup", encoding="ascii") as file:
-        return next(int(line.split()[1]) / 1024 for line in file if line.startswith("Pss:"))
 
 
 def _print(name: str, values: list[float], unit: str = "s") -> None:
     print(f"{statistics.median(values):8.2f} {max(values):8.2f} {unit:3} {name}", flush=True)
 
 
-MEASUREMENTS: dict[str, Callable[[Stage], None]] = {
+MEASUREMENTS: dict[str, Callable[[MeasuredFleet], None]] = {
     "roster": measure_roster,
     "idle": measure_idle,
     "sentence": measure_sentence,
@@ -220,11 +216,11 @@ def main() -> None:
     parser.add_argument("--only", action="append", choices=[*MEASUREMENTS], help="measure this only")
     options = parser.parse_args()
     with contextlib.ExitStack() as stack:
-        stage = Stage(options, stack)
-        print(f"{len(stage.names)} robots are online", file=sys.stderr)
+        fleet = MeasuredFleet(options, stack)
+        print(f"{len(fleet.names)} robots are online", file=sys.stderr)
         for name in options.only or MEASUREMENTS:
-            MEASUREMENTS[name](stage)
-        stage.simulated.stop()
+            MEASUREMENTS[name](fleet)
+        fleet.simulated.stop()
 
 
 if __name__ == "__main__":

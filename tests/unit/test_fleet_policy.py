@@ -219,7 +219,7 @@ def test_an_unknown_echo_tells_nothing(unknown: bytes) -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(["send", "come", "wait"]), st.integers(0, 12)), max_size=60))
-def test_nothing_is_taken_that_is_older_than_what_the_echoes_prove(steps: list[tuple[str, int]]) -> None:
+def test_messages_older_than_the_newest_echo_allows_are_refused(steps: list[tuple[str, int]]) -> None:
     """A message that comes with an echo was forwarded by the broker no earlier than that echo was sent."""
     now, proved, echoes = 0.0, 0.0, Echoes(0.0)
     sent: dict[int, float] = {}

@@ -152,7 +152,7 @@ def _says(texts: Iterable[str], **fields: object) -> bytes:
     return b"".join(encode({"seq": n, "request": "say", "text": text, **fields}) for n, text in enumerate(texts, 1))
 
 
-class Crowd:
+class BusyScheduler:
     """A scheduler with many pending goals, and the steps whose cost is measured."""
 
     def __init__(self, size: int) -> None:
@@ -188,7 +188,7 @@ def _microseconds(steps: Iterable[Callable[[], object]]) -> float:
 
 def queue(stage: Stage) -> list[Row]:
     """Measure each step with few goals pending and with many; then the memory of a pending goal."""
-    few, many = Crowd(FEW), Crowd(MANY)
+    few, many = BusyScheduler(FEW), BusyScheduler(MANY)
     gc.collect()
     gc.disable()  # a collection would fall into one step or another
     try:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.askers import Askers
 
 
-class House:
+class AskersWithoutBroker:
     """The askers of anna, in the running event loop."""
 
     def __init__(self, socket: str, room: int = 200_000) -> None:
