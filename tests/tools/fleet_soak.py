@@ -16,17 +16,15 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from talkcli import Client
-from talkcli.fleet.broker import from_environment
-from talkcli.fleet.robot import reach
 from talkcli.goals.states import State
 from tests.support import census
 from tests.support.bridge import Bridge
 from tests.support.broker import Broker
 from tests.support.processes import Talk
 from tests.support.proxy import Proxy
-from tests.tools.fleet_soak_desks import RATE, Desks, Ledger
+from tests.tools.fleet_soak_desks import RATE, Desks, Ledger, connect
 from tests.tools.fleet_soak_faults import FleetFaults, Overheard, judge
-from tests.tools.soak import Report, parser
+from tests.tools.soak import Report, assert_no_bug, parser
 from tests.tools.witness import Witness
 
 if TYPE_CHECKING:
@@ -84,9 +82,8 @@ class FleetSoak:
         self._judge(warm)
         assert self._bridge.terminate() == 0, self._bridge.log[-2000:]
         self._talk.stop()
-        for log in (self._talk.log, self._bridge.log):
-            assert "a bug" not in log, log[-2000:]
-        return Report(Counter({(how, None): count for how, count in self.ledger.ends.items()}), self.faults.done, 0)
+        assert_no_bug(self._talk.log, self._bridge.log)
+        return Report(Counter({(how, None): count for how, count in self.ledger.ends.items()}), self.faults.done)
 
     @property
     def _processes(self) -> dict[str, Talk | Bridge]:
@@ -130,8 +127,7 @@ class FleetSoak:
         """Send a goal from a desk of its own, and return the seconds that it took."""
         goal = self.ledger.new()
         began = time.monotonic()
-        broker = from_environment(self._broker.env("calm", password=False))
-        with Client.over(reach(ROBOT, broker)) as client:
+        with Client.over(connect(self._broker, ROBOT, "calm")) as client:
             found = client.say(goal.text, id=goal.id, rate=RATE).wait(_BACK_LIMIT_S)
         self.ledger.end(goal, found.state.name)
         assert found.state is State.SUCCEEDED, f"{goal.id} is {found.state.name}: {found.message}"

@@ -75,6 +75,11 @@ class Ledger:
             self.ends[how] += 1
 
 
+def connect(broker: Broker, robot: str, user: str) -> Connection:
+    """Return a connection of this user to a robot."""
+    return reach(robot, from_environment(broker.env(user, password=False)), name="soak")
+
+
 class Desks:
     """Sends goals to a robot until they are stopped."""
 
@@ -104,10 +109,9 @@ class Desks:
                 self._await_ends([self._say(client, {"preempt": True, "ttl": 0.2})], chance)
 
     def _connections(self, name: str, over: threading.Event) -> Iterator[tuple[Client, Connection]]:
-        broker = from_environment(self._broker.env(name, password=False))
         while not over.is_set():
             try:
-                connection = reach(self._robot, broker, name="soak")
+                connection = connect(self._broker, self._robot, name)
             except ServerUnavailable:
                 over.wait(_RETRY_S)
                 continue

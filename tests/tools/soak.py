@@ -42,7 +42,7 @@ class Report:
 
     ends: Counter[tuple[str, str | None]]  # by state and reason
     faults: Counter[str]
-    heard_whole: int  # sentences
+    heard_whole: int = 0  # sentences
 
 
 class Soak:
@@ -77,7 +77,7 @@ class Soak:
         assert lines <= limit, f"{lines} lines in the log for {witness.ended} goals"
         assert not witness.closed, f"the server let its watcher go: {talk.log[-2000:]}"
         talk.stop()
-        assert "a bug" not in talk.log, talk.log[-2000:]
+        assert_no_bug(talk.log)
         return report
 
     def _disturb(self, seconds: float, every: float | None, least: int) -> Report:
@@ -131,6 +131,11 @@ def soak(seconds: float, seed: int, every: float | None = 5.0, player: str = "ap
     print(f"seed {seed}", flush=True)
     with contextlib.ExitStack() as stack:
         return Soak(seed, player, stack).run(seconds, every, least)
+
+
+def assert_no_bug(*logs: str) -> None:
+    for log in logs:
+        assert "a bug" not in log, log[-2000:]
 
 
 def parser(every: float) -> argparse.ArgumentParser:
