@@ -118,7 +118,7 @@ def test_row_44_a_goal_that_nobody_stopped_cannot_have_been_stopped(talk: Talk) 
     assert states(talk, goal_id) == ["PENDING", "ACTIVE", "ABORTED"]
 
 
-def test_row_44_an_engine_that_says_what_is_no_message_takes_nothing_along(talk: Talk) -> None:
+def test_row_44_malformed_engine_message_affects_no_other_goal(talk: Talk) -> None:
     lines = ("no-json", "[]", "{}", '{"kind":"sing"}', '{"kind":"Word","id":7}', "\x01", '{"kind":"Ended"}')
     with talk.connect() as wire:
         for line in lines:

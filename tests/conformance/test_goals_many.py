@@ -189,7 +189,7 @@ def _loudness(samples: Samples) -> float:
 
 
 def test_an_engine_that_reads_nothing_for_a_second_while_goals_come_and_go_is_not_lost(scripted: Talk) -> None:
-    """It is told each time whether a goal waits behind the one in hand: of that it may miss what it has no room for."""
+    """The engine may miss updates about waiting goals if its socket is full."""
     goal = scripted.run("say", "length=1").id
     scripted.watcher.wait_for_word(goal)
     (engine,) = census.descendants(scripted.pid)

@@ -201,7 +201,7 @@ def test_all_hear_of_a_cancel_that_ends_more_than_may_wait_for_them(make_talk: M
     assert_told_in_order(talk)
 
 
-def test_all_hear_of_the_server_s_end_where_it_is_more_than_may_wait_for_them(make_talk: MakeTalk) -> None:
+def test_all_clients_get_their_results_at_shutdown_even_beyond_the_output_limit(make_talk: MakeTalk) -> None:
     count = 150
     talk, _, _ = fill(make_talk)
     with talk.connect() as wire, ThreadPoolExecutor() as pool:

@@ -83,7 +83,7 @@ def test_row_13_text_that_cannot_be_spoken_is_rejected_on_the_command_line(scrip
     bystanders.assert_untouched()
 
 
-def test_what_is_told_of_an_input_that_was_not_read_to_its_end_is_true(scripted: Talk) -> None:
+def test_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
     longest = "😀" * 10_000
     for text in (f"{longest}\n", f"{longest}\r\n"):
         assert json.loads(scripted.run("--json", "say", "-", stdin=text).out)["text"] == longest

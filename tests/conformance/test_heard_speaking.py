@@ -263,9 +263,7 @@ def position(reference: Rendering, start: int) -> float:
         *(pytest.param("pulse", rate, marks=pytest.mark.slow) for rate in (100, 200)),
     ],
 )
-def test_done_when_thirty_words_are_told_as_they_are_heard(
-    make_talk: MakeTalk, sink: Sink, player: str, rate: int
-) -> None:
+def test_thirty_words_are_told_as_they_are_heard(make_talk: MakeTalk, sink: Sink, player: str, rate: int) -> None:
     with limits():
         talk = make_talk("--rate", str(rate), "--player", player, sink=sink)
         measured = measure(talk, THIRTY, rate)
@@ -275,7 +273,7 @@ def test_done_when_thirty_words_are_told_as_they_are_heard(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [200, 300])
-def test_done_when_thirty_words_of_a_neural_voice_are_told_as_they_are_heard(
+def test_thirty_words_of_a_neural_voice_are_told_as_they_are_heard(
     make_talk: MakeTalk, sink: Sink, joe: Joe, rate: int
 ) -> None:
     with limits():

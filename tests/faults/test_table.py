@@ -1,4 +1,4 @@
-"""The tables of faults name tests that exist."""
+"""The tables of faults name tests that exist, and the one of this folder names each of its modules."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ def functions(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("folder", ["tests/faults", "tests/fleet"])
 def test_every_row_names_tests_that_exist(folder: str) -> None:
-    lines = (ROOT / folder / "README.md").read_text(encoding="utf-8").splitlines()
-    for row in (each for each in lines if each.startswith("| ") and not _HEAD.match(each)):
+    for row in _rows(folder):
         path = None
         for file, function in _NAMED.findall(row.split("|")[2]):
             if file:
@@ -34,3 +33,15 @@ def test_every_row_names_tests_that_exist(folder: str) -> None:
                 assert function in functions(path), f"{path.name} has no {function}: {row}"
                 assert function.startswith("test_"), f"{function} is no test"
         assert path, f"no test: {row}"
+
+
+def test_each_module_of_faults_is_named_in_a_row() -> None:
+    rows = "\n".join(_rows("tests/faults"))
+    modules = {each.name for each in Path(__file__).parent.glob("test_*.py")}
+    # Units for systemd and this table are no faults.
+    assert {each for each in modules if f"`{each}" not in rows} == {"test_service_units.py", "test_table.py"}
+
+
+def _rows(folder: str) -> list[str]:
+    lines = (ROOT / folder / "README.md").read_text(encoding="utf-8").splitlines()
+    return [each for each in lines if each.startswith("| ") and not _HEAD.match(each)]

@@ -17,8 +17,9 @@ import pytest
 from talkcli.engine.render import render
 from talkcli.goals.text import fault
 from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, begin, send
-from tests.faults.broken import assert_answers
+from tests.faults.broken import await_end
 from tests.support.compare import assert_heard
+from tests.support.connection import PATIENCE
 from tests.support.reference import Sentence
 from tests.support.reference import render as reference
 from tests.support.timing import assert_within, limits
@@ -169,7 +170,7 @@ def test_a_server_survives_bad_texts_and_speaks_the_next_one(talk: Talk) -> None
         goal = send(talk, text)
         talk.watcher.wait_for(goal, "ACTIVE")
         assert talk.request("cancel", timeout=5)["ok"]
-        assert talk.watcher.wait_for_terminal(goal) in {"PREEMPTED", "ABORTED", "SUCCEEDED"}
+        assert await_end(talk, goal, PATIENCE) in {"PREEMPTED", "ABORTED", "SUCCEEDED"}
     assert talk.run("say", "--wait", "--rate", "450", "--", LOW).code == 0
 
 
@@ -233,10 +234,9 @@ def test_a_crashing_text_in_the_middle_of_ten_goals(make_talk: MakeTalk, sink: S
     talk = unguarded(make_talk, sink, "--rate", "450")
     texts = [LOW, HOME, "battery two", "coming three", "battery four", CRASHING]
     texts += ["coming six", "battery seven", "coming eight", "battery nine"]
-    goals = [send(talk, text) for text in texts]
     with limits():
-        assert_answers(talk)
-    states = [talk.watcher.wait_for_terminal(goal) for goal in goals]
+        goals = [send(talk, text) for text in texts]
+        states = [await_end(talk, goal, PATIENCE) for goal in goals]
     assert states == ["SUCCEEDED"] * 5 + ["ABORTED"] + ["SUCCEEDED"] * 4
     assert talk.watcher.states(goals[5]) == ["PENDING", "ACTIVE", "ABORTED"]  # never tried again
     assert [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"] == goals
@@ -257,7 +257,7 @@ def test_crash_loop_of_100_texts(make_talk: MakeTalk, sink: Sink, texts: int) ->
             with talk.connect() as wire:
                 replies = [wire.request("say", text=CRASHING)["goal"]["id"] for _ in range(texts)]
             last = send(talk, LOW)
-            assert talk.watcher.wait_for_terminal(last, 4 * texts * LOOP_LIMIT) == "SUCCEEDED"
+            assert await_end(talk, last, 4 * texts * LOOP_LIMIT) == "SUCCEEDED"
             assert_same(recording.samples, reference([LOW])[0])
             heard_at = recording.first_sound()
         assert heard_at is not None
