@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import talkcli
-from tests.conformance.hearing import HOME, QUICK, render_quick
+from tests.conformance.hearing import HELP, QUICK, render_quick
 from tests.conformance.stopped import likeliest
 from tests.support import census
 from tests.support.compare import assert_heard, extent
@@ -47,7 +47,7 @@ def await_end(talk: Talk, goal_id: str, within: float) -> str:
     end = time.monotonic() + within
     while True:
         with contextlib.suppress(AssertionError):  # not yet
-            return talk.watcher.wait_for_terminal(goal_id, 0.25)
+            return talk.watcher.wait_for_terminal(goal_id, 0.05)
         assert time.monotonic() < end, f"{goal_id} did not end within {within} s: {talk.watcher.states(goal_id)}"
         assert_answers(talk)
 
@@ -73,14 +73,14 @@ def heard_again(talk: Talk, sink: Sink) -> float:
     """Assert that a goal that is sent now is heard whole, and return when its sound began.
 
     After a stopped sentence the library makes other samples of the next one, so only its length is compared, without
-    the zeros of a player that ran dry.
+    the zeros of a player that ran dry. LOW and LONG, which are lost at the faults, have other lengths.
     """
     with sink.record() as recording:
         recording.wait_until_quiet(0.2)  # a frozen sound server plays its buffer when it goes on
         start = len(recording)
-        assert talk.run("say", "--wait", "--rate", str(QUICK), "--", HOME).code == 0
+        assert talk.run("say", "--wait", "--rate", str(QUICK), "--", HELP).code == 0
         recording.wait_until_quiet(0.2)
-    heard, expected = recording.samples[start:], render_quick([HOME])[0]
+    heard, expected = recording.samples[start:], render_quick([HELP])[0]
     found = extent(heard)
     assert found
     seconds, usual = (np.count_nonzero(each) / RATE for each in (heard, expected))

@@ -6,6 +6,7 @@ A module or a library in the environment of a real server shadows the installed 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import resource
 import signal
@@ -34,9 +35,16 @@ if TYPE_CHECKING:
 
 #: Seconds in which a goal is ABORTED that waits for nothing.
 AT_ONCE = 0.1
+#: Seconds in which the next goal is being spoken after an engine was killed.
+SPEAKING = 0.5
 
-#: A module that cannot be imported.
+#: The promised seconds between the starts of an engine that fails each time.
+WAITS = (0.0, 0.1, 0.5, 2.0, 10.0)
+#: A module that cannot be imported, and writes the times of the attempts.
 ABSENT = """
+import time
+with open({attempts!r}, "a") as file:
+    file.write(str(time.monotonic()) + "\\n")
 raise ModuleNotFoundError("No module named " + repr(__name__), name=__name__)
 """
 #: The wheel without its data.
@@ -64,19 +72,33 @@ def test_without_a_part_of_the_engine_goals_end_at_once_until_it_is_installed(
     make_talk: MakeTalk, sink: Sink, tmp_path: Path, what: str
 ) -> None:
     name, module, words = MISSING[what]
+    attempts = write(tmp_path / "attempts", "")
     with limits():
-        shadow = write(tmp_path / f"{name}.py", module.format(real=WHEEL, empty=tmp_path))
+        shadow = write(tmp_path / f"{name}.py", module.format(real=WHEEL, empty=tmp_path, attempts=str(attempts)))
         library = write(tmp_path / "libespeak-ng.so.1", "no library")
         talk = make_talk(sink=sink, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
         took = _assert_aborted_at_once(talk, words)
         assert talk.log.count(words) == 3, f"once for the engine, once for each goal: {talk.log}"
         assert_answers(talk)
+        times = _await_attempts(attempts, 3 if what == "pyttsx3" else 0)
         (shadow if what == "pyttsx3" else library).unlink()
         with talk.connect() as wire:
             _await_engine(wire, "ready")
+            times.append(time.monotonic())
         heard_again(talk, sink)
         talk.stop()
+        for (former, following), wait in zip(itertools.pairwise(times), WAITS, strict=False):
+            assert following - former >= wait
         assert_within(took, AT_ONCE, "the end of a goal without an engine")
+
+
+def _await_attempts(path: Path, count: int) -> list[float]:
+    """Return the times of so many attempts to start the engine."""
+    end = time.monotonic() + PATIENCE
+    while len(times := path.read_text(encoding="utf-8").splitlines()) < count:
+        assert time.monotonic() < end, times
+        time.sleep(0.01)  # the attempts of another process send no event
+    return [float(each) for each in times]
 
 
 def _assert_aborted_at_once(talk: Talk, words: str) -> float:
@@ -118,9 +140,9 @@ def _scripted_engine(talk: Talk) -> int:
     return engine
 
 
-def _replaced(talk: Talk, engine: int) -> int:
+def _replaced(talk: Talk, engine: int, number: signal.Signals = signal.SIGKILL) -> int:
     """Kill the engine process, and return the next one, once it is there."""
-    os.kill(engine, signal.SIGKILL)
+    os.kill(engine, number)
     end = time.monotonic() + PATIENCE
     while not (found := set(census.descendants(talk.pid)) - {engine}):
         assert time.monotonic() < end, talk.log
@@ -162,16 +184,19 @@ def test_a_moment_without_descriptors_costs_the_goal_whose_engine_was_killed_and
 
 def test_a_kill_in_a_goal_and_two_in_the_starts_behind_it_cost_one_goal(scripted: Talk) -> None:
     talk = scripted
-    first = begin(talk, "never-ends", number=1)
-    goals = [send(talk, "length=0.01") for _ in range(WAITING)]
-    talk.script_start("hang")  # so that each start can be met in its middle
-    engine = _scripted_engine(talk)
-    for _ in range(3):
-        engine = _replaced(talk, engine)
-    talk.script_start("")
-    os.kill(engine, signal.SIGKILL)
-    assert _ends(talk, [first]) == [("ABORTED", "engine_crashed")]
-    assert _ends(talk, goals) == [("SUCCEEDED", None)] * WAITING
+    with limits():
+        first = begin(talk, "never-ends", number=1)
+        goals = [send(talk, "length=0.01") for _ in range(WAITING)]
+        talk.script_start("hang")  # so that each start can be met in its middle
+        engine = _replaced(talk, _scripted_engine(talk))
+        engine = _replaced(talk, engine, signal.SIGSEGV)
+        talk.script_start("")
+        killed = time.monotonic()
+        os.kill(engine, signal.SIGKILL)
+        speaking = talk.watcher.arrived(talk.watcher.wait_for_word(goals[0])) - killed
+        assert _ends(talk, [first]) == [("ABORTED", "engine_crashed")]
+        assert _ends(talk, goals) == [("SUCCEEDED", None)] * WAITING
+        assert_within(speaking, SPEAKING, "the next goal after an engine was killed in its start")
 
 
 def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(make_talk: MakeTalk) -> None:
@@ -184,6 +209,7 @@ def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(m
 
 
 def test_engines_that_have_spoken_and_are_killed_while_idle_are_replaced_at_once(scripted: Talk) -> None:
+    assert BACK_OFF == WAITS
     assert BACK_OFF[-1] > PATIENCE, "a goal that has to wait so long is not awaited"
     engine = _scripted_engine(scripted)
     for _ in range(2 * len(BACK_OFF)):

@@ -50,14 +50,24 @@ def server(request: pytest.FixtureRequest) -> Iterator[Server]:
 
 
 @pytest.fixture(scope="module")
-def talk(server: Server) -> Iterator[Talk]:
-    """A server for all tests at this sound server; none leaves a goal or a setting behind."""
+def shared(server: Server) -> Iterator[Talk]:
+    """A server for all tests at this sound server."""
     found = Talk(("--rate", "450"), env=server.env)
     try:
         yield found
         found.stop()
     finally:
         found.close()
+
+
+@pytest.fixture
+def talk(shared: Talk) -> Iterator[Talk]:
+    """The shared server; each goal of a test has one end by the end of the test, and none goes on into the next one."""
+    try:
+        yield shared
+        shared.watcher.check()
+    finally:
+        shared.request("cancel")
 
 
 class Card(NamedTuple):
