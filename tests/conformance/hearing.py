@@ -65,12 +65,12 @@ def begin(talk: Talk, text: str, *, number: int = 3, **fields: Any) -> str:
     return goal_id
 
 
-def begin_with_client(talk: Talk, text: str, *options: str, number: int = 3) -> tuple[str, Process]:
-    """Start a client that waits for its goal, wait until this word is heard, and return the id and the client."""
+def begin_with_client(talk: Talk, text: str, *options: str) -> tuple[str, Process]:
+    """Start a client that waits for its goal, wait until its third word is heard, and return the id and the client."""
     known = {None, *talk.watcher.goals()}
     client = talk.start("say", "--wait", *options, "--", text)
     goal_id = str(talk.watcher.wait_until(lambda each: each.get("id") not in known)["id"])
-    await_word(talk, goal_id, number)
+    await_word(talk, goal_id)
     return goal_id, client
 
 

@@ -53,9 +53,9 @@ class Raw(contextlib.AbstractContextManager["Raw"]):
         self.received += data
         return data
 
-    def receive_lines(self, count: int, timeout: float = PATIENCE) -> list[dict[str, Any]]:
+    def receive_lines(self, count: int) -> list[dict[str, Any]]:
         """Wait for so many lines since the connection began, and return all that came whole."""
-        end = time.monotonic() + timeout
+        end = time.monotonic() + PATIENCE
         while self.received.count(b"\n") < count:
             if not self.receive(max(0.001, end - time.monotonic())):
                 raise EOFError(f"closed after {bytes(self.received)!r}")

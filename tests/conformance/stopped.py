@@ -50,7 +50,6 @@ def assert_heard_after_stop(
     following: Sequence[str],
     *,
     begun: bool = True,
-    rate: int = QUICK,
     voice: Voice = ESPEAK,
 ) -> list[Comparison]:
     """Assert that a beginning of a fresh engine's first sentence was heard, then the following ones whole.
@@ -60,8 +59,8 @@ def assert_heard_after_stop(
     """
     samples = heard if isinstance(heard, np.ndarray) else heard.samples
     wrong: AssertionError | None = None
-    turns = [voice.render(following, rate)] if voice.repeats else _render_after_stop((stopped, *following), rate)
-    beginning = voice.render([stopped], rate)[0]
+    turns = [voice.render(following, QUICK)] if voice.repeats else _render_after_stop((stopped, *following), QUICK)
+    beginning = voice.render([stopped], QUICK)[0]
     # The sound server may join the rest of the first sentence and the next one, with no silence between them.
     for start, references in likeliest(samples, turns, [same_until(samples, beginning)] if begun else []):
         try:

@@ -23,7 +23,7 @@ Message = dict[str, Any]
 class Wire(contextlib.AbstractContextManager["Wire"]):
     """A connection, greeted. `greeting` is the server's first line. Close it, or use `with`."""
 
-    def __init__(self, path: str, timeout: float = PATIENCE) -> None:
+    def __init__(self, path: str) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
         self._buffer = bytearray()
         self._seq = 0
@@ -31,9 +31,9 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
         self.events: list[Message] = []
         self.items: list[Message] = []
         try:
-            self._socket.settimeout(timeout)
+            self._socket.settimeout(PATIENCE)
             self._socket.connect(path)
-            self.greeting = self.receive(timeout)
+            self.greeting = self.receive()
         except BaseException:
             self._socket.close()
             raise

@@ -50,18 +50,18 @@ class Heard(NamedTuple):
     end: float
 
 
-def understand(samples: Samples, sentences: Iterable[str], rate: int = RATE) -> str:
+def understand(samples: Samples, sentences: Iterable[str]) -> str:
     """Return which of the sentences, of small letters and blanks, was said; "" where it is none of them."""
     rules = " | ".join(sentences)
     listener = _listener()
     listener.add_jsgf_string("sentences", f"#JSGF V1.0;\ngrammar sentences;\npublic <one> = {rules} ;\n")
     listener.activate_search("sentences")
-    _hear(listener, samples, rate)
+    _hear(listener, samples)
     found = listener.hyp()
     return str(found.hypstr) if found else ""
 
 
-def align(samples: Samples, text: str, rate: int = RATE) -> list[Heard]:
+def align(samples: Samples, text: str) -> list[Heard]:
     """Return when each word of a sentence was said; AssertionError where it was not, as far as it can be heard.
 
     What is silent before a word counts as a part of it, to the recognizer; here it doesn't.
@@ -69,11 +69,11 @@ def align(samples: Samples, text: str, rate: int = RATE) -> list[Heard]:
     words = WORD.findall(text.lower())
     listener = _listener()
     listener.set_align_text(" ".join(words))
-    _hear(listener, samples, rate)
+    _hear(listener, samples)
     found = [
         Heard(
             re.sub(r"\(\d+\)$", "", each.word),
-            _behind_silence(samples, _seconds(each.start_frame), rate),
+            _behind_silence(samples, _seconds(each.start_frame)),
             _seconds(each.end_frame + 1),
         )
         for each in listener.seg() or ()
@@ -92,23 +92,23 @@ def _listener() -> Any:
     return pocketsphinx.Decoder(samprate=_HEARS, lm=None, loglevel="FATAL", **_BEAMS)
 
 
-def _hear(listener: Any, samples: Samples, rate: int) -> None:
+def _hear(listener: Any, samples: Samples) -> None:
     beside = np.zeros(int(_BESIDE * _HEARS), np.int16)
-    sound = np.concatenate([beside, resampled(samples, rate, _HEARS), beside])
+    sound = np.concatenate([beside, resampled(samples, RATE, _HEARS), beside])
     room = np.random.default_rng(1).normal(0, _ROOM, len(sound))
     listener.start_utt()
     listener.process_raw(np.clip(sound + room, *_RANGE).astype("<i2").tobytes(), full_utt=True)
     listener.end_utt()
 
 
-def _behind_silence(samples: Samples, begin: float, rate: int) -> float:
+def _behind_silence(samples: Samples, begin: float) -> float:
     """Return when the silence is over in which something begins; if there is none, when it begins."""
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > _FAINT)
-    place = int(np.searchsorted(loud, begin * rate))
+    place = int(np.searchsorted(loud, begin * RATE))
     if place == len(loud):
         return begin
     before = loud[place - 1] if place else -len(samples)
-    return float(loud[place]) / rate if loud[place] - before > _SILENCE * rate else begin
+    return float(loud[place]) / RATE if loud[place] - before > _SILENCE * RATE else begin
 
 
 def _seconds(frame: int) -> float:

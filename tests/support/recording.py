@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 LOUD = 50
 #: Seconds of the blocks that may tell the time of a sample.
 _WINDOW_S = 0.25
+#: Seconds within which a sink must be quiet.
+_QUIET_WITHIN_S = 30
 
 
 class Recording:
@@ -91,7 +93,7 @@ class Recording:
                 raise TimeoutError(f"nothing was heard within {timeout} s")
             return self.time_of(start + int(_loud(np.concatenate(self._blocks)[start:])[0]))
 
-    def wait_until_quiet(self, quiet: float = 0.5, timeout: float = 30) -> float | None:
+    def wait_until_quiet(self, quiet: float = 0.5) -> float | None:
         """Wait for so many seconds of silence after this call, and return the time of the last sound.
 
         The silence is counted in samples, so a suspended sink is never quiet: that raises TimeoutError.
@@ -99,9 +101,10 @@ class Recording:
         with self._changed:
             start = len(self)
             if not self._changed.wait_for(
-                lambda: len(self) - max(start, (self._last_loud or 0) + 1) >= quiet * RATE, timeout
+                lambda: len(self) - max(start, (self._last_loud or 0) + 1) >= quiet * RATE, _QUIET_WITHIN_S
             ):
-                raise TimeoutError(f"not quiet for {quiet} s within {timeout} s, of which {len(self) - start} samples")
+                came = f"{len(self) - start} samples"
+                raise TimeoutError(f"not quiet for {quiet} s within {_QUIET_WITHIN_S} s, in which {came} came")
             return self.last_sound()
 
     def wait_until(self, moment: float, timeout: float = 1) -> bool:

@@ -74,9 +74,9 @@ class Watcher:
         """Return the event of a goal's state, or of any goal's if the id is None."""
         return self.wait_until(lambda each: each.get("state") == state and goal_id in (None, each["id"]), timeout)
 
-    def wait_for_word(self, goal_id: str, timeout: float = PATIENCE) -> Message:
+    def wait_for_word(self, goal_id: str) -> Message:
         """Return the first word event of a goal. A goal that is ACTIVE may still wait for an engine."""
-        return self.wait_until(lambda each: each["event"] == "word" and each["id"] == goal_id, timeout)
+        return self.wait_until(lambda each: each["event"] == "word" and each["id"] == goal_id)
 
     def wait_for_terminal(self, goal_id: str, timeout: float = PATIENCE) -> str:
         """Return the terminal state of an accepted goal."""
@@ -91,10 +91,10 @@ class Watcher:
         assert found, f"{what}: not within {timeout} s: {self._ended or 'still connected'}; events: {events}"
         return found
 
-    def wait_for_end(self, timeout: float = PATIENCE) -> None:
+    def wait_for_end(self) -> None:
         """Wait until the server has closed the connection."""
-        self._thread.join(timeout)
-        assert not self._thread.is_alive(), f"the server still has the watcher's connection after {timeout} s"
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive(), f"the server still has the watcher's connection after {PATIENCE} s"
 
     def close(self) -> None:
         self._wire.shut_down()
