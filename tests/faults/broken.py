@@ -36,10 +36,9 @@ GROWTH = 4096
 
 def assert_answers(talk: Talk) -> None:
     """Assert that the server answers in time, whatever is broken."""
-    with talk.connect() as wire:
-        asked = time.monotonic()
-        assert wire.request("status")["ok"]
-        assert_within(time.monotonic() - asked, ANSWER, "`status`")
+    asked = time.monotonic()  # before it connects: the greeting takes its time as well
+    assert talk.request("status")["ok"]
+    assert_within(time.monotonic() - asked, ANSWER, "`status`")
 
 
 def await_end(talk: Talk, goal_id: str, within: float) -> str:
