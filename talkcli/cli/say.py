@@ -10,10 +10,9 @@ import os
 import time
 
 from talkcli.cli.command import read_value, readable
-from talkcli.cli.interrupts import Interrupts, give_up_unread, watched_output
+from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.show import (
     Feedback,
-    end_line,
     give_up_output,
     note,
     reader_is_gone,
@@ -34,7 +33,7 @@ from talkcli.cli.wait import (
     until_ended,
 )
 from talkcli.client.connect import Interrupted
-from talkcli.errors import EXIT_OK, EXIT_SIGPIPE, Lost, UsageError
+from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import SOUND
 from talkcli.goals.states import State
@@ -77,14 +76,12 @@ def say(
         from talkcli.cli.stdin import InputTooLong, read_text, rejected
 
         try:
-            sentence = read_text(end, watched_output() if wait else {}, whole=output is not None)
+            read = read_text(end, wait=wait, whole=output is not None)
         except InputTooLong as error:
             return regardless(refuse, rejected(str(error)), options, feedback_for(options, asked=feedback))
-        except Interrupted:  # nothing was sent
-            return EXIT_SIGPIPE
-        except KeyboardInterrupt:
-            end_line()  # that the terminal has shown ^C on
-            raise
+        if isinstance(read, int):
+            return read  # nothing was sent
+        sentence = read
     if output is not None:
         return _render(output, sentence, chosen, rest(end), options)
     return _say(_readable(sentence, options), chosen, name, timeout, options, wait=wait, feedback=feedback)

@@ -10,11 +10,11 @@ import sys
 from typing import TYPE_CHECKING
 
 from talkcli.cli.command import readable
-from talkcli.cli.interrupts import Interrupts, give_up_unread, watched_output
-from talkcli.cli.show import end_line, give_up_output, note, reader_is_gone, show, show_error, show_json
+from talkcli.cli.interrupts import Interrupts, give_up_unread
+from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.wait import SILENCE, regardless, rest, show_if_possible, timed_out
 from talkcli.client.connect import Interrupted
-from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_SIGPIPE, EXIT_TIMEOUT, TalkError, UsageError
+from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.protocol.requests import Pause, Resume, Status, Wait
 from talkcli.terminal.goals import ending, setting_lines
@@ -48,14 +48,12 @@ def say(
         from talkcli.cli.stdin import InputTooLong, read_text
 
         try:
-            sentence = read_text(end, watched_output() if wait else {})
+            read = read_text(end, wait=wait)
         except InputTooLong as error:
             raise UsageError(str(error)) from error
-        except Interrupted:  # nothing was sent
-            return EXIT_SIGPIPE
-        except KeyboardInterrupt:
-            end_line()  # that the terminal has shown ^C on
-            raise
+        if isinstance(read, int):
+            return read  # nothing was sent
+        sentence = read
     sentence, unreadable = readable(sentence)
     if unreadable and not options.quiet:
         note(unreadable)

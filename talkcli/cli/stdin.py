@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import time
 from collections import deque
 from functools import partial
@@ -16,7 +17,7 @@ from itertools import islice
 
 from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts
-from talkcli.cli.show import Feedback, give_up_output, note, reader_is_gone, show_error
+from talkcli.cli.show import Feedback, end_line, give_up_output, note, reader_is_gone, show_error
 from talkcli.cli.wait import (
     SILENCE,
     feedback_for,
@@ -70,12 +71,26 @@ class InputTooLong(Exception):
     """There is more on standard input than one text may have."""
 
 
-def read_text(end: float | None, interrupt: Mapping[int, int], *, whole: bool = False) -> str:
-    """Return standard input as one text; InputTooLong for more than the longest one, which is not read to its end.
+def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> str | int:
+    """Read standard input as one text. If something ends the reading, return the exit code instead.
 
-    `end`: the monotonic time by which it must have been read, else TimedOut; `interrupt`: what ends the reading with
-    Interrupted, as in `connect.ready`; `whole`: read all of it, for no goal.
+    Args:
+        end: the monotonic time by which the whole text must have been read.
+        wait: end the reading, too, if the reader of standard output goes away.
+        whole: read a text of any length.
+
+    Raises:
+        TimedOut: `end` has come.
+        InputTooLong: there is more than the longest text. The rest isn't read.
     """
+    with Interrupts(output=wait) as interrupts:
+        return _read_text(interrupts.watched, end, whole=whole)
+    if interrupts.number == signal.SIGINT:
+        end_line()  # the terminal has shown ^C
+    return interrupts.exit_code
+
+
+def _read_text(interrupt: Mapping[int, int], end: float | None, *, whole: bool) -> str:
     data = bytearray()
     while whole or len(data) <= _TEXT_BYTES:
         more = _read(_CHUNK_BYTES if whole else _TEXT_BYTES + 1 - len(data), interrupt, end)
