@@ -10,8 +10,8 @@ TYPE_CHECKING = False  # `typing` takes as long to import as a server to answer
 if TYPE_CHECKING:
     from talkcli.client.client import Client
     from talkcli.client.goal import GoalHandle
-    from talkcli.fleet.fleet import Fleet
-    from talkcli.fleet.outcome import Outcome
+    from talkcli.fleet.api import Fleet
+    from talkcli.fleet.desk.outcome import Outcome
     from talkcli.fleet.presence import Presence
     from talkcli.goals.goal import Goal
     from talkcli.goals.states import State
@@ -43,9 +43,10 @@ def __getattr__(name: str) -> object:
 
         return getattr(client, name)
     if name in {"Fleet", "Outcome", "Presence"}:
-        from talkcli.fleet import fleet, outcome, presence
+        from talkcli.fleet import api, presence
+        from talkcli.fleet.desk import outcome
 
-        return {"Fleet": fleet.Fleet, "Outcome": outcome.Outcome, "Presence": presence.Presence}[name]
+        return {"Fleet": api.Fleet, "Outcome": outcome.Outcome, "Presence": presence.Presence}[name]
     if name in {"Goal", "State"}:
         from talkcli.goals import goal
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli import polling
 from talkcli.client import connect
 from talkcli.client.connection import SocketConnection
 from talkcli.errors import AccessDenied, ProtocolMismatch, ServerUnavailable, TalkError
@@ -66,8 +67,8 @@ class Waits:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, act: Callable[[int], object] = lambda _: None) -> None:
         self.pauses: list[float] = []
         self.others: list[float] = []
-        self._act, self._ready = act, connect.ready
-        monkeypatch.setattr(connect, "ready", self)
+        self._act, self._ready = act, polling.wait_ready
+        monkeypatch.setattr(connect, "wait_ready", self)
 
     def __call__(
         self, watched: Mapping[int, int], timeout: float, interrupt: Mapping[int, int] | None = None

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import Client, GoalHandle
-from talkcli.client.connect import Interrupted
 from talkcli.client.connection import SocketConnection
 from talkcli.client.following import MAX_FEEDBACK, MAX_STATES
 from talkcli.errors import Lost, RequestRefused, ServerUnavailable, UnknownGoal
 from talkcli.goals.states import State
+from talkcli.polling import Interrupted
 from talkcli.protocol.events import Event, PausedChanged, Result, Snapshot, StateChanged, WordHeard
 from talkcli.protocol.lines import MAX_LINE
 from tests.support.connection import PATIENCE

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import Client, install
-from talkcli.client.connect import Interrupted
 from talkcli.doctor import examine, neural, voice
 from talkcli.doctor.machine import Session
 from talkcli.doctor.neural import Neural, Tried
 from talkcli.doctor.report import FAILED, OK, WARNING
 from talkcli.doctor.voice import Engine
-from talkcli.engine.synthesizers.models import NEEDED
+from talkcli.engine.child.synthesizers.models import NEEDED
+from talkcli.polling import Interrupted
 from tests.conformance.bareserve import environment, serving
 from tests.support import tiny_voice
 from tests.support.surroundings import needs_packages
@@ -33,7 +33,7 @@ __all__ = ["home"]
 #: Hides the voices of packages, so that only the voices of a test are found.
 ALONE = """
 import importlib, sys
-from talkcli.engine.synthesizers import models
+from talkcli.engine.child.synthesizers import models
 models._PACKAGE = "no such package"
 """
 TRIED = r"is in use: loaded in \d+\.\d s, makes a sentence \d+\.\d times as fast as it is heard, takes \d+ MB"
@@ -44,7 +44,7 @@ LIMIT = 20.0
 def alone(home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """Return an environment with the voice that hums, and no other."""
     needs_packages(*NEEDED)
-    monkeypatch.setattr("talkcli.engine.synthesizers.models._PACKAGE", "no such package")
+    monkeypatch.setattr("talkcli.engine.child.synthesizers.models._PACKAGE", "no such package")
     tiny_voice.put(Path(home) / "v", "tiny")
     return _environment(home, tmp_path, ALONE)
 
@@ -214,7 +214,9 @@ def test_a_voice_that_takes_too_long_is_given_up(alone: dict[str, str]) -> None:
 def test_a_voice_that_kills_the_engine_process_is_a_fact(home: str, tmp_path: Path) -> None:
     needs_packages(*NEEDED)
     tiny_voice.put(Path(home) / "v", "tiny")
-    dies = "from talkcli.engine.synthesizers import inference\nimport os\ninference.halves = lambda _: os.abort()\n"
+    dies = (
+        "from talkcli.engine.child.synthesizers import inference\nimport os\ninference.halves = lambda _: os.abort()\n"
+    )
     tried = neural.look("piper/tiny", _environment(home, tmp_path, dies), LIMIT).tried
     assert tried
     assert "SIGABRT" in (tried.words or "")

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.cli.interrupts import Interrupts
-from talkcli.client.connect import Begun, ask, connect, hello, reach, ready, stand_back
+from talkcli.client.connect import Begun, ask, connect, hello, reach, stand_back
 from talkcli.errors import EXIT_TIMEOUT, AccessDenied
 from talkcli.frozen import replace
 from talkcli.paths import client_sockets
+from talkcli.polling import wait_ready
 from tests.conformance.bareserve import TALK, run
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import GREETING, Peer, goal, result, serving
@@ -291,7 +292,7 @@ def test_a_signal_to_another_thread_ends_the_waiting(number: signal.Signals) -> 
     with Interrupts(60) as interrupts:
         sender = threading.Timer(0.1, to_another_thread, [number])
         sender.start()
-        ready({}, 10, interrupts.watched)
+        wait_ready({}, 10, interrupts.watched)
     sender.join()
     assert interrupts.exit_code == (EXIT_TIMEOUT if number == signal.SIGALRM else 128 + number)
     assert time.monotonic() - began < 5
@@ -303,11 +304,11 @@ def test_after_clear_only_a_first_signal_ends_the_waiting() -> None:
         signal.raise_signal(signal.SIGHUP)
         interrupts.clear()
         signal.raise_signal(signal.SIGHUP)
-        assert ready({}, 0.05, interrupts.watched) == set()
+        assert wait_ready({}, 0.05, interrupts.watched) == set()
     assert interrupts.number == signal.SIGHUP
     with Interrupts() as interrupts:
         interrupts.clear()
         signal.raise_signal(signal.SIGTERM)
-        ready({}, 10, interrupts.watched)
+        wait_ready({}, 10, interrupts.watched)
         pytest.fail("it was not interrupted")
     assert interrupts.number == signal.SIGTERM

@@ -15,7 +15,7 @@ from talkcli import errors
 from talkcli.cli import commands, show
 from talkcli.cli.click_app import ClickCommand, talk
 from talkcli.cli.command import ALL_EXIT_CODES
-from talkcli.engine.players import devices
+from talkcli.engine.child.players import devices
 from talkcli.goals import states
 from tests.conformance.bareserve import TALK, alone, environment, run
 from tests.golden import surface

@@ -14,9 +14,9 @@ import pytest
 
 from talkcli import install
 from talkcli.client.client import Client
+from talkcli.engine.child.synthesizers.models import NEEDED
+from talkcli.engine.child.synthesizers.voices import find_voice
 from talkcli.engine.protocol import Voice
-from talkcli.engine.synthesizers.models import NEEDED
-from talkcli.engine.synthesizers.voices import find_voice
 from tests.conformance.bareserve import LIMIT, SERVE, TALK, environment, run, serving
 from tests.engine.test_neural import SLOW_TO_SPEAK, WITHOUT
 from tests.support import tiny_voice
@@ -41,7 +41,7 @@ SITE = """
 import importlib.abc, importlib.util, os, sys, time
 class Held(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
-        if name != "talkcli.engine.synthesizers.inference":
+        if name != "talkcli.engine.child.synthesizers.inference":
             return None
         sys.meta_path.remove(self)
         spec = importlib.util.find_spec(name)

@@ -9,7 +9,7 @@ from talkcli.cli.command import nearest
 from talkcli.cli.show import show
 from talkcli.errors import UsageError
 from talkcli.fleet import topics
-from talkcli.fleet.policy import ASKABLE
+from talkcli.fleet.bridge.policy import ASKABLE
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ def bridge(options: Common, print_unit: str | None, print_acl: bool, **given: An
         units.print_bridge(options, print_unit, given)
         return 0
     found = options.broker()
-    from talkcli.fleet import run
-    from talkcli.fleet.bridge import Settings
+    from talkcli.fleet.bridge.main import Settings
+    from talkcli.fleet.bridge.run import bridge
 
     settings = Settings(
         given["name"],
@@ -49,7 +49,7 @@ def bridge(options: Common, print_unit: str | None, print_acl: bool, **given: An
         with_text=not given["no_text"],
         homeassistant=given["homeassistant"],
     )
-    return run.bridge(settings, options.broker)
+    return bridge(settings, options.broker)
 
 
 def _listed(value: str | None) -> list[str]:

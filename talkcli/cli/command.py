@@ -116,7 +116,7 @@ class Command:
 
     def _stray(self, given: Mapping[str, Any], robot: str, socket: str | None) -> str | None:
         """Return what is wrong with naming a robot, or several, or None."""
-        from talkcli.fleet.selection import Selection, several
+        from talkcli.fleet.desk.selection import Selection, several
 
         if socket:
             return "--robot is a robot of a fleet, --socket a server of this machine: leave out one of them"
@@ -138,7 +138,7 @@ class Command:
         if not (self.asks and self.connects) or output:
             return f"'talk {self.name}{' --output' * output}' does not wait for a server: leave out --connect-timeout"
         if robot is not None:
-            from talkcli.fleet.selection import several
+            from talkcli.fleet.desk.selection import several
 
             if several(robot):
                 return "--connect-timeout waits for one robot: name it, or leave out --connect-timeout"
@@ -155,7 +155,7 @@ class Command:
                 fault = self._waiting_fault(given, robot)
             if fault:
                 raise UsageError(fault)
-            from talkcli.fleet.selection import several
+            from talkcli.fleet.desk.selection import several
 
             if several(robot):
                 runs = self.several

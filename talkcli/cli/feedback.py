@@ -12,9 +12,9 @@ import sys
 import threading
 
 from talkcli.cli.show import USUAL_WIDTH, Feedback, colourful, columns, note, show, show_json
-from talkcli.client.connect import ready
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
+from talkcli.polling import wait_ready
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, WordHeard
 from talkcli.terminal.goals import NOT_KEPT
 from talkcli.terminal.text import Screen, Sentence, printable
@@ -235,4 +235,4 @@ def _write(text: str) -> None:
         try:
             data = data[os.write(fd, data) :]
         except BlockingIOError:  # another program has made the terminal so
-            ready({fd: select.POLLOUT}, None)
+            wait_ready({fd: select.POLLOUT}, None)

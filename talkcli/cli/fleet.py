@@ -9,8 +9,8 @@ from talkcli import paths
 from talkcli.cli.show import note, screen, show_found
 from talkcli.client.connect import ANSWER_LIMIT
 from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable
-from talkcli.fleet.selection import Selection
-from talkcli.fleet.sighting import Away, Back, Begun, Changed, Happened, Missed
+from talkcli.fleet.desk.selection import Selection
+from talkcli.fleet.desk.sighting import Away, Back, Begun, Changed, Happened, Missed
 from talkcli.frozen import replace
 from talkcli.terminal.fleet import FleetTranscript, Robot, robot_lines
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from talkcli.cli.show import Common
     from talkcli.fleet.broker import Broker
+    from talkcli.fleet.desk.sighting import Sighting
     from talkcli.fleet.presence import Presence
-    from talkcli.fleet.sighting import Sighting
     from talkcli.fleet.status import Standing
     from talkcli.goals.goal import JsonObject
 
@@ -38,7 +38,7 @@ def fleet(options: Common, what: str) -> int | None:
 
 def _status(options: Common, broker: Broker, selection: Selection | None) -> None:
     """Show how each robot stands."""
-    from talkcli.fleet.roster import standings
+    from talkcli.fleet.desk.roster import standings
 
     found = standings(broker, ANSWER_LIMIT, selection.only if selection else None)
     picked = [each for _, each in sorted(found.items()) if selection is None or selection.picks(each.presence)]
@@ -55,7 +55,7 @@ def _status(options: Common, broker: Broker, selection: Selection | None) -> Non
 def _watch(options: Common, broker: Broker, selection: Selection | None) -> int:
     """Show what happens, and which robots come and go; return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
-    from talkcli.fleet.lookout import Lookout
+    from talkcli.fleet.desk.lookout import Lookout
 
     if not has_reader():
         return EXIT_SIGPIPE

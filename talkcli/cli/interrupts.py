@@ -13,9 +13,9 @@ import signal
 import sys
 
 from talkcli.cli.show import OUTPUT, give_up_output
-from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_SIGNAL, EXIT_SIGPIPE, EXIT_TIMEOUT
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.polling import Interrupted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -32,11 +32,11 @@ from talkcli.cli.wait import (
     timed_out,
     until_ended,
 )
-from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import SOUND
 from talkcli.goals.states import State
+from talkcli.polling import Interrupted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -174,7 +174,7 @@ def _render(path: str, text: str, chosen: Mapping[str, Any], timeout: float | No
 
     `chosen`: the options of a goal; those that the engine isn't told of mean nothing here. `timeout`: seconds.
     """
-    from talkcli.engine.render import STANDARD_OUTPUT, render
+    from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
     settings = _settings(chosen)
     if path in STANDARD_OUTPUT:

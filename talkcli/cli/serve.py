@@ -43,15 +43,15 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
     With a device and no player named it only looks at the names of files, so that the start is not kept waiting.
     """
-    from talkcli.engine.players import PACKAGES, is_silent
-    from talkcli.engine.players.devices import nothing_sounds
+    from talkcli.engine.child.players import PACKAGES, is_silent
+    from talkcli.engine.child.players.devices import nothing_sounds
 
     if is_silent(player):
         return
     silent = nothing_sounds(os.environ)
     if not player and not silent:
         return
-    from talkcli.engine.synthesizers import is_own
+    from talkcli.engine.child.synthesizers import is_own
 
     if not is_own(driver):
         return  # it plays by itself, and the server says so
@@ -63,8 +63,8 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
 def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
-    from talkcli.engine.players import PACKAGES, PLAYERS, commands
-    from talkcli.engine.players.base import CannotSpeak
+    from talkcli.engine.child.players import PACKAGES, PLAYERS, commands
+    from talkcli.engine.child.players.base import CannotSpeak
 
     if player in PLAYERS and player not in PACKAGES:
         return  # it is no program

@@ -13,9 +13,9 @@ from talkcli.cli.command import readable
 from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
 from talkcli.cli.wait import SILENCE, regardless, rest, show_if_possible, timed_out
-from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.goals.options import Cancel, Say, Set
+from talkcli.polling import Interrupted
 from talkcli.protocol.requests import Pause, Resume, Status, Wait
 from talkcli.terminal.goals import ending, setting_lines
 from talkcli.terminal.text import printable
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.cli.show import Common
-    from talkcli.fleet.crowd import Round
-    from talkcli.fleet.outcome import Outcome
+    from talkcli.fleet.desk.crowd import Round
+    from talkcli.fleet.desk.outcome import Outcome
     from talkcli.protocol.requests import Request
 
 #: Names of robots in one note, and notes of those that did not do it: all of them are on standard output.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from talkcli.client.connect import Begun
     from talkcli.client.connection import Connection
     from talkcli.fleet.broker import Broker
-    from talkcli.fleet.crowd import Crowd
+    from talkcli.fleet.desk.crowd import Crowd
     from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.events import Event
     from talkcli.terminal.text import Screen
@@ -96,10 +96,10 @@ class Common:
         `timeout`: seconds that all may take, and so the longest that an answer is waited for.
         """
         from talkcli.client.connect import ANSWER_LIMIT
-        from talkcli.fleet.selection import Selection
+        from talkcli.fleet.desk.selection import Selection
 
         broker = self.broker()
-        from talkcli.fleet.crowd import Crowd
+        from talkcli.fleet.desk.crowd import Crowd
 
         to = Selection(paths.named_robot(self.robot, self.socket) or "")
         return Crowd(broker, to, patience=min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), **options)
@@ -119,7 +119,7 @@ class Common:
 
             return SocketConnection(self.socket, begun=self.begun, **{"urgent": self.urgent, **options})
         broker = self.broker()
-        from talkcli.fleet.robot import reach
+        from talkcli.fleet.desk.robot import reach
 
         options.pop("urgent", None)  # a broker keeps no places for that
         return reach(robot, broker, **options)

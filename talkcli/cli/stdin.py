@@ -29,7 +29,6 @@ from talkcli.cli.wait import (
     show_if_possible,
     timed_out,
 )
-from talkcli.client.connect import Interrupted, ready
 from talkcli.client.connection import BaseConnection
 from talkcli.errors import EXIT_OK, ServerUnavailable, TalkError, TimedOut, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
@@ -37,6 +36,7 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.option import figure
 from talkcli.goals.options import MAX_BYTES, MAX_CHARACTERS, Say
 from talkcli.goals.states import State
+from talkcli.polling import Interrupted, wait_ready
 from talkcli.protocol.events import Canceled, Result, unfinished
 from talkcli.protocol.lines import Cut, LineSplitter
 
@@ -172,7 +172,7 @@ class LineBuffer:
 def _read(count: int, interrupt: Mapping[int, int], end: float | None = None) -> bytes:
     """Return what there is of standard input once there is something, at most so many bytes; b"" at its end."""
     while True:
-        if not ready({0: select.POLLIN}, rest(end), interrupt):
+        if not wait_ready({0: select.POLLIN}, rest(end), interrupt):
             raise TimedOut("standard input has not ended within the time: nothing was sent")
         data = _read_now(count)
         if data is not None:
@@ -432,11 +432,11 @@ class _Lines:
             if self._sent or self._goals:
                 hear(end)
             else:
-                ready({}, rest(end), watched)
+                wait_ready({}, rest(end), watched)
         except Interrupted:
             if watched.pop(0, None) is None:
                 raise
-            ready({}, 0, watched)  # raises Interrupted again, unless it was the input alone
+            wait_ready({}, 0, watched)  # raises Interrupted again, unless it was the input alone
             data = _read_now(_CHUNK_BYTES)
             if data is not None:
                 self._buffer.feed(data, time.monotonic())

@@ -10,11 +10,11 @@ import time
 
 from talkcli.cli.interrupts import Interrupts, give_up_unread
 from talkcli.cli.show import Feedback, give_up_failed, give_up_output, reader_is_gone, show, show_json
-from talkcli.client.connect import Interrupted
 from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable, TimedOut
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.option import figure
 from talkcli.goals.states import State
+from talkcli.polling import Interrupted
 from talkcli.protocol.events import Result
 
 if TYPE_CHECKING:

@@ -15,6 +15,7 @@ import time
 
 from talkcli import paths
 from talkcli.frozen import TYPE_CHECKING, frozen, replace
+from talkcli.polling import wait_ready
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -44,10 +45,6 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 0.25
 _START = "start one with: talk serve"
 _LET_IN = "have its owner let you in, with `talk serve --socket-mode 0660` and the socket's group"
 _OWN = "or start your own with: talk serve"
-
-
-class Interrupted(Exception):
-    """One of the caller's own descriptors became ready while something was awaited."""
 
 
 @frozen
@@ -235,7 +232,7 @@ def connect(
             pause = random.uniform(*_BUSY_PAUSE)
         else:
             next_pause = min(2 * pause, _LONGEST_PAUSE_S)
-        ready({}, min(pause, left), interrupt)
+        wait_ready({}, min(pause, left), interrupt)
         begun = reach(named)
 
 
@@ -243,27 +240,6 @@ def _may_come(begun: Begun) -> bool:
     """Whether a server may still start at one of the places that were tried in vain."""
     found = (paths.found_at(path, error) for path, error in begun.failures if isinstance(error, OSError))
     return any(each in {paths.ABSENT, paths.STALE} for each in found)
-
-
-def ready(watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None) -> set[int]:
-    """Return the descriptors that are ready for what they are watched for, waiting at most `timeout` seconds.
-
-    Each comes with poll's events; that it is broken or hung up counts in any case. `interrupt`: others, of which
-    each ends it with Interrupted as soon as it is ready.
-    """
-    import math
-    import select
-
-    interrupt = interrupt or {}
-    poll = select.poll()  # not select(), which fails in a program that has more than 1,024 descriptors
-    for fd, events in (*watched.items(), *interrupt.items()):
-        poll.register(fd, events)
-    # poll takes a C int of milliseconds, 24 days at most: whoever waits that long is woken, and looks again
-    milliseconds = None if timeout is None else math.ceil(min(max(0.0, timeout * 1000), 2**31 - 1))
-    found = {fd for fd, _ in poll.poll(milliseconds)}
-    if not found.isdisjoint(interrupt):
-        raise Interrupted
-    return found
 
 
 def _greet(
@@ -305,7 +281,7 @@ def _heard(connected: _socket.socket, path: str, end: float, interrupt: Mapping[
     from talkcli import peers
     from talkcli.errors import ServerUnavailable
 
-    if not ready({connected.fileno(): POLLIN}, end - time.monotonic(), interrupt):
+    if not wait_ready({connected.fileno(): POLLIN}, end - time.monotonic(), interrupt):
         pid, _ = peers.credentials(connected)
         hint = f"look at process {pid}, and restart it if it hangs"
         raise ServerUnavailable(f"the server at {path} does not answer; {hint}")

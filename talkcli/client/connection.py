@@ -16,12 +16,13 @@ from collections import deque
 from collections.abc import Callable
 
 from talkcli import paths, peers
-from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, hello, ready, sender
+from talkcli.client.connect import ANSWER_LIMIT, FIRST, connect, hello, sender
 from talkcli.client.following import Followed
 from talkcli.errors import BadRequest, Lost, ServerUnavailable, Unreadable, UsageError, refusal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.option import MAX_NAME
 from talkcli.goals.options import Say
+from talkcli.polling import wait_ready
 from talkcli.protocol.lines import LineSplitter, decode, request_line, write_request
 
 if TYPE_CHECKING:
@@ -432,7 +433,7 @@ class SocketConnection(BaseConnection):
     def _fill(self, timeout: float, interruptible: bool) -> None:
         try:
             watched = {self._socket.fileno(): select.POLLIN}
-            if not ready(watched, timeout, self._interrupt if interruptible else None):
+            if not wait_ready(watched, timeout, self._interrupt if interruptible else None):
                 return
             data = self._socket.recv(262144)
         except BlockingIOError:
@@ -476,7 +477,7 @@ class SocketConnection(BaseConnection):
                 try:
                     rest = rest[self._socket.send(rest) :]
                 except BlockingIOError:
-                    if not ready({self._socket.fileno(): select.POLLOUT}, end - time.monotonic()):
+                    if not wait_ready({self._socket.fileno(): select.POLLOUT}, end - time.monotonic()):
                         # Half a line may be out: nothing that follows could be understood.
                         self._mute = f"it took nothing for {ANSWER_LIMIT:g} s"
                         self._shut(SHUT_WR)

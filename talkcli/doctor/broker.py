@@ -19,17 +19,17 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.client.client import Client
-from talkcli.client.connect import ready
 from talkcli.doctor.report import ADMITTED, ANSWERED, FAILED, Finding, failed, ok, some, warning
 from talkcli.doctor.server import span, summary
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, from_environment, is_here, user
+from talkcli.fleet.desk.robot import reach
+from talkcli.fleet.desk.roster import roster
 from talkcli.fleet.link import NOT_AUTHORIZED, PATIENCE, Link
 from talkcli.fleet.presence import Presence
-from talkcli.fleet.robot import reach
-from talkcli.fleet.roster import roster
 from talkcli.frozen import frozen, replace
+from talkcli.polling import wait_ready
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ class Examination:
         said: Presence | None = None
         back = False
         while link.ended is None and now < end and not (taken and back and said):
-            if link.fileno() in ready(_watched(link), end - now, self._interrupt):
+            if link.fileno() in wait_ready(_watched(link), end - now, self._interrupt):
                 link.read()
             back = back or any(each.topic == mark and each.payload == _MARK for each in self._inbox)
             told = [each.payload for each in self._inbox if each.topic == presence]
@@ -253,7 +253,7 @@ class Examination:
 
         threading.Thread(target=run, name="talk doctor: asking", daemon=True).start()
         try:
-            if not ready({wake: 0}, _LIMIT, self._interrupt):
+            if not wait_ready({wake: 0}, _LIMIT, self._interrupt):
                 raise TimeoutError
         finally:
             os.close(wake)

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor import machine, sentence, server, sound, voice
 from talkcli.doctor.report import HEARD
-from talkcli.engine.players import PLAYERS, is_silent
-from talkcli.engine.synthesizers import is_own, models
-from talkcli.engine.synthesizers.voices import find_voice, is_neural
+from talkcli.engine.child.players import PLAYERS, is_silent
+from talkcli.engine.child.synthesizers import is_own, models
+from talkcli.engine.child.synthesizers.voices import find_voice, is_neural
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
 from talkcli.goals.states import State

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import peers
 from talkcli.doctor.report import Finding, ok, some, warning
-from talkcli.engine.players import devices
+from talkcli.engine.child.players import devices
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:

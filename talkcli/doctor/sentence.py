@@ -8,15 +8,15 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from talkcli.client.connect import Interrupted
 from talkcli.doctor.report import SENTENCE, Finding, failed, ok
 from talkcli.doctor.sound import is_custom
 from talkcli.doctor.voice import INSTALL_LIBRARY, conversation, fault
 from talkcli.engine import protocol
-from talkcli.engine.process import EngineFailed
+from talkcli.engine.parent.process import EngineFailed
 from talkcli.errors import TalkError
 from talkcli.frozen import frozen, replace
 from talkcli.goals.states import State
+from talkcli.polling import Interrupted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

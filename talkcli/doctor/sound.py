@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor.machine import judge_access, judge_cards
 from talkcli.doctor.report import Finding, failed, ok, some, warning
-from talkcli.engine.players import PACKAGES, PLAYERS, is_silent, on_path
-from talkcli.engine.players.child import kill, signal_name
-from talkcli.engine.players.devices import DUMMY, sound_servers
+from talkcli.engine.child.players import PACKAGES, PLAYERS, is_silent, on_path
+from talkcli.engine.child.players.devices import DUMMY, sound_servers
 from talkcli.frozen import frozen, replace
+from talkcli.processes import kill, signal_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

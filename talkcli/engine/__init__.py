@@ -1,6 +1,6 @@
-"""The engine: the supervisor, a thread in the server that owns one engine process, and what runs inside that process.
+"""The engine speaks the goals, one at a time.
 
-It may import what is below the server: the client's way to wait, daemon, protocol, goals, the ground. It knows no queue
-and no client. What plays goes to `players`, what speaks to `synthesizers`, what watches over the process to
-`supervisor`; only here pyttsx3 is named.
+`parent` runs in the server: it starts the engine process, sends it goals and watches it. `child` runs in the engine
+process: the driver, the players and the synthesizers. They exchange the messages in `protocol`. The engine may import
+the layers below the client.
 """

@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from talkcli.daemon.log import line, shown
-from talkcli.engine.players import NO_PLAYER
-from talkcli.engine.synthesizers import is_own
+from talkcli.engine.child.players import NO_PLAYER
+from talkcli.engine.child.synthesizers import is_own
 from talkcli.goals.states import State
 from talkcli.terminal.text import printable
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 from talkcli.daemon import log
 from talkcli.engine import protocol
-from talkcli.engine.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
-from talkcli.engine.synthesizers.voices import is_neural
+from talkcli.engine.child.synthesizers.voices import is_neural
+from talkcli.engine.parent.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals.goal import Output
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from typing import Any
 
-    from talkcli.engine.supervisor import Supervisor
+    from talkcli.engine.parent.supervisor import Supervisor
     from talkcli.goals.goal import By
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Scheduler

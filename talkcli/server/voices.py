@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from talkcli.engine.synthesizers import is_own
-from talkcli.engine.synthesizers.base import UnknownVoice
-from talkcli.engine.synthesizers.voices import NEURAL, find_voice, is_neural, speaker_number, unknown_voice
+from talkcli.engine.child.synthesizers import is_own
+from talkcli.engine.child.synthesizers.base import UnknownVoice
+from talkcli.engine.child.synthesizers.voices import NEURAL, find_voice, is_neural, speaker_number, unknown_voice
 from talkcli.goals.options import DEFAULT_VOICE, SPEAKER
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class Voices:
         """Return the voices that a word may mean: of neural ones those whose files are there now."""
         if self._foreign is not None:
             return () if is_neural(voice) else self._of_driver
-        from talkcli.engine.synthesizers import models
+        from talkcli.engine.child.synthesizers import models
 
         listed = {each.id: each for each in self.listed or ()}
         neural = (listed.get(each.id, each) for each in models.undescribed())
@@ -131,7 +131,7 @@ class Voices:
     @staticmethod
     def _lacking(voice: str) -> str | None:
         """Return what a neural voice lacks, by its id: a package, or the speaker that is asked for."""
-        from talkcli.engine.synthesizers import models
+        from talkcli.engine.child.synthesizers import models
 
         model, mark, speaker = voice.partition(SPEAKER)
         if mark:
@@ -314,7 +314,7 @@ class Voices:
 
     @staticmethod
     def _size(voice: str) -> int:
-        from talkcli.engine.synthesizers import models
+        from talkcli.engine.child.synthesizers import models
 
         try:
             return os.path.getsize(models.found()[voice.removeprefix(NEURAL)])
@@ -327,6 +327,6 @@ class Voices:
 
     @staticmethod
     def _files() -> tuple[Voice, ...]:
-        from talkcli.engine.synthesizers import models
+        from talkcli.engine.child.synthesizers import models
 
         return models.voices()

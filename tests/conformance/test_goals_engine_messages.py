@@ -61,7 +61,7 @@ SERVE = """
 import sys
 sys.path.insert(0, {root!r})
 from talkcli.cli import main
-from talkcli.engine import process
+from talkcli.engine.parent import process
 
 process.engine_command = lambda: [sys.executable, {engine!r}]
 sys.argv = ["talk", "serve", *sys.argv[1:]]

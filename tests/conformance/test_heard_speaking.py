@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.players.choice import MOST
+from talkcli.engine.child.players.choice import MOST
 from tests.conformance import stopped
 from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_aborted, assert_same, await_word, heard, send
 from tests.conformance.voices import ESPEAK, with_both

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine import supervisor
+from talkcli.engine.parent import supervisor
 from tests.engine.programs import Player
 from tests.engine.threads import Thread
 from tests.support import scripted_engine
@@ -38,7 +38,9 @@ def engine(shared: Shared, request: pytest.FixtureRequest) -> Spawned:
 @pytest.fixture
 def scripted_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the scripted engine started as the engine process."""
-    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: [sys.executable, scripted_engine.__file__])
+    monkeypatch.setattr(
+        "talkcli.engine.parent.process.engine_command", lambda: [sys.executable, scripted_engine.__file__]
+    )
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import time
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.engine import protocol
-from talkcli.engine.synthesizers.voices import is_neural
+from talkcli.engine.child.synthesizers.voices import is_neural
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -90,10 +90,10 @@ class Spawned:
         if alive_every is not None:
             settings += f"from talkcli.engine import protocol\nprotocol.ALIVE_EVERY = {alive_every}\n"
         path = f"import sys\nsys.path[:] = {sys.path!r}\n"
-        code = f"{path}{before}\nfrom talkcli.engine import playback\n{settings}"
+        code = f"{path}{before}\nfrom talkcli.engine.child import playback\n{settings}"
         with theirs:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", f"{code}from talkcli.engine.main import main\nmain()"],
+                [sys.executable, "-c", f"{code}from talkcli.engine.child.main import main\nmain()"],
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,

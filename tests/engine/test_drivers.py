@@ -14,10 +14,10 @@ from pyttsx3.engine import Engine
 
 from talkcli import install
 from talkcli.engine import protocol
-from talkcli.engine.driver import register
-from talkcli.engine.players.base import CannotSpeak
-from talkcli.engine.players.choice import Players
-from talkcli.engine.synthesizers.base import UnknownVoice
+from talkcli.engine.child.driver import register
+from talkcli.engine.child.players.base import CannotSpeak
+from talkcli.engine.child.players.choice import Players
+from talkcli.engine.child.synthesizers.base import UnknownVoice
 from tests.engine.spawned import Shared, Spawned
 from tests.engine.test_synthesizer_contract import Scripted
 from tests.support.timing import assert_within, limits
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from typing import Any
 
-    from talkcli.engine.players.base import Interest
-    from talkcli.engine.session import Session
-    from talkcli.engine.synthesizers.base import Output, Sound, Synthesizer
+    from talkcli.engine.child.players.base import Interest
+    from talkcli.engine.child.session import Session
+    from talkcli.engine.child.synthesizers.base import Output, Sound, Synthesizer
 
 #: The parts of a driver that all have here: it has no properties, and puts itself among pyttsx3's.
 _DRIVER = """
@@ -223,7 +223,7 @@ def test_a_stop_ends_a_driver_that_is_paused(silent: bool) -> None:
 
 @limits()
 def test_a_driver_that_never_ends_shows_no_sign_of_life_after_a_while() -> None:
-    patience = "from talkcli.engine import session\nsession.PATIENCE, session.WORDS_A_CHARACTER = 0.7, 0\n"
+    patience = "from talkcli.engine.child import session\nsession.PATIENCE, session.WORDS_A_CHARACTER = 0.7, 0\n"
     never = "Driver.stop = lambda self: None\nDriver.END = 1e9\n"
     with Spawned(driver="slow", before=patience + SLOW_DRIVER + never) as engine:
         engine.until(protocol.Voices)
@@ -258,7 +258,7 @@ def test_the_wheels_library_serves_if_the_system_has_none() -> None:
 
 #: A library that has not even talk's own voice.
 WITHOUT_ENGLISH = """
-from talkcli.engine.synthesizers import espeak
+from talkcli.engine.child.synthesizers import espeak
 load = espeak.load
 def without_english():
     library, *more = load()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.engine.synthesizers import guard
+from talkcli.engine.child.synthesizers import guard
 
 #: The matter of the rules, and its like: initials, stops, apostrophes, scripts of every kind, long words.
 _PIECES = (

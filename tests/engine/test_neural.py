@@ -21,7 +21,7 @@ import pytest
 
 from talkcli import install
 from talkcli.engine import protocol
-from talkcli.engine.synthesizers.models import NEEDED
+from talkcli.engine.child.synthesizers.models import NEEDED
 from tests.engine.programs import Player, without_silence
 from tests.engine.spawned import SOON, Shared, Spawned, first
 from tests.support import tiny_voice
@@ -59,7 +59,10 @@ sys.meta_path.insert(0, Without())
 NEURAL_MODULES = [
     *NEEDED,
     *("difflib", "hashlib", "queue"),
-    *(f"talkcli.engine.synthesizers.{each}" for each in ("cache", "inference", "phonemes", "piper", "vits", "work")),
+    *(
+        f"talkcli.engine.child.synthesizers.{each}"
+        for each in ("cache", "inference", "phonemes", "piper", "vits", "work")
+    ),
 ]
 
 
@@ -535,7 +538,7 @@ def test_a_voice_that_is_not_loaded_or_was_dropped_is_spoken_by_espeak_in_its_la
 
 def test_growth_by_each_voice_is_told_and_memory_of_dropped_ones_is_given_back(place: Path) -> None:
     heavy = """
-from talkcli.engine.synthesizers import inference
+from talkcli.engine.child.synthesizers import inference
 init, kept = inference.Model.__init__, []
 def heavier(self, *rest):
     init(self, *rest)

@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from talkcli.engine.players import Command
-from talkcli.engine.players.base import PIECE, SAMPLE, CannotSpeak
-from talkcli.engine.players.null import NullPlayer
-from talkcli.engine.players.program import ProgramPlayer
-from talkcli.engine.players.pulse import PulsePlayer
-from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
+from talkcli.engine.child.players import Command
+from talkcli.engine.child.players.base import PIECE, SAMPLE, CannotSpeak
+from talkcli.engine.child.players.null import NullPlayer
+from talkcli.engine.child.players.program import ProgramPlayer
+from talkcli.engine.child.players.pulse import PulsePlayer
+from talkcli.engine.child.players.wav import WavPlayer, WavStreamPlayer
 from tests.engine.spawned import PATIENCE
 from tests.support.processes import children
 from tests.support.surroundings import short_directory
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from talkcli.engine.players.base import Player
+    from talkcli.engine.child.players.base import Player
     from tests.support.sink import Sink
 
 RATE = 22050

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine import playback, protocol
-from talkcli.engine.players import Command
-from talkcli.engine.players import child as child_module
-from talkcli.engine.players.child import Child
-from talkcli.engine.players.program import ProgramPlayer
+from talkcli import processes
+from talkcli.engine import protocol
+from talkcli.engine.child import playback
+from talkcli.engine.child.players import Command
+from talkcli.engine.child.players.child import Child
+from talkcli.engine.child.players.program import ProgramPlayer
 from tests.engine.programs import NEVER_READS, PLAYS, SWALLOWS, Player
 from tests.engine.spawned import FAST, SOON, Spawned
 from tests.support import census
@@ -247,7 +248,7 @@ def test_no_descriptor_is_left_over(player: Player) -> None:
 
 #: Tells when a player is started, a text is looked at, and a process is forked: a line each.
 _WATCHED = """
-from talkcli.engine.synthesizers import guard
+from talkcli.engine.child.synthesizers import guard
 tell = lambda what: sys.stderr.write(what + "\\n")
 sys.addaudithook(lambda name, _: name in ("os.posix_spawn", "os.fork", "subprocess.Popen") and tell(name))
 guarded = guard.guarded
@@ -279,9 +280,9 @@ def test_the_holders_of_a_pipe_are_looked_for_no_longer_than_it_is_held(monkeypa
             os.close(writing)
         return []
 
-    monkeypatch.setattr(child_module, "_links", links)
-    monkeypatch.setattr(child_module, "processes", lambda: [-1, -2, -3, -4])
-    assert not child_module.kill_holders(reading)
+    monkeypatch.setattr(processes, "_links", links)
+    monkeypatch.setattr(processes, "processes", lambda: [-1, -2, -3, -4])
+    assert not processes.kill_holders(reading)
     assert looked == ["/proc/-1/fd", "/proc/-2/fd"]
     os.close(reading)
 
@@ -430,7 +431,7 @@ def test_a_text_without_a_sound_is_no_fault_of_the_player(player: Player) -> Non
 
 def test_a_player_for_another_rate_is_replaced_before_the_first_sample(player: Player) -> None:
     before = """
-from talkcli.engine.synthesizers import espeak
+from talkcli.engine.child.synthesizers import espeak
 load = espeak.load
 espeak.load = lambda: (*load()[:2], 16_000)
 """

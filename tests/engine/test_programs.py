@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine import players, protocol
-from talkcli.engine.players import PACKAGES, PLAYERS, commands, devices
-from talkcli.engine.players.base import CannotSpeak
-from talkcli.engine.players.choice import Players
-from talkcli.engine.players.program import LONGEST_LINE, Complaint, ProgramPlayer
-from talkcli.engine.players.wav import WavPlayer, WavStreamPlayer
+from talkcli.engine import protocol
+from talkcli.engine.child import players
+from talkcli.engine.child.players import PACKAGES, PLAYERS, commands, devices
+from talkcli.engine.child.players.base import CannotSpeak
+from talkcli.engine.child.players.choice import Players
+from talkcli.engine.child.players.program import LONGEST_LINE, Complaint, ProgramPlayer
+from talkcli.engine.child.players.wav import WavPlayer, WavStreamPlayer
 from tests.engine.spawned import Spawned
 
 if TYPE_CHECKING:

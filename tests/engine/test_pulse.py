@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.engine.players import libpulse
-from talkcli.engine.players.base import PIECE, SAMPLE, CannotSpeak
-from talkcli.engine.players.devices import DUMMY
-from talkcli.engine.players.pulse import PulsePlayer
+from talkcli.engine.child.players import libpulse
+from talkcli.engine.child.players.base import PIECE, SAMPLE, CannotSpeak
+from talkcli.engine.child.players.devices import DUMMY
+from talkcli.engine.child.players.pulse import PulsePlayer
 from tests.support.pipewire import PipeWire
 from tests.support.relay import Relay
 from tests.support.surroundings import short_directory

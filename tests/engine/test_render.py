@@ -24,15 +24,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.client.connect import Interrupted
 from talkcli.doctor import sentence, voice
 from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Engine, Setting
-from talkcli.engine import process, protocol
-from talkcli.engine.process import Conversation, EngineFailed, engine_command
-from talkcli.engine.render import CannotWrite, RenderFailed, pieces, render
+from talkcli.engine import protocol
+from talkcli.engine.parent import process
+from talkcli.engine.parent.process import Conversation, EngineFailed, engine_command
+from talkcli.engine.parent.render import CannotWrite, RenderFailed, pieces, render
 from talkcli.errors import TalkError, UsageError
 from talkcli.goals.states import State
+from talkcli.polling import Interrupted
 from tests.support.reference import RATE, Sentence
 from tests.support.reference import render as reference
 from tests.support.surroundings import MARK, assert_none_left, needs
@@ -87,7 +88,7 @@ def test_the_file_has_espeak_ngs_own_samples_by_the_settings_of_a_goal(tmp_path:
 
 def test_a_text_longer_than_a_goal_is_rendered_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "x.wav"
-    monkeypatch.setattr("talkcli.engine.render.LONGEST_PIECE", 500)
+    monkeypatch.setattr("talkcli.engine.parent.render.LONGEST_PIECE", 500)
     sentences = [f"This is number {number}, and so on." for number in range(20)]
     text = f"{' '.join(sentences)}\n\n{'... ' * 200}"  # and what is silent is no failure
     first, second, *rest = pieces(text)
@@ -97,7 +98,7 @@ def test_a_text_longer_than_a_goal_is_rendered_in_pieces(tmp_path: Path, monkeyp
     spoken = reference([Sentence(first, 450), Sentence(second, 450)])
     assert samples(path) == b"".join(each.tobytes() for each in spoken)
     assert seconds == pytest.approx(len(samples(path)) / RATE / 2, abs=1e-3)
-    monkeypatch.setattr("talkcli.engine.render.LONGEST_PIECE", 10_000)
+    monkeypatch.setattr("talkcli.engine.parent.render.LONGEST_PIECE", 10_000)
     assert seconds == pytest.approx(render(first + second, str(path), rate=450), abs=0.02)
 
 
@@ -178,7 +179,7 @@ def test_a_path_that_cannot_be_written_is_told_before_anything_is_started(
 RENDERS = """
 import sys
 sys.path[:] = {path!r}
-from talkcli.engine.render import render
+from talkcli.engine.parent.render import render
 print("begun", file=sys.stderr, flush=True)
 render(sys.argv[1], sys.argv[2])
 """
@@ -220,12 +221,12 @@ def have_engines_run(monkeypatch: pytest.MonkeyPatch, before: str) -> None:
     interpreter, option, code = engine_command()
     path, rest = code.split("; from ", 1)
     command = [interpreter, option, f"{path}\n{before}\nfrom {rest}"]
-    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: command)
+    monkeypatch.setattr("talkcli.engine.parent.process.engine_command", lambda: command)
 
 
 def test_a_reader_that_takes_its_time_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """More than a pipe holds, and it is read later than a player that is stuck would be given up."""
-    limits = "from talkcli.engine import playback; playback.FIRST_WITHIN = playback.STALLED_AFTER = 0.1"
+    limits = "from talkcli.engine.child import playback; playback.FIRST_WITHIN = playback.STALLED_AFTER = 0.1"
     have_engines_run(monkeypatch, limits)
     text = TEXT * 4
     (expected,) = reference([text])
@@ -395,12 +396,12 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path, interrupt: di
         ("import time; time.sleep(60)", "engine_failed", "the engine was not ready after 0.3 s"),
         ("raise RuntimeError('no tongue')", "engine_crashed", "RuntimeError: no tongue"),
         (
-            "import os; from talkcli.engine import session; session.Session._say = lambda *_: os.abort()",
+            "import os; from talkcli.engine.child import session; session.Session._say = lambda *_: os.abort()",
             "engine_crashed",
             'the engine crashed while it spoke with the voice "en-us": it was killed by SIGABRT',
         ),
         (
-            "import time; from talkcli.engine import session; session.Session._say = lambda *_: time.sleep(60)",
+            "import time; from talkcli.engine.child import session; session.Session._say = lambda *_: time.sleep(60)",
             "engine_hung",
             'the engine gave no sign of life for 0.5 s while it spoke with the voice "en-us"',
         ),
@@ -418,7 +419,7 @@ def test_a_useless_engine_is_told_and_killed(
 
 
 def test_an_interpreter_that_cannot_be_started_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: ["/nonesuch"])
+    monkeypatch.setattr("talkcli.engine.parent.process.engine_command", lambda: ["/nonesuch"])
     error = failed("yes", tmp_path / "x.wav")
     assert (error.code, "/nonesuch" in str(error)) == ("engine_failed", True)
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.players import choice
-from talkcli.engine.players.choice import LONGEST, MOST, REMEMBERED, Gap
-from talkcli.engine.stream import QUIET, Samples
+from talkcli.engine.child.players import choice
+from talkcli.engine.child.players.choice import LONGEST, MOST, REMEMBERED, Gap
+from talkcli.engine.child.stream import QUIET, Samples
 from tests.engine.programs import SWALLOWS, Player
 from tests.engine.spawned import FAST, SOON, Spawned
 from tests.support.processes import children
@@ -38,7 +38,7 @@ def _sentence() -> bytes:
 
 
 def _idle_after(seconds: float) -> str:
-    return f"from talkcli.engine.players import choice\nchoice.IDLE_AFTER = {seconds}"
+    return f"from talkcli.engine.child.players import choice\nchoice.IDLE_AFTER = {seconds}"
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ TEXTS = ["battery low", "coming home", "please help"]
 #: Seconds that are left out in some tests, and their bytes: even a fast sentence ends in as much silence.
 LEFT_OUT = 0.02
 _BYTES = int(LEFT_OUT * RATE) * 2
-_SAYS_SO = f"from talkcli.engine.players.choice import Gap\nGap.allowance = lambda *_: {LEFT_OUT}"
+_SAYS_SO = f"from talkcli.engine.child.players.choice import Gap\nGap.allowance = lambda *_: {LEFT_OUT}"
 
 
 def _all_played(rate: int = FAST) -> list[bytes]:
@@ -285,7 +285,7 @@ def test_a_goal_that_waits_counts_if_it_does_at_the_end_of_a_sentence(player: Pl
 
 
 def test_no_sample_that_is_sound_is_left_out(player: Player) -> None:
-    louder_than_nothing = f"{_SAYS_SO}\nfrom talkcli.engine import stream\nstream.QUIET = -1"
+    louder_than_nothing = f"{_SAYS_SO}\nfrom talkcli.engine.child import stream\nstream.QUIET = -1"
     with Spawned(player.plays(), before=louder_than_nothing) as engine:
         assert engine.spoken(TEXTS[0], followed=True).outcome == protocol.COMPLETED
     assert player.heard.read_bytes() == _all_played()[0]
@@ -304,7 +304,7 @@ def test_a_player_that_ends_too_early_is_seen_if_silence_is_left_out(player: Pla
     """A sentence may not end much sooner than its whole length, the omitted silence included."""
     rate = 200  # at which the silence at the end is that long
     length = len(_all_played(rate)[0]) / 2 / RATE
-    before = "from talkcli.engine.players.choice import Gap\nGap.allowance = lambda *_: 0.2"
+    before = "from talkcli.engine.child.players.choice import Gap\nGap.allowance = lambda *_: 0.2"
     with Spawned(player.command(SWALLOWS), before=before, limits={"EARLY_END": length - 0.2}) as engine:
         ended = engine.spoken(TEXTS[0], followed=True, rate=rate)
         assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_lost")

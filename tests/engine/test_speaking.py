@@ -91,7 +91,7 @@ def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: s
         engine.spoken(text)
         engine.leave()
         imported = set(engine.errors().split())
-    assert "talkcli.engine.playback" in imported
+    assert "talkcli.engine.child.playback" in imported
     assert imported.isdisjoint(_NOT_NEEDED), imported.intersection(_NOT_NEEDED)
 
 

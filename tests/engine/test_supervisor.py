@@ -20,12 +20,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from talkcli.client.connect import ready
-from talkcli.engine import protocol, supervisor
-from talkcli.engine.inbox import NEVER, Inbox
-from talkcli.engine.process import LONGEST, EngineProcess
-from talkcli.engine.protocol import COMPLETED, FAILED, SILENCE_LIMIT, STOPPED
-from talkcli.engine.supervisor import (
+from talkcli.engine import protocol
+from talkcli.engine.parent import supervisor
+from talkcli.engine.parent.inbox import NEVER, Inbox
+from talkcli.engine.parent.process import LONGEST, EngineProcess
+from talkcli.engine.parent.supervisor import (
     BACK_OFF,
     LINES,
     SHORT_LIFE,
@@ -37,14 +36,16 @@ from talkcli.engine.supervisor import (
     Restarts,
     Supervisor,
 )
-from talkcli.engine.supervisor import PATIENCE as WAITED
+from talkcli.engine.parent.supervisor import PATIENCE as WAITED
+from talkcli.engine.protocol import COMPLETED, FAILED, SILENCE_LIMIT, STOPPED
+from talkcli.polling import wait_ready
 from tests.engine.threads import CONFIGURE, PATIENCE, Thread, answering
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from talkcli.engine.supervisor import Report
+    from talkcli.engine.parent.supervisor import Report
     from tests.engine.threads import Start
 
 YES = protocol.Say("g1", "yes", 200, 1.0, None, 50)
@@ -187,7 +188,7 @@ def answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callabl
     with contextlib.ExitStack() as stack:
 
         def make(*lines: str) -> Thread:
-            monkeypatch.setattr("talkcli.engine.process.engine_command", lambda: answering(tmp_path, *lines))
+            monkeypatch.setattr("talkcli.engine.parent.process.engine_command", lambda: answering(tmp_path, *lines))
             return stack.enter_context(contextlib.closing(Thread()))
 
         yield make
@@ -518,7 +519,7 @@ def _complaining(script: str) -> tuple[list[str], str]:
     """Return the lines that a process passes on which writes to standard error, and its last words."""
     lines: list[str] = []
     process = EngineProcess(CONFIGURE, lines.append, command=[sys.executable, "-c", f"import os\n{script}"])
-    while process.stderr in ready({process.stderr: select.POLLIN}, 20.0) and process.read_stderr():
+    while process.stderr in wait_ready({process.stderr: select.POLLIN}, 20.0) and process.read_stderr():
         pass
     words = process.last_words()
     process.close()

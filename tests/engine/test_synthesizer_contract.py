@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.players.base import SAMPLE, CannotSpeak, Stopped
+from talkcli.engine.child.players.base import SAMPLE, CannotSpeak, Stopped
+from talkcli.engine.child.synthesizers.base import Sound, UnknownVoice
+from talkcli.engine.child.synthesizers.choice import Choice
+from talkcli.engine.child.synthesizers.espeak import Espeak
+from talkcli.engine.child.synthesizers.models import NEEDED
+from talkcli.engine.child.synthesizers.phonemes import pieces
+from talkcli.engine.child.synthesizers.piper import Piper
 from talkcli.engine.protocol import Voice
-from talkcli.engine.synthesizers.base import Sound, UnknownVoice
-from talkcli.engine.synthesizers.choice import Choice
-from talkcli.engine.synthesizers.espeak import Espeak
-from talkcli.engine.synthesizers.models import NEEDED
-from talkcli.engine.synthesizers.phonemes import pieces
-from talkcli.engine.synthesizers.piper import Piper
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_VOICE, real_voice, silence_noise
 from tests.support.surroundings import needs_packages
@@ -33,7 +33,7 @@ from tests.support.timing import assert_within, limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from talkcli.engine.synthesizers.base import Output, Synthesizer
+    from talkcli.engine.child.synthesizers.base import Output, Synthesizer
 
 TEXT = "battery low, please come home"
 #: Texts of all kinds.

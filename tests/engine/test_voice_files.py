@@ -18,11 +18,11 @@ from typing import Any
 
 import pytest
 
+from talkcli.engine.child.synthesizers import cache as caches
+from talkcli.engine.child.synthesizers import models
+from talkcli.engine.child.synthesizers.cache import Cache
+from talkcli.engine.child.synthesizers.models import BadFile, describe, found, open_checked, voices
 from talkcli.engine.protocol import Voice
-from talkcli.engine.synthesizers import cache as caches
-from talkcli.engine.synthesizers import models
-from talkcli.engine.synthesizers.cache import Cache
-from talkcli.engine.synthesizers.models import BadFile, describe, found, open_checked, voices
 from talkcli.paths import cache_directory, voice_directories
 from tests.support import tiny_voice
 

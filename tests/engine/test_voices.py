@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
+from talkcli.engine.child.synthesizers import espeak
+from talkcli.engine.child.synthesizers.voices import find_voice, languages, list_voices, unknown_voice
 from talkcli.engine.protocol import Voice
-from talkcli.engine.synthesizers import espeak
-from talkcli.engine.synthesizers.voices import find_voice, languages, list_voices, unknown_voice
 from tests.engine.spawned import USUAL, Spawned
 from tests.support.reference import Sentence, render
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 SET_ALL = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
-from talkcli.engine.synthesizers.espeak import load
+from talkcli.engine.child.synthesizers.espeak import load
 espeak, *_ = load()
 current = []
 for each in json.load(sys.stdin):

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.engine.synthesizers import espeak
-from talkcli.engine.words import TimedWord, WordClock, Words, letters
+from talkcli.engine.child.synthesizers import espeak
+from talkcli.engine.child.words import TimedWord, WordClock, Words, letters
 from tests.support.reference import Sentence, render_with_words
 
 if TYPE_CHECKING:

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import talkcli
 from talkcli.engine import protocol
-from talkcli.engine.supervisor import Supervisor
+from talkcli.engine.parent.supervisor import Supervisor
 
 if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
-    from talkcli.engine.supervisor import Report
+    from talkcli.engine.parent.supervisor import Report
 
 _R = TypeVar("_R")
 

@@ -8,7 +8,7 @@ import sys
 sys.path.insert(0, os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
 
 from talkcli.cli import main
-from talkcli.engine import process
+from talkcli.engine.parent import process
 from tests.tools.fuzz_texts import engine_command
 
 if __name__ == "__main__":

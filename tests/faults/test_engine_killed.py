@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.playback import GONE_WITHIN, STALLED_AFTER
+from talkcli.engine.child.playback import GONE_WITHIN, STALLED_AFTER
 from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT
 from tests.conformance.hearing import (
     LONG,
@@ -171,7 +171,7 @@ def test_a_sound_server_that_a_player_has_started_is_left_alone(make_talk: MakeT
 #: A library that complains of each text, with an escape that would colour a terminal.
 COMPLAINS = """
 import sys
-if "talkcli.engine.main" in "".join(sys.orig_argv):
+if "talkcli.engine.child.main" in "".join(sys.orig_argv):
     from pyttsx3.drivers import _espeak
     speak = _espeak.Synth
     def complain(text, *rest, **options):
@@ -225,7 +225,7 @@ STUCK_SYNTHESIS = """
 from talkcli.engine import protocol
 protocol.HANG_AFTER = {limit}
 import sys, time
-if "talkcli.engine.main" in "".join(sys.orig_argv):
+if "talkcli.engine.child.main" in "".join(sys.orig_argv):
     from pyttsx3.drivers import _espeak
     speak = _espeak.Synth
     def wait(text, *rest, **options):

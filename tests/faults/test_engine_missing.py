@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import espeakng_loader
 import pytest
 
-from talkcli.engine.supervisor import BACK_OFF
+from talkcli.engine.parent.supervisor import BACK_OFF
 from tests.conformance.bareserve import SERVE, environment, run
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
 from tests.faults.broken import assert_answers, heard_again, python_path, write
@@ -122,7 +122,7 @@ WAITING = 20
 TOO_FEW = 12
 #: Shortens the waits of a server whose engine can't start: no second, but tenths.
 HASTY = """
-from talkcli.engine import supervisor
+from talkcli.engine.parent import supervisor
 supervisor.BACK_OFF, supervisor.PATIENCE = (0.0, 0.05, 0.1), {patience}
 """
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from talkcli.engine.players.devices import DUMMY
-from talkcli.engine.players.pulse import SUSPENDED_FOR
+from talkcli.engine.child.players.devices import DUMMY
+from talkcli.engine.child.players.pulse import SUSPENDED_FOR
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
 from tests.support.census import descendants
 from tests.support.pipewire import PipeWire

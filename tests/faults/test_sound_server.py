@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from talkcli.engine.playback import DRAIN_WITHIN, FIRST_WITHIN, LOOK_EVERY, STALLED_AFTER
-from talkcli.engine.players.pulse import READY_WITHIN, SUSPENDED_FOR
+from talkcli.engine.child.playback import DRAIN_WITHIN, FIRST_WITHIN, LOOK_EVERY, STALLED_AFTER
+from talkcli.engine.child.players.pulse import READY_WITHIN, SUSPENDED_FOR
 from tests.conformance.hearing import (
     HOME,
     LONG,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.render import render
+from talkcli.engine.parent.render import render
 from talkcli.goals.text import fault
 from tests.conformance.hearing import HOME, LOW, assert_aborted, assert_same, begin, send
 from tests.faults.broken import await_end

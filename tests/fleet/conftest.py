@@ -12,7 +12,7 @@ import pytest
 
 from talkcli import Fleet
 from talkcli.fleet import topics
-from talkcli.fleet.policy import ASKABLE
+from talkcli.fleet.bridge.policy import ASKABLE
 from tests.fleet.many import RealRobots, request
 from tests.fleet.robot import Robot
 from tests.support.bridge import Bridge, Desk
@@ -138,7 +138,7 @@ def fleet(pair: RealRobots, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
 def fleet_of(broker: Broker, monkeypatch: pytest.MonkeyPatch, *, grace: float = 0.05, user: str | None = None) -> Fleet:
     """Return the library for a broker; `grace`: seconds in which the broker may still tell what it keeps."""
     needs_packages("paho")
-    from talkcli.fleet import desk
+    from talkcli.fleet.desk import desk
 
     monkeypatch.setattr(desk, "GRACE", grace)  # mosquitto tells at once all that it keeps
     for each in [name for name in os.environ if name.startswith("TALK_") and not name.startswith("TALK_TEST_")]:

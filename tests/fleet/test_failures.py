@@ -10,7 +10,7 @@ import pytest
 from paho.mqtt import client as paho
 
 from talkcli.fleet import broker as brokers
-from talkcli.fleet.bridge import Bridge, Settings
+from talkcli.fleet.bridge.main import Bridge, Settings
 from talkcli.fleet.broker import from_environment
 from tests.fleet.asker import Asker
 from tests.fleet.conftest import in_loop

@@ -13,7 +13,7 @@ import pytest
 
 from talkcli import __version__
 from talkcli.errors import Busy, ServerUnavailable
-from talkcli.fleet.local import apart, dial
+from talkcli.fleet.bridge.local import apart, dial
 from talkcli.protocol.events import busy_greeting, greeting
 from talkcli.protocol.lines import encode
 from tests.fleet.conftest import in_loop
@@ -22,7 +22,7 @@ from tests.support.surroundings import short_directory
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
-    from talkcli.fleet.local import Local
+    from talkcli.fleet.bridge.local import Local
 
 GREETING = encode(greeting(__version__, 7, "a1b2"))
 PATIENCE = 10.0
@@ -211,7 +211,7 @@ async def test_a_dial_without_a_free_descriptor_gives_its_slot_back(
     def none_left(_: str | None) -> None:
         raise OSError("Too many open files")
 
-    monkeypatch.setattr("talkcli.fleet.local.reach", none_left)
+    monkeypatch.setattr("talkcli.fleet.bridge.local.reach", none_left)
     slots = asyncio.Semaphore(1)
     with pytest.raises(OSError, match="Too many"):
         await dial(listening.getsockname(), "bob", slots=slots)

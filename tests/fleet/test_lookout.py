@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from talkcli.client.connect import Interrupted
 from talkcli.errors import Lost
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.selection import Selection
-from talkcli.fleet.sighting import Away, Back, Begun, Changed, Happened, Missed
+from talkcli.fleet.desk.selection import Selection
+from talkcli.fleet.desk.sighting import Away, Back, Begun, Changed, Happened, Missed
 from talkcli.goals.states import State
+from talkcli.polling import Interrupted
 from talkcli.protocol.events import StateChanged
 from tests.fleet import told
 from tests.support.connection import PATIENCE
@@ -25,7 +25,7 @@ from tests.support.mqtt import Listener
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from talkcli.fleet.sighting import Sighting
+    from talkcli.fleet.desk.sighting import Sighting
     from tests.support.broker import Broker
 
 
@@ -33,7 +33,7 @@ class Looking(contextlib.AbstractContextManager["Looking"]):
     """A lookout in a thread of its own, which `with` starts and ends."""
 
     def __init__(self, broker: Broker, selection: str | None = None) -> None:
-        from talkcli.fleet.lookout import Lookout  # which needs paho
+        from talkcli.fleet.desk.lookout import Lookout  # which needs paho
 
         self._lookout = Lookout(from_environment(broker.env()), Selection(selection) if selection else None)
         self._queue: queue.SimpleQueue[Sighting | Exception] = queue.SimpleQueue()
@@ -86,7 +86,7 @@ def robots(broker: Broker) -> Iterator[Listener]:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A desk that reconnects soon after its broker is back."""
-    from talkcli.fleet import desk
+    from talkcli.fleet.desk import desk
 
     monkeypatch.setattr(desk, "_LONGEST_PAUSE", 0.1)
 
@@ -190,7 +190,7 @@ def test_after_a_break_it_tells_what_has_changed_and_nothing_twice(broker: Broke
 def test_a_robot_that_does_not_come_back_with_its_broker_is_gone(
     broker: Broker, robots: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from talkcli.fleet import lookout
+    from talkcli.fleet.desk import lookout
 
     monkeypatch.setattr(lookout, "BACK_WITHIN", 0.5)
     told.presence(robots, "anna")
@@ -224,7 +224,7 @@ def test_a_robot_that_was_away_tells_what_it_has_spoken_meanwhile(broker: Broker
 
 @pytest.mark.usefixtures("quick")
 def test_a_broker_that_stays_away_is_lost(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
-    from talkcli.fleet import lookout
+    from talkcli.fleet.desk import lookout
 
     monkeypatch.setattr(lookout, "ABSENCE_LIMIT", 0.5)
     with Looking(broker) as looking:

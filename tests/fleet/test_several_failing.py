@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.fleet.policy import ASKABLE
+from talkcli.fleet.bridge.policy import ASKABLE
 from tests.fleet import told as robots_told
 from tests.fleet.many import RealRobots, alike, assert_told, at_once, objects, request, told
 from tests.fleet.robot import LONG

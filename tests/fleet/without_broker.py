@@ -6,7 +6,8 @@ import asyncio
 import json
 from typing import TYPE_CHECKING, Any
 
-from talkcli.fleet import policy, topics
+from talkcli.fleet import topics
+from talkcli.fleet.bridge import policy
 from talkcli.fleet.message import Message
 from tests.support.connection import PATIENCE
 from tests.support.surroundings import needs_packages
@@ -14,7 +15,7 @@ from tests.support.surroundings import needs_packages
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.fleet.askers import Askers
+    from talkcli.fleet.bridge.askers import Askers
 
 
 class AskersWithoutBroker:
@@ -23,7 +24,7 @@ class AskersWithoutBroker:
     def __init__(self, socket: str, room: int = 200_000) -> None:
         """`socket`: the server's; `room`: bytes of the largest payload."""
         needs_packages("paho")
-        from talkcli.fleet.askers import Askers
+        from talkcli.fleet.bridge.askers import Askers
 
         #: the topic and the lines of each message
         self.published: list[tuple[str, list[dict[str, Any]]]] = []

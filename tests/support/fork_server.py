@@ -29,7 +29,7 @@ import talkcli
 
 _KILLED_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 #: Modules that no client and no server imports.
-_LEFT_OUT = ("talkcli.__main__", "talkcli.engine.main", "talkcli.engine.synthesizers")
+_LEFT_OUT = ("talkcli.__main__", "talkcli.engine.child.main", "talkcli.engine.child.synthesizers")
 
 
 def _import_talk() -> None:

@@ -1,6 +1,6 @@
 """An engine process that fails, hangs, crashes or ignores stop if the text of a goal says so; see `script`.
 
-It replaces `talkcli.engine.main`, and speaks the same protocol on file descriptor 0.
+It replaces `talkcli.engine.child.main`, and speaks the same protocol on file descriptor 0.
 """
 
 from __future__ import annotations

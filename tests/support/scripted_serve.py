@@ -6,7 +6,7 @@ import os
 import sys
 
 from talkcli.cli import main as run_talk
-from talkcli.engine import process
+from talkcli.engine.parent import process
 
 _ENGINE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "scripted_engine.py")
 

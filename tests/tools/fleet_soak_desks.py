@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from talkcli import Client
 from talkcli.errors import Lost, RequestRefused, ServerUnavailable, UnknownGoal
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.robot import reach
+from talkcli.fleet.desk.robot import reach
 from talkcli.protocol.events import Result
 from tests.support.bridge import Desk
 from tests.tools.soak_clients import PATIENCE_S, Workers

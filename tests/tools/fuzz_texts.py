@@ -25,8 +25,9 @@ from functools import cache
 from typing import TYPE_CHECKING
 from unittest import mock
 
-from talkcli.engine import process, protocol
-from talkcli.engine.process import Conversation, EngineFailed
+from talkcli.engine import protocol
+from talkcli.engine.parent import process
+from talkcli.engine.parent.process import Conversation, EngineFailed
 from talkcli.goals.text import fault
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ _RATE = 450
 _START_LIMIT_S, _HANG_LIMIT_S = 20.0, 60.0
 #: How a process dies that wrote past the end of a buffer. The guard prevents that.
 OVERFLOW = "SIGABRT"
-_WITHOUT_GUARD = "from talkcli.engine.synthesizers import guard; guard.guarded = lambda text, voice: text; "
+_WITHOUT_GUARD = "from talkcli.engine.child.synthesizers import guard; guard.guarded = lambda text, voice: text; "
 SENTENCES = (
     "Battery low, returning to the docking station.",
     "It's 10:30 on 2024-05-01; the U.S.A. and e.g. Mr. Smith's well-known e-mail: a.b@example.org (see http://x.y/z?a=1).",

@@ -27,9 +27,9 @@ from typing import TYPE_CHECKING, Any, cast
 from talkcli import __version__
 from talkcli.daemon import log
 from talkcli.engine import protocol
-from talkcli.fleet.bridge import Bridge, Settings
+from talkcli.fleet.bridge.main import Bridge, Settings
+from talkcli.fleet.bridge.policy import ASKABLE
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.policy import ASKABLE
 from talkcli.goals.goal import Sender
 from talkcli.goals.options import as_shown
 from talkcli.goals.scheduler import Scheduler

@@ -15,7 +15,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.roster import roster
+from talkcli.fleet.desk.roster import roster
 from tests.fleet.many import RealRobots, Roll, SimulatedRobots
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker

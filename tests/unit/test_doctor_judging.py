@@ -17,7 +17,7 @@ from talkcli.doctor.sentence import Played, behind
 from talkcli.doctor.server import Place, Places
 from talkcli.doctor.sound import Devices, Level, Players, SoundServer
 from talkcli.doctor.voice import Engine, Setting
-from talkcli.engine.players.devices import DUMMY
+from talkcli.engine.child.players.devices import DUMMY
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State

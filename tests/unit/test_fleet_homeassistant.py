@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from talkcli.fleet import homeassistant, topics
-from talkcli.fleet.policy import ASKABLE
+from talkcli.fleet import topics
+from talkcli.fleet.bridge import homeassistant
+from talkcli.fleet.bridge.policy import ASKABLE
 from talkcli.goals.states import State
 from tests.fleet.homeassistant import TOPIC, faults, rendered
 

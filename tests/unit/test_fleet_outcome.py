@@ -18,7 +18,7 @@ from talkcli.errors import (
     UnknownGoal,
     UsageError,
 )
-from talkcli.fleet.outcome import IDLE, NO_SERVER, OFFLINE, PAUSED, SET, Outcome, failed
+from talkcli.fleet.desk.outcome import IDLE, NO_SERVER, OFFLINE, PAUSED, SET, Outcome, failed
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
 

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.fleet import policy, topics
+from talkcli.fleet import topics
+from talkcli.fleet.bridge import policy
+from talkcli.fleet.bridge.policy import Ask, Dropped, Echoes, HungUp, Ids, Policy, Refused, Share
 from talkcli.fleet.message import Message
-from talkcli.fleet.policy import Ask, Dropped, Echoes, HungUp, Ids, Policy, Refused, Share
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.option import MAX_NAME, is_clients_id

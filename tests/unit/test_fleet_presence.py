@@ -7,8 +7,8 @@ import json
 import pytest
 
 from talkcli.fleet import topics
+from talkcli.fleet.desk.selection import Selection, several
 from talkcli.fleet.presence import Presence, rank
-from talkcli.fleet.selection import Selection, several
 from talkcli.fleet.status import LastGoal, Status
 from talkcli.goals.states import State
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.engine.synthesizers.guard import guarded
+from talkcli.engine.child.synthesizers.guard import guarded
 
 #: As people write; each has something that looks like what a rule is about.
 ORDINARY = (

@@ -23,17 +23,18 @@ from tests.support.surroundings import needs
 PACKAGE = Path(talkcli.__file__).parent
 
 #: The layers: each may import itself and those before it.
-LAYERS = ["ground", "goals", "protocol", "terminal", "daemon", "client", "engine", "server", "fleet", "doctor", "cli"]
+LAYERS = ["ground", "goals", "protocol", "terminal", "daemon", "engine", "client", "server", "fleet", "doctor", "cli"]
 #: The modules of the ground, which import only each other.
-GROUND = {"errors", "frozen", "install", "paths", "peers"}
+GROUND = {"errors", "frozen", "install", "paths", "peers", "polling", "processes"}
 #: The package itself and its command, which only pass on the work of others.
 FACE = {"", "__main__"}
 #: What is pure besides all of `goals`, `protocol` and `terminal`.
 PURE = [
-    *("errors", "frozen", "client.following", "daemon.quota", "engine.words", "engine.synthesizers.guard"),
-    *("engine.synthesizers.phonemes", "engine.synthesizers.vits"),
-    *(f"fleet.{each}" for each in ("homeassistant", "message", "outcome", "policy", "presence", "selection")),
-    *(f"fleet.{each}" for each in ("sighting", "status", "topics")),
+    *("errors", "frozen", "client.following", "daemon.quota", "engine.child.words", "engine.child.synthesizers.guard"),
+    *("engine.child.synthesizers.phonemes", "engine.child.synthesizers.vits"),
+    *(f"fleet.{each}" for each in ("message", "presence", "status", "topics")),
+    *("fleet.bridge.homeassistant", "fleet.bridge.policy"),
+    *(f"fleet.desk.{each}" for each in ("outcome", "selection", "sighting")),
 ]
 IMPURE = {
     *("asyncio", "threading", "_thread", "socket", "_socket", "select", "selectors", "signal", "time", "datetime"),
@@ -46,7 +47,7 @@ ONLY = {
     "pyttsx3": {"engine"},
     "espeakng_loader": {"engine"},
     "numpy": {"engine"},
-    "onnxruntime": {"engine.synthesizers.inference"},  # which turns its telemetry off first
+    "onnxruntime": {"engine.child.synthesizers.inference"},  # which turns its telemetry off first
     "click": {"cli"},
     "asyncio": {"daemon", "server", "fleet"},
     "paho": {"fleet"},
@@ -64,7 +65,7 @@ class Import(NamedTuple):
 
 
 def module_name(path: Path) -> str:
-    """Return a file's name within the package: `paths`, `engine.supervisor`, and "" for the package itself."""
+    """Return a file's name within the package: `paths`, `engine.parent.supervisor`, and "" for the package itself."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -166,7 +167,7 @@ def test_every_module_is_used() -> None:
     """By the command, by the engine process, or by a module that is itself run."""
     used: set[str] = set()
     runs = {each for command in COMMANDS.values() for each in (command.runs, command.several) if each}
-    new = {"__main__", "engine.main", "", *(f"cli.{each.partition(':')[0]}" for each in runs)}
+    new = {"__main__", "engine.child.main", "", *(f"cli.{each.partition(':')[0]}" for each in runs)}
     while new:
         used |= new
         new = {name for module in new for name, _ in inside(module)} - used
@@ -235,9 +236,9 @@ def test_server_doctor_and_fleet_are_imported_only_if_they_are_asked_for() -> No
 
 
 #: Other modules that may end the process on the spot, as the server does on its second signal.
-ENDING = {"server.run": {"os._exit"}, "engine.main": {"os._exit"}}
+ENDING = {"server.run": {"os._exit"}, "engine.child.main": {"os._exit"}}
 #: Other modules that may write to standard error: the log, and the engine process, whose server reads it.
-COMPLAINING = {"daemon.log", "engine.main", "engine.session"}
+COMPLAINING = {"daemon.log", "engine.child.main", "engine.child.session"}
 
 
 def test_only_the_cli_prints_and_exits() -> None:
@@ -282,7 +283,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 JUDGING = ["machine", "voice", "neural", "sound", "server", "sentence", "broker", "report"]
 #: Modules that the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
-    *("talkcli.engine.players", "talkcli.fleet.presence", "talkcli.goals.options", "talkcli.goals.states"),
+    *("talkcli.engine.child.players", "talkcli.fleet.presence", "talkcli.goals.options", "talkcli.goals.states"),
     *("talkcli.terminal.goals", "talkcli.terminal.text", "talkcli.frozen"),
 }
 

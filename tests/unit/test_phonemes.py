@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from talkcli.engine.synthesizers.phonemes import LONGEST, Piece, pieces
+from talkcli.engine.child.synthesizers.phonemes import LONGEST, Piece, pieces
 from tests.support.timing import assert_within, limits
 
 STOPS = {"。": ".", "？": "?", "，": ",", "…": ".", "؟": "?", ";": ";"}

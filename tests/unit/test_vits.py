@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.engine.synthesizers import vits
-from talkcli.engine.synthesizers.vits import NotCut, halves
+from talkcli.engine.child.synthesizers import vits
+from talkcli.engine.child.synthesizers.vits import NotCut, halves
 from tests.support import tiny_voice
 from tests.support.tiny_voice import field, node, tensor, weight
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from talkcli import errors, paths
 from talkcli.cli import commands
-from talkcli.fleet import policy, topics
+from talkcli.fleet import topics
+from talkcli.fleet.bridge import policy
 from talkcli.goals import states
 from talkcli.goals.goal import Goal
 from talkcli.goals.history import MAX_RECALLED, MAX_REJECTED, MAX_SPOKEN
@@ -85,7 +86,9 @@ def test_limits_are_those_of_the_code() -> None:
 
 def test_limits_of_a_fleet_are_those_of_the_code() -> None:
     needs_packages("paho")
-    from talkcli.fleet import askers, bridge, link, news, session
+    from talkcli.fleet import link
+    from talkcli.fleet.bridge import askers, news, session
+    from talkcli.fleet.bridge import main as bridge
 
     limits = {row[0]: row[1] for row in tables(FLEET.section("Limits"))[0][1:]}
     assert limits["a request"].startswith(f"{MAX_LINE:,} bytes")

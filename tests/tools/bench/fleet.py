@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import Client, State
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.robot import reach
+from talkcli.fleet.desk.robot import reach
 from talkcli.protocol.events import StateChanged
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker

@@ -1,0 +1,41 @@
+"""Wait for descriptors, for a limited time and so that something else can interrupt the wait."""
+
+from __future__ import annotations
+
+from talkcli.frozen import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+class Interrupted(Exception):
+    """One of the caller's own descriptors became ready during a wait."""
+
+
+def wait_ready(
+    watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
+) -> set[int]:
+    """Return the descriptors that are ready.
+
+    Args:
+        watched: the poll events to wait for, by descriptor. Errors and hang-ups always count.
+        timeout: the longest wait in seconds, or None for no limit.
+        interrupt: more descriptors with their events.
+
+    Raises:
+        Interrupted: one of the descriptors in `interrupt` is ready.
+    """
+    # No start of a client pays for these imports.
+    import math
+    import select
+
+    interrupt = interrupt or {}
+    poll = select.poll()  # unlike select(), it works in a program with more than 1,024 descriptors
+    for fd, events in (*watched.items(), *interrupt.items()):
+        poll.register(fd, events)
+    # poll takes milliseconds as a C int, at most 24 days. After a longer timeout the caller looks again.
+    milliseconds = None if timeout is None else math.ceil(min(max(0.0, timeout * 1000), 2**31 - 1))
+    found = {fd for fd, _ in poll.poll(milliseconds)}
+    if not found.isdisjoint(interrupt):
+        raise Interrupted
+    return found

@@ -1,0 +1,90 @@
+"""Pipes that show which processes still run, and signals for those processes."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import select
+import signal
+
+from talkcli.frozen import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+#: How long to wait for a killed process to close its pipe before looking for other holders. It takes 1 to 2 ms.
+_RELEASE_S = 0.01
+
+
+def open_pipes(count: int) -> list[tuple[int, int]]:
+    """Open all of the pipes or none, and return each one's reading and writing end."""
+    with contextlib.ExitStack() as opened:
+        pipes = []
+        for _ in range(count):
+            pipes.append(os.pipe())
+            opened.callback(close, *pipes[-1])
+        opened.pop_all()
+    return pipes
+
+
+def close(*descriptors: int) -> None:
+    """Close the descriptors."""
+    for each in descriptors:
+        os.close(each)
+
+
+def is_held(pipe: int, seconds: float = 0.0) -> bool:
+    """Whether any process still holds the other end of the pipe after this many seconds."""
+    poll = select.poll()
+    poll.register(pipe, 0)  # poll always reports a closed other end
+    return not poll.poll(seconds * 1000)
+
+
+def kill_holders(pipe: int) -> bool:
+    """Kill all other processes that keep the pipe open, and return whether any was killed.
+
+    Another user's process can't be killed, and without /proc no process can be found.
+    """
+    if not is_held(pipe, _RELEASE_S):
+        return False
+    link, own = f"pipe:[{os.fstat(pipe).st_ino}]", os.getpid()
+    # Stop as soon as the pipe is closed, because reading all of a busy machine's /proc takes tenths of a second.
+    while_held = itertools.takewhile(lambda _: is_held(pipe, 0), processes())
+    return kill(pid for pid in while_held if pid != own and link in _links(f"/proc/{pid}/fd"))
+
+
+def kill(pids: Iterable[int]) -> bool:
+    """Kill the processes, and return whether any was killed. A negative number stands for a process group."""
+    killed = False
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, signal.SIGKILL)
+            killed = True
+    return killed
+
+
+def processes() -> list[int]:
+    """Return the ids of all processes. The list is empty without a readable /proc."""
+    return [int(name) for name in _names("/proc") if name.isdigit()]
+
+
+def _links(folder: str) -> Iterator[str]:
+    for name in _names(folder):
+        with contextlib.suppress(OSError):  # it was closed in the meantime
+            yield os.readlink(f"{folder}/{name}")
+
+
+def _names(folder: str) -> list[str]:
+    try:
+        return os.listdir(folder)
+    except OSError:  # it belongs to another user, is gone, or doesn't exist on this system
+        return []
+
+
+def signal_name(number: int) -> str:
+    """Return the name of a signal for people."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
