@@ -18,7 +18,7 @@ from talkcli.doctor.machine import Session
 from talkcli.doctor.neural import Neural, Tried
 from talkcli.doctor.report import FAILED, OK, WARNING
 from talkcli.doctor.voice import Engine
-from talkcli.engine.child.synthesizers.models import NEEDED
+from talkcli.engine.models import NEEDED
 from talkcli.polling import Interrupted
 from tests.conformance.bareserve import environment, serving
 from tests.support import tiny_voice
@@ -33,7 +33,7 @@ __all__ = ["home"]
 #: Hides the voices of packages, so that only the voices of a test are found.
 ALONE = """
 import importlib, sys
-from talkcli.engine.child.synthesizers import models
+from talkcli.engine import models
 models._PACKAGE = "no such package"
 """
 TRIED = r"is in use: loaded in \d+\.\d s, makes a sentence \d+\.\d times as fast as it is heard, takes \d+ MB"
@@ -44,7 +44,7 @@ LIMIT = 20.0
 def alone(home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """Return an environment with the voice that hums, and no other."""
     needs_packages(*NEEDED)
-    monkeypatch.setattr("talkcli.engine.child.synthesizers.models._PACKAGE", "no such package")
+    monkeypatch.setattr("talkcli.engine.models._PACKAGE", "no such package")
     tiny_voice.put(Path(home) / "v", "tiny")
     return _environment(home, tmp_path, ALONE)
 

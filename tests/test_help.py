@@ -15,7 +15,7 @@ from talkcli import errors
 from talkcli.cli import commands, show
 from talkcli.cli.click_app import ClickCommand, talk
 from talkcli.cli.command import ALL_EXIT_CODES
-from talkcli.engine.child.players import devices
+from talkcli.engine import players
 from talkcli.goals import states
 from tests.conformance.bareserve import TALK, alone, environment, run
 from tests.golden import surface
@@ -165,8 +165,8 @@ def test_a_missing_player_is_told_at_the_start(make_talk: MakeTalk) -> None:
 def test_a_missing_sound_device_is_told_at_the_start_and_found_when_it_comes(make_talk: MakeTalk, sink: Sink) -> None:
     talk = make_talk(*FAST, env={"PULSE_SERVER": ""}, forked=False)
     first = talk.log.splitlines()[0]
-    assert first.startswith("talk: no sound device is here, ") == devices.nothing_sounds(talk.env)
-    if devices.nothing_sounds(talk.env):
+    assert first.startswith("talk: no sound device is here, ") == players.has_no_output(talk.env)
+    if players.has_no_output(talk.env):
         assert "talk doctor" in first
         assert "--player file:PATH.wav" in first
         done = talk.run("say", "--wait", "hello")

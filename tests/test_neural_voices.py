@@ -14,9 +14,9 @@ import pytest
 
 from talkcli import install
 from talkcli.client.client import Client
-from talkcli.engine.child.synthesizers.models import NEEDED
-from talkcli.engine.child.synthesizers.voices import find_voice
+from talkcli.engine.models import NEEDED
 from talkcli.engine.protocol import Voice
+from talkcli.engine.voices import find_voice
 from tests.conformance.bareserve import LIMIT, SERVE, TALK, environment, run, serving
 from tests.engine.test_neural import SLOW_TO_SPEAK, WITHOUT
 from tests.support import tiny_voice

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli import install
-from talkcli.engine.child.synthesizers.models import NEEDED
+from talkcli.engine.models import NEEDED
 from tests.conformance.bareserve import TALK, environment, run, serving
 from tests.engine.test_neural import NEURAL_MODULES
 from tests.support import census, tiny_voice

@@ -86,8 +86,8 @@ def voices(options: Common, language: str | None) -> None:
     with options.connect() as client:
         found = every = client.voices()
     if language:
-        from talkcli.engine.child.synthesizers.voices import languages
         from talkcli.engine.protocol import Voice
+        from talkcli.engine.voices import languages
 
         listed = [Voice(str(each.get("id")), _language(each), str(each.get("name"))) for each in every]
         wanted = languages(language, listed)
@@ -155,7 +155,7 @@ def _suggest_key(key: str, client: Client) -> None:
 
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
     """Return what is said where no voice speaks a language, which may have been given by its name."""
-    from talkcli.engine.child.synthesizers.voices import is_neural
+    from talkcli.engine.voices import is_neural
     from talkcli.terminal.text import printable
 
     codes = {_language(each): _language(each) for each in voices}

@@ -20,7 +20,7 @@ import click
 from click.shell_completion import CompletionItem, ShellComplete, add_completion_class, split_arg_string
 
 from talkcli.cli.show import show
-from talkcli.engine.child.synthesizers.voices import is_neural
+from talkcli.engine.voices import is_neural
 from talkcli.errors import TalkError
 from talkcli.protocol.events import ServerStatus, unfinished
 from talkcli.terminal.text import printable
@@ -236,7 +236,7 @@ def files(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
 
 def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
     """Return the players that talk knows by name."""
-    from talkcli.engine.child.players import PLAYERS
+    from talkcli.engine.players import PLAYERS
 
     return _items([(name, each.about) for name, each in PLAYERS.items()], incomplete)
 

@@ -43,17 +43,16 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
     With a device and no player named it only looks at the names of files, so that the start is not kept waiting.
     """
-    from talkcli.engine.child.players import PACKAGES, is_silent
-    from talkcli.engine.child.players.devices import nothing_sounds
+    from talkcli.engine.players import PACKAGES, has_no_output, is_silent
 
     if is_silent(player):
         return
-    silent = nothing_sounds(os.environ)
+    silent = has_no_output(os.environ)
     if not player and not silent:
         return
-    from talkcli.engine.child.synthesizers import is_own
+    from talkcli.engine.voices import is_own_driver
 
-    if not is_own(driver):
+    if not is_own_driver(driver):
         return  # it plays by itself, and the server says so
     if silent and (not player or player in PACKAGES):
         note(NO_DEVICE)
@@ -63,14 +62,13 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
 
 def _warn_of_player(player: str) -> None:
     """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
-    from talkcli.engine.child.players import PACKAGES, PLAYERS, commands
-    from talkcli.engine.child.players.base import CannotSpeak
+    from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, player_commands
 
     if player in PLAYERS and player not in PACKAGES:
         return  # it is no program
     try:
-        commands(player, None, 0)
-    except CannotSpeak as error:
+        player_commands(player, None, 0)
+    except PlayerMissing as error:
         near = nearest(player, PLAYERS.keys() - {player})
         hint = f"did you mean '{near}'? " if near else ""
         note(f"{printable(str(error))}: {hint}nothing can be heard until it is there")

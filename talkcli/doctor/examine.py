@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor import machine, sentence, server, sound, voice
 from talkcli.doctor.report import HEARD
-from talkcli.engine.child.players import PLAYERS, is_silent
-from talkcli.engine.child.synthesizers import is_own, models
-from talkcli.engine.child.synthesizers.voices import find_voice, is_neural
+from talkcli.engine import models
+from talkcli.engine.players import PLAYERS, is_silent
+from talkcli.engine.voices import find_voice, is_neural, is_own_driver
 from talkcli.errors import TalkError
 from talkcli.frozen import replace
 from talkcli.goals.states import State
@@ -94,7 +94,7 @@ class Examination:
         told = self._server.get("neural_voices")
         if used and not is_neural(used):  # the engine knows what a short name means, unless it failed because of that
             used = used if engine.reason and find_voice(used, models.undescribed(env)) else engine.voice
-        if not is_own(self._told("driver")) or not (used or told or engine.neural or env.get("TALK_VOICES")):
+        if not is_own_driver(self._told("driver")) or not (used or told or engine.neural or env.get("TALK_VOICES")):
             return
         from talkcli.doctor import neural
 
@@ -115,7 +115,7 @@ class Examination:
     def _sound(
         self, engine: voice.Engine, here: machine.Session, env: Mapping[str, str], *, running: bool
     ) -> Iterator[Finding]:
-        if not is_own(self._told("driver")):
+        if not is_own_driver(self._told("driver")):
             return  # it plays by itself
         wanted, device = self._player(), self._told("device")
         players = sound.players(env, wanted, None if running else engine.player)

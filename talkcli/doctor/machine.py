@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import peers
 from talkcli.doctor.report import Finding, ok, some, warning
-from talkcli.engine.child.players import devices
+from talkcli.engine import players
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def cards(session: Session, kernel: str = "/proc/asound", nodes: str = "/dev/snd
     """Return the kernel's sound cards, and which of them this user may open."""
     # " 0 [Device         ]: USB-Audio - USB Audio Device", and a second line with its place
     names = re.findall(r"^\s*\d+ \[[^\]]*\]:.*? - (.*)$", _text(f"{kernel}/cards"), re.MULTILINE)
-    playing = devices.playing(nodes)
+    playing = players.playback_devices(nodes)
     group = _AUDIO
     forbidden = []
     for each in playing:

@@ -18,10 +18,9 @@ from talkcli import install
 from talkcli.doctor.report import Finding, failed, ok, some, warning
 from talkcli.doctor.sound import asked
 from talkcli.doctor.voice import fault
-from talkcli.engine import protocol
-from talkcli.engine.child.synthesizers import models
-from talkcli.engine.child.synthesizers.voices import NEURAL
+from talkcli.engine import models, protocol
 from talkcli.engine.parent.process import Conversation, EngineFailed
+from talkcli.engine.voices import NEURAL
 from talkcli.frozen import frozen
 
 if TYPE_CHECKING:

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.doctor.machine import judge_access, judge_cards
 from talkcli.doctor.report import Finding, failed, ok, some, warning
-from talkcli.engine.child.players import PACKAGES, PLAYERS, is_silent, on_path
-from talkcli.engine.child.players.devices import DUMMY, sound_servers
+from talkcli.engine.players import DUMMY_SINK, PACKAGES, PLAYERS, is_silent, on_path, sound_server_sockets
 from talkcli.frozen import frozen, replace
 from talkcli.processes import kill, signal_name
 
@@ -257,7 +256,7 @@ def sound_server(env: Mapping[str, str], session: Session) -> SoundServer:
         return SoundServer(f"one listens on {native}")
     answers = {"pactl": pulse, "pw-cli": wire}
     trouble = next((said.trouble for each, said in answers.items() if on_path(each, env)), None)
-    sockets = sound_servers(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else []))
+    sockets = sound_server_sockets(env, session.uid, *([session.sudo_uid] if session.sudo_uid is not None else []))
     named = env.get("PULSE_SERVER") or None
     return SoundServer(sockets=tuple(sockets), trouble=trouble, hangs=wire.late, named=named)
 
@@ -270,7 +269,7 @@ def _listening(env: Mapping[str, str]) -> str | None:
     named = env.get("PULSE_SERVER", "").removeprefix("unix:")
     if named and not named.startswith("/"):
         return named
-    for path in [named] if named else [each for each in sound_servers(env) if each.endswith("/native")]:
+    for path in [named] if named else [each for each in sound_server_sockets(env) if each.endswith("/native")]:
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(LIMIT)
             probe.connect(path)
@@ -391,9 +390,9 @@ def _device(devices: Devices) -> Finding:
 
 def _sound_server(server: SoundServer, cards: Cards, session: Session) -> Finding:
     where = "from here" if session.server is None else f"from the server (process {session.server})"
-    if server.name is not None and server.sink == DUMMY:
+    if server.name is not None and server.sink == DUMMY_SINK:
         step = "plug in a loudspeaker, and look whether it is there: pactl list short sinks"
-        return warning(_SERVER, f"{server.name} has only a dummy output, {DUMMY}: nobody hears it", step)
+        return warning(_SERVER, f"{server.name} has only a dummy output, {DUMMY_SINK}: nobody hears it", step)
     if server.name is not None:
         sink = f", plays to {server.sink}" if server.sink else ""
         return ok(_SERVER, f"{server.name}{sink}")

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 from talkcli import install
 from talkcli.doctor.report import Finding, failed, ok, warning
 from talkcli.engine import protocol
-from talkcli.engine.child.synthesizers.voices import is_neural
 from talkcli.engine.parent.process import Conversation, EngineFailed
+from talkcli.engine.voices import is_neural
 from talkcli.frozen import frozen, replace
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from talkcli.daemon.log import line, shown
-from talkcli.engine.child.players import NO_PLAYER
-from talkcli.engine.child.synthesizers import is_own
+from talkcli.engine.players import NO_PLAYER
+from talkcli.engine.voices import is_own_driver
 from talkcli.goals.states import State
 from talkcli.terminal.text import printable
 
@@ -58,7 +58,7 @@ def sound_of(engine: Ready) -> str:
     """Return what plays, for people."""
     if engine.player:
         return f"player {engine.player}"
-    return NO_PLAYER if is_own(engine.driver) else _BY_ITSELF
+    return NO_PLAYER if is_own_driver(engine.driver) else _BY_ITSELF
 
 
 def who(sender: Sender) -> str:

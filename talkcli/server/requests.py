@@ -13,7 +13,7 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from talkcli.daemon import log
-from talkcli.engine.child.synthesizers.voices import is_neural
+from talkcli.engine.voices import is_neural
 from talkcli.errors import RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals.goal import By

@@ -16,9 +16,9 @@ from talkcli import __version__, peers
 from talkcli.daemon import log
 from talkcli.daemon.systemd import Systemd
 from talkcli.engine import protocol
-from talkcli.engine.child.synthesizers.voices import is_neural
 from talkcli.engine.parent.supervisor import Supervisor
 from talkcli.engine.protocol import START_LIMIT
+from talkcli.engine.voices import is_neural
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, limits
 from talkcli.frozen import frozen, replace
 from talkcli.goals.goal import Sender

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 from talkcli.daemon import log
 from talkcli.engine import protocol
-from talkcli.engine.child.synthesizers.voices import is_neural
 from talkcli.engine.parent.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
+from talkcli.engine.voices import is_neural
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals.goal import Output

@@ -11,9 +11,15 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from talkcli.engine.child.synthesizers import is_own
-from talkcli.engine.child.synthesizers.base import UnknownVoice
-from talkcli.engine.child.synthesizers.voices import NEURAL, find_voice, is_neural, speaker_number, unknown_voice
+from talkcli.engine.voices import (
+    NEURAL,
+    UnknownVoice,
+    find_voice,
+    is_neural,
+    is_own_driver,
+    speaker_number,
+    unknown_voice,
+)
 from talkcli.goals.options import DEFAULT_VOICE, SPEAKER
 
 if TYPE_CHECKING:
@@ -117,7 +123,7 @@ class Voices:
         """Return the voices that a word may mean: of neural ones those whose files are there now."""
         if self._foreign is not None:
             return () if is_neural(voice) else self._of_driver
-        from talkcli.engine.child.synthesizers import models
+        from talkcli.engine import models
 
         listed = {each.id: each for each in self.listed or ()}
         neural = (listed.get(each.id, each) for each in models.undescribed())
@@ -126,12 +132,12 @@ class Voices:
     @property
     def _foreign(self) -> str | None:
         """The driver, where it is none of `talk`'s own; on another system than Linux all are."""
-        return None if is_own(self.driver) else self.driver or "the system's own"
+        return None if is_own_driver(self.driver) else self.driver or "the system's own"
 
     @staticmethod
     def _lacking(voice: str) -> str | None:
         """Return what a neural voice lacks, by its id: a package, or the speaker that is asked for."""
-        from talkcli.engine.child.synthesizers import models
+        from talkcli.engine import models
 
         model, mark, speaker = voice.partition(SPEAKER)
         if mark:
@@ -149,7 +155,7 @@ class Voices:
 
         It takes no more than to read some directories, and only where somebody asks.
         """
-        if self.listed and is_own(self.driver):
+        if self.listed and is_own_driver(self.driver):
             self.listed = (*(each for each in self.listed if not is_neural(each.id)), *self._files())
 
     # -- what is loaded
@@ -314,7 +320,7 @@ class Voices:
 
     @staticmethod
     def _size(voice: str) -> int:
-        from talkcli.engine.child.synthesizers import models
+        from talkcli.engine import models
 
         try:
             return os.path.getsize(models.found()[voice.removeprefix(NEURAL)])
@@ -327,6 +333,6 @@ class Voices:
 
     @staticmethod
     def _files() -> tuple[Voice, ...]:
-        from talkcli.engine.child.synthesizers import models
+        from talkcli.engine import models
 
         return models.voices()

@@ -17,7 +17,7 @@ from talkcli.engine import protocol
 from talkcli.engine.child.driver import register
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.choice import Players
-from talkcli.engine.child.synthesizers.base import UnknownVoice
+from talkcli.engine.voices import UnknownVoice
 from tests.engine.spawned import Shared, Spawned
 from tests.engine.test_synthesizer_contract import Scripted
 from tests.support.timing import assert_within, limits

@@ -15,7 +15,7 @@ import pytest
 
 from talkcli.engine.child.synthesizers.cache import Cache
 from talkcli.engine.child.synthesizers.inference import AROUND, Model, Run
-from talkcli.engine.child.synthesizers.models import NEEDED, BadFile, describe
+from talkcli.engine.models import NEEDED, BadFile, describe
 from tests.support import tiny_voice
 from tests.support.real_voice import real_voice, silence_noise
 from tests.support.surroundings import needs_packages
@@ -191,7 +191,7 @@ def test_a_file_that_is_larger_than_any_model_is_not_read(tmp_path: Path) -> Non
 _WITH_LITTLE_MEMORY = """
 import resource, sys
 from talkcli.engine.child.synthesizers.inference import Model, Run
-from talkcli.engine.child.synthesizers.models import BadFile, describe
+from talkcli.engine.models import BadFile, describe
 sys.argv[1:] = {arguments!r}
 model = Model(sys.argv[1], describe(sys.argv[1]))
 before = resource.getrlimit(resource.RLIMIT_AS)

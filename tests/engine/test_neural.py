@@ -21,7 +21,7 @@ import pytest
 
 from talkcli import install
 from talkcli.engine import protocol
-from talkcli.engine.child.synthesizers.models import NEEDED
+from talkcli.engine.models import NEEDED
 from tests.engine.programs import Player, without_silence
 from tests.engine.spawned import SOON, Shared, Spawned, first
 from tests.support import tiny_voice

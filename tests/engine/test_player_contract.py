@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from talkcli.engine.child.players import Command
-from talkcli.engine.child.players.base import PIECE, SAMPLE, CannotSpeak
+from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.null import NullPlayer
 from talkcli.engine.child.players.program import ProgramPlayer
 from talkcli.engine.child.players.pulse import PulsePlayer
 from talkcli.engine.child.players.wav import WavPlayer, WavStreamPlayer
+from talkcli.engine.players import PIECE_S, SAMPLE_BYTES, PlayerCommand
 from tests.engine.spawned import PATIENCE
 from tests.support.processes import children
 from tests.support.surroundings import short_directory
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from tests.support.sink import Sink
 
 RATE = 22050
-_PIECE = int(PIECE * RATE) * SAMPLE
+_PIECE = int(PIECE_S * RATE) * SAMPLE_BYTES
 #: A quarter of a second, of which no two pieces are alike.
 SOUND = b"".join(number.to_bytes(2, "little") for number in range(RATE // 4))
 #: Samples of silence before which a tape has all that was played: 0.1 s.
@@ -66,7 +66,7 @@ class Case:
 
 
 def _program(*argv: str) -> ProgramPlayer:
-    return ProgramPlayer(Command("tape", argv, read_ahead=0))
+    return ProgramPlayer(PlayerCommand("tape", argv, read_ahead=0))
 
 
 def _stream(at: Path) -> WavStreamPlayer:
@@ -133,7 +133,7 @@ def _taped(at: Path) -> bytes:
 
 
 def _on(tape: Path) -> npt.NDArray[np.int16]:
-    return np.frombuffer(tape.read_bytes()[: tape.stat().st_size // SAMPLE * SAMPLE], "<i2")
+    return np.frombuffer(tape.read_bytes()[: tape.stat().st_size // SAMPLE_BYTES * SAMPLE_BYTES], "<i2")
 
 
 def _cut_off(_: Path) -> PulsePlayer:
@@ -271,7 +271,7 @@ def _fill(player: Player) -> int:
     sent = 0
     while taken := player.offer(memoryview(bytes(_PIECE))):
         sent += taken
-        assert sent < 10 * RATE * SAMPLE, "it is never full"
+        assert sent < 10 * RATE * SAMPLE_BYTES, "it is never full"
     return sent
 
 
@@ -354,12 +354,12 @@ def test_the_null_player_takes_the_time_that_its_sound_would() -> None:
     player = NullPlayer(RATE)
     began = time.monotonic()
     _offer(player, SOUND[: len(SOUND) // 2])
-    while player.consumed() / SAMPLE / RATE > time.monotonic() - began:
+    while player.consumed() / SAMPLE_BYTES / RATE > time.monotonic() - began:
         time.sleep(0.005)  # that it runs dry is no event
     time.sleep(0.1)
     _offer(player, SOUND[len(SOUND) // 2 :])
     _finish(player)
-    assert time.monotonic() - began >= len(SOUND) / SAMPLE / RATE + 0.1
+    assert time.monotonic() - began >= len(SOUND) / SAMPLE_BYTES / RATE + 0.1
     _end(player)
 
 

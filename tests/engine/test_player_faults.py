@@ -15,9 +15,9 @@ import pytest
 from talkcli import processes
 from talkcli.engine import protocol
 from talkcli.engine.child import playback
-from talkcli.engine.child.players import Command
 from talkcli.engine.child.players.child import Child
 from talkcli.engine.child.players.program import ProgramPlayer
+from talkcli.engine.players import PlayerCommand
 from tests.engine.programs import NEVER_READS, PLAYS, SWALLOWS, Player
 from tests.engine.spawned import FAST, SOON, Spawned
 from tests.support import census
@@ -396,7 +396,7 @@ def test_a_process_that_left_its_session_and_closed_its_descriptors_is_left_alon
 
 @pytest.mark.parametrize(("at_start", "pieces"), [(0, 1), (3528, 4), (2000, 3)])
 def test_a_player_finds_enough_to_begin_and_then_a_piece_at_a_time(at_start: int, pieces: int) -> None:
-    player = ProgramPlayer(Command("sleep", ("sleep", "100"), read_ahead=0, at_start=at_start))
+    player = ProgramPlayer(PlayerCommand("sleep", ("sleep", "100"), read_ahead=0, at_start=at_start))
     taken = []
     while size := player.offer(memoryview(bytes(882))):
         taken.append(size)

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine import protocol
-from talkcli.engine.child import players
-from talkcli.engine.child.players import PACKAGES, PLAYERS, commands, devices
+from talkcli.engine import players, protocol
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.choice import Players
 from talkcli.engine.child.players.program import LONGEST_LINE, Complaint, ProgramPlayer
 from talkcli.engine.child.players.wav import WavPlayer, WavStreamPlayer
+from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, player_commands
 from tests.engine.spawned import Spawned
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ def there(monkeypatch: pytest.MonkeyPatch) -> There:
 
 
 def _names(player: str | None, last: str | None = None) -> list[str]:
-    return [command.name for command in commands(player, None, 22050, last)]
+    return [command.name for command in player_commands(player, None, 22050, last)]
 
 
 def test_the_players_that_are_there_are_tried_and_the_one_that_worked_comes_first(there: There) -> None:
@@ -51,7 +50,7 @@ def test_the_players_that_are_there_are_tried_and_the_one_that_worked_comes_firs
 )
 def test_the_device_is_given_in_the_players_own_words(there: There, player: str, expected: list[str]) -> None:
     there({player})
-    (command,) = commands(player, "usb", 16000)
+    (command,) = player_commands(player, "usb", 16000)
     assert list(command.argv[-len(expected) :]) == expected
     assert "16000" in " ".join(command.argv) or b"\x80\x3e\x00\x00" in command.preamble
 
@@ -70,7 +69,7 @@ def test_a_player_with_a_name_that_is_no_program_is_built_in(sink: Sink, monkeyp
 
 def test_a_command_line_is_split_without_a_shell(there: There) -> None:
     there({"/opt/my"})
-    (command,) = commands("/opt/my player -r{rate} '{device} x' $HOME", None, 22050)
+    (command,) = player_commands("/opt/my player -r{rate} '{device} x' $HOME", None, 22050)
     assert command.argv == ("/opt/my", "player", "-r22050", "default x", "$HOME")
     assert command.name == "my"
 
@@ -87,8 +86,11 @@ def test_a_command_line_is_split_without_a_shell(there: There) -> None:
 )
 def test_a_player_that_is_not_there_is_an_error(there: There, player: str, words: str) -> None:
     there(set())
+    with pytest.raises(PlayerMissing, match=words):
+        player_commands(player, None, 22050)
+    (opens,) = Players(protocol.Configure(0, None, player, None, None)).candidates(22050)
     with pytest.raises(CannotSpeak, match=words) as caught:
-        commands(player, None, 22050)
+        opens()
     assert caught.value.reason == "no_player"
 
 
@@ -151,8 +153,8 @@ def put(path: Path, text: str = "") -> None:
 def nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, str]], bool]:
     """Tells whether nothing sounds in an environment of that container."""
     monkeypatch.setattr(os, "getuid", lambda: 4_242_424)  # this machine's user may have a sound server
-    monkeypatch.setattr(devices, "_SYSTEM_WIDE", f"{tmp_path}/system")  # and this machine
-    return lambda env: devices.nothing_sounds(env, f"{tmp_path}/snd", f"{tmp_path}/etc")
+    monkeypatch.setattr(players, "_SYSTEM_PULSE", f"{tmp_path}/system")  # and this machine
+    return lambda env: players.has_no_output(env, f"{tmp_path}/snd", f"{tmp_path}/etc")
 
 
 Nothing = Callable[[dict[str, str]], bool]
@@ -161,7 +163,7 @@ Nothing = Callable[[dict[str, str]], bool]
 def test_nothing_is_there(tmp_path: Path, bare: dict[str, str], nothing: Nothing) -> None:
     assert nothing(bare)
     assert nothing({})
-    assert devices.nothing_sounds({}, f"{tmp_path}/gone", f"{tmp_path}/gone")
+    assert players.has_no_output({}, f"{tmp_path}/gone", f"{tmp_path}/gone")
 
 
 @pytest.mark.parametrize(
@@ -200,7 +202,7 @@ def test_sound_servers_are_those_of_the_environment_and_of_the_users(tmp_path: P
     there = ["XDG_RUNTIME_DIR/pulse/native", "PULSE_RUNTIME_PATH/native", "PIPEWIRE_RUNTIME_DIR/pipewire-0"]
     for each in there:
         put(tmp_path / each)
-    found = [each.removeprefix(f"{tmp_path}/") for each in devices.sound_servers(env)]
+    found = [each.removeprefix(f"{tmp_path}/") for each in players.sound_server_sockets(env)]
     assert [each for each in found if not each.startswith("/run/")] == there
 
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.engine.child.players import libpulse
-from talkcli.engine.child.players.base import PIECE, SAMPLE, CannotSpeak
-from talkcli.engine.child.players.devices import DUMMY
+from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.pulse import PulsePlayer
+from talkcli.engine.players import DUMMY_SINK, PIECE_S, SAMPLE_BYTES
 from tests.support.pipewire import PipeWire
 from tests.support.relay import Relay
 from tests.support.surroundings import short_directory
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     MakeRig = Callable[[], AbstractContextManager["Rig"]]
 
 RATE = 22050
-_PIECE = int(PIECE * RATE) * SAMPLE
+_PIECE = int(PIECE_S * RATE) * SAMPLE_BYTES
 #: Seconds of sound: more than the server holds, so that it has to ask for some of it.
 SECONDS = 0.2
 SOUND = b"".join((number % 3000).to_bytes(2, "little") for number in range(int(SECONDS * RATE)))
@@ -211,7 +211,7 @@ def test_a_move_told_together_with_the_end_is_seen(rig: MakeRig, sink: Sink) -> 
             behind.relay.pump()
             # the newest: that of a test before this one may not be gone yet
             streams = [int(each.split("\t")[0]) for each in sink.pactl("list", "short", "sink-inputs").splitlines()]
-            sink.pactl("move-sink-input", str(max(streams)), DUMMY)
+            sink.pactl("move-sink-input", str(max(streams)), DUMMY_SINK)
             over = time.monotonic() + 2 * SECONDS
             while (rest := over - time.monotonic()) > 0:
                 waiting = select.poll()
@@ -229,7 +229,7 @@ def test_a_move_told_together_with_the_end_is_seen(rig: MakeRig, sink: Sink) -> 
 @contextmanager
 def dummy_of(sink: Sink) -> Iterator[None]:
     """Have a dummy beside the sink, which stays the default."""
-    module = sink.pactl("load-module", "module-null-sink", f"sink_name={DUMMY}").strip()
+    module = sink.pactl("load-module", "module-null-sink", f"sink_name={DUMMY_SINK}").strip()
     try:
         yield
     finally:

@@ -17,14 +17,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.child.players.base import SAMPLE, CannotSpeak, Stopped
-from talkcli.engine.child.synthesizers.base import Sound, UnknownVoice
+from talkcli.engine.child.players.base import CannotSpeak, Stopped
+from talkcli.engine.child.synthesizers.base import Sound
 from talkcli.engine.child.synthesizers.choice import Choice
 from talkcli.engine.child.synthesizers.espeak import Espeak
-from talkcli.engine.child.synthesizers.models import NEEDED
 from talkcli.engine.child.synthesizers.phonemes import pieces
 from talkcli.engine.child.synthesizers.piper import Piper
+from talkcli.engine.models import NEEDED
+from talkcli.engine.players import SAMPLE_BYTES
 from talkcli.engine.protocol import Voice
+from talkcli.engine.voices import UnknownVoice
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_VOICE, real_voice, silence_noise
 from tests.support.surroundings import needs_packages
@@ -182,7 +184,7 @@ class Tape:
 
     @property
     def seconds(self) -> float:
-        return len(self.samples) / SAMPLE / self.rate
+        return len(self.samples) / SAMPLE_BYTES / self.rate
 
     @property
     def loudest(self) -> int:
@@ -201,16 +203,16 @@ class Tape:
         assert self.rate, "the rate comes first"
         assert length > 0
         assert position >= 0
-        assert round(position * self.rate) >= len(self.samples) // SAMPLE, "a word comes before its samples"
+        assert round(position * self.rate) >= len(self.samples) // SAMPLE_BYTES, "a word comes before its samples"
         assert not self.words or position >= self.words[-1][2], "positions never decrease"
         self.words.append((start, length, position))
 
     def write(self, samples: bytes) -> None:
         self._called("write")
         assert self.rate, "the rate comes first"
-        assert len(samples) % SAMPLE == 0, "samples are whole"
+        assert len(samples) % SAMPLE_BYTES == 0, "samples are whole"
         self.samples += samples
-        self.most = max(self.most, len(samples) / SAMPLE / self.rate)
+        self.most = max(self.most, len(samples) / SAMPLE_BYTES / self.rate)
 
     def wait(self, descriptor: int) -> None:
         self._called("wait")

@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 
+from talkcli.engine import models
 from talkcli.engine.child.synthesizers import cache as caches
-from talkcli.engine.child.synthesizers import models
 from talkcli.engine.child.synthesizers.cache import Cache
-from talkcli.engine.child.synthesizers.models import BadFile, describe, found, open_checked, voices
+from talkcli.engine.models import BadFile, describe, found, open_checked, voices
 from talkcli.engine.protocol import Voice
 from talkcli.paths import cache_directory, voice_directories
 from tests.support import tiny_voice

@@ -14,8 +14,8 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.child.synthesizers import espeak
-from talkcli.engine.child.synthesizers.voices import find_voice, languages, list_voices, unknown_voice
 from talkcli.engine.protocol import Voice
+from talkcli.engine.voices import find_voice, languages, list_voices, unknown_voice
 from tests.engine.spawned import USUAL, Spawned
 from tests.support.reference import Sentence, render
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from talkcli.engine.child.players.devices import DUMMY
 from talkcli.engine.child.players.pulse import SUSPENDED_FOR
+from talkcli.engine.players import DUMMY_SINK
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
 from tests.support.census import descendants
 from tests.support.pipewire import PipeWire
@@ -159,14 +159,14 @@ def test_a_stream_that_is_moved_to_another_device_goes_on_there(talk: Talk, serv
 
 def test_a_dummy_is_no_output_unless_it_is_named(make_talk: MakeTalk, server: Server, card: Card) -> None:
     with contextlib.ExitStack() as stack:
-        if DUMMY not in server.pactl("list", "short", "sinks"):
-            stack.enter_context(_loaded(server, DUMMY))
-        _make_default(server, DUMMY)
+        if DUMMY_SINK not in server.pactl("list", "short", "sinks"):
+            stack.enter_context(_loaded(server, DUMMY_SINK))
+        _make_default(server, DUMMY_SINK)
         done = (talk := make_talk(env=server.env)).run("say", "--wait", "--", LOW)
         goal = talk.goal(done.id)
         assert_aborted(goal, "audio_device", "the sound server has only a dummy output")
         assert (done.code, goal["spoken"]) == (4, "")
-        talk = make_talk("--player", "pulse", "--device", DUMMY, "--rate", "450", env=server.env)
+        talk = make_talk("--player", "pulse", "--device", DUMMY_SINK, "--rate", "450", env=server.env)
         assert talk.run("say", "--wait", "--", LOW).code == 0
         server.pactl("set-default-sink", card.name)
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.daemon.systemd import RETRY_AFTER, STATUS_AFTER
-from talkcli.engine.child.synthesizers.models import NEEDED
+from talkcli.engine.models import NEEDED
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
 from tests.faults.broken import write
 from tests.faults.supervisor import Supervisor

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from talkcli.engine.child.synthesizers.models import NEEDED
+from talkcli.engine.models import NEEDED
 from tests.readme.blocks import block, commands, runs
 from tests.readme.shell import Shell
 from tests.support.compare import assert_heard

@@ -6,7 +6,7 @@ import json
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from talkcli.engine.child.synthesizers.models import NEEDED
+from talkcli.engine.models import NEEDED
 from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:

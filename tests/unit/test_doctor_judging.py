@@ -17,7 +17,7 @@ from talkcli.doctor.sentence import Played, behind
 from talkcli.doctor.server import Place, Places
 from talkcli.doctor.sound import Devices, Level, Players, SoundServer
 from talkcli.doctor.voice import Engine, Setting
-from talkcli.engine.child.players.devices import DUMMY
+from talkcli.engine.players import DUMMY_SINK
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.states import State
@@ -418,7 +418,7 @@ def test_a_sound_server_that_answers_needs_no_program() -> None:
 
 
 def test_a_sound_server_with_only_a_dummy_output_is_not_heard() -> None:
-    found = judged("sound server", server=replace(PULSE, sink=DUMMY))
+    found = judged("sound server", server=replace(PULSE, sink=DUMMY_SINK))
     assert (found.state, found.next) == (
         WARNING, "plug in a loudspeaker, and look whether it is there: pactl list short sinks"
     )  # fmt: skip

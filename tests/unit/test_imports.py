@@ -18,6 +18,8 @@ import pytest
 
 import talkcli
 from talkcli.cli.commands import COMMANDS
+from talkcli.engine.players import PLAYERS
+from talkcli.engine.voices import SYNTHESIZERS
 from tests.support.surroundings import needs
 
 PACKAGE = Path(talkcli.__file__).parent
@@ -168,6 +170,8 @@ def test_every_module_is_used() -> None:
     used: set[str] = set()
     runs = {each for command in COMMANDS.values() for each in (command.runs, command.several) if each}
     new = {"__main__", "engine.child.main", "", *(f"cli.{each.partition(':')[0]}" for each in runs)}
+    new |= {f"engine.child.players.{each.opens.partition(':')[0]}" for each in PLAYERS.values() if each.opens}
+    new |= {f"engine.child.synthesizers.{each.partition(':')[0]}" for each in SYNTHESIZERS.values()}
     while new:
         used |= new
         new = {name for module in new for name, _ in inside(module)} - used
@@ -235,6 +239,13 @@ def test_server_doctor_and_fleet_are_imported_only_if_they_are_asked_for() -> No
                 assert each.function or each.typing or module in OF_THE_FLEET, where
 
 
+def test_only_the_engine_imports_its_process() -> None:
+    """The server, doctor and the commands use the tables in `engine` itself, and its `parent`."""
+    for module in sources():
+        if part(module) != "engine":
+            assert not {name for name, _ in inside(module) if name.startswith("engine.child")}, module
+
+
 #: Other modules that may end the process on the spot, as the server does on its second signal.
 ENDING = {"server.run": {"os._exit"}, "engine.child.main": {"os._exit"}}
 #: Other modules that may write to standard error: the log, and the engine process, whose server reads it.
@@ -283,7 +294,7 @@ def test_a_client_loads_nothing_heavy(statement: str, without: list[str]) -> Non
 JUDGING = ["machine", "voice", "neural", "sound", "server", "sentence", "broker", "report"]
 #: Modules that the doctor's judgements may call besides each other; a clock's format is all that they read.
 FOR_JUDGING = {
-    *("talkcli.engine.child.players", "talkcli.fleet.presence", "talkcli.goals.options", "talkcli.goals.states"),
+    *("talkcli.engine.players", "talkcli.fleet.presence", "talkcli.goals.options", "talkcli.goals.states"),
     *("talkcli.terminal.goals", "talkcli.terminal.text", "talkcli.frozen"),
 }
 

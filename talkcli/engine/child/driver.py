@@ -9,14 +9,23 @@ import contextlib
 import os
 import sys
 import types
+from importlib import import_module
 
 from talkcli import install
 from talkcli.engine.child.playback import Playback
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
-from talkcli.engine.child.synthesizers import SYNTHESIZERS, is_own
-from talkcli.engine.child.synthesizers.base import NotInstalled, Sound, UnknownVoice
-from talkcli.engine.child.synthesizers.voices import find_voice, is_neural, language_of, list_voices, unknown_voice
+from talkcli.engine.child.synthesizers.base import NotInstalled, Sound
 from talkcli.engine.protocol import Ready, StartFailed
+from talkcli.engine.voices import (
+    SYNTHESIZERS,
+    UnknownVoice,
+    find_voice,
+    is_neural,
+    is_own_driver,
+    language_of,
+    list_voices,
+    unknown_voice,
+)
 from talkcli.frozen import TYPE_CHECKING, fields, replace
 from talkcli.goals.options import model_of
 
@@ -49,7 +58,7 @@ def start(configure: Configure, session: Session) -> Ready:
         import pyttsx3
     except ModuleNotFoundError as error:
         raise CannotStart(f"pyttsx3 is missing ({error}): {install.command('pyttsx3')}") from error
-    own = is_own(configure.driver)
+    own = is_own_driver(configure.driver)
     shown = configure.driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
     name = f"talk_{shown}" if own else shown
     made = _register_own(shown, name, session) if own else None
@@ -70,7 +79,8 @@ def start(configure: Configure, session: Session) -> Ready:
 def _register_own(synthesizer: str, driver: str, session: Session) -> Choice:
     """Make a synthesizer, and put a driver for it among pyttsx3's."""
     try:
-        made = SYNTHESIZERS[synthesizer]()
+        module, _, function = SYNTHESIZERS[synthesizer].partition(":")
+        made: Choice = getattr(import_module(f"talkcli.engine.child.synthesizers.{module}"), function)()
     except NotInstalled as error:
         raise CannotStart(str(error)) from error
     except UnknownVoice as error:  # not even its own: a part of it is missing
@@ -196,7 +206,7 @@ class Settings:
             self._voices = list_voices(self._engine)
             found = find_voice(wanted, self._voices)
         if found is None:
-            foreign = None if is_own(self._driver) else self._driver
+            foreign = None if is_own_driver(self._driver) else self._driver
             raise CannotSpeak("unknown_voice", unknown_voice(wanted, self._voices, foreign))
         return found.id
 

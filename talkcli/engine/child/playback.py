@@ -9,9 +9,10 @@ from __future__ import annotations
 import select
 import time
 
-from talkcli.engine.child.players.base import PIECE, SAMPLE, CannotEnd, CannotSpeak, Stopped
+from talkcli.engine.child.players.base import CannotEnd, CannotSpeak, Stopped
 from talkcli.engine.child.stream import Samples, Stream
 from talkcli.engine.child.words import TimedWord, WordClock
+from talkcli.engine.players import PIECE_S, SAMPLE_BYTES
 from talkcli.frozen import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
@@ -178,7 +179,7 @@ class Playback:
         while not player.gone():
             if time.monotonic() >= limit:
                 raise CannotEnd(f"{player.name} could not be ended within {GONE_WITHIN:g} s")
-            self._wait((), time.monotonic() + PIECE)
+            self._wait((), time.monotonic() + PIECE_S)
         if player.real_time and player.proven:
             self._players.let_go(self._silent_at)
 
@@ -344,7 +345,7 @@ class Playback:
         """Return the end of what is to be played: less silence where a goal waits, and for as long as one may come."""
         if not stream.player.real_time or (self._complete and not self._players.gap.followed):
             return self._samples.end
-        most = int(self._players.gap.allowance(stream.player.name) * self._rate) * SAMPLE
+        most = int(self._players.gap.allowance(stream.player.name) * self._rate) * SAMPLE_BYTES
         return max(self._sent, self._samples.end - self._samples.quiet_end(most))
 
     def _tick(self, stream: Stream) -> None:
@@ -439,7 +440,7 @@ class Playback:
         moments = [until, player.wake_at(), self._clock.next_due() if player.proven else None]
         idle = more is not None or self._full(stream)
         if idle:
-            moments[1] = now + PIECE
+            moments[1] = now + PIECE_S
         if stream.taken < stream.written:  # a player that takes a part of what waits wakes nobody
             moments.append(now + LOOK_EVERY)
         # Where nothing is to be written, not for room to write.
@@ -456,8 +457,8 @@ class Playback:
 
     def _unheard(self) -> int:
         """Return the bytes before those that may not have been heard yet, of those that this player got."""
-        heard = int(max(0.0, self._clock.heard(time.monotonic()) - SAID_AGAIN) * self._rate) * SAMPLE
+        heard = int(max(0.0, self._clock.heard(time.monotonic()) - SAID_AGAIN) * self._rate) * SAMPLE_BYTES
         return min(self._sent, max(self._begin, self._samples.begin, heard))
 
     def _seconds(self, length: int) -> float:
-        return length / (self._rate * SAMPLE)
+        return length / (self._rate * SAMPLE_BYTES)

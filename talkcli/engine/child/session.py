@@ -18,8 +18,8 @@ from collections import deque
 
 from talkcli.engine import protocol
 from talkcli.engine.child.players.base import CannotSpeak
-from talkcli.engine.child.synthesizers.voices import list_voices
 from talkcli.engine.child.words import Words
+from talkcli.engine.voices import list_voices
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.protocol.lines import LineSplitter
 

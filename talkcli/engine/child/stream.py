@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from array import array
 
-from talkcli.engine.child.players.base import PIECE, SAMPLE
+from talkcli.engine.players import PIECE_S, SAMPLE_BYTES
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -52,11 +52,11 @@ class Samples:
         self.speaks = self.speaks or samples.count(0) != len(samples)
         last = reversed(array("h", samples))
         loud = next((number for number, each in enumerate(last) if abs(each) > QUIET), None)
-        self._quiet = self._quiet + len(samples) if loud is None else loud * SAMPLE
+        self._quiet = self._quiet + len(samples) if loud is None else loud * SAMPLE_BYTES
 
     def zeros(self) -> int:
         """Return how many bytes at the beginning are zero samples."""
-        return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE * SAMPLE
+        return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
     def part(self, begin: int, end: int) -> memoryview:
         """Return the samples between two places. It must be released before more are added or forgotten."""
@@ -78,7 +78,7 @@ class Stream:
     def __init__(self, player: Player, rate: int, clock: WordClock, begin: float, lead_in: float) -> None:
         self.player = player
         #: bytes that are offered at once
-        self.piece = int(PIECE * rate) * SAMPLE
+        self.piece = int(PIECE_S * rate) * SAMPLE_BYTES
         #: bytes that the player has taken, by its own count, when it last grew; silence included, as in the next
         self.taken = 0
         #: bytes that were written to it
@@ -92,7 +92,7 @@ class Stream:
         #: when all of it will have been heard
         self._over_at = 0.0
         #: bytes of silence that are to be written before the first sample
-        self.lead_in = int(lead_in * rate) * SAMPLE if player.real_time else 0
+        self.lead_in = int(lead_in * rate) * SAMPLE_BYTES if player.real_time else 0
         self.begin(begin)
 
     def begin(self, position: float) -> None:
@@ -153,4 +153,4 @@ class Stream:
         return self._first_write + self._seconds(self.written) - now
 
     def _seconds(self, length: int) -> float:
-        return length / (self._rate * SAMPLE)
+        return length / (self._rate * SAMPLE_BYTES)

@@ -10,11 +10,12 @@ import contextlib
 import time
 from collections import deque
 from functools import partial
+from importlib import import_module
 
-from talkcli.engine.child.players import FILE, PLAYERS, commands, sound_server
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.program import ProgramPlayer
 from talkcli.engine.child.players.wav import WavPlayer, WavStreamPlayer
+from talkcli.engine.players import FILE_PREFIX, PLAYERS, PlayerMissing, player_commands
 from talkcli.frozen import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from talkcli.engine.child.players.base import Player
     from talkcli.engine.protocol import Configure, Say
     from talkcli.goals.goal import Output
+
+#: The players that are tried before the programs if neither a player nor a device is named.
+_AUTOMATIC = [name for name, each in PLAYERS.items() if each.automatic and each.opens]
 
 #: Seconds after which a device that was let go of counts as idle, and gets the lead-in again: the power saving of sound
 #: cards (snd_hda_intel) begins after 1 s where it is on, sound servers suspend a device after 5 s. Silence counts as
@@ -91,7 +95,7 @@ class Players:
         #: opens the player that is no program, for samples per second; None where programs play
         self._built_in = self._opens()
         #: whether what plays takes the time of its sound, and a while to begin: all but a file
-        self.takes_time = configure.output is None and not (configure.player or "").startswith(FILE)
+        self.takes_time = configure.output is None and not (configure.player or "").startswith(FILE_PREFIX)
         #: whether nothing says what is to play
         self._any = configure.player is configure.device is None
         self._streaming = False
@@ -115,11 +119,11 @@ class Players:
             yield partial(self._built_in, rate)
             return
         if self._any:
-            yield partial(sound_server, rate, None, self._audible)
+            yield from (partial(_open, name, rate, None, self._audible) for name in _AUTOMATIC)
         try:
-            found = commands(self._configure.player, self._configure.device, rate, self.worked)
-        except CannotSpeak as error:
-            yield partial(_fail, error)
+            found = player_commands(self._configure.player, self._configure.device, rate, self.worked)
+        except PlayerMissing as error:
+            yield partial(_fail, CannotSpeak("no_player", str(error)))
             return
         yield from (partial(ProgramPlayer, command, self._inherited) for command in found)
 
@@ -163,28 +167,37 @@ class Players:
             return WavStreamPlayer.name
         if self._configure.player is not None:
             return self._configure.player
-        if self._any:
+        for name in _AUTOMATIC if self._any else ():
             with contextlib.suppress(CannotSpeak):
-                server = sound_server(1)
-                server.kill()
-                return server.name
+                player = _open(name, 1)
+                player.kill()
+                return player.name
         try:
-            return commands(None, None, 1, self.worked)[0].name
-        except CannotSpeak:
+            return player_commands(None, None, 1, self.worked)[0].name
+        except PlayerMissing:
             return None
 
     def _opens(self) -> Callable[[int], Player] | None:
         player, device, output = self._configure.player or "", self._configure.device, self._configure.output
         if output is not None:
             return partial(self._stream, output)
-        if player.startswith(FILE):
-            return partial(WavPlayer, player.removeprefix(FILE))
-        opens = PLAYERS[player].opens if player in PLAYERS else None
-        return opens and (lambda rate: opens(rate, device, self._audible))
+        if player.startswith(FILE_PREFIX):
+            return partial(WavPlayer, player.removeprefix(FILE_PREFIX))
+        if player in PLAYERS and PLAYERS[player].opens:
+            return lambda rate: _open(player, rate, device, self._audible)
+        return None
 
     def _stream(self, output: int, rate: int) -> WavStreamPlayer:
         first, self._streaming = not self._streaming, True
         return WavStreamPlayer(output, rate, first=first)
+
+
+def _open(name: str, rate: int, device: str | None = None, audible: bool = False) -> Player:
+    """Open the player of a row in PLAYERS that is not a program."""
+    module, _, member = PLAYERS[name].opens.partition(":")
+    opens = getattr(import_module(f"talkcli.engine.child.players.{module}"), member)
+    player: Player = opens(rate, device, audible)
+    return player
 
 
 def _fail(error: CannotSpeak) -> Player:

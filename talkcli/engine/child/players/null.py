@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import time
 
-from talkcli.engine.child.players.base import SAMPLE, BuiltIn
+from talkcli.engine.child.players.base import BuiltIn
+from talkcli.engine.players import SAMPLE_BYTES
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -23,9 +24,16 @@ class NullPlayer(BuiltIn):
     name = "null"
     real_time = True
 
-    def __init__(self, rate: int, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        rate: int,
+        _device: str | None = None,
+        _audible: bool = False,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         super().__init__()
-        self._bytes_per_second = rate * SAMPLE
+        self._bytes_per_second = rate * SAMPLE_BYTES
         self._clock = clock
         self._started: float | None = None
 

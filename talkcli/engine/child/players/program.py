@@ -23,8 +23,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from talkcli.engine.child.players import Command
     from talkcli.engine.child.players.base import Interest
+    from talkcli.engine.players import PlayerCommand
 
 #: Seconds that a player which closed its input is given to end and to say why, before it is killed.
 LAST_WORDS = 0.5
@@ -92,7 +92,7 @@ class ProgramPlayer(Player):
 
     real_time = True
 
-    def __init__(self, command: Command, inherited: Sequence[int] = ()) -> None:
+    def __init__(self, command: PlayerCommand, inherited: Sequence[int] = ()) -> None:
         """Start the player; CannotSpeak (no_player) if that is impossible. It inherits the descriptors given."""
         self.name = command.name
         self.proven = False

@@ -11,8 +11,8 @@ import time
 from ctypes import byref, c_uint64
 
 from talkcli.engine.child.players import libpulse
-from talkcli.engine.child.players.base import SAMPLE, CannotSpeak, Player
-from talkcli.engine.child.players.devices import DUMMY
+from talkcli.engine.child.players.base import CannotSpeak, Player
+from talkcli.engine.players import DUMMY_SINK, SAMPLE_BYTES
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Output
 
@@ -60,7 +60,7 @@ class PulsePlayer(Player):
     name = "pulse"
     real_time = True
 
-    def __init__(self, rate: int, device: str | None = None, *, audible: bool = False) -> None:
+    def __init__(self, rate: int, device: str | None = None, audible: bool = False) -> None:
         """Connect; CannotSpeak (no_player) where no server answers.
 
         `device`: a sink's name, None for the server's choice. `audible`: it fails (muted) where it is muted.
@@ -140,9 +140,9 @@ class PulsePlayer(Player):
             self._heard = self._written
         elif self._told is not None:
             seconds, at = self._told
-            heard = int((seconds + time.monotonic() - at) * self._rate) * SAMPLE
+            heard = int((seconds + time.monotonic() - at) * self._rate) * SAMPLE_BYTES
             self._heard = max(self._heard, min(heard, self._written if self._dry_at is None else self._dry_at))
-        return self._heard / (self._rate * SAMPLE)
+        return self._heard / (self._rate * SAMPLE_BYTES)
 
     def close(self) -> None:
         """Have what was written played to its end."""
@@ -239,7 +239,7 @@ class PulsePlayer(Player):
         return False
 
     def _open(self) -> bool:
-        held, asked = (each * self._rate // 1000 * SAMPLE for each in (BUFFER_MS, REQUEST_MS))
+        held, asked = (each * self._rate // 1000 * SAMPLE_BYTES for each in (BUFFER_MS, REQUEST_MS))
         sizes = libpulse.BufferSizes(2 * held, held, held, asked, libpulse.NONE)
         spec = libpulse.SampleSpec(libpulse.S16LE, self._rate, 1)
         self._stream = self._lib.stream_new(self._context, b"talk", byref(spec), None)
@@ -263,7 +263,7 @@ class PulsePlayer(Player):
             begins, self._index = self._index == libpulse.NONE, index
             self._settled_at = time.monotonic() + SETTLED_AFTER if begins else self._settled_at
             self.device = (self._lib.stream_get_device_name(self._stream) or b"").decode("utf-8", "replace")
-            if self.device == DUMMY != self._wanted:
+            if self.device == DUMMY_SINK != self._wanted:
                 self._failed = _dummy(begins)
             self._ask_sink()
             if begins:
@@ -360,7 +360,7 @@ class PulsePlayer(Player):
         if self._audible and not (self._untold or self.output):
             return 0  # for less than 1 ms
         room = self._lib.stream_writable_size(self._stream)
-        return 0 if room == libpulse.FAILED else room // SAMPLE * SAMPLE
+        return 0 if room == libpulse.FAILED else room // SAMPLE_BYTES * SAMPLE_BYTES
 
     def _started(self, *_: Any) -> None:
         self.proven, self._dry_at = True, None

@@ -13,7 +13,8 @@ import select
 import stat
 import struct
 
-from talkcli.engine.child.players.base import SAMPLE, BuiltIn, CannotSpeak
+from talkcli.engine.child.players.base import BuiltIn, CannotSpeak
+from talkcli.engine.players import SAMPLE_BYTES
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -146,7 +147,21 @@ def _open(path: str) -> int:
 
 def _fields(rate: int, rest: int, length: int) -> tuple[bytes | int, ...]:
     """Return what is in a header; `rest`: the bytes behind where that is told, `length`: those of the samples."""
-    return b"RIFF", rest, b"WAVE", b"fmt ", 16, 1, 1, rate, rate * SAMPLE, SAMPLE, 8 * SAMPLE, b"data", length
+    return (
+        b"RIFF",
+        rest,
+        b"WAVE",
+        b"fmt ",
+        16,
+        1,
+        1,
+        rate,
+        rate * SAMPLE_BYTES,
+        SAMPLE_BYTES,
+        8 * SAMPLE_BYTES,
+        b"data",
+        length,
+    )
 
 
 def _data_length(file: int, path: str, rate: int) -> int:

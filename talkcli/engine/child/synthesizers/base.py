@@ -20,10 +20,6 @@ class NotInstalled(Exception):
     """A part that a synthesizer needs is not there, until somebody installs it: the text says what."""
 
 
-class UnknownVoice(Exception):
-    """A voice can't be had; the text says why, as a user would read it behind "it cannot be loaded"."""
-
-
 @frozen
 class Sound:
     """How a sentence is to sound, besides its voice. What it is where nobody asks for another is pyttsx3's."""

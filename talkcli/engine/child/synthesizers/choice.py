@@ -12,7 +12,7 @@ import traceback
 from talkcli.engine import protocol
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers.base import Sound
-from talkcli.engine.child.synthesizers.voices import is_neural
+from talkcli.engine.voices import is_neural
 from talkcli.frozen import TYPE_CHECKING, replace
 
 if TYPE_CHECKING:
@@ -20,6 +20,13 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.espeak import Espeak
     from talkcli.engine.child.synthesizers.piper import Piper
     from talkcli.engine.protocol import Drop, Grown, Load, Loaded, Unloaded, Voice
+
+
+def make_espeak() -> Choice:
+    """Make the default synthesizer; NotInstalled."""
+    from talkcli.engine.child.synthesizers.espeak import Espeak
+
+    return Choice(Espeak())
 
 
 class Choice:
@@ -34,7 +41,7 @@ class Choice:
 
     def voices(self) -> tuple[Voice, ...]:
         """Return libespeak-ng's voices, its variants, and the neural voices whose files are there now."""
-        from talkcli.engine.child.synthesizers import models
+        from talkcli.engine import models
 
         return (*self._espeak.voices(), *models.voices())
 

@@ -14,13 +14,13 @@ import itertools
 import os
 
 from talkcli import install
-from talkcli.engine.child.players import on_path
-from talkcli.engine.child.players.base import SAMPLE, CannotSpeak, Stopped
+from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers import guard
-from talkcli.engine.child.synthesizers.base import NotInstalled, UnknownVoice
-from talkcli.engine.child.synthesizers.voices import VARIANT, find_voice
+from talkcli.engine.child.synthesizers.base import NotInstalled
 from talkcli.engine.child.words import letters
+from talkcli.engine.players import SAMPLE_BYTES, on_path
 from talkcli.engine.protocol import Voice
+from talkcli.engine.voices import VARIANT, UnknownVoice, find_voice
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -281,7 +281,7 @@ class Espeak:
                 if word is not None:
                     output.word(*word, event.sample / self._rate)
         if samples and count > 0:
-            output.write(ctypes.string_at(samples, count * SAMPLE))
+            output.write(ctypes.string_at(samples, count * SAMPLE_BYTES))
 
 
 class Spelling:

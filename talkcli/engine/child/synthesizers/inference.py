@@ -13,8 +13,8 @@ import hashlib
 import os
 
 from talkcli.engine.child.synthesizers.cache import AT_ONCE
-from talkcli.engine.child.synthesizers.models import BEGIN, END, NO_TELEMETRY, PAD, BadFile, open_checked
 from talkcli.engine.child.synthesizers.vits import NotCut, halves
+from talkcli.engine.models import BEGIN, END, NO_TELEMETRY, PAD, BadFile, open_checked
 from talkcli.frozen import TYPE_CHECKING, frozen
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.child.synthesizers.cache import Cache
-    from talkcli.engine.child.synthesizers.models import Description
     from talkcli.engine.child.synthesizers.vits import Buffer
+    from talkcli.engine.models import Description
 
 os.environ.update(NO_TELEMETRY)  # before onnxruntime is imported
 

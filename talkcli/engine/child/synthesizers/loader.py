@@ -13,13 +13,14 @@ import traceback
 from collections import deque
 
 from talkcli import install
-from talkcli.engine.child.synthesizers import memory, models
+from talkcli.engine import models
+from talkcli.engine.child.synthesizers import memory
 from talkcli.engine.child.synthesizers.cache import Cache
 from talkcli.engine.child.synthesizers.inference import Model, load_libraries
-from talkcli.engine.child.synthesizers.models import BadFile
-from talkcli.engine.child.synthesizers.voices import NEURAL
 from talkcli.engine.child.synthesizers.work import Work
+from talkcli.engine.models import BadFile
 from talkcli.engine.protocol import LOAD_LIMIT, Grown, Loaded, Unloaded
+from talkcli.engine.voices import NEURAL
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.paths import cache_directory
 

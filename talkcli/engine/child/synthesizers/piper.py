@@ -10,15 +10,15 @@ from __future__ import annotations
 import contextlib
 import itertools
 
-from talkcli.engine.child.players.base import SAMPLE, CannotSpeak
-from talkcli.engine.child.synthesizers import models
-from talkcli.engine.child.synthesizers.base import UnknownVoice
+from talkcli.engine import models
+from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.synthesizers.inference import Run
 from talkcli.engine.child.synthesizers.loader import Loader
-from talkcli.engine.child.synthesizers.models import BEGIN, END, PAD, BadFile
 from talkcli.engine.child.synthesizers.phonemes import STOPS, pieces
-from talkcli.engine.child.synthesizers.voices import NEURAL, language_of, speaker_number
 from talkcli.engine.child.synthesizers.work import Work
+from talkcli.engine.models import BEGIN, END, PAD, BadFile
+from talkcli.engine.players import SAMPLE_BYTES
+from talkcli.engine.voices import NEURAL, UnknownVoice, language_of, speaker_number
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.options import SPEAKER
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.base import Output, Sound
     from talkcli.engine.child.synthesizers.espeak import Espeak
     from talkcli.engine.child.synthesizers.inference import Model
-    from talkcli.engine.child.synthesizers.models import Description
     from talkcli.engine.child.synthesizers.phonemes import Piece
+    from talkcli.engine.models import Description
     from talkcli.engine.protocol import Voice
 
 #: Frames that are made into samples at once, at first and at most: 0.23 s of sound, so that the first is soon there,
@@ -167,7 +167,7 @@ class Piper:
         """Write what a thread makes of the pieces, which are spelled there, too, as they are needed."""
         run = Run()
         rate = model.description.rate
-        at_once = int(_AT_ONCE * rate) * SAMPLE
+        at_once = int(_AT_ONCE * rate) * SAMPLE_BYTES
         seconds = 0.0
         work = Work(_made(model, spelled, speaker, sound, run), _AHEAD)
         try:
@@ -176,7 +176,7 @@ class Piper:
                     output.word(start, length, seconds + position)
                 for at in range(0, len(made.samples), at_once):
                     output.write(made.samples[at : at + at_once])
-                seconds += len(made.samples) / SAMPLE / rate
+                seconds += len(made.samples) / SAMPLE_BYTES / rate
         finally:
             run.end()
             work.close()
@@ -220,7 +220,7 @@ def _made(model: Model, spelled: Iterator[Piece], speaker: int, sound: Sound, ru
         if loudest < _SILENT:
             raise BadFile(f"{model.path} makes no sound of a text: get the voice anew")
         if piece.ends and faint < pause:
-            yield Made(bytes((pause - faint) * SAMPLE))
+            yield Made(bytes((pause - faint) * SAMPLE_BYTES))
     if lacking and not known:
         why = f"has no number for a sound of the text ({lacking[:20]})"
         raise BadFile(f"{model.path}.json {why}: get both files from the same place")

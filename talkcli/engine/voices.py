@@ -17,7 +17,6 @@ import re
 import sys
 
 from talkcli import install
-from talkcli.engine.child.synthesizers.base import UnknownVoice
 from talkcli.engine.protocol import Voice
 from talkcli.goals.options import SPEAKER
 
@@ -40,6 +39,20 @@ _NEAR, _CUTOFF = 3, 0.7
 _WITH_REGION = re.compile(r"([a-z]{2,3})-(?:[a-z]{2}|[0-9]{3})")
 #: Characters of an unknown word that are repeated in the message.
 _SHOWN = 60
+
+
+#: The synthesizers by their names for --driver, the default first. Each is made by "module:function" in
+#: `talkcli.engine.child.synthesizers`, and replaces the driver of pyttsx3 that has the same name.
+SYNTHESIZERS = {"espeak": "choice:make_espeak"}
+
+
+class UnknownVoice(Exception):
+    """A voice can't be loaded; the text says why, as a user would read it after "it cannot be loaded"."""
+
+
+def is_own_driver(driver: str | None) -> bool:
+    """Return whether a driver of `talk` speaks, which plays through a player; other drivers play by themselves."""
+    return sys.platform.startswith("linux") and driver in (None, *SYNTHESIZERS)
 
 
 def list_voices(engine: Any) -> tuple[Voice, ...]:

@@ -14,8 +14,8 @@ import stat
 import sys
 
 from talkcli import install
-from talkcli.engine.child.synthesizers.voices import NEURAL
 from talkcli.engine.protocol import Voice
+from talkcli.engine.voices import NEURAL
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.options import SPEAKER
 from talkcli.paths import voice_directories

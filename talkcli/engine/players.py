@@ -1,0 +1,236 @@
+"""The players that `talk` knows by name, the command lines of player programs, and whether any device is there.
+
+Nothing is started or opened here, so the server, doctor and the command line may use this module. The classes that play
+are in `talkcli.engine.child.players`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+
+from talkcli.frozen import TYPE_CHECKING, frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+#: Bytes of one sample: signed 16 bit, one channel.
+SAMPLE_BYTES = 2
+
+#: Seconds of sound that a player is offered at a time. A short piece keeps little sound on its way when speech stops.
+PIECE_S = 0.02
+
+#: Milliseconds of sound that a player may buffer. Buffered sound delays words and is lost in a stall. With fewer than
+#: three periods of 20 ms, a busy machine makes gaps.
+BUFFER_MS = 60
+
+#: Milliseconds of sound that wait for aplay while it starts. aplay starts to play when its buffer is full, and reads
+#: whole periods of 15 ms. If it had to ask for each piece of 20 ms, it would start 2 ms later (measured on a PC).
+APLAY_START_MS = 80
+
+#: Bytes that a program may read before it opens its device: one block of standard input. Only what it reads beyond
+#: them proves that the sound is played.
+READ_AHEAD_BYTES = 4096
+
+#: The prefix of a player that writes a file: "file:PATH".
+FILE_PREFIX = "file:"
+
+#: The name of the sink that PulseAudio and PipeWire create if they have no other; PipeWire describes it as "Dummy
+#: Output". Nobody can hear it. Every other virtual sink (echo canceller, remap, tunnel, effect) leads to a real device.
+DUMMY_SINK = "auto_null"
+#: Environment variables that name a sound server or an unusual configuration.
+_SOUND_VARIABLES = ("PULSE_SERVER", "PULSE_CLIENTCONFIG", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH")
+#: The directory in which a PulseAudio that serves all users listens.
+_SYSTEM_PULSE = "/run/pulse"
+
+
+@frozen
+class PlayerCommand:
+    """The command line of a player program."""
+
+    name: str
+    argv: tuple[str, ...]
+    #: bytes of samples that the program may read before it opens its device
+    read_ahead: int = READ_AHEAD_BYTES
+    #: bytes to write before the samples
+    preamble: bytes = b""
+    #: bytes of samples that may wait for the program while it starts, if more than one piece
+    at_start: int = 0
+
+
+@frozen
+class KnownPlayer:
+    """A player that `talk` knows by name: either a program or a class in `talkcli.engine.child.players`."""
+
+    #: what it plays to, for people
+    about: str
+    #: the Debian package to install
+    package: str = ""
+    #: builds the command line of a program from the sample rate and the device
+    command: Callable[[int, str | None], PlayerCommand] | None = None
+    #: the class as "module:Class", called with the sample rate, the device, and whether a muted output is an error
+    opens: str = ""
+    #: whether it is tried if neither a player nor a device is named; programs are also tried if only a device is named
+    automatic: bool = False
+    #: whether it makes no sound, and therefore needs no device
+    silent: bool = False
+
+
+def _aplay(rate: int, device: str | None) -> PlayerCommand:
+    argv = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "1", "-r", str(rate)]
+    argv += [f"--buffer-time={BUFFER_MS * 1000}"]
+    argv += ["-D", device] if device else []
+    # aplay opens the device before it reads.
+    return PlayerCommand("aplay", tuple(argv), read_ahead=0, at_start=APLAY_START_MS * rate // 1000 * SAMPLE_BYTES)
+
+
+def _pacat(rate: int, device: str | None) -> PlayerCommand:
+    argv = ["pacat", "--playback", "--raw", "--format=s16le", "--channels=1", f"--rate={rate}"]
+    argv += [f"--latency-msec={BUFFER_MS}", "--process-time-msec=20", "--client-name=talk", "--stream-name=talk"]
+    argv += ["-d", device] if device else []
+    # pacat reads once while it still connects, and at most one piece is there to be read.
+    return PlayerCommand("pacat", tuple(argv), read_ahead=int(PIECE_S * rate) * SAMPLE_BYTES)
+
+
+def _pw_cat(rate: int, device: str | None) -> PlayerCommand:
+    argv = ["pw-cat", "--playback", f"--latency={BUFFER_MS}ms", "--media-role=Accessibility"]
+    argv += [f"--target={device}"] if device else []
+    return PlayerCommand("pw-cat", (*argv, "-"), preamble=_au_header(rate))
+
+
+def _au_header(rate: int) -> bytes:
+    """Return the header of an AU stream of unknown length, in little-endian form.
+
+    pw-cat reads standard input through libsndfile, which needs a header that works in a pipe. The pw-cat of Debian 12
+    has no option for raw samples yet; every version reads this header.
+    """
+    unknown_length = 0xFFFFFFFF
+    pcm16 = 3
+    return b"dns." + struct.pack("<5I", 24, unknown_length, pcm16, rate, 1)
+
+
+#: The players by name. Automatic players are tried in this order, classes before programs: the sound server starts at
+#: once and reports more than any program. aplay comes first of the programs because it opens the device before it
+#: reads, so no sample is lost if that fails, and because it is installed on robots without a desktop.
+PLAYERS = {
+    "aplay": KnownPlayer("ALSA", "alsa-utils", _aplay, automatic=True),
+    "pacat": KnownPlayer("PulseAudio", "pulseaudio-utils", _pacat, automatic=True),
+    "pw-cat": KnownPlayer("PipeWire", "pipewire-bin", _pw_cat, automatic=True),
+    "pulse": KnownPlayer(
+        "the sound server, PulseAudio's or PipeWire's", "libpulse0", opens="pulse:PulsePlayer", automatic=True
+    ),
+    "null": KnownPlayer("silent, in real time", opens="null:NullPlayer", silent=True),
+}
+#: The player programs with the packages that they come in.
+PACKAGES = {name: each.package for name, each in PLAYERS.items() if each.command is not None}
+*_OTHERS, _LAST = [f"{package} ({name})" for name, package in PACKAGES.items()]
+#: The error if no player program is installed.
+NO_PLAYER = f"no player found: install {', '.join(_OTHERS)} or {_LAST}"
+
+
+class PlayerMissing(Exception):
+    """A player program is not installed, or its command line can't be parsed; the text is for people."""
+
+
+def is_silent(player: str | None) -> bool:
+    """Return whether a player never makes a sound, and therefore needs no device."""
+    return player is not None and (player.startswith(FILE_PREFIX) or (player in PLAYERS and PLAYERS[player].silent))
+
+
+def on_path(program: str, env: Mapping[str, str] | None = None) -> bool:
+    """Return whether a program can be run; a name without a slash is searched for on the PATH of `env`."""
+    places = [""] if os.sep in program else os.get_exec_path(env)
+    paths = [os.path.join(place, program) for place in places]
+    return any(os.path.isfile(each) and os.access(each, os.X_OK) for each in paths)
+
+
+def player_commands(player: str | None, device: str | None, rate: int, last: str | None = None) -> list[PlayerCommand]:
+    """Return the command lines to try, best first.
+
+    Args:
+        player: The name of a program that `talk` knows, a command line of the user's own, or None for every
+            installed program of the automatic choice.
+        device: The device to play to, or None for the program's default.
+        rate: Samples per second.
+        last: The name of the program that worked last; the automatic choice starts with it.
+
+    Raises:
+        PlayerMissing: None of them is installed.
+    """
+    if player is None:
+        programs = {name: each.command for name, each in PLAYERS.items() if each.automatic and each.command}
+        names = sorted((name for name in programs if on_path(name)), key=lambda name: name != last)
+        if not names:
+            raise PlayerMissing(NO_PLAYER)
+        return [programs[name](rate, device) for name in names]
+    command = PLAYERS[player].command if player in PLAYERS else None
+    if command is None:
+        return [_custom_command(player, device, rate)]
+    if not on_path(player):
+        raise PlayerMissing(f'player "{player}" not found: install {PACKAGES[player]}')
+    return [command(rate, device)]
+
+
+def _custom_command(player: str, device: str | None, rate: int) -> PlayerCommand:
+    import shlex
+
+    try:
+        parts = shlex.split(player)
+    except ValueError as error:
+        raise PlayerMissing(f"player command {player!r}: {str(error).lower()}") from error
+    if not parts:
+        raise PlayerMissing("player command is empty: name a program that reads samples")
+    argv = [part.replace("{rate}", str(rate)).replace("{device}", device or "default") for part in parts]
+    if not on_path(argv[0]):
+        raise PlayerMissing(f'player "{argv[0]}" not found')
+    return PlayerCommand(os.path.basename(argv[0]), tuple(argv))
+
+
+def playback_devices(nodes: str = "/dev/snd") -> list[str]:
+    """Return the kernel's playback devices, such as /dev/snd/pcmC0D0p."""
+    return [f"{nodes}/{each}" for each in _listed(nodes) if each.startswith("pcmC") and each.endswith("p")]
+
+
+def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
+    """Return the existing sockets of PulseAudio and PipeWire: those of an environment, these users and the system."""
+    runtime = [env.get("XDG_RUNTIME_DIR"), *(f"/run/user/{each}" for each in uids)]
+    found = [f"{each}/{socket}" for each in runtime if each for socket in ("pulse/native", "pipewire-0")]
+    found += [f"{each}/native" for each in (env.get("PULSE_RUNTIME_PATH"), _SYSTEM_PULSE) if each]
+    if env.get("PIPEWIRE_RUNTIME_DIR"):
+        found.append(f"{env['PIPEWIRE_RUNTIME_DIR']}/pipewire-0")
+    # Without a runtime directory, PulseAudio creates one in /tmp, with a link to it in its settings.
+    settings = f"{_settings(env)}/pulse"
+    found += [f"{settings}/{each}/native" for each in _listed(settings) if each.endswith("-runtime")]
+    return [each for each in dict.fromkeys(found) if os.path.exists(each)]
+
+
+def has_no_output(env: Mapping[str, str], nodes: str = "/dev/snd", etc: str = "/etc") -> bool:
+    """Return whether this process's players certainly have nothing to play to.
+
+    Only file names are read, so no device wakes up. Any configuration of the user's own counts as an output, because
+    it may lead anywhere.
+    """
+    if playback_devices(nodes) or any(map(env.get, _SOUND_VARIABLES)) or sound_server_sockets(env, os.getuid()):
+        return False
+    alsa = (f"{env.get('HOME', '')}/.asoundrc", f"{_settings(env)}/alsa/asoundrc", f"{etc}/asound.conf")
+    pulse = [f"{each}/pulse/client.conf" for each in (_settings(env), etc)]
+    pulse += [f"{each}.d/{name}" for each in pulse for name in _listed(f"{each}.d")]
+    return not any(map(os.path.exists, alsa)) and not any(map(_names_a_server, pulse))
+
+
+def _settings(env: Mapping[str, str]) -> str:
+    return env.get("XDG_CONFIG_HOME") or f"{env.get('HOME', '')}/.config"
+
+
+def _names_a_server(path: str) -> bool:
+    """Return whether a configuration of PulseAudio's clients names a server; the one that Debian ships doesn't."""
+    with contextlib.suppress(OSError), open(path, "rb") as file:
+        return any(line.lstrip().startswith(b"default-server") for line in file)
+    return False
+
+
+def _listed(directory: str) -> list[str]:
+    with contextlib.suppress(OSError):
+        return sorted(os.listdir(directory))
+    return []
