@@ -120,7 +120,7 @@ PLAYERS = {
     "pulse": KnownPlayer(
         "the sound server, PulseAudio's or PipeWire's", "libpulse0", opens="pulse:PulsePlayer", automatic=True
     ),
-    "null": KnownPlayer("silent, in real time", opens="null:NullPlayer", silent=True),
+    "null": KnownPlayer("silent, in real time", opens="builtin:NullPlayer", silent=True),
 }
 #: The player programs with the packages that they come in.
 PACKAGES = {name: each.package for name, each in PLAYERS.items() if each.command is not None}

@@ -41,9 +41,9 @@ _WITH_REGION = re.compile(r"([a-z]{2,3})-(?:[a-z]{2}|[0-9]{3})")
 _SHOWN = 60
 
 
-#: The synthesizers by their names for --driver, the default first. Each is made by "module:function" in
+#: The synthesizers by their names for --driver, the default first. Each is made by "module:callable" in
 #: `talkcli.engine.child.synthesizers`, and replaces the driver of pyttsx3 that has the same name.
-SYNTHESIZERS = {"espeak": "choice:make_espeak"}
+SYNTHESIZERS = {"espeak": "combined:CombinedSynthesizer"}
 
 
 class UnknownVoice(Exception):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.child.players.choice import MOST
+from talkcli.engine.child.players.chooser import MAX_CUT_S
 from tests.conformance import stopped
 from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_aborted, assert_same, await_word, heard, send
 from tests.conformance.voices import ESPEAK, with_both
@@ -130,9 +130,9 @@ def test_only_silence_is_left_out_between_queued_sentences_and_never_too_much(ta
         assert after is not None
         own = (len(references[number]) - before[1] + after[0]) / RATE
         pause = (found[number + 1].offset - found[number].offset) / RATE - found[number].expected
-        assert pause > own - MOST - LOST
+        assert pause > own - MAX_CUT_S - LOST
         whole = len(references[number]) / RATE
-        assert whole - MOST <= talk.goal(goals[number])["duration"] <= whole + 0.001
+        assert whole - MAX_CUT_S <= talk.goal(goals[number])["duration"] <= whole + 0.001
     assert abs(talk.goal(goals[-1])["duration"] - len(references[-1]) / RATE) < 0.001
 
 

@@ -16,7 +16,7 @@ from talkcli import install
 from talkcli.engine import protocol
 from talkcli.engine.child.driver import register
 from talkcli.engine.child.players.base import CannotSpeak
-from talkcli.engine.child.players.choice import Players
+from talkcli.engine.child.players.chooser import PlayerChooser
 from talkcli.engine.voices import UnknownVoice
 from tests.engine.spawned import Shared, Spawned
 from tests.engine.test_synthesizer_contract import Scripted
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.players.base import Interest
     from talkcli.engine.child.session import Session
-    from talkcli.engine.child.synthesizers.base import Output, Sound, Synthesizer
+    from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings, Synthesizer
 
 #: The parts of a driver that all have here: it has no properties, and puts itself among pyttsx3's.
 _DRIVER = """
@@ -339,7 +339,7 @@ class Told:
         #: called when a word is told, and in each wait
         self.at_word: Callable[[], None] = lambda: None
         self.at_wait: Callable[[], None] = lambda: None
-        self.players = Players(protocol.Configure(0, None, player, None, None))
+        self.players = PlayerChooser(protocol.Configure(0, None, player, None, None))
         self.held = 0
         register(_NAME, synthesizer or Scripted(), cast("Session", self))
         self.engine: Any = Engine(_NAME)
@@ -452,7 +452,7 @@ def test_a_wrong_property_is_an_error(told: Told, name: str, value: object, kind
 class Thinking(Scripted):
     """Has a little, and then nothing for long, like a synthesizer that computes."""
 
-    def speak(self, text: str, sound: Sound, output: Output) -> None:  # noqa: ARG002 - no text is spoken
+    def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:  # noqa: ARG002 - no text is spoken
         output.begin(self._RATE, "scripted")
         tone = array("h", [9000 if each % 100 < 50 else -9000 for each in range(self._RATE // 5)]).tobytes()
         output.word(0, 1, 0.0)

@@ -19,10 +19,9 @@ import numpy as np
 import pytest
 
 from talkcli.engine.child.players.base import CannotSpeak
-from talkcli.engine.child.players.null import NullPlayer
+from talkcli.engine.child.players.builtin import NullPlayer, WavPlayer, WavStreamPlayer
 from talkcli.engine.child.players.program import ProgramPlayer
 from talkcli.engine.child.players.pulse import PulsePlayer
-from talkcli.engine.child.players.wav import WavPlayer, WavStreamPlayer
 from talkcli.engine.players import PIECE_S, SAMPLE_BYTES, PlayerCommand
 from tests.engine.spawned import PATIENCE
 from tests.support.processes import children

@@ -15,8 +15,7 @@ import pytest
 from talkcli import processes
 from talkcli.engine import protocol
 from talkcli.engine.child import playback
-from talkcli.engine.child.players.child import Child
-from talkcli.engine.child.players.program import ProgramPlayer
+from talkcli.engine.child.players.program import PlayerProcess, ProgramPlayer
 from talkcli.engine.players import PlayerCommand
 from tests.engine.programs import NEVER_READS, PLAYS, SWALLOWS, Player
 from tests.engine.spawned import FAST, SOON, Spawned
@@ -256,7 +255,7 @@ guard.guarded = lambda *text: (tell("text"), guarded(*text))[1]
 """
 
 
-def _status(child: Child, seconds: float = 10.0) -> int:
+def _status(child: PlayerProcess, seconds: float = 10.0) -> int:
     """Wait for a child's end, and return its status."""
     end = time.monotonic() + seconds
     while (status := child.status()) is None:
@@ -266,8 +265,8 @@ def _status(child: Child, seconds: float = 10.0) -> int:
     return status
 
 
-def _run(script: str, *inherited: int) -> Child:
-    return Child(("/bin/sh", "-c", script), inherited)
+def _run(script: str, *inherited: int) -> PlayerProcess:
+    return PlayerProcess(("/bin/sh", "-c", script), inherited)
 
 
 def test_the_holders_of_a_pipe_are_looked_for_no_longer_than_it_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -310,9 +309,9 @@ def test_a_failed_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.
     plain.write_text("no program")
     before = os.listdir("/proc/self/fd")
     with pytest.raises(FileNotFoundError):
-        Child(("no-such-program",))
+        PlayerProcess(("no-such-program",))
     with pytest.raises(PermissionError):
-        Child((str(plain),))
+        PlayerProcess((str(plain),))
     assert os.listdir("/proc/self/fd") == before
 
 
@@ -366,8 +365,8 @@ time.sleep(100)
 """
 
 
-def _leaving(then: str, *inherited: int) -> Child:
-    return Child((sys.executable, "-S", "-c", _LEAVES.format(then=then)), inherited)
+def _leaving(then: str, *inherited: int) -> PlayerProcess:
+    return PlayerProcess((sys.executable, "-S", "-c", _LEAVES.format(then=then)), inherited)
 
 
 def test_a_process_that_left_its_session_is_killed_too_before_it_counts_as_ended() -> None:

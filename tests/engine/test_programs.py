@@ -11,9 +11,9 @@ import pytest
 
 from talkcli.engine import players, protocol
 from talkcli.engine.child.players.base import CannotSpeak
-from talkcli.engine.child.players.choice import Players
-from talkcli.engine.child.players.program import LONGEST_LINE, Complaint, ProgramPlayer
-from talkcli.engine.child.players.wav import WavPlayer, WavStreamPlayer
+from talkcli.engine.child.players.builtin import WavPlayer, WavStreamPlayer
+from talkcli.engine.child.players.chooser import PlayerChooser
+from talkcli.engine.child.players.program import MAX_ERROR_LINE_BYTES, ErrorOutput, ProgramPlayer
 from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, player_commands
 from tests.engine.spawned import Spawned
 
@@ -59,7 +59,7 @@ def test_a_player_with_a_name_that_is_no_program_is_built_in(sink: Sink, monkeyp
     for name, value in sink.env.items():
         monkeypatch.setenv(name, value)
     for name in PLAYERS.keys() - PACKAGES.keys():
-        (opens,) = Players(protocol.Configure(0, None, name, None, None)).candidates(22050)
+        (opens,) = PlayerChooser(protocol.Configure(0, None, name, None, None)).candidates(22050)
         player = opens()
         assert player.name == name
         assert not isinstance(player, ProgramPlayer)
@@ -88,7 +88,7 @@ def test_a_player_that_is_not_there_is_an_error(there: There, player: str, words
     there(set())
     with pytest.raises(PlayerMissing, match=words):
         player_commands(player, None, 22050)
-    (opens,) = Players(protocol.Configure(0, None, player, None, None)).candidates(22050)
+    (opens,) = PlayerChooser(protocol.Configure(0, None, player, None, None)).candidates(22050)
     with pytest.raises(CannotSpeak, match=words) as caught:
         opens()
     assert caught.value.reason == "no_player"
@@ -117,17 +117,17 @@ def test_a_player_that_is_not_there_is_an_error(there: There, player: str, words
     ],
 )
 def test_the_line_that_names_the_error_is_found(said: str, line: str | None) -> None:
-    complaint = Complaint()
+    complaint = ErrorOutput()
     for byte in said.encode():
         complaint.feed(bytes([byte]))
     assert complaint.line() == line
 
 
 def test_a_flood_of_standard_error_is_not_kept() -> None:
-    complaint = Complaint()
+    complaint = ErrorOutput()
     for _ in range(100):
         complaint.feed(b"x" * 10_000)
-    assert complaint.line() == "x" * LONGEST_LINE
+    assert complaint.line() == "x" * MAX_ERROR_LINE_BYTES
 
 
 # -- whether anything could sound

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from talkcli.engine.child.players import choice
-from talkcli.engine.child.players.choice import LONGEST, MOST, REMEMBERED, Gap
+from talkcli.engine.child.players import chooser
+from talkcli.engine.child.players.chooser import MAX_CUT_S, MAX_HANDOVER_S, MAX_HANDOVERS, HandoverTimes
 from talkcli.engine.child.stream import QUIET, Samples
 from tests.engine.programs import SWALLOWS, Player
 from tests.engine.spawned import FAST, SOON, Spawned
@@ -38,7 +38,7 @@ def _sentence() -> bytes:
 
 
 def _idle_after(seconds: float) -> str:
-    return f"from talkcli.engine.child.players import choice\nchoice.IDLE_AFTER = {seconds}"
+    return f"from talkcli.engine.child.players import chooser\nchooser.IDLE_AFTER = {seconds}"
 
 
 @pytest.mark.parametrize(
@@ -161,14 +161,14 @@ def test_a_player_that_ends_within_the_lead_in_did_not_say_the_sentence(player: 
 def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    found = choice.Players(protocol.Configure(0, None, "null", None, None, lead_in=400))
-    assert found.lead_in() == 0.4
-    found.let_go()
-    now += choice.IDLE_AFTER - 0.01
-    assert found.lead_in() == 0.0
+    found = chooser.PlayerChooser(protocol.Configure(0, None, "null", None, None, lead_in=400))
+    assert found.lead_in_seconds() == 0.4
+    found.device_released()
+    now += chooser.IDLE_AFTER_S - 0.01
+    assert found.lead_in_seconds() == 0.0
     now += 0.02
-    assert found.lead_in() == 0.4
-    assert choice.Players(protocol.Configure(0, None, "null", None, None)).lead_in() == 0.0
+    assert found.lead_in_seconds() == 0.4
+    assert chooser.PlayerChooser(protocol.Configure(0, None, "null", None, None)).lead_in_seconds() == 0.0
 
 
 # -- from one sentence to the next
@@ -178,7 +178,7 @@ TEXTS = ["battery low", "coming home", "please help"]
 #: Seconds that are left out in some tests, and their bytes: even a fast sentence ends in as much silence.
 LEFT_OUT = 0.02
 _BYTES = int(LEFT_OUT * RATE) * 2
-_SAYS_SO = f"from talkcli.engine.child.players.choice import Gap\nGap.allowance = lambda *_: {LEFT_OUT}"
+_SAYS_SO = f"from talkcli.engine.child.players.chooser import HandoverTimes\nGap.silence_to_cut = lambda *_: {LEFT_OUT}"
 
 
 def _all_played(rate: int = FAST) -> list[bytes]:
@@ -187,57 +187,59 @@ def _all_played(rate: int = FAST) -> list[bytes]:
     return [each.tobytes() for each in (played(first), *others)]
 
 
-def _changed(gap: Gap, took: float, player: str = "aplay", *, neural: bool = False) -> None:
+def _changed(gap: HandoverTimes, took: float, player: str = "aplay", *, neural: bool = False) -> None:
     """Have one sentence follow another after so many seconds."""
     gap.followed = True
-    gap.ended(player, 100.0)
-    gap.began(player, 100.0 + took, neural=neural)
+    gap.sentence_ended(player, 100.0)
+    gap.sentence_started(player, 100.0 + took, neural=neural)
 
 
 # -- how much
 
 
 def test_as_much_is_left_out_as_the_last_changes_took_in_their_median() -> None:
-    gap = Gap()
-    gap.began("aplay", 100.0)
-    assert gap.allowance("aplay") == 0.0
+    gap = HandoverTimes()
+    gap.sentence_started("aplay", 100.0)
+    assert gap.silence_to_cut("aplay") == 0.0
     for took in (0.03, 0.031, 0.09, 0.029, 0.032):
         _changed(gap, took)
-    assert gap.allowance("aplay") == pytest.approx(0.031)
-    for _ in range(REMEMBERED):
+    assert gap.silence_to_cut("aplay") == pytest.approx(0.031)
+    for _ in range(MAX_HANDOVERS):
         _changed(gap, 0.01)
-    assert gap.allowance("aplay") == pytest.approx(0.01)
+    assert gap.silence_to_cut("aplay") == pytest.approx(0.01)
     _changed(gap, 0.4, "pacat")
-    assert gap.allowance("pacat") == MOST < 0.235 / 2 + 0.01, "never more than half of the pause between sentences"
+    assert gap.silence_to_cut("pacat") == MAX_CUT_S < 0.235 / 2 + 0.01, (
+        "never more than half of the pause between sentences"
+    )
 
 
 def test_each_player_has_changes_of_its_own() -> None:
-    gap = Gap()
+    gap = HandoverTimes()
     _changed(gap, 0.03)
-    assert gap.allowance("pacat") == 0.0
-    gap.ended("aplay", 200.0)
-    gap.began("pacat", 200.1)
-    assert gap.allowance("aplay") == pytest.approx(0.03)
-    assert gap.allowance("pacat") == 0.0
+    assert gap.silence_to_cut("pacat") == 0.0
+    gap.sentence_ended("aplay", 200.0)
+    gap.sentence_started("pacat", 200.1)
+    assert gap.silence_to_cut("aplay") == pytest.approx(0.03)
+    assert gap.silence_to_cut("pacat") == 0.0
 
 
 def test_the_longer_change_to_a_neural_voice_counts_for_neural_voices_alone() -> None:
-    gap = Gap()
+    gap = HandoverTimes()
     _changed(gap, 0.03)
     _changed(gap, 0.1, neural=True)
-    assert gap.allowance("aplay") == pytest.approx(0.03)
+    assert gap.silence_to_cut("aplay") == pytest.approx(0.03)
     gap.by_neural = True
-    assert gap.allowance("aplay") == pytest.approx(0.1)
+    assert gap.silence_to_cut("aplay") == pytest.approx(0.1)
 
 
 def test_a_start_without_a_goal_that_waited_is_no_change() -> None:
     """Nobody waited; or the goal that waited was recalled, and another came much later."""
-    gap = Gap()
-    gap.ended("aplay", 100.0)
-    gap.began("aplay", 100.03)
-    _changed(gap, LONGEST + 0.1)
-    gap.began("aplay", 100.04)
-    assert gap.allowance("aplay") == 0.0
+    gap = HandoverTimes()
+    gap.sentence_ended("aplay", 100.0)
+    gap.sentence_started("aplay", 100.03)
+    _changed(gap, MAX_HANDOVER_S + 0.1)
+    gap.sentence_started("aplay", 100.04)
+    assert gap.silence_to_cut("aplay") == 0.0
 
 
 # -- which samples
@@ -304,7 +306,7 @@ def test_a_player_that_ends_too_early_is_seen_if_silence_is_left_out(player: Pla
     """A sentence may not end much sooner than its whole length, the omitted silence included."""
     rate = 200  # at which the silence at the end is that long
     length = len(_all_played(rate)[0]) / 2 / RATE
-    before = "from talkcli.engine.child.players.choice import Gap\nGap.allowance = lambda *_: 0.2"
+    before = "from talkcli.engine.child.players.chooser import HandoverTimes\nGap.silence_to_cut = lambda *_: 0.2"
     with Spawned(player.command(SWALLOWS), before=before, limits={"EARLY_END": length - 0.2}) as engine:
         ended = engine.spoken(TEXTS[0], followed=True, rate=rate)
         assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_lost")
@@ -331,5 +333,5 @@ def test_the_engine_measures_what_a_change_takes(player: Player) -> None:
         for number, text in enumerate(TEXTS):
             assert engine.spoken(text, f"g{number}", followed=True).outcome == protocol.COMPLETED
     left_out = len(b"".join(sentences)) - player.heard.stat().st_size
-    assert 0 < left_out <= 2 * 2 * MOST * RATE
+    assert 0 < left_out <= 2 * 2 * MAX_CUT_S * RATE
     assert player.heard.read_bytes().startswith(sentences[0])

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
-from talkcli.engine.child.synthesizers.base import Sound
-from talkcli.engine.child.synthesizers.choice import Choice
+from talkcli.engine.child.synthesizers.base import SpeechSettings
+from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
 from talkcli.engine.child.synthesizers.espeak import Espeak
 from talkcli.engine.child.synthesizers.phonemes import pieces
 from talkcli.engine.child.synthesizers.piper import Piper
@@ -35,7 +35,7 @@ from tests.support.timing import assert_within, limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from talkcli.engine.child.synthesizers.base import Output, Synthesizer
+    from talkcli.engine.child.synthesizers.base import SampleSink, Synthesizer
 
 TEXT = "battery low, please come home"
 #: Texts of all kinds.
@@ -79,7 +79,7 @@ class Scripted:
             raise UnknownVoice("there is no such thing")
         self.voice = voice
 
-    def speak(self, text: str, sound: Sound, output: Output) -> None:
+    def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:
         output.begin(self._RATE, self.voice)
         end = samples = 0
         for word in text.split():
@@ -117,7 +117,7 @@ def _joe() -> Synthesizer:
 
 def _choice() -> Synthesizer:
     needs_packages(*NEEDED)
-    return Choice(_espeak())
+    return CombinedSynthesizer(_espeak())
 
 
 SYNTHESIZERS: dict[str, Callable[[], Synthesizer]] = {
@@ -228,9 +228,9 @@ class Tape:
                 raise self._fails
 
 
-def _spoken(synthesizer: Synthesizer, text: str = TEXT, sound: Sound | None = None) -> Tape:
+def _spoken(synthesizer: Synthesizer, text: str = TEXT, sound: SpeechSettings | None = None) -> Tape:
     tape = Tape()
-    synthesizer.speak(text, sound or Sound(voice_only=True), tape)
+    synthesizer.speak(text, sound or SpeechSettings(voice_only=True), tape)
     return tape
 
 
@@ -290,12 +290,12 @@ def test_the_voice_is_the_one_that_was_loaded_last(made: tuple[Synthesizer, str]
 
 @pytest.mark.parametrize("voice", ["no such voice", "", "no/such+voice", "\ud800"])
 def test_a_voice_that_cannot_be_had_leaves_the_one_before(synthesizer: Synthesizer, voice: str) -> None:
-    before, spoken = synthesizer.voice, _spoken(synthesizer, sound=Sound(rate=300))
+    before, spoken = synthesizer.voice, _spoken(synthesizer, sound=SpeechSettings(rate=300))
     with pytest.raises(UnknownVoice) as caught:
         synthesizer.load(voice)
     assert str(caught.value)
     assert synthesizer.voice == before
-    _assert_alike(_spoken(synthesizer, sound=Sound(rate=300)), spoken)
+    _assert_alike(_spoken(synthesizer, sound=SpeechSettings(rate=300)), spoken)
 
 
 # -- words and samples
@@ -307,7 +307,7 @@ def test_any_text_is_spoken_with_its_words_if_it_has_any_and_nothing_of_it_stays
 ) -> None:
     """The tape holds the order: the rate, then words before their samples, at positions that never decrease."""
     alone = _spoken(synthesizer)
-    tape = _spoken(synthesizer, text, Sound(rate=450, volume=0.1, pitch=99 if pitched else 50))
+    tape = _spoken(synthesizer, text, SpeechSettings(rate=450, volume=0.1, pitch=99 if pitched else 50))
     assert tape.rate
     assert tape.most < MOST_AT_ONCE, "the first samples are written while the rest is made"
     if text in SILENT:
@@ -329,17 +329,17 @@ def test_the_words_of_a_sentence_are_told_with_their_places_in_the_text(synthesi
 
 def test_rate_volume_and_pitch_of_a_sentence_are_obeyed_or_refused(synthesizer: Synthesizer, pitched: bool) -> None:
     usual = _spoken(synthesizer)
-    assert _spoken(synthesizer, sound=Sound(rate=400)).seconds < 0.8 * usual.seconds
-    assert _spoken(synthesizer, sound=Sound(rate=100)).seconds > 1.3 * usual.seconds
-    assert 0 < _spoken(synthesizer, sound=Sound(volume=0.5)).loudest < 0.7 * usual.loudest
-    assert _spoken(synthesizer, sound=Sound(volume=0.0)).loudest == 0
+    assert _spoken(synthesizer, sound=SpeechSettings(rate=400)).seconds < 0.8 * usual.seconds
+    assert _spoken(synthesizer, sound=SpeechSettings(rate=100)).seconds > 1.3 * usual.seconds
+    assert 0 < _spoken(synthesizer, sound=SpeechSettings(volume=0.5)).loudest < 0.7 * usual.loudest
+    assert _spoken(synthesizer, sound=SpeechSettings(volume=0.0)).loudest == 0
     if pitched:
-        high, low = (_spoken(synthesizer, sound=Sound(pitch=each)).samples for each in (90, 10))
+        high, low = (_spoken(synthesizer, sound=SpeechSettings(pitch=each)).samples for each in (90, 10))
         assert high != low
     else:
         tape = Tape()
         with pytest.raises(CannotSpeak) as caught:
-            synthesizer.speak(TEXT, Sound(pitch=90), tape)
+            synthesizer.speak(TEXT, SpeechSettings(pitch=90), tape)
         assert caught.value.reason == "bad_option"
         assert not tape.samples
     _assert_alike(_spoken(synthesizer), usual)
@@ -350,10 +350,10 @@ def test_libespeak_speaks_on_as_before_after_it_was_asked_how_another_language_s
     own = espeak.voice
     try:
         espeak.load("gmw/de")
-        before = _spoken(espeak, "zwanzig Züge", Sound(rate=300))
+        before = _spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300))
         with espeak.spelling("en-us") as speller:
             assert speller.places("twenty trains") == [(0, 6), (7, 6)]
-        _assert_alike(_spoken(espeak, "zwanzig Züge", Sound(rate=300)), before)
+        _assert_alike(_spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300)), before)
     finally:
         espeak.load(own)
 
@@ -383,7 +383,7 @@ def test_the_end_of_a_spelling_waits_for_nothing_and_the_next_sentence_for_the_l
         assert asked.wait(LATE)
     assert not order
     threading.Timer(0.1, go.set).start()
-    espeak.speak(TEXT, Sound(), tape)
+    espeak.speak(TEXT, SpeechSettings(), tape)
     assert order[0] == "returned"
     thread.join(LATE)
     assert order == ["returned", "stopped"]
@@ -427,7 +427,7 @@ def test_an_error_of_the_output_comes_out_at_once_and_the_output_is_left_alone(
     alone = _spoken(synthesizer)
     tape = Tape(fails=fails, at=at, after=after)
     with pytest.raises(type(fails)) as caught:
-        synthesizer.speak("word " * 1000, Sound(), tape)
+        synthesizer.speak("word " * 1000, SpeechSettings(), tape)
     assert caught.value is fails
     assert tape.failed_at is not None
     assert_within(time.monotonic() - tape.failed_at, AT_ONCE, "the end of a sentence that was stopped")
@@ -448,5 +448,5 @@ def test_an_output_that_takes_its_time_is_waited_for(synthesizer: Synthesizer) -
             inside = False
 
     tape = Slow()
-    synthesizer.speak(TEXT, Sound(), tape)
+    synthesizer.speak(TEXT, SpeechSettings(), tape)
     _assert_alike(tape, _spoken(synthesizer))

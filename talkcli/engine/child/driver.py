@@ -14,7 +14,7 @@ from importlib import import_module
 from talkcli import install
 from talkcli.engine.child.playback import Playback
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
-from talkcli.engine.child.synthesizers.base import NotInstalled, Sound
+from talkcli.engine.child.synthesizers.base import NotInstalled, SpeechSettings
 from talkcli.engine.protocol import Ready, StartFailed
 from talkcli.engine.voices import (
     SYNTHESIZERS,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.session import Session
     from talkcli.engine.child.synthesizers.base import Synthesizer
-    from talkcli.engine.child.synthesizers.choice import Choice
+    from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.child.words import TimedWord
     from talkcli.engine.protocol import Configure, Say, Voice
 
@@ -73,14 +73,14 @@ def start(configure: Configure, session: Session) -> Ready:
         raise CannotStart(str(error), error.reason, lasting=unknown, usage=unknown) from error
     session.open(engine, settings.apply, None if own else _pump(name), made)
     neural = voice if is_neural(voice) else None
-    return Ready(shown, made.version if made else None, session.players.first() if own else None, neural)
+    return Ready(shown, made.version if made else None, session.players.first_player() if own else None, neural)
 
 
-def _register_own(synthesizer: str, driver: str, session: Session) -> Choice:
+def _register_own(synthesizer: str, driver: str, session: Session) -> CombinedSynthesizer:
     """Make a synthesizer, and put a driver for it among pyttsx3's."""
     try:
         module, _, function = SYNTHESIZERS[synthesizer].partition(":")
-        made: Choice = getattr(import_module(f"talkcli.engine.child.synthesizers.{module}"), function)()
+        made: CombinedSynthesizer = getattr(import_module(f"talkcli.engine.child.synthesizers.{module}"), function)()
     except NotInstalled as error:
         raise CannotStart(str(error)) from error
     except UnknownVoice as error:  # not even its own: a part of it is missing
@@ -152,7 +152,7 @@ class Settings:
     def __init__(self, engine: Any, driver: str) -> None:
         self._engine = engine
         self._driver = driver
-        self._set = fields(Sound())  # what pyttsx3's drivers set themselves
+        self._set = fields(SpeechSettings())  # what pyttsx3's drivers set themselves
         self._default_voice: Any = None
         self._voices: tuple[Voice, ...] = ()
         self._voice: str | None = None
@@ -241,7 +241,7 @@ class Driver:
         self._proxy = proxy
         self._synthesizer = synthesizer
         self._session = session
-        self._sound = Sound()
+        self._sound = SpeechSettings()
         self._text: str | None = None
         self._playback: Playback | None = None
 

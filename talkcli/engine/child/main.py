@@ -93,10 +93,10 @@ def _configuration(channel: Channel) -> protocol.Configure | None:
 def _serve(channel: Channel, configure: protocol.Configure) -> None:
     from talkcli.engine.child.driver import CannotStart, start
     from talkcli.engine.child.players.base import CannotEnd
-    from talkcli.engine.child.players.choice import Players
+    from talkcli.engine.child.players.chooser import PlayerChooser
     from talkcli.engine.child.session import Session
 
-    session = Session(channel, Players(configure, _inherited()))
+    session = Session(channel, PlayerChooser(configure, _inherited()))
     try:
         channel.send(start(configure, session))
     except CannotStart as error:

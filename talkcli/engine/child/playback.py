@@ -71,7 +71,7 @@ RELEASE_AFTER = 10.0
 
 
 class Playback:
-    """One sentence on its way to the player: the `Output` of whoever makes it.
+    """One sentence on its way to the player: the `SampleSink` of whoever makes it.
 
     Every method may raise Stopped or CannotSpeak, except the last two, which are for others than the synthesizer.
     """
@@ -158,7 +158,7 @@ class Playback:
         if self._stream is not None:
             name, now = self._stream.player.name, time.monotonic()
             self._players.worked = name
-            self._players.gap.ended(name, now + self._stream.unheard(self._stream.written, now))
+            self._players.handovers.sentence_ended(name, now + self._stream.unheard(self._stream.written, now))
         return self._seconds(self._sent - self._left_out)
 
     def stop(self) -> None:
@@ -173,7 +173,7 @@ class Playback:
             return
         player = self._stream.player
         if player.proven:
-            self._players.tell(player)
+            self._players.update_output(player)
         player.kill()
         limit = time.monotonic() + GONE_WITHIN
         while not player.gone():
@@ -181,7 +181,7 @@ class Playback:
                 raise CannotEnd(f"{player.name} could not be ended within {GONE_WITHIN:g} s")
             self._wait((), time.monotonic() + PIECE_S)
         if player.real_time and player.proven:
-            self._players.let_go(self._silent_at)
+            self._players.device_released(self._silent_at)
 
     # -- players
 
@@ -205,7 +205,7 @@ class Playback:
         player = next(self._untried)()
         self._sent = self._begin
         self._silent_at = None
-        lead_in = self._players.lead_in(begins=self._begin == self._left_out)
+        lead_in = self._players.lead_in_seconds(begins=self._begin == self._left_out)
         return Stream(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _next_player(self, error: CannotSpeak) -> None:
@@ -223,7 +223,7 @@ class Playback:
         self._untried = iter(others) if others else None
         if lost or not (others or self._is_busy(first)):
             if stream is not None:
-                self._players.tell(stream.player)
+                self._players.update_output(stream.player)
             raise error if lost else first
         self._leave()
         if not others:
@@ -321,7 +321,7 @@ class Playback:
         if silent and self._seconds(zeros) < ZEROS:
             return False
         self._settled = True
-        if not silent and self._players.takes_time and not self._players.gap.follows and self._sent == 0:
+        if not silent and self._players.takes_time and not self._players.handovers.follows and self._sent == 0:
             self._left_out = self._begin = self._sent = zeros
             self._clock.leave_out(self._seconds(zeros))
             if self._stream is not None:
@@ -343,9 +343,9 @@ class Playback:
 
     def _audible_end(self, stream: Stream) -> int:
         """Return the end of what is to be played: less silence where a goal waits, and for as long as one may come."""
-        if not stream.player.real_time or (self._complete and not self._players.gap.followed):
+        if not stream.player.real_time or (self._complete and not self._players.handovers.followed):
             return self._samples.end
-        most = int(self._players.gap.allowance(stream.player.name) * self._rate) * SAMPLE_BYTES
+        most = int(self._players.handovers.silence_to_cut(stream.player.name) * self._rate) * SAMPLE_BYTES
         return max(self._sent, self._samples.end - self._samples.quiet_end(most))
 
     def _tick(self, stream: Stream) -> None:
@@ -356,10 +356,10 @@ class Playback:
         player = stream.player
         if not player.proven:
             return
-        self._players.tell(player)
+        self._players.update_output(player)
         if stream.taken and not self._began:
             self._began = True
-            self._players.gap.began(player.name, now - self._clock.elapsed(now), neural=self._beside)
+            self._players.handovers.sentence_started(player.name, now - self._clock.elapsed(now), neural=self._beside)
         self._samples.forget(self._unheard() if player.real_time else self._sent)
         self._tell(self._clock.due(now) if player.real_time else self._clock.rest())
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.child.players.base import Interest
-    from talkcli.engine.child.players.choice import Players
-    from talkcli.engine.child.synthesizers.choice import Choice
+    from talkcli.engine.child.players.chooser import PlayerChooser
+    from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.protocol import Command, Event
     from talkcli.goals.goal import Output
 
@@ -118,7 +118,7 @@ class InHand:
 class Session:
     """The loop. `open` gives it its engine, `run` runs it."""
 
-    def __init__(self, channel: Channel, players: Players) -> None:
+    def __init__(self, channel: Channel, players: PlayerChooser) -> None:
         self._channel = channel
         #: what our own driver plays with
         self.players = players
@@ -132,7 +132,7 @@ class Session:
         self._engine: Any = None
         self._apply: Any = None
         self._pump: Callable[[], None] | None = None
-        self._synthesizer: Choice | None = None
+        self._synthesizer: CombinedSynthesizer | None = None
         #: the number of the pause for which the sentence in hand is to be held, 0 for none: for the playback to obey,
         #: as pyttsx3 has no word for a pause; with a driver that is not ours the session itself goes by it
         self.held = 0
@@ -150,7 +150,7 @@ class Session:
         engine: Any,
         apply: Callable[[protocol.Say], str | None],
         pump: Callable[[], None] | None,
-        synthesizer: Choice | None = None,
+        synthesizer: CombinedSynthesizer | None = None,
     ) -> None:
         """Take the engine, and what sets its properties for a goal: CannotSpeak, or why another voice speaks, or None.
 
@@ -198,10 +198,10 @@ class Session:
         for descriptor, events in interests:
             poll.register(descriptor, events)
         loads = self._synthesizer
-        loading = loads.descriptor if loads else None
+        loading = loads.load_descriptor if loads else None
         if loads and loading is not None:
             poll.register(loading, select.POLLIN)
-        voice_due = loads.due if loads and loading is not None else None
+        voice_due = loads.load_deadline if loads and loading is not None else None
         moments = [moment for moment in (until, self._alive_due(), voice_due) if moment is not None]
         timeout = max(0.0, min(moments) - time.monotonic()) * 1000 if moments else None
         ready = [descriptor for descriptor, _ in poll.poll(timeout)]
@@ -221,7 +221,7 @@ class Session:
         goal = self._goal
         if isinstance(command, (protocol.Load, protocol.Drop)):
             if self._synthesizer is not None:
-                self._synthesizer.obey(command)
+                self._synthesizer.carry_out(command)
         elif goal is None or not isinstance(command, _OF_THE_GOAL):
             self._backlog.append(command)
         elif goal.id != command.id:
@@ -229,7 +229,7 @@ class Session:
         elif isinstance(command, protocol.Stop):
             self._silence()
         elif isinstance(command, protocol.Followed):
-            self.players.gap.followed, self.players.gap.by_neural = command.followed, command.by_neural
+            self.players.handovers.followed, self.players.handovers.by_neural = command.followed, command.by_neural
         elif isinstance(command, protocol.Resume):
             self.held = 0
         elif not goal.stop_asked:
@@ -239,11 +239,11 @@ class Session:
                 self._engine.stop()
 
     def _tell_loaded(self) -> None:
-        for event in self._synthesizer.news() if self._synthesizer else ():
+        for event in self._synthesizer.load_events() if self._synthesizer else ():
             self._channel.send(event)
 
     def tell_voice(self, voice: str, why: str | None) -> None:
-        """Tell by which voice the goal in hand is heard, if that is not known; `why`: as in `Output.begin`."""
+        """Tell by which voice the goal in hand is heard, if that is not known; `why`: as in `SampleSink.begin`."""
         if self._goal is not None and voice != self._voice:
             self._voice = voice
             self._channel.send(protocol.Speaks(self._goal.id, voice, why or self._why))
@@ -369,7 +369,7 @@ class Session:
         self._channel.send(protocol.Ended(goal.id, outcome, reason, message, duration, *gaps, self.players.chosen))
 
     def _alive_due(self) -> float | None:
-        loading = self._synthesizer is not None and self._synthesizer.descriptor is not None
+        loading = self._synthesizer is not None and self._synthesizer.load_descriptor is not None
         if not loading and (self._goal is None or self._lost(self._goal)):
             return None
         return self._channel.sent_at + protocol.ALIVE_EVERY

@@ -17,7 +17,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
-from talkcli.engine.child.players.wav import WavStreamPlayer
+from talkcli.engine.child.players.builtin import WavStreamPlayer
 from talkcli.engine.parent.process import Conversation, EngineFailed
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts

@@ -1,7 +1,7 @@
-"""What makes sound of a text: the interface of a synthesizer, its contract, and what it speaks into.
+"""The interface of a synthesizer, and of the sink that it writes a sentence to.
 
-Places in a text are characters from 0, samples are signed 16 bit, little-endian, one channel. Nothing here loads or
-makes anything. `tests/engine/test_synthesizer_contract.py` puts every synthesizer through what `Synthesizer` says.
+Positions in a text are characters from 0. Samples are signed 16 bit, little-endian, one channel.
+`tests/engine/test_synthesizer_contract.py` tests every synthesizer against the promises of `Synthesizer`.
 """
 
 from __future__ import annotations
@@ -17,84 +17,102 @@ else:
 
 
 class NotInstalled(Exception):
-    """A part that a synthesizer needs is not there, until somebody installs it: the text says what."""
+    """A part of a synthesizer is not installed; the text says what to install."""
 
 
 @frozen
-class Sound:
-    """How a sentence is to sound, besides its voice. What it is where nobody asks for another is pyttsx3's."""
+class SpeechSettings:
+    """The settings of a sentence besides its voice, with pyttsx3's defaults."""
 
     rate: int = 200  # words per minute, 80 to 450
-    volume: float = 1.0  # 0.0 to 1.0, of the voice's own
+    volume: float = 1.0  # 0.0 to 1.0; 1.0 is the voice's own
     pitch: int = 50  # 0 to 100; 50 is the voice's own
-    voice_only: bool = False  # whether it is the voice that was loaded, or none
+    voice_only: bool = False  # whether the sentence fails if its own voice can't speak it
 
 
-class Output(Protocol):
-    """Where one sentence goes; the playback is one.
+class SampleSink(Protocol):
+    """Receives the samples and words of one sentence; the playback is one.
 
-    Each method may wait, for as long as a sentence is held, and may raise: Stopped when the sentence is to end,
-    CannotSpeak when it can't be played. It was told everything then, and is told no more.
+    Each method may block for as long as the sentence is held. Each may raise Stopped if the sentence has to end, or
+    CannotSpeak if it can't be played. After that, the sink must not be called again.
     """
 
     def begin(self, rate: int, voice: str, why: str | None = None) -> None:
-        """Take note of the samples per second, before anything else: a player is started by it; and of who speaks.
+        """Announce the sample rate and the voice, before anything else.
 
-        `voice`: its id; `why`: why that is another than was asked for, for people. Once more, if any of it turns out to
-        be wrong, while there are no words and no samples yet.
+        It may be called again with corrections as long as there are no words and no samples.
+
+        Args:
+            rate: Samples per second.
+            voice: The id of the voice that speaks.
+            why: Why this is not the voice that was asked for, for people.
         """
 
     def word(self, start: int, length: int, position: float) -> None:
-        """Take note that `length` characters from `start`, 1 or more, begin `position` seconds into the samples."""
+        """Announce a word.
+
+        Args:
+            start: Where the word begins in the text.
+            length: The length of the word in characters, at least 1.
+            position: Where the word begins in the samples, in seconds.
+        """
 
     def write(self, samples: bytes) -> None:
-        """Take samples, whole ones. With none it only lets in what may have come: it raises Stopped, or returns."""
+        """Write whole samples. An empty write only gives the sink a chance to raise Stopped."""
 
     def wait(self, descriptor: int) -> None:
-        """Go on with what was written until this is readable, for who makes the sentence in a thread of its own.
+        """Play what was written until a descriptor is readable, for a synthesizer that works in a thread.
 
-        It may return before. What was asked of the sentence is done meanwhile: it is held, or Stopped is raised. It may
-        be called before `begin`.
+        It may return earlier, and may be called before `begin`. The sentence can be held or stopped meanwhile.
         """
 
 
 class Synthesizer(Protocol):
-    """Makes samples and words of texts, one at a time, in the voice that was loaded last.
+    """Turns texts into samples and words, one text at a time, in the voice that was loaded last.
 
-    All of it is called in the one thread that made it, the engine process's main thread, and calls its output in no
-    other. It plays nothing, and knows of no goals. What makes one raises NotInstalled where a part is missing.
+    Only the thread that made the synthesizer calls it, and the synthesizer calls its sink in that thread only. It
+    raises NotInstalled when it is made if a part of it is missing.
     """
 
-    #: what speaks, for people: "eSpeak NG 1.51 (system)"; None if there is nothing to be said
+    #: the synthesizer's name for people, such as "eSpeak NG 1.51 (system)", or None
     version: str | None
-    #: id of the voice in force: the one that was loaded last, before that the synthesizer's own
+    #: the id of the current voice: the one that was loaded last, or the synthesizer's default
     voice: str
 
     def voices(self) -> tuple[Voice, ...]:
-        """Return all voices, each by an id of its own, the usual ones first. More may be there the next time.
+        """Return all voices by unique ids, the usual ones first; another call may return more.
 
-        One whose id begins with "+" is no voice but a variant, which is written behind the id of another.
+        An id that begins with "+" is a variant, which is appended to the id of a voice.
         """
 
     def load(self, voice: str) -> None:
-        """Speak with the voice of this id from now on; UnknownVoice leaves the one in force that was before.
+        """Speak in the voice with this id from now on.
 
-        It returns soon, as nothing can be stopped meanwhile, and no sign of life given: what takes seconds is for
-        `speak`, which waits in its output.
+        It returns quickly, because it can't be stopped. A voice that takes seconds to load is loaded by `speak`, which
+        waits in its sink.
+
+        Raises:
+            UnknownVoice: The voice can't be loaded. The previous voice stays.
         """
 
-    def speak(self, text: str, sound: Sound, output: Output) -> None:
-        """Make the sentence, and return when all of it was written.
+    def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
+        """Synthesize a sentence, and return once all of it is written.
 
-        The rate comes first, then each word before its first sample, at positions that never decrease; where in the
-        text they are may jump and repeat. The first samples are written as soon as there are any, the rest bit by bit:
-        between two calls of the output nothing can stop or hold the sentence, so that one that needs longer than some
-        milliseconds writes nothing (`b""`) meanwhile, or has it done by a thread of its own, and waits. A text in which
-        nothing can be spoken, the empty one too, has no words, and silence at most. Any string is a text: control
-        characters and lone surrogates are silent.
+        The order is: the sample rate, then each word before its first sample. The positions of words in the samples
+        never decrease; their positions in the text may jump and repeat.
 
-        What the output raises comes out of here, at once, and the output is not called again. Of its own it raises
-        CannotSpeak, no other: `engine_failed`, `voice_failed` where a voice's files are to blame, and `bad_option` for
-        a sound that it can't make, before anything is spoken. Nothing of a sentence stays, whichever way it ended: the
-        next is what it would have been without it, but for what of the samples is noise.
+        The first samples are written as soon as they exist, and the rest in small parts, because a sentence can only be
+        stopped or held in a call of the sink. A synthesizer that needs more than some milliseconds writes `b""`
+        meanwhile, or works in a thread and waits in the sink.
+
+        Every string is a valid text. Control characters and lone surrogates are silent. A text without anything to
+        speak yields no words, and no samples or only silence.
+
+        No state of a sentence is left behind, however it ends: except for noise in the samples, the next sentence is
+        the same as it would be without it.
+
+        Raises:
+            CannotSpeak: `engine_failed`; `voice_failed` if the files of a voice are faulty; or `bad_option` for
+                settings that the voice doesn't support, before any sample is written. What the sink raises passes
+                through at once.
         """

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import Any
 
-    from talkcli.engine.child.synthesizers.base import Output, Sound
+    from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings
 
 _LIBRARY = "libespeak-ng.so.1"
 
@@ -166,7 +166,7 @@ class Espeak:
         #: sentence of a fresh process is what the library alone would make
         self._set = {espeak.RATE: _USUAL, espeak.VOLUME: 100, espeak.PITCH: 50}
         self._text = ""
-        self._output: Output | None = None
+        self._output: SampleSink | None = None
         self._raised: BaseException | None = None
         #: to whom the library was lent last, who may still be at work with it; None where it was taken back
         self._lent: Spelling | None = None
@@ -193,7 +193,7 @@ class Espeak:
             raise UnknownVoice("part of it is missing")
         self.voice = voice
 
-    def speak(self, text: str, sound: Sound, output: Output) -> None:
+    def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:
         """Speak as `Synthesizer` says; with this library the samples differ a little each time."""
         self._take_back()
         output.begin(self._rate, self.voice)
@@ -251,7 +251,7 @@ class Espeak:
             self._espeak.SetVoiceByName(self.voice.encode())
             self._set.clear()
 
-    def _obey(self, sound: Sound) -> None:
+    def _obey(self, sound: SpeechSettings) -> None:
         espeak = self._espeak
         wanted = {espeak.RATE: sound.rate, espeak.VOLUME: round(sound.volume * 100), espeak.PITCH: sound.pitch}
         for parameter, value in wanted.items():
@@ -270,7 +270,7 @@ class Espeak:
             return 1
         return 0
 
-    def _hand_on(self, output: Output, samples: Any, count: int, events: Any) -> None:
+    def _hand_on(self, output: SampleSink, samples: Any, count: int, events: Any) -> None:
         for event in _until_terminator(events):
             if event.type == _EVENT_SAMPLERATE:
                 if event.id.number != self._rate:

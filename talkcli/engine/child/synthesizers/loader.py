@@ -68,7 +68,7 @@ class Loader:
         return self._work.descriptor if self._work else None
 
     @property
-    def due(self) -> float:
+    def deadline(self) -> float:
         """The monotonic time at which what is being loaded is given up."""
         return self._began + LOAD_LIMIT
 
@@ -78,7 +78,7 @@ class Loader:
             self._unmeasured = ""
         self._suspect.discard(voice)
 
-    def begin(self, voice: str) -> None:
+    def start(self, voice: str) -> None:
         """Have a voice loaded, unless it is, or is about to be; what was wrong with it is forgotten."""
         if voice in self._models:
             self._news.append(Loaded(voice, 0.0))
@@ -112,7 +112,7 @@ class Loader:
         elif self._unmeasured is None:
             self._unmeasured = voice
 
-    def news(self) -> list[Loaded | Unloaded | Grown]:
+    def events(self) -> list[Loaded | Unloaded | Grown]:
         """Return what became of voices since this was asked last."""
         self._look()
         if self._unmeasured is not None:
@@ -127,7 +127,7 @@ class Loader:
             return
         try:
             if not work.ready:
-                if time.monotonic() < self.due:
+                if time.monotonic() < self.deadline:
                     return
                 # Whatever its thread hangs in, a file of a server that is gone, may hang for ever.
                 raise BadFile(f"{voice} was not loaded within {LOAD_LIMIT:g} s: are its files on a slow disk?")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from typing import Any
 
-    from talkcli.engine.child.synthesizers.base import Output, Sound
+    from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings
     from talkcli.engine.child.synthesizers.espeak import Espeak
     from talkcli.engine.child.synthesizers.inference import Model
     from talkcli.engine.child.synthesizers.phonemes import Piece
@@ -122,7 +122,7 @@ class Piper:
             _number(models.describe(path), speaker)
         self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
 
-    def speak(self, text: str, sound: Sound, output: Output) -> None:
+    def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:
         """Speak as `Synthesizer` says; the samples differ each time, as far as the voice's noise is not 0.
 
         Where the voice is not loaded yet, it waits until it is.
@@ -150,11 +150,11 @@ class Piper:
             self.loader.suspect(voice)
             raise CannotSpeak("voice_failed", f"{model.path}.json: {error}: get the voice anew") from error
 
-    def _loaded(self, voice: str, output: Output) -> Model:
+    def _loaded(self, voice: str, output: SampleSink) -> Model:
         """Return the model of a voice, as soon as it is loaded."""
         loader = self.loader
         if loader.model(voice) is None:
-            loader.begin(voice)  # what was wrong with it may be mended
+            loader.start(voice)  # what was wrong with it may be mended
         while (model := loader.model(voice)) is None:
             why = loader.error(voice)
             if why is not None:
@@ -163,7 +163,9 @@ class Piper:
             output.wait(loader.descriptor)
         return model
 
-    def _write(self, model: Model, speaker: int, spelled: Iterator[Piece], sound: Sound, output: Output) -> None:
+    def _write(
+        self, model: Model, speaker: int, spelled: Iterator[Piece], sound: SpeechSettings, output: SampleSink
+    ) -> None:
         """Write what a thread makes of the pieces, which are spelled there, too, as they are needed."""
         run = Run()
         rate = model.description.rate
@@ -183,7 +185,7 @@ class Piper:
             self.loader.spoken(self._model_id)
 
 
-def _made(model: Model, spelled: Iterator[Piece], speaker: int, sound: Sound, run: Run) -> Iterator[Made]:
+def _made(model: Model, spelled: Iterator[Piece], speaker: int, sound: SpeechSettings, run: Run) -> Iterator[Made]:
     """Yield the sound of the pieces."""
     pause = int(_PAUSE * model.description.rate)
     known, lacking = False, ""

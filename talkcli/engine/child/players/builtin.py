@@ -1,0 +1,256 @@
+"""The players without a program or a sound server: "null", "file:PATH", and the stream of `talk say --output`."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import stat
+import struct
+import time
+
+from talkcli.engine.child.players.base import CannotSpeak, Player
+from talkcli.engine.players import FILE_PREFIX, SAMPLE_BYTES
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from talkcli.engine.child.players.base import Interest
+
+#: Seconds of sound that the null player takes ahead of its clock: as much as a real player buffers.
+NULL_AHEAD_S = 0.06
+
+_WAV_HEADER = struct.Struct("<4sI4s4sIHHIIHH4sI")
+#: Bytes of the header that the length after "RIFF" includes.
+_RIFF_HEADER_BYTES = _WAV_HEADER.size - 8
+#: The length in the header of a stream; the two lengths are 32 bits wide.
+_UNKNOWN_BYTES = 0xFFFFFFFF
+_MAX_WAV_BYTES = _UNKNOWN_BYTES - _WAV_HEADER.size
+
+
+class BuiltInPlayer(Player):
+    """Base class of players that handle samples at once and have nothing to release."""
+
+    proven = True
+
+    def __init__(self) -> None:
+        self._taken = 0
+        self._closed = False
+
+    def consumed(self) -> int:
+        return self._taken
+
+    def close(self) -> None:
+        self._closed = True
+
+    def ended(self) -> bool:
+        return self._closed
+
+    def interests(self) -> Sequence[Interest]:
+        return ()
+
+    def wake_at(self) -> float | None:
+        return 0.0
+
+    def kill(self) -> None:
+        self._closed = True
+
+    def gone(self) -> bool:
+        return True
+
+
+class NullPlayer(BuiltInPlayer):
+    """Makes no sound, but takes as long as the sound would.
+
+    It is for robots in simulation and for CI, where scripts have to keep their timing.
+    """
+
+    name = "null"
+    real_time = True
+
+    def __init__(
+        self,
+        rate: int,
+        _device: str | None = None,
+        _audible: bool = False,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__()
+        self._bytes_per_second = rate * SAMPLE_BYTES
+        self._clock = clock
+        self._started: float | None = None
+
+    def offer(self, data: memoryview) -> int:
+        now = self._clock()
+        if self._started is None:
+            self._started = now
+        self._started += max(0.0, now - self._end_time())  # a silence in which no samples came
+        if self._taken + len(data) > (now - self._started + NULL_AHEAD_S) * self._bytes_per_second:
+            return 0
+        self._taken += len(data)
+        return len(data)
+
+    def ended(self) -> bool:
+        return self._closed and (self._started is None or self._clock() >= self._end_time())
+
+    def wake_at(self) -> float | None:
+        if self._started is None:
+            return self._clock()
+        # A third of the buffer is free by then, so it wakes up no more often than a real player.
+        return self._end_time() if self._closed else self._end_time() - NULL_AHEAD_S * 2 / 3
+
+    def _end_time(self) -> float:
+        """Return the time at which the last sample would have been heard."""
+        return (self._started or 0.0) + self._taken / self._bytes_per_second
+
+
+class WavPlayer(BuiltInPlayer):
+    """Appends each sentence to a WAV file, which is valid after every sentence and after a stop.
+
+    It only writes to files with the plain 44-byte header that it writes itself. If a crash left samples beyond the
+    length in that header, they are cut off.
+    """
+
+    real_time = False
+
+    def __init__(self, path: str, rate: int) -> None:
+        """Open or create the file.
+
+        Raises:
+            CannotSpeak: The file can't take this sentence (`audio_device`).
+        """
+        super().__init__()
+        self.name = f"{FILE_PREFIX}{path}"
+        self._path = path
+        self._rate = rate
+        with _os_errors("audio_device", f"{path} cannot be written"), contextlib.ExitStack() as opened:
+            self._file = _open_regular(path)
+            opened.callback(os.close, self._file)
+            self._start = _sample_bytes(self._file, path, rate)
+            os.ftruncate(self._file, _WAV_HEADER.size + self._start)
+            self._write_header()
+            opened.pop_all()
+
+    def offer(self, data: memoryview) -> int:
+        if self._closed:
+            return 0
+        end = self._start + self._taken
+        if end + len(data) > _MAX_WAV_BYTES:
+            raise CannotSpeak("audio_lost", f"{self._path} is full: a WAV file holds 4 GiB")
+        with _os_errors("audio_lost", self._path):
+            taken = os.pwrite(self._file, data, _WAV_HEADER.size + end)
+        self._taken += taken
+        return taken
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        with _os_errors("audio_lost", self._path):
+            try:
+                self._write_header()
+            finally:
+                os.close(self._file)  # a quota or a network file system may report only here that it is full
+
+    def kill(self) -> None:
+        with contextlib.suppress(CannotSpeak):  # the sentence already ended with a stop or an error of its own
+            self.close()
+
+    def _write_header(self) -> None:
+        length = self._start + self._taken
+        os.pwrite(self._file, _WAV_HEADER.pack(*_header_fields(self._rate, _RIFF_HEADER_BYTES + length, length)), 0)
+
+
+class WavStreamPlayer(BuiltInPlayer):
+    """Writes a WAV stream to a pipe, a device or a file that the shell has opened, one sentence after another.
+
+    The header states unknown lengths, because it can't be rewritten later. The reader sets the pace. Other programs
+    share the descriptor, so it is left in blocking mode and only written to if poll reports room.
+    """
+
+    real_time = False
+    name = "the output"
+
+    def __init__(self, output: int, rate: int, *, first: bool) -> None:
+        """Initialize the player.
+
+        Args:
+            output: An open descriptor.
+            rate: Samples per second.
+            first: Whether this is the first sentence of the stream, which starts with the header.
+        """
+        super().__init__()
+        self._output = output
+        self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES, _UNKNOWN_BYTES)) if first else b""
+        self._poll = select.poll()
+        self._poll.register(output, select.POLLOUT)
+
+    def offer(self, data: memoryview) -> int:
+        if not self._poll.poll(0):  # a writable pipe has room for a header and a piece at least
+            return 0
+        try:
+            written = os.write(self._output, self._header + data if self._header else data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            raise CannotSpeak("audio_lost", f"{self.name}: {error.strerror}") from error
+        header = min(written, len(self._header))
+        self._header = self._header[header:]
+        self._taken += written - header
+        return written - header
+
+    def interests(self) -> list[Interest]:
+        return [(self._output, select.POLLOUT)]
+
+    def wake_at(self) -> float | None:
+        return None
+
+
+@contextlib.contextmanager
+def _os_errors(reason: str, subject: str) -> Iterator[None]:
+    """Turn an OSError into CannotSpeak."""
+    try:
+        yield
+    except OSError as error:
+        raise CannotSpeak(reason, f"{subject}: {error.strerror}") from error
+
+
+def _open_regular(path: str) -> int:
+    if not path:
+        raise CannotSpeak("audio_device", "the player file: needs a path, as in file:speech.wav")
+    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o666)
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
+        raise CannotSpeak("audio_device", f"{path} is no regular file")
+    return file
+
+
+def _header_fields(rate: int, riff_bytes: int, sample_bytes: int) -> tuple[bytes | int, ...]:
+    """Return the fields of a WAV header: `riff_bytes` follow the first length, `sample_bytes` the second."""
+    audio_format = (1, 1, rate, rate * SAMPLE_BYTES, SAMPLE_BYTES, 8 * SAMPLE_BYTES)  # PCM, one channel
+    return b"RIFF", riff_bytes, b"WAVE", b"fmt ", 16, *audio_format, b"data", sample_bytes
+
+
+def _sample_bytes(file: int, path: str, rate: int) -> int:
+    """Return the length of the samples in a file, or 0 if it is empty.
+
+    Raises:
+        CannotSpeak: The file wasn't written by a `WavPlayer` with this sample rate.
+    """
+    size = os.fstat(file).st_size
+    if size == 0:
+        return 0
+    header = os.pread(file, _WAV_HEADER.size, 0)
+    found = _WAV_HEADER.unpack(header.ljust(_WAV_HEADER.size, b"\0"))
+    found_rate, length = int(found[7]), int(found[12])
+    if found != _header_fields(found_rate, _RIFF_HEADER_BYTES + length, length):
+        fault = "is no WAV file of talk's (16 bit, one channel)"
+    elif found_rate != rate:
+        fault = f"has {found_rate} samples a second, this voice {rate}"
+    elif size < _WAV_HEADER.size + length:
+        fault = "is shorter than its header says"
+    else:
+        return length
+    raise CannotSpeak("audio_device", f"{path} {fault}: use another file")

@@ -1,0 +1,119 @@
+"""The synthesizer that `talk` speaks with: libespeak-ng, and the neural voices beside it.
+
+The code for neural voices is imported when one is asked for. If a neural voice isn't loaded, or fails before any of the
+sentence was heard, libespeak-ng speaks in the same language instead, unless the sentence must have that voice.
+"""
+
+from __future__ import annotations
+
+import traceback
+
+from talkcli.engine import models, protocol
+from talkcli.engine.child.players.base import CannotSpeak, Stopped
+from talkcli.engine.child.synthesizers.base import SpeechSettings
+from talkcli.engine.child.synthesizers.espeak import Espeak
+from talkcli.engine.voices import is_neural
+from talkcli.frozen import TYPE_CHECKING, replace
+
+if TYPE_CHECKING:
+    from talkcli.engine.child.synthesizers.base import SampleSink, Synthesizer
+    from talkcli.engine.child.synthesizers.piper import Piper
+    from talkcli.engine.protocol import Drop, Grown, Load, Loaded, Unloaded, Voice
+
+
+class CombinedSynthesizer:
+    """Speaks each voice with the synthesizer that has it: libespeak-ng or Piper."""
+
+    def __init__(self, espeak: Espeak | None = None) -> None:
+        self._espeak = espeak or Espeak()
+        self._neural: Piper | None = None
+        self._current: Synthesizer = self._espeak
+        self.version = self._espeak.version
+        self.voice = self._espeak.voice
+
+    def voices(self) -> tuple[Voice, ...]:
+        return (*self._espeak.voices(), *models.voices())
+
+    def load(self, voice: str) -> None:
+        current: Synthesizer = self._piper() if is_neural(voice) else self._espeak
+        current.load(voice)
+        self._current, self.voice = current, current.voice
+
+    def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
+        """Speak with the current voice, or with libespeak-ng if a neural voice can't."""
+        neural = self._neural
+        if neural is None or self._current is not neural or settings.voice_only:
+            self._current.speak(text, settings, sink)
+            return
+        why = neural.error or f"{neural.voice} is not loaded"
+        if neural.ready:
+            watched = _WatchedSink(sink)
+            try:
+                neural.speak(text, replace(settings, pitch=SpeechSettings().pitch), watched)
+                return
+            except Stopped:
+                raise
+            except CannotSpeak as error:
+                if error.reason != "voice_failed" or watched.used:
+                    raise
+                why = str(error)
+            except Exception as error:
+                if watched.used:
+                    raise
+                traceback.print_exc()  # a bug is no reason for silence either
+                why = f"{neural.voice} failed: {type(error).__name__}: {error}"
+        self._espeak.load_language(neural.language)
+        self._espeak.speak(text, settings, _WatchedSink(sink, why))
+
+    # -- neural voices that are loaded while another voice speaks
+
+    @property
+    def load_descriptor(self) -> int | None:
+        """A descriptor that is readable once a voice has been loaded; None if none is being loaded."""
+        return self._neural.loader.descriptor if self._neural else None
+
+    @property
+    def load_deadline(self) -> float:
+        """The monotonic time at which the load in progress is given up."""
+        return self._piper().loader.deadline
+
+    def carry_out(self, command: Load | Drop) -> None:
+        """Start to load a neural voice in the background, or drop one."""
+        loader = self._piper().loader
+        if isinstance(command, protocol.Drop):
+            loader.drop(command.voice)
+        else:
+            loader.start(command.voice)
+
+    def load_events(self) -> list[Loaded | Unloaded | Grown]:
+        """Return what has happened to neural voices since the last call."""
+        return self._neural.loader.events() if self._neural else []
+
+    def _piper(self) -> Piper:
+        if self._neural is None:
+            from talkcli.engine.child.synthesizers.piper import Piper
+
+            self._neural = Piper(self._espeak)
+        return self._neural
+
+
+class _WatchedSink:
+    """Passes a sentence on to a sink, and records whether it has any words or samples yet."""
+
+    def __init__(self, sink: SampleSink, why: str | None = None) -> None:
+        """Initialize the sink; `why` says why another voice speaks than was asked for."""
+        self._sink = sink
+        self._why = why
+        self.used = False
+        self.wait = sink.wait
+
+    def begin(self, rate: int, voice: str, why: str | None = None) -> None:
+        self._sink.begin(rate, voice, why or self._why)
+
+    def word(self, start: int, length: int, position: float) -> None:
+        self.used = True
+        self._sink.word(start, length, position)
+
+    def write(self, samples: bytes) -> None:
+        self.used = self.used or bool(samples)
+        self._sink.write(samples)
