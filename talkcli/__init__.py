@@ -1,12 +1,12 @@
-"""talk: speech for robots with action semantics and no robot middleware.
+"""Speech for robots, with the semantics of actions and without robot middleware.
 
-`from talkcli import Client` is the library; the command `talk` is `talkcli.cli`. Nothing is imported here before it is
-asked for, because every start of the command pays for it.
+The library is `from talkcli import Client`, and the command `talk` is in `talkcli.cli`. A module is only imported when
+one of its names is used, because every start of the command has to wait for imports.
 """
 
 from __future__ import annotations
 
-TYPE_CHECKING = False  # `typing` takes as long to import as a server to answer
+TYPE_CHECKING = False  # importing it from `typing` takes as long as a server takes to answer
 if TYPE_CHECKING:
     from talkcli.client.client import Client
     from talkcli.client.goal import GoalHandle

@@ -1,4 +1,4 @@
-"""`python -m talkcli`: the command `talk`, where it isn't on the PATH."""
+"""The command `talk`, run as `python -m talkcli`."""
 
 from talkcli.cli import main
 

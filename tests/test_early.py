@@ -299,16 +299,16 @@ def test_a_signal_to_another_thread_ends_the_waiting(number: signal.Signals) -> 
     assert signal.set_wakeup_fd(-1) == -1  # nothing is left behind
 
 
-def test_after_clear_only_a_first_signal_ends_the_waiting() -> None:
+def test_after_a_reset_only_a_first_signal_ends_the_waiting() -> None:
     with Interrupts() as interrupts:
         signal.raise_signal(signal.SIGHUP)
-        interrupts.clear()
+        interrupts.reset()
         signal.raise_signal(signal.SIGHUP)
         assert wait_ready({}, 0.05, interrupts.watched) == set()
-    assert interrupts.number == signal.SIGHUP
+    assert interrupts.signal_number == signal.SIGHUP
     with Interrupts() as interrupts:
-        interrupts.clear()
+        interrupts.reset()
         signal.raise_signal(signal.SIGTERM)
         wait_ready({}, 10, interrupts.watched)
         pytest.fail("it was not interrupted")
-    assert interrupts.number == signal.SIGTERM
+    assert interrupts.signal_number == signal.SIGTERM

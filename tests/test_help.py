@@ -145,7 +145,7 @@ def test_on_a_terminal_a_message_breaks_between_words(columns: int, lines: int) 
 def test_a_command_in_a_message_is_not_broken() -> None:
     command = "sudo python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install ."
     for told in (f"one two {'three ' * 20}'{command}' four {'five ' * 20}", f"{'one ' * 30}start one with: {command}"):
-        lines = show._folded(told).splitlines()
+        lines = show._wrap(told).splitlines()
         assert len(lines) > 2
         assert sum(command in each for each in lines) == 1
         assert " ".join(each.strip() for each in lines) == told.strip()

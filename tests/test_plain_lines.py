@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from talkcli.cli import plain
 from talkcli.cli.click_app import talk
-from talkcli.cli.command import COMMON
+from talkcli.cli.command import COMMON_OPTIONS
 from talkcli.cli.commands import COMMANDS
-from talkcli.cli.show import Common
+from talkcli.cli.show import CommonOptions
 from talkcli.client.client import check, too_long
 from talkcli.client.connect import GREETING
 from talkcli.goals.option import FLAG
@@ -35,7 +35,7 @@ PLAIN = [each.name for each in COMMANDS.values() if each.plain]
 #: The options of a goal.
 GIVEN = [each.name for each in Say.options if each.flags and each.name not in {"wait", "feedback"}]
 TYPED = ParameterSource.COMMANDLINE
-ROWS = [*COMMON, *(option for each in COMMANDS.values() if each.plain for option in each.options)]
+ROWS = [*COMMON_OPTIONS, *(option for each in COMMANDS.values() if each.plain for option in each.options)]
 SPELLINGS = {form: each for each in ROWS for part in each.flags.split("/") for form in part.split(", ")}
 OPTIONS = sorted(SPELLINGS)
 VALUES = [
@@ -68,9 +68,9 @@ LINES = st.builds(
 ENVIRONMENTS = st.sampled_from([{}, {"TALK_NAME": "patrol"}, {"TALK_NAME": ""}])
 
 
-def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], Common]:
+def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], CommonOptions]:
     """Return the command, its options and arguments, and the common ones, as click reads them; UsageError."""
-    options = Common()
+    options = CommonOptions()
     with talk.make_context("talk", list(arguments), obj=options) as group:
         name, command, rest = talk.resolve_command(group, [*group._protected_args, *group.args])
         assert name
@@ -160,12 +160,12 @@ def test_any_other_line_is_left_to_click(line: list[str]) -> None:
     assert plain.read(line, {}) is None
 
 
-def sent_early(found: plain.Plain) -> tuple[JsonObject, JsonObject] | None:
+def sent_early(found: plain.PlainCommand) -> tuple[JsonObject, JsonObject] | None:
     """Return the requests that are sent early for a command; None if there are none."""
-    return plain.first(found) if plain.asks_at_once(found) else None
+    return plain.early_messages(found) if plain.may_send_early(found) else None
 
 
-def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
+def library_sends(found: plain.PlainCommand) -> tuple[Hello, Request]:
     """Return the requests that the client library sends for a command."""
     name, command = found.given.get("name") or os.environ.get("TALK_NAME") or None, found.command.name
     hello = Hello(name, urgent=command in {"cancel", "status"})
@@ -180,7 +180,7 @@ def library_sends(found: plain.Plain) -> tuple[Hello, Request]:
     return hello, others[command]
 
 
-def written(found: plain.Plain) -> tuple[JsonObject, JsonObject]:
+def written(found: plain.PlainCommand) -> tuple[JsonObject, JsonObject]:
     """Return the requests that the client library sends for a command, as they go over the wire."""
     hello, request = library_sends(found)
     return write_request(hello), write_request(request)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from talkcli.terminal.text import MORE, Sentence, printable, width
+from talkcli.terminal.text import ELLIPSIS, MeasuredText, printable, width
 from tests.conformance.bareserve import TALK
 from tests.support.screen import Screen, Terminal
 
@@ -217,35 +217,35 @@ def word(text: str, view: str) -> tuple[int, int]:
 
 
 def test_a_sentence_is_cut_around_the_word() -> None:
-    assert Sentence("battery low").view(8, 11, 11) == ("battery ", "low", "")
-    assert Sentence("").view(0, 0, 80) == ("", "", "")
-    sentence = Sentence(LONG)
-    assert sentence.view(*word(LONG, "the"), 20) == ("", "the", f" quick brown fox{MORE}")
-    assert sentence.view(*word(LONG, "jumps"), 20) == (f"{MORE} fox ", "jumps", f" over th{MORE}")
-    assert sentence.view(*word(LONG, "dog"), 20) == (f"{MORE}s over the lazy ", "dog", "")
-    heard, lit, ahead = Sentence("a" * 50 + " " + "b" * 50).view(51, 101, 12)
-    assert (lit[:3], ahead) == ("bbb", MORE), "a word wider than the terminal shows its beginning"
+    assert MeasuredText("battery low").view(8, 11, 11) == ("battery ", "low", "")
+    assert MeasuredText("").view(0, 0, 80) == ("", "", "")
+    sentence = MeasuredText(LONG)
+    assert sentence.view(*word(LONG, "the"), 20) == ("", "the", f" quick brown fox{ELLIPSIS}")
+    assert sentence.view(*word(LONG, "jumps"), 20) == (f"{ELLIPSIS} fox ", "jumps", f" over th{ELLIPSIS}")
+    assert sentence.view(*word(LONG, "dog"), 20) == (f"{ELLIPSIS}s over the lazy ", "dog", "")
+    heard, lit, ahead = MeasuredText("a" * 50 + " " + "b" * 50).view(51, 101, 12)
+    assert (lit[:3], ahead) == ("bbb", ELLIPSIS), "a word wider than the terminal shows its beginning"
     assert width(heard + lit + ahead) <= 12
     for end in (0, 3, 7, 11, 99):
-        assert Sentence("battery low").split(end) == ("battery low"[:end], "battery low"[end:])
+        assert MeasuredText("battery low").split(end) == ("battery low"[:end], "battery low"[end:])
 
 
 def test_wide_characters_take_two_columns() -> None:
     assert [width(each) for each in ("a", "日", "ｱ", "Ａ", "👩", "e\u0301", "…")] == [1, 2, 1, 2, 2, 1, 1]
     assert width("❤\ufe0f") == width("🇩🇪") / 2 == 2  # drawn by some terminals in fewer, by none in more
-    heard, lit, ahead = Sentence("日本語" * 10).view(12, 15, 11)
+    heard, lit, ahead = MeasuredText("日本語" * 10).view(12, 15, 11)
     assert width(heard + lit + ahead) <= 11
     assert lit == "日本語"
 
 
 def test_control_and_bidi_characters_are_shown_escaped_and_still_lit_in_place() -> None:
     text = "a\x1b[31m \u202ered\nnext"
-    assert Sentence(text).view(*word(text, "next"), 80)[:2] == ("a\\x1b[31m \\u202ered\\n", "next")
+    assert MeasuredText(text).view(*word(text, "next"), 80)[:2] == ("a\\x1b[31m \\u202ered\\n", "next")
 
 
 @given(text=ODD, start=st.integers(-3, 90), length=st.integers(-3, 30), columns=st.integers(-2, 60))
 def test_never_wider_than_the_terminal_and_never_anything_raw(text: str, start: int, length: int, columns: int) -> None:
-    sentence = Sentence(text)
+    sentence = MeasuredText(text)
     assert sentence.whole == printable(text)
     heard, lit, ahead = sentence.view(start, start + length, columns)
     shown = heard + lit + ahead
@@ -255,4 +255,4 @@ def test_never_wider_than_the_terminal_and_never_anything_raw(text: str, start: 
         assert shown == sentence.whole
     elif columns >= 15 and 0 <= start < len(text) and length > 0:
         assert lit
-        assert shown.removeprefix(MORE).removesuffix(MORE) in sentence.whole
+        assert shown.removeprefix(ELLIPSIS).removesuffix(ELLIPSIS) in sentence.whole

@@ -1,8 +1,8 @@
-"""The command line. Only this package knows click, and only here is anything printed or exited.
+"""The command line. Only this package uses click, and only this package prints or exits.
 
-Scripts call `say`, `wait`, `cancel` and `status` all the time, and importing click takes longer than a server takes to
-answer. So a plain command line of these is read, its request sent, and the rest of the program imported only then; any
-other line, every error in one and all help are click's.
+Scripts often call `say`, `wait`, `cancel` and `status`, and importing click takes longer than a server takes to answer.
+So `plain` parses simple command lines of these commands, sends their requests, and imports the rest of the program only
+then. Click handles all other lines, all errors in command lines, and all help.
 """
 
 from __future__ import annotations
@@ -17,50 +17,50 @@ if TYPE_CHECKING:
 
 
 def main() -> NoReturn:
-    """Run the command line, and exit."""
+    """Run the command line of this process, and exit."""
     try:
         code = _run_plain(sys.argv[1:])
-    except KeyboardInterrupt:  # before there was anything to interrupt
+    except KeyboardInterrupt:  # nothing has been started yet
         code = 128 + 2
     if code is None:
-        sys.exit(_run_by_click(sys.argv[1:]))
-    # All is written. To tidy up what ends with it anyway would take the interpreter an eighth of the command's life.
+        sys.exit(_run_with_click(sys.argv[1:]))
+    # All output is written. The interpreter's own cleanup would take an eighth of the command's time.
     os._exit(code)
 
 
 def run(arguments: list[str]) -> int:
     """Run a command line, and return its exit code."""
     code = _run_plain(arguments)
-    return _run_by_click(arguments) if code is None else code
+    return _run_with_click(arguments) if code is None else code
 
 
 def _run_plain(arguments: list[str]) -> int | None:
-    """Run a plain command line, and return its exit code; None where it isn't one."""
+    """Run a plain command line, and return its exit code. Return None for any other."""
     _prepare_streams()
     if "_TALK_COMPLETE" in os.environ:
         return None
-    from talkcli.cli.plain import carry_out, read
+    from talkcli.cli import plain
 
-    plain = read(arguments, os.environ)
-    return None if plain is None else carry_out(plain)
+    command = plain.read(arguments, os.environ)
+    return None if command is None else plain.run(command)
 
 
-def _run_by_click(arguments: list[str]) -> int:
-    from talkcli.cli.click_app import run as run_by_click
+def _run_with_click(arguments: list[str]) -> int:
+    from talkcli.cli import click_app
 
-    return run_by_click(arguments)
+    return click_app.run(arguments)
 
 
 def _prepare_streams() -> None:
-    """Open /dev/null where 0, 1 or 2 is closed: a socket or a lock must not end up as standard error.
+    """Open closed standard streams as /dev/null, and escape characters that the locale can't encode.
 
-    What the locale can't encode is shown escaped.
+    If 0, 1 or 2 stayed closed, a socket or a lock could get this descriptor, and notes would be written to it.
     """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest that is free: this one
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free descriptor, which is this one
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

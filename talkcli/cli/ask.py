@@ -1,34 +1,37 @@
-"""The commands that ask the server and show what it says: cancel, status, watch, log, voices, set, pause, resume.
+"""The commands that ask the server and show its answer: cancel, status, watch, log, voices, set, pause, resume, doctor.
 
-They know no click: plain command lines come here without it. What watching takes is imported for that alone.
+Plain command lines come here without click. Each command imports by itself what only it needs.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from functools import partial
 
 from talkcli.cli.command import nearest
-from talkcli.cli.show import note, screen, show, show_found, show_json
+from talkcli.cli.show import note, screen, show, show_json, show_result
 from talkcli.errors import EXIT_SIGPIPE, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.paths import named_robot
 from talkcli.protocol.events import Canceled, unfinished
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from typing import Any
 
-    from talkcli.cli.show import Common
+    from talkcli.cli.show import CommonOptions
     from talkcli.client.client import Client
+    from talkcli.doctor import broker, examine
     from talkcli.goals.goal import Goal, JsonObject
 
-#: Characters of what was heard last that are shown of a goal that is held.
-_MAX_SPOKEN = 40
+#: How much of the last words heard is shown when a goal is paused.
+_PAUSED_TEXT_CHARS = 40
 
 
-def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> None:
-    """Cancel what these select, or everything."""
+def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> None:
+    """Cancel the selected goals, or all goals."""
     with options.connect() as client:
         try:
             done = client.cancel(ids or None, current=current, before=before, key=key)
@@ -40,8 +43,8 @@ def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | N
             raise
 
 
-def status(options: Common, goal_id: str | None) -> None:
-    """Show how the server stands, or one goal."""
+def status(options: CommonOptions, goal_id: str | None) -> None:
+    """Show the server's status, or one goal."""
     from talkcli.goals.goal import Goal
     from talkcli.terminal.goals import goal_lines, status_lines
 
@@ -52,35 +55,35 @@ def status(options: Common, goal_id: str | None) -> None:
         now = time.time()
         return goal_lines(found, screen(), now) if isinstance(found, Goal) else status_lines(found, screen(), now)
 
-    show_found(options, [found.to_json()], lines)
+    show_result(options, [found.to_json()], lines)
 
 
-def watch(options: Common, words: bool) -> int:
-    """Show all goals as they happen, and each word as it is heard, too, if asked for; return the exit code."""
+def watch(options: CommonOptions, words: bool) -> int:
+    """Show the events of all goals until the user interrupts the command, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.terminal.transcript import Transcript
 
     if not has_reader():
         return EXIT_SIGPIPE
     transcript = Transcript(full=screen().width is None, words=words)
-    # The reader of its output, too, ends it: in `talk watch | head`, the next event may be far.
+    # In `talk watch | head`, the command ends when `head` does, even if the next event is hours away.
     with Interrupts(output=True) as interrupts, options.connect(interrupt=interrupts.watched) as client:
         for event in client.events():
-            show_found(options, [event.to_json()], partial(transcript.lines, event, screen(), time.time()))
+            show_result(options, [event.to_json()], partial(transcript.lines, event, screen(), time.time()))
     return interrupts.exit_code
 
 
-def log(options: Common, count: int) -> None:
-    """Show the goals that ended last."""
+def log(options: CommonOptions, count: int) -> None:
+    """Show the last goals that have ended."""
     from talkcli.terminal.transcript import log_lines
 
     with options.connect() as client:
         goals = client.log(count)
-    show_found(options, (each.to_json() for each in goals), lambda: log_lines(goals, screen(), time.time()))
+    show_result(options, (each.to_json() for each in goals), lambda: log_lines(goals, screen(), time.time()))
 
 
-def voices(options: Common, language: str | None) -> None:
-    """Show the engine's voices, or those of a language with its variants."""
+def voices(options: CommonOptions, language: str | None) -> None:
+    """Show all voices of the engine, or those of a language and of its variants."""
     from talkcli.terminal.goals import voice_lines
 
     with options.connect() as client:
@@ -94,42 +97,89 @@ def voices(options: Common, language: str | None) -> None:
         found = [each for each in every if _language(each) in wanted]
         if not found:
             raise TalkError(_no_voice(language, every))
-    show_found(options, found, lambda: voice_lines(found))
+    show_result(options, found, lambda: voice_lines(found))
 
 
-def change(options: Common, **settings: Any) -> None:
-    """Change those settings of the server that aren't None, or show them all."""
+def change(options: CommonOptions, **settings: Any) -> None:
+    """Change the server's settings that aren't None. If all are None, show the settings."""
     from talkcli.terminal.goals import setting_lines
 
     asked = {name: value for name, value in settings.items() if value is not None}
     with options.connect() as client:
         found = client.set(**asked) if asked else client.settings()
-    show_found(options, [found], lambda: [] if asked else setting_lines(found))
+    show_result(options, [found], lambda: [] if asked else setting_lines(found))
 
 
-def pause(options: Common) -> None:
-    """Hold speech."""
+def pause(options: CommonOptions) -> None:
+    """Pause speech."""
     with options.connect() as client:
-        held = client.pause()
+        goal = client.pause()
     from talkcli.terminal.text import printable
 
-    heard = held.spoken[-_MAX_SPOKEN:] if held and held.spoken else ""
-    where = f', after "{printable(heard)}"' if heard else ""
-    words = f"{printable(held.id)} is held{where}" if held else "nothing is being spoken, and nothing will be"
-    _tell(options, held, paused=True, words=f"{words}; 'talk resume' goes on")
+    heard = goal.spoken[-_PAUSED_TEXT_CHARS:] if goal and goal.spoken else ""
+    place = f', after "{printable(heard)}"' if heard else ""
+    words = f"{printable(goal.id)} is held{place}" if goal else "nothing is being spoken, and nothing will be"
+    _show_paused(options, goal, paused=True, words=f"{words}; 'talk resume' goes on")
 
 
-def resume(options: Common) -> None:
-    """Go on where speech is held."""
+def resume(options: CommonOptions) -> None:
+    """Resume speech."""
     with options.connect() as client:
         goal = client.resume()
     from talkcli.terminal.text import printable
 
     words = f"speech goes on with {printable(goal.id)}" if goal else "speech goes on"
-    _tell(options, goal, paused=False, words=words)
+    _show_paused(options, goal, paused=False, words=words)
 
 
-def _show_canceled(done: Canceled, options: Common) -> None:
+def _show_paused(options: CommonOptions, goal: Goal | None, *, paused: bool, words: str) -> None:
+    """Show whether speech is paused, and the goal that is being spoken."""
+    if options.json:
+        show_json({"paused": paused, "goal": None if goal is None else goal.to_json()})
+    elif not options.quiet:
+        note(words)
+
+
+def doctor(options: CommonOptions, silent: bool) -> int:
+    """Show the doctor's findings and the one thing to do next. Return the exit code."""
+    from talkcli.cli.interrupts import Interrupts
+    from talkcli.doctor.report import heard, lines, verdict
+    from talkcli.goals.states import EXIT_CODES, State
+
+    findings = []
+    with Interrupts() as interrupts:
+        examination = _examination(options, interrupts.watched, silent=silent)
+        for finding in examination.findings():
+            findings.append(finding)
+            show_result(options, [finding.to_json()], partial(lines, finding, screen()))
+            if interrupts.signal_number is not None:
+                break
+    if interrupts.signal_number is not None:
+        return interrupts.exit_code
+    if not options.json and not options.quiet:
+        note(verdict(findings, screen(), examination.question))
+    # A sentence that nobody would hear counts as an aborted goal.
+    return 0 if heard(findings, examination.question) else EXIT_CODES[State.ABORTED]
+
+
+def _examination(
+    options: CommonOptions, interrupt: Mapping[int, int], *, silent: bool
+) -> examine.Examination | broker.Examination:
+    """Return the examination of this machine, or of the way to a robot in a fleet."""
+    robot = named_robot(options.robot, options.socket)
+    if robot is None:
+        from talkcli.doctor.examine import Examination
+
+        return Examination(options.socket, silent=silent, interrupt=interrupt)
+    from talkcli.fleet.broker import need_client
+
+    need_client()
+    from talkcli.doctor import broker
+
+    return broker.Examination(robot, os.environ, insecure=options.insecure, interrupt=interrupt)
+
+
+def _show_canceled(done: Canceled, options: CommonOptions) -> None:
     for goal in done.canceled:
         if options.json:
             show_json(goal.to_json())
@@ -141,26 +191,26 @@ def _show_canceled(done: Canceled, options: Common) -> None:
 
 
 def _suggest_key(key: str, client: Client) -> None:
-    """Where nothing has this key, but something a similar one, tell whoever typed it."""
+    """Suggest a similar key if an unfinished goal has one."""
     from talkcli.terminal.text import printable
 
     try:
         status = client.status()
     except TalkError:
-        return  # what was asked for is done
+        return  # the goals have been canceled, so this is no error
     near = nearest(key, {each.key for each in unfinished(status) if each.key})
     if near:
         note(f"no goal has the key '{printable(key)}': did you mean '{printable(near)}'?")
 
 
 def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
-    """Return what is said where no voice speaks a language, which may have been given by its name."""
+    """Return the error for a language without a voice. The user may have typed a language's code or its name."""
     from talkcli.engine.voices import is_neural
     from talkcli.terminal.text import printable
 
     codes = {_language(each): _language(each) for each in voices}
-    # "German", "English_(America)": all that speak it are listed by the first part of its code. A neural voice's name
-    # is no language's.
+    # Names are such as "German" or "English_(America)". The first part of the code lists all voices of the language.
+    # The name of a neural voice isn't that of a language.
     names = {
         str(each.get("name") or "").partition(" ")[0]: _language(each).partition("-")[0]
         for each in voices
@@ -173,11 +223,3 @@ def _no_voice(language: str, voices: Iterable[JsonObject]) -> str:
 
 def _language(voice: JsonObject) -> str:
     return str(voice.get("language") or "").lower()
-
-
-def _tell(options: Common, goal: Goal | None, *, paused: bool, words: str) -> None:
-    """Tell what became of speech, and of the goal that was held."""
-    if options.json:
-        show_json({"paused": paused, "goal": None if goal is None else goal.to_json()})
-    elif not options.quiet:
-        note(words)

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Any
 
-    from talkcli.cli.show import Common
+    from talkcli.cli.show import CommonOptions
 
 
-def bridge(options: Common, print_unit: str | None, print_acl: bool, **given: Any) -> int:
+def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
     """Run the bridge, or print a unit that would, or the broker's rules; return the exit code."""
     _check_names("--name", [] if given["name"] is None else [given["name"]])
     if print_acl:
@@ -34,7 +34,7 @@ def bridge(options: Common, print_unit: str | None, print_acl: bool, **given: An
             hint = f"did you mean '{near}'?" if near else f"there are {', '.join(ASKABLE)}"
             raise UsageError(f"--allow: no request is called '{printable(each)}': {hint}")
     if print_unit:
-        units.print_bridge(options, print_unit, given)
+        units.print_bridge_unit(options, print_unit, given)
         return 0
     found = options.broker()
     from talkcli.fleet.bridge.main import Settings

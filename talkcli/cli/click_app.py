@@ -1,6 +1,6 @@
-"""The commands as click has them, made from their rows: help, completion, errors, and every line that isn't plain.
+"""The command line in click, made from the commands' rows. It handles help, completion, errors and complex lines.
 
-What carries a command out is imported when it is run, so that no command pays for another.
+The function of a command is imported when the command is run, so that no command needs the imports of another.
 """
 
 from __future__ import annotations
@@ -15,9 +15,17 @@ import click
 from click.core import ParameterSource
 
 from talkcli import __version__
-from talkcli.cli.command import ALL_EXIT_CODES, COMMON, FILE, limits, nearest, read_value, spelt
+from talkcli.cli.command import (
+    ALL_EXIT_CODES,
+    COMMON_OPTIONS,
+    OUTPUT_FILE,
+    nearest,
+    range_help,
+    read_value,
+    spelling,
+)
 from talkcli.cli.commands import COMMANDS
-from talkcli.cli.show import Common, end_line, ended, note, show_error
+from talkcli.cli.show import CommonOptions, note, run_command, show_error, write_error_line
 from talkcli.errors import EXIT_ERROR, UsageError
 from talkcli.goals.option import FLAG, INTEGER, NUMBER, SECONDS
 
@@ -26,7 +34,7 @@ if TYPE_CHECKING:
 
     from click.shell_completion import CompletionItem
 
-    from talkcli.cli.command import Codes, Command
+    from talkcli.cli.command import Command, ExitCodes
     from talkcli.goals.option import Option
 
 _EXAMPLES = """
@@ -35,8 +43,8 @@ _EXAMPLES = """
     talk cancel                       silence, now
     talk doctor                       silent? what to do next
 """
-#: What a command is called elsewhere, where that isn't near to its name here.
-_ELSEWHERE = {
+#: Names that other programs have for a command, if they aren't similar to its name here.
+_FOREIGN_NAMES = {
     "check": "doctor",
     "follow": "watch",
     "history": "log",
@@ -49,8 +57,8 @@ _ELSEWHERE = {
 }
 
 
-class _Value(click.FloatRange):
-    """The value of an option, as `command` reads it. Of a number, help shows the limits; others have none."""
+class _OptionType(click.FloatRange):
+    """The type of an option that `read_value` reads. It is a range so that help shows the limits of a number."""
 
     def __init__(self, option: Option) -> None:
         self._option = option
@@ -61,15 +69,15 @@ class _Value(click.FloatRange):
             return read_value(self._option, str(value))
         except ValueError as error:
             if self._option.kind in (INTEGER, NUMBER, SECONDS):
-                came_from = None  # click's own words say it
+                source = None  # click's own message names the option
             elif ctx and ctx.get_parameter_source(self._option.name) is not ParameterSource.ENVIRONMENT:
-                came_from = spelt(self._option)
+                source = spelling(self._option)
             else:
-                came_from = f"{self._option.env} in the environment"
-            raise click.BadParameter(str(error), ctx, param, came_from) from error
+                source = f"{self._option.env} in the environment"
+            raise click.BadParameter(str(error), ctx, param, source) from error
 
     def _describe_range(self) -> str:
-        return limits(self._option)
+        return range_help(self._option)
 
 
 def _option(option: Option, *, common: bool = False) -> click.Option:
@@ -84,8 +92,8 @@ def _option(option: Option, *, common: bool = False) -> click.Option:
         help=option.help,
         envvar=option.env or None,
         show_envvar=bool(option.env),
-        shell_complete=_offering(option.offers),
-        callback=_store if common else None,
+        shell_complete=_completer(option.offers),
+        callback=_store_common if common else None,
         expose_value=not common,
     )
 
@@ -93,7 +101,7 @@ def _option(option: Option, *, common: bool = False) -> click.Option:
 def _type(option: Option) -> Any:
     if option.choices:
         return click.Choice(option.choices)
-    return click.Path(dir_okay=False) if option.kind is FILE else _Value(option)
+    return click.Path(dir_okay=False) if option.kind is OUTPUT_FILE else _OptionType(option)
 
 
 def _argument(argument: Option) -> click.Argument:
@@ -103,37 +111,37 @@ def _argument(argument: Option) -> click.Argument:
         required=bool(argument.choices),
         type=click.Choice(argument.choices) if argument.choices else None,
         metavar=argument.metavar,
-        shell_complete=_offering(argument.offers),
+        shell_complete=_completer(argument.offers),
     )
 
 
-def _offering(name: str) -> Callable[..., list[CompletionItem]] | None:
-    """Return what offers values to a shell, "" for nothing: that of `completion` of this name, once a shell asks."""
+def _completer(name: str) -> Callable[..., list[CompletionItem]] | None:
+    """Return a function that calls the one of this name in `completion`; None for an empty name."""
 
-    def offer(*arguments: Any) -> list[CompletionItem]:
+    def complete(*arguments: Any) -> list[CompletionItem]:
         from talkcli.cli import completion
 
         found: list[CompletionItem] = getattr(completion, name)(*arguments)
         return found
 
-    return offer if name else None
+    return complete if name else None
 
 
-def _store(context: click.Context, parameter: click.Parameter, value: object) -> None:
+def _store_common(context: click.Context, parameter: click.Parameter, value: object) -> None:
     if value:
-        setattr(context.ensure_object(Common), parameter.name or "", value)
+        setattr(context.ensure_object(CommonOptions), parameter.name or "", value)
 
 
-class _Documented(click.Command):
-    """Has the sections of our help: examples, its own options, those that all have, and exit codes."""
+class _HelpfulCommand(click.Command):
+    """A command whose help has examples, its own options, the common options, and exit codes."""
 
     examples: str
-    exit_codes: Codes
-    #: the heading of the options that all have
-    shared = "Options of every command"
+    exit_codes: ExitCodes
+    #: the heading of the common options
+    common_heading = "Options of every command"
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return what is offered, with as much help as a shell has room for: what stands before its first stop."""
+        """Return the completions. Of each help text, a shell has only room for the part before the first stop."""
         found = super().shell_complete(ctx, incomplete)
         for each in found:
             each.help = re.split(r"[.;](?:\s|$)", each.help or "", maxsplit=1)[0] + "."
@@ -145,11 +153,11 @@ class _Documented(click.Command):
             _write_lines(self.examples, formatter)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        sections: dict[str, list[tuple[str, str]]] = {"Options": [], self.shared: []}
+        sections: dict[str, list[tuple[str, str]]] = {"Options": [], self.common_heading: []}
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
             if record and isinstance(parameter, click.Option):
-                sections["Options" if parameter.expose_value else self.shared].append(record)
+                sections["Options" if parameter.expose_value else self.common_heading].append(record)
         for heading, records in sections.items():
             if records:
                 with formatter.section(heading):
@@ -161,41 +169,41 @@ class _Documented(click.Command):
             formatter.write_dl([(str(code), words) for code, words in rows])
 
 
-class ClickCommand(_Documented):
-    """A command, as its row says."""
+class ClickCommand(_HelpfulCommand):
+    """A command made from its row."""
 
     def __init__(self, row: Command) -> None:
         self.row = row
         self.examples, self.exit_codes = row.examples, row.exit_codes
         arguments: list[click.Parameter] = [_argument(row.argument)] if row.argument else []
-        own, shared = map(_option, row.options), [_option(each, common=True) for each in COMMON]
+        own, common = map(_option, row.options), [_option(each, common=True) for each in COMMON_OPTIONS]
         super().__init__(
             row.name,
-            params=[*arguments, *own, *shared],
-            help=cleandoc(row.about),
+            params=[*arguments, *own, *common],
+            help=cleandoc(row.description),
             short_help=row.summary,
-            callback=self._carry_out,
+            callback=self._run,
         )
 
-    def _carry_out(self, **given: Any) -> int | None:
+    def _run(self, **given: Any) -> int | None:
         context = click.get_current_context()
-        options: Common = context.obj
+        options: CommonOptions = context.obj
         options.typed = {each for each in given if context.get_parameter_source(each) is ParameterSource.COMMANDLINE}
-        fault = self.row.fault(given, options.typed, options.robot, options.socket, options.connect_timeout)
+        fault = self.row.usage_fault(given, options.typed, vars(options))
         if fault:
             raise click.UsageError(fault, context)
-        return self.row.carry_out(options, given)
+        return self.row.run(options, given)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        ctx.allow_extra_args = True  # so that it is said here what is too much
+        ctx.allow_extra_args = True  # they are reported below
         try:
             rest = super().parse_args(ctx, args)
         except click.UsageError as error:
-            error.ctx = error.ctx or ctx  # the help to look at is this command's
-            if isinstance(error, click.NoSuchOption) and self.row.no_such_option:
-                words = _what_is_wrong(error)
+            error.ctx = error.ctx or ctx  # the note below the error names this command's help
+            if isinstance(error, click.NoSuchOption) and self.row.unknown_option_hint:
+                words = _describe(error)
                 stop = "" if words.endswith("?") else "."
-                raise click.UsageError(f"{words}{stop} {self.row.no_such_option}", ctx) from error
+                raise click.UsageError(f"{words}{stop} {self.row.unknown_option_hint}", ctx) from error
             raise
         if rest and not ctx.resilient_parsing:
             names = [each.make_metavar(ctx) for each in self.params if isinstance(each, click.Argument)]
@@ -204,11 +212,11 @@ class ClickCommand(_Documented):
         return rest
 
 
-class _Commands(_Documented, click.Group):
-    """All of them: each is made of its row when it is needed."""
+class _CommandGroup(_HelpfulCommand, click.Group):
+    """The group of all commands. Each is made from its row when it is needed."""
 
     examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
-    shared = "Options, before or after the command"
+    common_heading = "Options, before or after the command"
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         return list(COMMANDS)
@@ -220,7 +228,7 @@ class _Commands(_Documented, click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         unknown = args[0] not in COMMANDS and args[0][:1] not in ("", "-")
-        if unknown and not ctx.resilient_parsing:  # a shell that asks for completion is told nothing
+        if unknown and not ctx.resilient_parsing:  # completion shows no errors
             raise click.UsageError(_unknown_command(args), ctx)
         return super().resolve_command(ctx, args)
 
@@ -230,11 +238,11 @@ class _Commands(_Documented, click.Group):
 
 
 @click.group(
-    cls=_Commands,
+    cls=_CommandGroup,
     invoke_without_command=True,
     subcommand_metavar="COMMAND [ARGS]...",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    params=[_option(each, common=True) for each in COMMON],
+    params=[_option(each, common=True) for each in COMMON_OPTIONS],
 )
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
@@ -245,7 +253,7 @@ def talk(context: click.Context) -> None:
 
 
 def _first_screen(context: click.Context) -> str:
-    """Return what a newcomer needs first; with the prompt below it, it fits a terminal of 24 lines."""
+    """Return what a new user needs first. Together with the next prompt it fits on a terminal of 24 lines."""
     formatter = context.make_formatter()
     formatter.write(f"{talk.help}\n")
     with formatter.indentation():
@@ -256,28 +264,30 @@ def _first_screen(context: click.Context) -> str:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line, or answer a shell that asks for completion, and return the exit code."""
-    # Whoever started this may ignore it, and then no process that is started here leaves an exit status.
+    """Run a command line, or complete it for a shell. Return the exit code."""
+    # The parent process may have set this signal to be ignored. Child processes would then have no exit status.
     _signal.signal(_signal.SIGCHLD, _signal.SIG_DFL)
-    options = Common()
-    return _complete(options) if "_TALK_COMPLETE" in os.environ else ended(lambda: _main(arguments, options), options)
+    options = CommonOptions()
+    if "_TALK_COMPLETE" in os.environ:
+        return _complete(options)
+    return run_command(lambda: _main(arguments, options), options)
 
 
-def _main(arguments: list[str], options: Common) -> object:
+def _main(arguments: list[str], options: CommonOptions) -> object:
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:
             return talk.invoke(context)
-    except click.exceptions.Exit as end:  # of help, and of the version
+    except click.exceptions.Exit as end:  # after the help or the version
         return end.exit_code
     except KeyboardInterrupt:
-        end_line()  # that the terminal has shown ^C on
+        write_error_line()  # the terminal has shown ^C on the present line
         raise
     except click.ClickException as error:
         from talkcli.terminal.text import printable
 
-        # The options may not have been read as far as --json when the error was found.
+        # The error may have been found before --json was read.
         json = options.json or "--json" in arguments
-        words = printable(_what_is_wrong(error))  # what was typed may be text of somebody else's
+        words = printable(_describe(error))  # the command line may contain text from another program
         show_error(UsageError(words), json=json)
         if not json and "--help" not in words:
             found = getattr(error, "ctx", None)
@@ -285,13 +295,13 @@ def _main(arguments: list[str], options: Common) -> object:
         return error.exit_code
 
 
-def _complete(options: Common) -> int:
-    """Answer a shell that asks for completion: what there is to offer, and never a word besides."""
+def _complete(options: CommonOptions) -> int:
+    """Print the completions for a shell, and nothing else."""
     from talkcli.cli import completion
 
     completion.register()
     try:
-        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # ends by itself
+        talk.main([], prog_name="talk", standalone_mode=False, obj=options)  # exits after completing
     except Exception:
         if os.environ.get("TALK_DEBUG"):
             raise
@@ -299,34 +309,34 @@ def _complete(options: Common) -> int:
 
 
 def _write_lines(text: str, formatter: click.HelpFormatter) -> None:
-    """Write lines as they are, indented as the formatter is at this moment."""
+    """Write lines unchanged, with the present indentation of the formatter."""
     for line in text.strip().splitlines():
         formatter.write(f"{'':{formatter.current_indent}}{line.strip()}\n")
 
 
 def _unknown_command(words: list[str]) -> str:
-    """Return what is said of a command that there isn't: which was meant, or how to speak these words."""
+    """Return the error for an unknown command. It suggests a command, or how to speak these words."""
     name = words[0]
     if name.lower() == "help":
         meant = next((each for each in words[1:] if each in COMMANDS), None)
         return f"no such command '{name}': write 'talk{f' {meant}' if meant else ''} --help'"
-    near = _ELSEWHERE.get(name.lower()) or nearest(name, COMMANDS)
+    near = _FOREIGN_NAMES.get(name.lower()) or nearest(name, COMMANDS)
     return f"no such command '{name}': " + (
         f"did you mean '{near}'?" if near else f"to speak it, write: talk say {_quoted(' '.join(words))}"
     )
 
 
 def _quoted(text: str) -> str:
-    """Return a text as a shell takes it, in the quotes that people write where these do."""
+    """Return a text quoted for a shell, in double quotes if possible."""
     import shlex
 
     return shlex.quote(text) if any(each in text for each in '"$`\\!') else f'"{text}"'
 
 
-def _what_is_wrong(error: click.ClickException) -> str:
-    """Return what is wrong with a command line, without the next step."""
+def _describe(error: click.ClickException) -> str:
+    """Return what is wrong with a command line, in our own style."""
     if isinstance(error, click.NoSuchOption):
-        # Without the dashes, which make any two of them alike.
+        # The dashes would make any two options similar.
         near = nearest(error.option_name.lstrip("-"), [each.lstrip("-") for each in error.possibilities or ()])
         return f"no such option '{error.option_name}'" + (f": did you mean '--{near}'?" if near else "")
     if isinstance(error, click.MissingParameter) and error.param and isinstance(error.param.type, click.Choice):

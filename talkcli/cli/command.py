@@ -1,9 +1,7 @@
-"""What a command is: one row, from which help, completion, the documents' tables and both readers of lines are made.
+"""A command as one row, from which help, completion, the tables in documents and both parsers are made.
 
-Besides, what the words of its line mean, read alike wherever they are read: the value of an option; a text, which may
-hold bytes that are no UTF-8; and what was probably meant by a word that isn't known.
-
-It knows no single command; those are in `commands`. Pure; it is imported before anything is sent, and knows no click.
+This module also reads the words of a command line: option values, and texts that may contain bytes that aren't UTF-8.
+The commands themselves are in `commands`. This module is pure. It is imported before anything is sent, without click.
 """
 
 from __future__ import annotations
@@ -18,21 +16,23 @@ if TYPE_CHECKING:
     from collections.abc import Set as AbstractSet
     from typing import Any
 
-    from talkcli.cli.show import Common
+    from talkcli.cli.show import CommonOptions
 
-    Codes = Mapping[int | str, str]
-    #: What contradicts itself in the options that were given, their defaults included, and in those that were typed.
+    ExitCodes = Mapping[int | str, str]
+    #: Returns what is wrong with a combination of options. It is called with the values of all options, by name, and
+    #: with the names of the options on the command line.
     Rule = Callable[[Mapping[str, Any], AbstractSet[str]], str | None]
 
-#: A file that is to be written, and the mode of one.
-FILE = Kind("string", (str,), "must be a string")
-MODE = Kind("string", (str,), "must be a string", "MODE")
+#: A file to be written.
+OUTPUT_FILE = Kind("string", (str,), "must be a string")
+#: The permissions of a file, in octal.
+FILE_MODE = Kind("string", (str,), "must be a string", "MODE")
 
-#: Options that go with one robot, or with none, and not with several.
-_OF_ONE = ("lines", "ahead", "feedback", "output")
+#: Options of `say`, `wait` and others that can't be combined with several robots.
+_SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "feedback", "output")
 
-#: Exit codes of every command that asks the server for something; a command says more of those that mean more to it.
-ASKING: Codes = {
+#: The exit codes of every command that uses a server. A command can give other meanings to them.
+SERVER_EXIT_CODES: ExitCodes = {
     1: "anything not named here; a bug says so",
     2: "usage: what is wrong stands on standard error",
     3: "no server: nothing was sent, so it is safe to try again",
@@ -41,11 +41,14 @@ ASKING: Codes = {
     10: "permission denied",
     12: "lost: it was sent, then nothing more was heard; it may have an effect all the same",
 }
-#: … and of those that may ask several robots at once.
-ASKING_SEVERAL: Codes = {**ASKING, 13: "robots differ: those that did not do it failed in more than one way"}
-#: All of them, as the README's table has them; each command's help says which are its own.
-ALL_EXIT_CODES: Codes = {
-    **ASKING_SEVERAL,
+#: The exit codes of every command that can be sent to several robots.
+FLEET_EXIT_CODES: ExitCodes = {
+    **SERVER_EXIT_CODES,
+    13: "robots differ: those that did not do it failed in more than one way",
+}
+#: All exit codes, for the general help and the README. The help of each command has its own meanings.
+ALL_EXIT_CODES: ExitCodes = {
+    **FLEET_EXIT_CODES,
     0: "accepted; with --wait succeeded: all of it was played",
     1: "anything not named here; a bug says so, and TALK_DEBUG=1 where",
     2: "usage",
@@ -64,115 +67,105 @@ ALL_EXIT_CODES: Codes = {
 
 @frozen
 class Command:
-    """A command."""
+    """A row that describes a command."""
 
     name: str
-    #: what it does, in the list of all
+    #: one line for the list of commands
     summary: str
-    #: what it does, in its help
-    about: str
-    #: the function that carries it out, "module:name": called with a `Common` and what was given, by name
-    runs: str
-    #: lines, each a command line
+    #: the description in the command's help
+    description: str
+    #: the function that runs the command, as "module:name"; it is called with `CommonOptions` and the given values
+    function: str
+    #: example command lines, one on each line
     examples: str
-    #: what each exit code means after this command
-    exit_codes: Codes
+    exit_codes: ExitCodes
     options: tuple[Option, ...] = ()
-    #: what it takes besides options; any number of words, where its metavar ends with dots
+    #: the positional argument; it takes any number of words if its metavar ends with dots
     argument: Option | None = None
-    #: whether it finds a place where a server is full
+    #: whether it may connect to a server that has reached its client limit
     urgent: bool = False
-    #: what is said besides of an option that there isn't
-    no_such_option: str = ""
-    #: whether a plain line of it is read without click: scripts call most of them all the time
+    #: added to the error for an unknown option
+    unknown_option_hint: str = ""
+    #: whether the lightweight parser in `plain` may read it, without click
     plain: bool = True
-    #: whether it means a server, which may be a robot's of a fleet, and not this machine alone
-    asks: bool = True
-    #: whether it connects to one server, which it can wait for
+    #: whether it is about a server, which can be that of a robot in a fleet
+    uses_server: bool = True
+    #: whether it connects to a single server, for which --connect-timeout can wait
     connects: bool = True
-    #: the function that asks several robots at once, as `runs` one, without the options that don't go with that; ""
-    #: where the command does not
-    several: str = ""
+    #: the function that sends the command to several robots, called like `function`; empty if there is none
+    fleet_function: str = ""
     rule: Rule | None = None
 
-    def fault(
-        self,
-        given: Mapping[str, Any],
-        typed: AbstractSet[str],
-        robot: str | None = None,
-        socket: str | None = None,
-        connect_timeout: float | None = None,
-    ) -> str | None:
-        """Return what is wrong with values that each can be read, for people, or None.
+    def usage_fault(self, given: Mapping[str, Any], typed: AbstractSet[str], common: Mapping[str, Any]) -> str | None:
+        """Return what is wrong with a command line whose values are each valid, or None.
 
-        `robot`, `socket`, `connect_timeout`: options of every command, as they were typed.
+        Args:
+            given: the values of the command's own options and of its argument, by name.
+            typed: the names of the options on the command line.
+            common: the values of the common options on the command line, by name.
         """
-        if robot is not None and (fault := self._stray(given, robot, socket)):
-            return fault
-        if connect_timeout is not None and (fault := self._waiting_fault(given, robot)):
-            return fault
-        refused = (words for each in self.options if (words := each.refusal(given[each.name])))
-        return next(refused, None) or (self.rule(given, typed) if self.rule else None)
-
-    def _stray(self, given: Mapping[str, Any], robot: str, socket: str | None) -> str | None:
-        """Return what is wrong with naming a robot, or several, or None."""
-        from talkcli.fleet.desk.selection import Selection, several
-
-        if socket:
+        robot, connect_timeout = common.get("robot"), common.get("connect_timeout")
+        if robot is not None and common.get("socket"):
             return "--robot is a robot of a fleet, --socket a server of this machine: leave out one of them"
-        if not self.asks or given.get("output") is not None:
-            what = f"{self.name} --output" if self.asks else self.name
-            return f"'talk {what}' is of this machine alone: leave out --robot"
-        if several(robot):
-            lone = [f"--{each}" for each in _OF_ONE if given.get(each)]
-            if not self.several or lone:
-                what = " ".join([self.name, *lone])
+        fault = self._connection_fault(given, robot, connect_timeout)
+        refusals = (words for each in self.options if (words := each.refusal(given[each.name])))
+        return fault or next(refusals, None) or (self.rule(given, typed) if self.rule else None)
+
+    def _connection_fault(
+        self, given: Mapping[str, Any], robot: str | None, connect_timeout: float | None
+    ) -> str | None:
+        """Return what is wrong with naming a robot or waiting for a server, or None."""
+        is_local, is_several = not self.uses_server or given.get("output") is not None, False
+        if robot is not None:
+            from talkcli.fleet.desk.selection import Selection, several
+
+            if is_local:
+                what = f"{self.name} --output" if self.uses_server else self.name
+                return f"'talk {what}' is of this machine alone: leave out --robot"
+            is_several = several(robot)
+            single = [f"--{each}" for each in _SINGLE_ROBOT_OPTIONS if given.get(each)]
+            if is_several and (single or not self.fleet_function):
+                what = " ".join([self.name, *single])
                 return (
                     f"'talk {what}' is of one robot: name it; 'talk fleet status' and 'talk fleet watch' show several"
                 )
-        return Selection(robot).fault
+            if fault := Selection(robot).fault:
+                return fault
+        if connect_timeout is None:
+            return None
+        if is_local or not self.connects:
+            what = f"{self.name}{' --output' * (given.get('output') is not None)}"
+            return f"'talk {what}' does not wait for a server: leave out --connect-timeout"
+        return "--connect-timeout waits for one robot: name it, or leave out --connect-timeout" if is_several else None
 
-    def _waiting_fault(self, given: Mapping[str, Any], robot: str | None) -> str | None:
-        """Return what is wrong with waiting until the server can be reached, or None."""
-        output = given.get("output") is not None
-        if not (self.asks and self.connects) or output:
-            return f"'talk {self.name}{' --output' * output}' does not wait for a server: leave out --connect-timeout"
-        if robot is not None:
-            from talkcli.fleet.desk.selection import several
-
-            if several(robot):
-                return "--connect-timeout waits for one robot: name it, or leave out --connect-timeout"
-        return None
-
-    def carry_out(self, options: Common, given: Mapping[str, Any]) -> int | None:
-        """Carry it out with what was given, and return the exit code; None for 0."""
+    def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
+        """Run the command with the given values, and return its exit code, or None for 0."""
         options.urgent = self.urgent
-        runs = self.runs
-        robot = named_robot(options.robot, options.socket) if self.asks and given.get("output") is None else None
+        function = self.function
+        is_local = not self.uses_server or given.get("output") is not None
+        robot = None if is_local else named_robot(options.robot, options.socket)
         if robot:
-            fault = self._stray(given, robot, None)
-            if fault is None and options.connect_timeout is not None:
-                fault = self._waiting_fault(given, robot)
-            if fault:
+            # The robot can also come from the environment, so it is checked again.
+            if fault := self._connection_fault(given, robot, options.connect_timeout):
                 raise UsageError(fault)
             from talkcli.fleet.desk.selection import several
 
             if several(robot):
-                runs = self.several
-                given = {name: value for name, value in given.items() if name not in _OF_ONE}
-        module, _, name = runs.partition(":")
+                function = self.fleet_function
+                given = {name: value for name, value in given.items() if name not in _SINGLE_ROBOT_OPTIONS}
+        module, _, name = function.partition(":")
         run: Callable[..., int | None] = getattr(__import__(f"talkcli.cli.{module}", fromlist=[name]), name)
         return run(options, **given)
 
 
 def option(flags: str, kind: Kind, words: str, **more: Any) -> Option:
-    """Return an option of commands alone, named as its long form is; `words` is its help. A flag's default is no."""
+    """Return an option of a command, named after its long flag. `words` is its help, and `more` are further fields."""
     name = flags.rpartition("--")[2].replace("-", "_")
     return Option(name, kind, flags=flags, help=words, **{"default": False if kind is FLAG else None, **more})
 
 
-#: The options that may stand before and after every command.
-COMMON = (
+#: The options of every command. They can be written before or after its name.
+COMMON_OPTIONS = (
     option(
         "--socket",
         PATH,
@@ -200,38 +193,42 @@ COMMON = (
 )
 
 
-def spelt(option: Option, value: object = None) -> str:
-    """Return an option as it is typed, in its long form: the one that this value stands for."""
+def spelling(option: Option, value: object = None) -> str:
+    """Return the long flag of an option. If the flag has two forms, the value chooses one."""
     forms = option.flags.split("/")
     return (forms[-1] if value is False else forms[0]).split(", ")[-1]
 
 
 def read_value(option: Option, text: str) -> Any:
-    """Return the value that a text stands for; ValueError, with what is wrong for people, where it stands for none."""
+    """Return the value of an option from its text.
+
+    Raises:
+        ValueError: the text is no valid value. The message says why.
+    """
     kind = option.kind
     if kind in (INTEGER, NUMBER, SECONDS):
-        return _number(option, text)
-    if kind is MODE:
-        return _mode(text)
+        return _read_number(option, text)
+    if kind is FILE_MODE:
+        return _read_mode(text)
     if kind in (WORD, ID):
-        text = _decoded(text)
-        unreadable = next(filter(_is_byte, text), None)
-        if unreadable:
-            raise ValueError(f"the byte {_byte(unreadable)} in it is not UTF-8")
-    if not text and kind in (WORD, ID, PATH):  # it would select nothing
+        text = _as_utf8(text)
+        bad = next(filter(_is_bad_byte, text), None)
+        if bad:
+            raise ValueError(f"the byte {_format_byte(bad)} in it is not UTF-8")
+    if not text and kind in (WORD, ID, PATH):  # an empty name would select nothing
         raise ValueError("empty; is the variable set that it comes from?")
     return text
 
 
-def limits(option: Option) -> str:
-    """Return the limits of a number as help has them, "" where it has none."""
+def range_help(option: Option) -> str:
+    """Return the limits of a number for help; empty if it has none."""
     return f"from {option.range}" if option.limits[1] is not None else option.range
 
 
-def _number(option: Option, text: str) -> float:
+def _read_number(option: Option, text: str) -> float:
     whole = option.kind is INTEGER
     what = "a whole number" if whole else "a number"
-    wanted = f"{what} {limits(option)}" if option.range else "a valid integer" if whole else what
+    wanted = f"{what} {range_help(option)}" if option.range else "a valid integer" if whole else what
     try:
         value = int(text) if whole else float(text)
     except ValueError:
@@ -245,8 +242,8 @@ def _number(option: Option, text: str) -> float:
     return value
 
 
-def _mode(text: str) -> int:
-    """Return the mode of a file; the owner must be able to use the socket, and nobody executes it."""
+def _read_mode(text: str) -> int:
+    """Return the mode of a socket. Its owner must be able to use it, and nobody may execute it."""
     digits = 3 <= len(text) <= 4 and set(text) <= set("01234567")
     mode = int(text, 8) if digits else 0
     if mode & ~0o666 or mode & 0o600 != 0o600:
@@ -254,42 +251,44 @@ def _mode(text: str) -> int:
     return mode
 
 
-def _decoded(text: str) -> str:
-    """Return a text that came as bytes, read as UTF-8 even where the locale made Python take arguments for ASCII."""
+def _as_utf8(text: str) -> str:
+    """Return a text from the command line, decoded as UTF-8 even if Python has used another encoding."""
     return text.encode(errors="surrogateescape").decode(errors="surrogateescape")
 
 
-def _is_byte(character: str) -> bool:
-    """Whether a character stands for a byte that is no UTF-8: from 0x80 on Python shows them so, as `_decoded` does."""
+def _is_bad_byte(character: str) -> bool:
+    """Return whether a character stands for a byte that isn't UTF-8. Python decodes such bytes to surrogates."""
     return "\udc80" <= character <= "\udcff"
 
 
-def _byte(character: str) -> str:
+def _format_byte(character: str) -> str:
     return f"0x{ord(character) - 0xDC00:02x}"
 
 
-def readable(text: str, line: int = 1) -> tuple[str, str | None]:
-    """Return a text with U+FFFD for each byte that is no UTF-8, and what is said of them, if there are any.
+def replace_bad_bytes(text: str, line: int = 1) -> tuple[str, str | None]:
+    """Replace each byte that isn't UTF-8 by U+FFFD. `line` is the number of the text's first line.
 
-    `line`: the number of its first line.
+    Returns:
+        The text, and a note about the bytes, or None if there are none.
     """
     if text.isascii():
         return text, None
-    text = _decoded(text)
-    found = [place for place, each in enumerate(text) if _is_byte(each)]
+    text = _as_utf8(text)
+    found = [place for place, each in enumerate(text) if _is_bad_byte(each)]
     if not found:
         return text, None
     first = found[0]
     line += text.count("\n", 0, first)
     column = first - text.rfind("\n", 0, first)
-    words = f"line {line}, column {column}: the byte {_byte(text[first])} is not UTF-8, and is not spoken"
+    words = f"line {line}, column {column}: the byte {_format_byte(text[first])} is not UTF-8, and is not spoken"
     if len(found) > 1:
         words += f" (the first of {len(found):,})"
-    return "".join("\ufffd" if _is_byte(each) else each for each in text), words  # the engine takes it for a blank
+    # The engine treats U+FFFD as a space.
+    return "".join("\ufffd" if _is_bad_byte(each) else each for each in text), words
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the one of these that was most likely meant, None where none is near."""
+    """Return the known word that was most likely meant, or None if none is similar."""
     import difflib
 
     by_name = {each.lower(): each for each in known}

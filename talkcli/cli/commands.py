@@ -1,37 +1,39 @@
-"""The commands, a row each: what it is for, what it takes, what its exit codes mean, and what carries it out.
+"""The commands, one row each: what it is for, its options, its exit codes, and the function that runs it.
 
-Rules for this file: it is imported before anything is sent, so it imports nothing heavy, and it carries out nothing.
-The options of goals and servers are in `goals.options`; how two options go together is the rule beside a command's row.
+This module is imported before anything is sent, so it must import nothing heavy, and it must not run anything. The
+options of goals and servers are in `goals.options`. The functions here say which options can't be combined.
 """
 
 from __future__ import annotations
 
 import os
 
-from talkcli.cli.command import ASKING, ASKING_SEVERAL, FILE, Command, option, spelt
-from talkcli.cli.daemons import BRIDGE, SERVE
+from talkcli.cli.command import FILE_MODE, FLEET_EXIT_CODES, OUTPUT_FILE, SERVER_EXIT_CODES, Command, option, spelling
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.option import FLAG, ID, IDS, INTEGER, MAX_LOG, NUMBER, TEXT, WORD, Option
-from talkcli.goals.options import OPTIONS, SETTINGS, SOUND, Cancel
+from talkcli.goals.options import MAX_CHARACTERS, MAX_LEAD_IN, OPTIONS, SETTINGS, SOUND, Cancel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from collections.abc import Set as AbstractSet
     from typing import Any
 
-#: The most goals that `--ahead` allows: as many as a server's queue can be told to hold.
-MAX_AHEAD = 10_000
-#: The shells that there is a completion script for.
+#: The largest value of --max-queue, and so of --ahead.
+MAX_QUEUED_GOALS = 10_000
+#: The systemd units that `talk serve` and `talk bridge` can print.
+SERVE_UNITS = ("user", "system", "user-socket", "system-socket")
+BRIDGE_UNITS = ("user", "system")
+#: The shells that have a completion script.
 SHELLS = ("bash", "zsh", "fish")
 
 
 def _timeout(words: str) -> Option:
-    """Return the option --timeout; `words` is its help: what the command does when the time is over."""
+    """Return the option --timeout. `words` is its help."""
     return option("-t, --timeout", NUMBER, words, limits=(0, None), above=True, metavar="SEC")
 
 
-def _to_say() -> Iterator[Option]:
-    """Make the options of `say`: those of a goal, and its own."""
+def _say_options() -> Iterator[Option]:
+    """Yield the options of a goal, with the command's own ones in between."""
     for each in OPTIONS:
         if each.flags:
             yield replace(each, env="", help=f"{each.help}  [env var, with -o: {each.env}]") if each.env else each
@@ -42,27 +44,27 @@ def _to_say() -> Iterator[Option]:
             yield Option("name", WORD, flags="--as", metavar="NAME", help=what, env="TALK_NAME")
     yield option("--lines", FLAG, "Speak each line of standard input, as it comes; no TEXT then.")
     words = "With --lines: at most N of its goals are pending; other lines wait in the command.  [default: 10]"
-    yield option("--ahead", INTEGER, words, limits=(1, MAX_AHEAD))
+    yield option("--ahead", INTEGER, words, limits=(1, MAX_QUEUED_GOALS))
     words = "Write it into a file instead; '-' is standard output. Needs no server."
-    yield option("-o, --output", FILE, words, metavar="FILE.wav")
+    yield option("-o, --output", OUTPUT_FILE, words, metavar="FILE.wav")
 
 
-_SAY = tuple(_to_say())
-#: Options of `say` that mean something without a server, too.
-_WITHOUT_SERVER = {"timeout", "output", *(each.name for each in SOUND)}
-#: Endings by which a file of another format than WAV would be meant.
-_OTHER_FORMATS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
+_SAY_OPTIONS = tuple(_say_options())
+#: Options of `say` that also work without a server.
+_SERVERLESS_OPTIONS = {"timeout", "output", *(each.name for each in SOUND)}
+#: File extensions of other audio formats than WAV.
+_OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
 
 def _say_rule(given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
     output, text, waits = given["output"], given["text"], given["wait"] or given["feedback"]
     if output is not None:
-        named = [spelt(each, given[each.name]) for each in _SAY if each.name in typed - _WITHOUT_SERVER]
+        named = [spelling(each, given[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
         if named:
             return f"--output writes a file, without a server: leave out {', '.join(named)}"
-        ending = os.path.splitext(output)[1]
-        if ending.lower() in _OTHER_FORMATS:
-            return f"--output writes WAV, not {ending}: name it .wav, and convert it with ffmpeg or sox"
+        extension = os.path.splitext(output)[1]
+        if extension.lower() in _OTHER_EXTENSIONS:
+            return f"--output writes WAV, not {extension}: name it .wav, and convert it with ffmpeg or sox"
     if given["lines"] and text:
         return "--lines reads standard input: leave out TEXT"
     if given["lines"] and given["id"] is not None:
@@ -78,15 +80,135 @@ def _say_rule(given: Mapping[str, Any], typed: AbstractSet[str]) -> str | None:
     return None
 
 
-_IDS = Option("ids", IDS, metavar=IDS.metavar, offers="goal_ids")
+_SERVE_OPTIONS = (
+    *(each.at_start() for each in SETTINGS),
+    # At two seconds a sentence, 100 goals are more than three minutes of speech. Going through the longest queue takes
+    # about a millisecond.
+    option("--max-queue", INTEGER, "Goals that may wait.", default=100, limits=(1, MAX_QUEUED_GOALS)),
+    option("--max-text", INTEGER, "Characters of one text.", default=MAX_CHARACTERS, limits=(1, MAX_CHARACTERS)),
+    # Each client takes one of the 1,024 file descriptors that a process usually has.
+    option("--max-clients", INTEGER, "Clients at once.", default=256, limits=(1, None)),
+    option(
+        "--player",
+        TEXT,
+        "What plays the sound. One of pulse (the sound server), aplay, pacat and pw-cat; null (silent, in real time); "
+        "file:PATH.wav; or a command that reads 16-bit mono PCM, with {rate} for its rate and {device} for the "
+        "--device. [default: the first of the four that works]",
+        metavar="PLAYER",
+        env="TALK_PLAYER",
+        offers="players",
+    ),
+    option(
+        "--device",
+        TEXT,
+        "Device, by the player's own name for it. For aplay one that 'aplay -L' lists, such as plughw:1,0; for "
+        "pulse and pacat one of 'pactl list short sinks'; for pw-cat the name of a node, as in 'pw-cli ls Node'. Name "
+        "the --player, too.",
+        metavar="NAME",
+    ),
+    option(
+        "--lead-in",
+        INTEGER,
+        "Milliseconds of silence before a sentence; only where the output was idle: HDMI, USB and Bluetooth "
+        "outputs fall asleep, and swallow what comes while they wake.",
+        default=0,
+        limits=(0, MAX_LEAD_IN),
+        metavar="MS",
+    ),
+    option("--audible", FLAG, "Abort every sentence whose output is muted."),
+    option(
+        "--voice-memory",
+        INTEGER,
+        "Megabytes of memory that neural voices may take; past it those not used for longest are dropped.",
+        default=300,
+        limits=(0, 100_000),
+        metavar="MB",
+    ),
+    option("--driver", TEXT, "A driver of pyttsx3's. [default: the one for this system]", metavar="NAME"),
+    option("--socket-mode", FILE_MODE, "Who may connect: the socket's file mode.", default="0600"),
+    option("--greeting", TEXT, "A sentence to speak at the start."),
+    option(
+        "--print-unit",
+        TEXT,
+        f"Print a systemd unit with these options, and end. One of {', '.join(SERVE_UNITS)}; it says where it goes.",
+        metavar="UNIT",
+        choices=SERVE_UNITS,
+    ),
+)
 
-#: The commands, in the order in which help lists them: what a newcomer needs first comes first.
+
+def _serve_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
+    player = given["player"] or ""
+    if given["device"] and player.startswith(("null", "file:")):
+        return f"--device means nothing to the player {player}"
+    if player == "file:":
+        return "--player file: names no file: write file:PATH.wav"
+    return None
+
+
+_BRIDGE_OPTIONS = (
+    option("--name", WORD, "The robot's name, which no other robot has.", metavar="NAME"),
+    option("--group", WORD, "Groups that it is in besides 'all'; several with commas.", metavar="GROUP"),
+    option(
+        "--allow",
+        WORD,
+        "Requests that are taken from afar.",
+        default="say,cancel,status,wait,log,voices,pause,resume",
+        metavar="LIST",
+    ),
+    option("--no-text", FLAG, "Leave what is said out of status and events."),
+    option("--homeassistant", FLAG, "Be a device of Home Assistant's as well."),
+    option(
+        "--print-unit",
+        TEXT,
+        f"Print a systemd unit with these options, and end. One of {', '.join(BRIDGE_UNITS)}; it says where it goes.",
+        metavar="UNIT",
+        choices=BRIDGE_UNITS,
+    ),
+    option("--print-acl", FLAG, "Print who may do what on the broker; for mosquitto's acl_file."),
+)
+
+
+def _bridge_rule(given: Mapping[str, Any], _: AbstractSet[str]) -> str | None:
+    if given["name"] is None and not given["print_acl"]:
+        return "--name is missing: what the robot is called on the broker"
+    return None
+
+
+_GOAL_IDS = Option("ids", IDS, metavar=IDS.metavar, offers="goal_ids")
+
+#: The commands in the order of the help. Those that a new user needs first come first.
 _ROWS = (
-    SERVE,
+    Command(
+        name="serve",
+        summary="Run the server, in the foreground.",
+        description="""
+        Run the server, in the foreground, until SIGTERM or Ctrl-C.
+
+        It queues sentences and speaks one at a time; its log is on standard error. For systemd it prints its own
+        units.
+        """,
+        function="serve:serve",
+        plain=False,
+        uses_server=False,
+        examples="""
+        talk serve --rate 150
+        talk serve --player null       no sound, same timing: for simulation and CI
+        talk serve --print-unit user   a service for systemd, with how to install it
+        """,
+        exit_codes={
+            0: "ended by SIGTERM or SIGINT; by a second one 128+n",
+            1: "anything not named here; a bug says so",
+            2: "usage: an option or a voice that there isn't",
+            11: "this socket is served already, or its directory is not safe",
+        },
+        options=_SERVE_OPTIONS,
+        rule=_serve_rule,
+    ),
     Command(
         name="say",
         summary="Speak a sentence.",
-        about="""
+        description="""
         Speak TEXT: its words, joined by blanks; or standard input, as one sentence, where TEXT is '-'.
 
         Prints the goal's id. Without --wait it returns as soon as the goal is accepted. With --wait it owns the
@@ -94,8 +216,8 @@ _ROWS = (
         With --lines its exit code is that of the first line that did not succeed. With --ttl a line's time counts
         from when it was read.
         """,
-        runs="say:say",
-        several="several:say",
+        function="say:say",
+        fleet_function="several:say",
         examples="""
         talk say "battery low"
         talk say --wait -- "$text" || echo "nobody heard it"
@@ -107,7 +229,7 @@ _ROWS = (
         talk say -o - "hello" | aplay
         """,
         exit_codes={
-            **ASKING_SEVERAL,
+            **FLEET_EXIT_CODES,
             0: "accepted; with --wait succeeded: all of it was played; throttled, as was asked for",
             4: "aborted: engine or audio failed; 'talk doctor' says more",
             5: "rejected: never queued (bad text, full queue or full server)",
@@ -117,28 +239,28 @@ _ROWS = (
             124: "timed out, and cancelled",
             "128+n": "ended by signal n, and cancelled; 141: whoever read its output went away while it waited",
         },
-        options=_SAY,
+        options=_SAY_OPTIONS,
         argument=Option("text", TEXT, metavar="TEXT..."),
-        no_such_option="To speak a text that starts with '-', write: talk say -- TEXT",
+        unknown_option_hint="To speak a text that starts with '-', write: talk say -- TEXT",
         rule=_say_rule,
     ),
     Command(
         name="wait",
         summary="Wait until goals have ended.",
-        about="""
+        description="""
         Wait until these goals have ended, whoever sent them; without an ID, all that are active or pending now.
 
         It only watches: Ctrl-C and --timeout cancel nothing. A goal that has ended already is answered at once.
         """,
-        runs="wait:wait",
-        several="several:wait",
+        function="wait:wait",
+        fleet_function="several:wait",
         examples="""
         id=$(talk say "moving back")
         move_back
         talk wait "$id"
         """,
         exit_codes={
-            **ASKING_SEVERAL,
+            **FLEET_EXIT_CODES,
             0: "all succeeded; or no ID was given, and all have ended",
             4: "aborted; 4 to 7 are those of the first goal in order that did not succeed",
             5: "rejected; or the server has as many clients as it takes",
@@ -153,18 +275,18 @@ _ROWS = (
             _timeout("Wait no longer than SEC seconds; the goals go on; exit code 124."),
             option("-f, --feedback", FLAG, "Show each word as it is heard."),
         ),
-        argument=_IDS,
+        argument=_GOAL_IDS,
     ),
     Command(
         name="cancel",
         summary="Stop speaking: everything, or what is named.",
-        about="""
+        description="""
         Stop speaking: the goals that are named, or everything, from every client. Returns when it is silent.
 
         Prints the ids of the goals that ended because of it. Nothing to cancel is success. Selectors add up.
         """,
-        runs="ask:cancel",
-        several="several:cancel",
+        function="ask:cancel",
+        fleet_function="several:cancel",
         examples="""
         talk cancel                 everything, now
         talk cancel --current       this sentence; the next one follows
@@ -172,33 +294,33 @@ _ROWS = (
         talk cancel 12 13           these goals of this server
         """,
         exit_codes={
-            **ASKING_SEVERAL,
+            **FLEET_EXIT_CODES,
             0: "it is silent, or was already",
             8: "an ID is unknown; the others are cancelled all the same",
         },
         options=tuple(each for each in Cancel.options if each.flags),
-        argument=_IDS,
+        argument=_GOAL_IDS,
         urgent=True,
     ),
     Command(
         name="status",
         summary="What is being said, what will be, what was.",
-        about="Show what is being said, what will be and what was; with an ID, all that is known of that goal.",
-        runs="ask:status",
-        several="several:status",
+        description="Show what is being said, what will be and what was; with an ID, all that is known of that goal.",
+        function="ask:status",
+        fleet_function="several:status",
         examples="""
         talk status
         talk status 12                          goal 12 of this server
         talk --json status | jq .active.text
         """,
-        exit_codes={**ASKING_SEVERAL, 0: "the server runs", 8: "unknown goal"},
+        exit_codes={**FLEET_EXIT_CODES, 0: "the server runs", 8: "unknown goal"},
         argument=Option("goal_id", ID, metavar="[ID]", offers="known_ids"),
         urgent=True,
     ),
     Command(
         name="watch",
         summary="Follow all goals as they happen.",
-        about="""
+        description="""
         Show all goals as they happen, from now on: who says what, how it ends and why. Ctrl-C ends it.
 
         It begins with what is being said and what waits. On a terminal, what is over at once is left out: that a
@@ -206,7 +328,7 @@ _ROWS = (
 
         With --json each event is an object a line, words included; the first is {"event": "snapshot", ...}.
         """,
-        runs="ask:watch",
+        function="ask:watch",
         plain=False,
         examples="""
         talk watch
@@ -214,7 +336,7 @@ _ROWS = (
         talk --json watch | jq -r 'select(.event == "word").word'
         """,
         exit_codes={
-            **ASKING,
+            **SERVER_EXIT_CODES,
             12: "lost: the server went away",
             "128+n": "ended by signal n: 130 by Ctrl-C, 141 where its reader is gone",
         },
@@ -223,34 +345,34 @@ _ROWS = (
     Command(
         name="log",
         summary="What was said: when, by whom, how it ended.",
-        about="""
+        description="""
         Show what was said: when and how each goal ended, its text, who sent it, and why it ended; the newest last.
 
         Who sent it is the program that called talk, the process id of talk itself, and after "as" what the sender
         calls itself. Rejected goals are listed, too.
         """,
-        runs="ask:log",
+        function="ask:log",
         examples="""
         talk log
         talk log -n 100 | grep patrol
         talk --json log | jq -r 'select(.state == "ABORTED").message'
         """,
-        exit_codes={**ASKING, 0: "listed"},
+        exit_codes={**SERVER_EXIT_CODES, 0: "listed"},
         options=(option("-n, --count", INTEGER, "The last N goals that ended.", default=20, limits=(1, MAX_LOG)),),
     ),
     Command(
         name="pause",
         summary="Hold speech where it is.",
-        about="""
+        description="""
         Hold speech where it is, until 'talk resume'. Returns when it is silent; twice is success.
 
         Nothing is spoken until then, whoever sends it and however urgent it is. Goals can be sent and cancelled.
         """,
-        runs="ask:pause",
-        several="several:pause",
+        function="ask:pause",
+        fleet_function="several:pause",
         examples="talk pause; listen_to_the_operator; talk resume",
         exit_codes={
-            **ASKING_SEVERAL,
+            **FLEET_EXIT_CODES,
             0: "speech is held, and it is silent",
             1: "speech is held, but that it is silent was not known within 2 seconds",
         },
@@ -258,30 +380,30 @@ _ROWS = (
     Command(
         name="resume",
         summary="Go on where speech was held.",
-        about="Go on where 'talk pause' held speech. Twice is success, and so is without a pause.",
-        runs="ask:resume",
-        several="several:resume",
+        description="Go on where 'talk pause' held speech. Twice is success, and so is without a pause.",
+        function="ask:resume",
+        fleet_function="several:resume",
         examples="talk resume",
-        exit_codes={**ASKING_SEVERAL, 0: "speech goes on"},
+        exit_codes={**FLEET_EXIT_CODES, 0: "speech goes on"},
     ),
     Command(
         name="set",
         summary="Change the running server's settings, or print them.",
-        about="""
+        description="""
         Change settings of the running server; without an option, print them.
 
         They hold for each goal that doesn't bring its own, from the next one that begins; --preempt and --ttl from
         the next one that is sent. A server that is started anew has those of its command line.
         """,
-        runs="ask:change",
-        several="several:change",
+        function="ask:change",
+        fleet_function="several:change",
         examples="""
         talk set
         talk set --rate 150 --volume 0.5
         talk set --voice en-us --no-preempt
         """,
         exit_codes={
-            **ASKING_SEVERAL,
+            **FLEET_EXIT_CODES,
             0: "changed, or printed",
             2: "usage: a value out of its range, or an unknown voice; nothing was changed",
         },
@@ -290,7 +412,7 @@ _ROWS = (
     Command(
         name="voices",
         summary="List the voices.",
-        about="""
+        description="""
         List the voices of the server's engine: id, language, name. Any of the three can be given as a voice.
 
         So can a locale, and a language in English: de_DE, german.
@@ -300,13 +422,17 @@ _ROWS = (
         several speakers, a number or a name goes behind: "piper/NAME#3". Where the server speaks with a neural voice,
         that one's language means it, too.
         """,
-        runs="ask:voices",
+        function="ask:voices",
         examples="""
         talk voices --language en
         talk serve --voice en-us
         talk say --voice en-us+f3 "a variant"
         """,
-        exit_codes={**ASKING, 0: "listed", 1: "no voice speaks that language, or the engine can't list them"},
+        exit_codes={
+            **SERVER_EXIT_CODES,
+            0: "listed",
+            1: "no voice speaks that language, or the engine can't list them",
+        },
         options=(
             option("--language", TEXT, "Only this language, with its variants: en, pt-BR, german.", metavar="LANGUAGE"),
         ),
@@ -314,7 +440,7 @@ _ROWS = (
     Command(
         name="doctor",
         summary="Check everything between a sentence and a loudspeaker.",
-        about="""
+        description="""
         Check everything between a sentence and a loudspeaker, in order, and say the one thing to do next.
 
         Each check is a line: ok, warning or failed. At last a sentence is played: by the server, where it waits
@@ -324,7 +450,7 @@ _ROWS = (
 
         With --robot it is the way to a robot of a fleet: broker, certificate, login, rights, the robot's answer.
         """,
-        runs="doctor:doctor",
+        function="ask:doctor",
         plain=False,
         connects=False,
         examples="""
@@ -343,11 +469,39 @@ _ROWS = (
         },
         options=(option("--silent", FLAG, "Play half a second of zeros, which is no goal and no sound."),),
     ),
-    BRIDGE,
+    Command(
+        name="bridge",
+        summary="Be a robot on an MQTT broker, in the foreground.",
+        description="""
+        Be the robot of this name on an MQTT broker, in the foreground, until SIGTERM or Ctrl-C.
+
+        Who may write to it there can have it speak, by the server of this machine. Its log is on standard error.
+
+        TALK_BROKER names the broker: mqtts://HOST, or mqtt://HOST without TLS. Beside it are TALK_MQTT_USER and
+        TALK_MQTT_PASSWORD_FILE, and for certificates TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY, all three files.
+        """,
+        function="bridge:bridge",
+        plain=False,
+        uses_server=False,
+        examples="""
+        TALK_BROKER=mqtts://broker talk bridge --name anna
+        talk bridge --name anna --group warehouse,night --allow say,cancel
+        talk bridge --name anna --print-unit system   a service for systemd
+        talk bridge --print-acl                       for the broker
+        """,
+        exit_codes={
+            0: "ended by SIGTERM or SIGINT",
+            1: "anything not named here; a bug says so",
+            2: "usage: a setting that is wrong or missing, or paho-mqtt is",
+            11: "another bridge of this name is there already",
+        },
+        options=_BRIDGE_OPTIONS,
+        rule=_bridge_rule,
+    ),
     Command(
         name="fleet",
         summary="The robots of a fleet: who is there, what each says.",
-        about="""
+        description="""
         Show the robots of a fleet, by its broker (TALK_BROKER): who is there, and what each says.
 
         'status' is a table: whether a robot is there, its server's version, what it speaks, how many goals wait, how
@@ -355,8 +509,8 @@ _ROWS = (
 
         --robot picks some of them: a name, a glob such as 'wh-*', or a group as @warehouse.
         """,
-        runs="fleet:fleet",
-        several="fleet:fleet",
+        function="fleet:fleet",
+        fleet_function="fleet:fleet",
         connects=False,
         examples="""
         talk fleet status
@@ -379,15 +533,15 @@ _ROWS = (
     Command(
         name="completion",
         summary="Print the completion script of a shell.",
-        about="""
+        description="""
         Print the completion script of a shell: bash, zsh or fish. Its start file loads it.
 
         Tab then completes commands, options and their values, and what the running server knows: goals, keys,
         voices.
         """,
-        runs="completion:completion",
+        function="completion:completion",
         plain=False,
-        asks=False,
+        uses_server=False,
         examples="""
         eval "$(talk completion bash)"   the last line of ~/.bashrc
         eval "$(talk completion zsh)"    the last line of ~/.zshrc

@@ -1,12 +1,12 @@
-"""Completion: what the shells offer for a word that is being typed, and how each asks for it and takes the answer.
+"""Completion: the values that a shell offers for a word, and the exchange with bash, zsh and fish.
 
-What is offered is what the server that would be asked knows: it must be quick and never say anything, and where no
-server answers at once, there is nothing to offer.
+The values come from the server that the command would use. If it doesn't answer quickly, nothing is offered. Completion
+never prints an error.
 
-The scripts and formats are our own, on click's machinery. click's scripts give a shell the words as it cuts them: bash
-cuts at `:` and `=`, which ids may hold, and a value with a blank, a comma, a quote or a `*` doesn't survive the way
-back. Here the shell sends the line up to the cursor, as it was typed; what goes back is quoted, and begins where the
-shell puts it. The scripts are the files beside this one, which `talk completion` prints.
+The scripts and their output format are our own, on top of click's classes. click's scripts pass on the words that the
+shell has split. bash also splits at `:` and `=`, which ids may contain, and values with a space, a comma, a quote or a
+`*` don't survive the way back. Here the shell sends the line up to the cursor as it was typed, and gets back quoted
+values that start where it inserts them. The scripts are files in this directory, which `talk completion` prints.
 """
 
 from __future__ import annotations
@@ -29,43 +29,42 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from typing import ClassVar
 
-    from talkcli.cli.show import Common
+    from talkcli.cli.show import CommonOptions
     from talkcli.client.client import Client
-    from talkcli.fleet.presence import Presence
     from talkcli.goals.goal import Goal, JsonObject
 
     Items = list[CompletionItem[str]]
 
 _Answer = TypeVar("_Answer")
 
-#: Seconds in which the server must answer: somebody has pressed a key and looks at the screen.
-PATIENCE = 0.5
-#: Ended goals whose ids are offered.
-_ENDED = 100
-#: Characters of a text that stand beside an id.
-_MAX_TEXT = 60
-#: What there is to offer where no server answers.
+#: How long the server may take to answer, because a person has pressed a key and is waiting.
+COMPLETION_TIMEOUT_S = 0.5
+#: How many goals that have ended are offered.
+_MAX_ENDED_GOALS = 100
+#: Longer texts are cut in the help of a value.
+_HELP_TEXT_CHARS = 60
+#: Used if no server answers.
 _NO_STATUS = ServerStatus({}, None, (), ())
 
-#: What bash takes as it stands; letters and digits of other scripts, too.
-_BASH_PLAIN = re.compile(r"[^\w@%+=:,./-]")
+#: Characters that bash needs escaped. Letters and digits of all scripts can stay as they are.
+_BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
-class _Line(ShellComplete):
-    """A shell that sends its line up to the cursor in COMP_WORDS."""
+class _LineCompletion(ShellComplete):
+    """Completion for a shell that sends the line up to the cursor in COMP_WORDS."""
 
-    #: the file of its script
+    #: the name of the script's file
     script: ClassVar[str]
 
     def source(self) -> str:
-        """Return the script."""
+        """Return the script that sets up completion."""
         with open(os.path.join(os.path.dirname(__file__), self.script), encoding="utf-8") as file:
             return file.read()
 
     def get_completion_args(self) -> tuple[list[str], str]:
         line = os.environ["COMP_WORDS"]
         words = split_arg_string(line)
-        # One more character shows whether it would begin a word or belong to the last one.
+        # Another character shows whether it would begin a new word or continue the last one.
         if len(split_arg_string(f"{line}x")) > len(words):
             words.append("")
         return words[1:-1], words[-1]
@@ -74,12 +73,12 @@ class _Line(ShellComplete):
         return "file" if item.type == "file" else self.line(item.value, item.help)
 
     def line(self, value: str, words: str | None) -> str:  # noqa: ARG002
-        """Return a line for what is offered: a kind, and what the shell shall insert."""
+        """Return the line for a value: its kind and the text to insert. `words` is its help."""
         return f"plain,{value}"
 
 
-class Bash(_Line):
-    """bash replaces what it takes for the word, COMP_CWORD, by what it gets, and quotes nothing."""
+class BashCompletion(_LineCompletion):
+    """Completion for bash, which replaces the text in COMP_CWORD and doesn't quote."""
 
     name = "bash"
     script = "talk.bash"
@@ -88,14 +87,14 @@ class Bash(_Line):
         typed, quote = _last_word(os.environ["COMP_WORDS"])
         replaced = os.environ["COMP_CWORD"]
         if replaced in {":", "="}:
-            replaced = ""  # so bash-completion says, behind sudo for one, that nothing follows what bash cuts at
+            replaced = ""  # bash-completion, which is used after sudo, passes the separator if nothing follows it
         stays = typed.removesuffix(replaced) if replaced else typed
         kept = "".join(split_arg_string(stays))
-        return f"plain,{_quoted(_whole(value, typed).removeprefix(kept), quote)}"
+        return f"plain,{_quote_for_bash(_with_flag(value, typed).removeprefix(kept), quote)}"
 
 
-class Zsh(_Line):
-    """zsh quotes what it inserts; a help stands behind a colon."""
+class ZshCompletion(_LineCompletion):
+    """Completion for zsh, which quotes by itself and takes help after a colon."""
 
     name = "zsh"
     script = "_talk"
@@ -108,35 +107,36 @@ class Zsh(_Line):
         return f"described,{value}:{words}"
 
 
-class Fish(_Line):
-    """fish quotes what it inserts; a help stands behind a tab."""
+class FishCompletion(_LineCompletion):
+    """Completion for fish, which quotes by itself and takes help after a tab."""
 
     name = "fish"
     script = "talk.fish"
 
     def line(self, value: str, words: str | None) -> str:
         typed, _ = _last_word(os.environ["COMP_WORDS"])
-        return f"plain,{_whole(value, typed)}" + (f"\t{words}" if words else "")
+        return f"plain,{_with_flag(value, typed)}" + (f"\t{words}" if words else "")
 
 
-#: Each of them by its shell's name.
-SHELLS: dict[str, type[ShellComplete]] = {"bash": Bash, "zsh": Zsh, "fish": Fish}
+SHELL_COMPLETIONS: dict[str, type[ShellComplete]] = {
+    each.name: each for each in (BashCompletion, ZshCompletion, FishCompletion)
+}
 
 
-def completion(_: Common, shell: str) -> None:
-    """Print the script of a shell."""
+def completion(_: CommonOptions, shell: str) -> None:
+    """Print the completion script of a shell."""
     talk = click.get_current_context().find_root().command
-    show(SHELLS[shell](talk, {}, "talk", "_TALK_COMPLETE").source().rstrip("\n"))
+    show(SHELL_COMPLETIONS[shell](talk, {}, "talk", "_TALK_COMPLETE").source().rstrip("\n"))
 
 
 def register() -> None:
-    """Have click use these for their shells."""
-    for each in SHELLS.values():
+    """Make click use these classes."""
+    for each in SHELL_COMPLETIONS.values():
         add_completion_class(each)
 
 
 def _last_word(line: str) -> tuple[str, str]:
-    """Return the word at the end of a line as it was typed, and the quote that is open in it."""
+    """Return the last word of a line as it was typed, and the quote that is still open in it."""
     word, quote, escaped = "", "", False
     for character in line:
         if escaped:
@@ -154,49 +154,49 @@ def _last_word(line: str) -> tuple[str, str]:
     return word, quote
 
 
-def _whole(value: str, typed: str) -> str:
-    """Return what is offered for the value of --option=VALUE with its option, as it was typed."""
+def _with_flag(value: str, typed: str) -> str:
+    """Return a value together with its flag if --option=VALUE is being typed."""
     word = "".join(split_arg_string(typed))
     option, equals, _ = word.partition("=")
     return f"{option}={value}" if equals and option.startswith("-") else value
 
 
-def _quoted(value: str, quote: str) -> str:
-    """Return the value so that bash reads it as one word, within the quote that is open."""
+def _quote_for_bash(value: str, quote: str) -> str:
+    """Return the value so that bash reads it as one word within an open quote."""
     if quote == "'":
         return value.replace("'", "'\\''")
     if quote:
         return re.sub(r'(["\\$`])', r"\\\1", value)
-    return _BASH_PLAIN.sub(lambda found: f"\\{found[0]}", value)
+    return _BASH_SPECIAL.sub(lambda found: f"\\{found[0]}", value)
 
 
 def goal_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Return the ids of goals that have not ended."""
+    """Complete the id of an unfinished goal."""
     status = _status(context)
     return _ids(unfinished(status), status, incomplete)
 
 
 def known_ids(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Return the ids of goals, the ended ones too: first what is not over, then the newest."""
-    status, ended = _ask(context, lambda client: (client.status(), client.log(_ENDED))) or (_NO_STATUS, [])
+    """Complete the id of any goal. Unfinished goals come first, then the newest."""
+    status, ended = _ask(context, lambda client: (client.status(), client.log(_MAX_ENDED_GOALS))) or (_NO_STATUS, [])
     return _ids([*unfinished(status), *reversed(ended)], status, incomplete)
 
 
 def keys(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Return the keys of goals that have not ended, and of the last that have."""
+    """Complete the key of an unfinished or recent goal."""
     status = _status(context)
     return _keys([*unfinished(status), *reversed(status.recent)], incomplete)
 
 
 def unfinished_keys(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Return the keys of goals that have not ended."""
+    """Complete the key of an unfinished goal."""
     return _keys(unfinished(_status(context)), incomplete)
 
 
 def voices(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Return the languages of the engine's voices; their ids and names, once the word can't be a language.
+    """Complete a voice by its language, or by its id or name if no language starts with the word.
 
-    A neural voice is called by its id alone, which is offered with the languages: such voices are few.
+    Neural voices are few and are called by their ids, so these ids are offered together with the languages.
     """
     found = _ask(context, lambda client: client.voices()) or []
     for field in ("language", "id", "name"):
@@ -209,44 +209,41 @@ def voices(context: click.Context, _: click.Parameter, incomplete: str) -> Items
 
 
 def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items:
-    """Return the robots of the fleet that are there, and then their groups."""
-    options: Common = context.find_root().obj
+    """Complete an online robot of the fleet, or a group of such robots."""
+    options: CommonOptions = context.find_root().obj
     try:
         broker = options.broker()
         from talkcli.fleet import topics
         from talkcli.fleet.desk.roster import roster
 
-        found = roster(broker, PATIENCE)
+        found = roster(broker, COMPLETION_TIMEOUT_S)
     except (TalkError, OSError, ValueError):
         return []
-    there = [each for _, each in sorted(found.items()) if each.online]
-    members = Counter(f"@{group}" for each in there for group in {*each.groups} if not topics.fault(group))
-    groups = [(name, f"{count} robot{'' if count == 1 else 's'}") for name, count in sorted(members.items())]
-    return _items([*((each.name, ", ".join(_groups(each)) or "robot") for each in there), *groups], incomplete)
-
-
-def _groups(presence: Presence) -> list[str]:
-    return [printable(each, _MAX_TEXT) for each in presence.groups]
+    online = [each for _, each in sorted(found.items()) if each.online]
+    offered = [(each.name, ", ".join(map(_shorten, each.groups)) or "robot") for each in online]
+    members = Counter(f"@{group}" for each in online for group in {*each.groups} if not topics.fault(group))
+    offered += [(name, f"{count} robot{'' if count == 1 else 's'}") for name, count in sorted(members.items())]
+    return _items(offered, incomplete)
 
 
 def files(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
-    """Have the shell offer files."""
+    """Let the shell complete a file."""
     return [CompletionItem(incomplete, type="file")]
 
 
 def players(_: click.Context, __: click.Parameter, incomplete: str) -> Items:
-    """Return the players that talk knows by name."""
+    """Complete the name of a player."""
     from talkcli.engine.players import PLAYERS
 
     return _items([(name, each.about) for name, each in PLAYERS.items()], incomplete)
 
 
 def _ask(context: click.Context, question: Callable[[Client], _Answer]) -> _Answer | None:
-    """Return the server's answer, or None if there is none for whatever reason."""
-    options: Common = context.find_root().obj  # with --socket, where it stood before
+    """Ask the server something, and return the answer, or None after any error."""
+    options: CommonOptions = context.find_root().obj  # with --socket if it was typed before
     options.connect_timeout = None
     try:
-        with options.connect(PATIENCE) as client:
+        with options.connect(COMPLETION_TIMEOUT_S) as client:
             return question(client)
     except (TalkError, OSError, ValueError):
         return None
@@ -257,7 +254,7 @@ def _status(context: click.Context) -> ServerStatus:
 
 
 def _ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Items:
-    """Return the ids; where digits were typed, the numbers that stand for this server's as well."""
+    """Return the ids. If digits were typed, also return the bare numbers of this server's goals."""
     own = f"{status.server.get('boot')}-"
     digits = incomplete.isascii() and incomplete.isdecimal()
     offered = []
@@ -277,16 +274,19 @@ def _keys(goals: Iterable[Goal], incomplete: str) -> Items:
 
 
 def _items(offered: Iterable[tuple[str, str]], incomplete: str) -> Items:
-    # What can't be seen can't be chosen either, and would reach the terminal raw.
+    # A value with invisible characters couldn't be recognised, and would reach the terminal unescaped.
     fitting = ((value, words) for value, words in offered if value.startswith(incomplete) and value.isprintable())
     return [CompletionItem(value, help=words) for value, words in fitting if value]
 
 
+def _shorten(text: str) -> str:
+    return printable(text, _HELP_TEXT_CHARS)
+
+
 def _goal_help(goal: Goal) -> str:
-    text = "" if goal.text is None else printable(goal.text, _MAX_TEXT)
-    return f"{goal.state.name} {text}"
+    return f"{goal.state.name} {_shorten(goal.text or '')}"
 
 
 def _voice_help(voice: JsonObject, field: str) -> str:
-    parts = [printable(str(voice.get(each) or ""), _MAX_TEXT) for each in ("name", "language") if each != field]
+    parts = [_shorten(str(voice.get(each) or "")) for each in ("name", "language") if each != field]
     return ", ".join(filter(None, parts)) or "voice"

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli import paths
-from talkcli.cli.show import note, screen, show_found
+from talkcli.cli.show import note, screen, show_result
 from talkcli.client.connect import ANSWER_LIMIT
 from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable
 from talkcli.fleet.desk.selection import Selection
@@ -17,7 +17,7 @@ from talkcli.terminal.fleet import FleetTranscript, Robot, robot_lines
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from talkcli.cli.show import Common
+    from talkcli.cli.show import CommonOptions
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.sighting import Sighting
     from talkcli.fleet.presence import Presence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
 
-def fleet(options: Common, what: str) -> int | None:
+def fleet(options: CommonOptions, what: str) -> int | None:
     """Show the robots of a fleet, as they stand or as it happens; return the exit code, None for 0."""
     broker = options.broker()
     text = paths.named_robot(options.robot, options.socket)
@@ -36,7 +36,7 @@ def fleet(options: Common, what: str) -> int | None:
     return None
 
 
-def _status(options: Common, broker: Broker, selection: Selection | None) -> None:
+def _status(options: CommonOptions, broker: Broker, selection: Selection | None) -> None:
     """Show how each robot stands."""
     from talkcli.fleet.desk.roster import standings
 
@@ -45,14 +45,14 @@ def _status(options: Common, broker: Broker, selection: Selection | None) -> Non
     if not picked:
         raise _nobody(broker, selection)
 
-    show_found(
+    show_result(
         options,
         (each.to_json() for each in picked),
         lambda: robot_lines([_shown(each) for each in picked], screen(), time.time()),
     )
 
 
-def _watch(options: Common, broker: Broker, selection: Selection | None) -> int:
+def _watch(options: CommonOptions, broker: Broker, selection: Selection | None) -> int:
     """Show what happens, and which robots come and go; return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.fleet.desk.lookout import Lookout
@@ -70,13 +70,13 @@ def _watch(options: Common, broker: Broker, selection: Selection | None) -> int:
 class _Teller:
     """Shows what happens to a fleet, for people or for programs."""
 
-    def __init__(self, options: Common, broker: Broker, transcript: FleetTranscript) -> None:
+    def __init__(self, options: CommonOptions, broker: Broker, transcript: FleetTranscript) -> None:
         self._options, self._broker, self._transcript = options, broker, transcript
 
     def tell(self, seen: Sighting) -> None:
         """Show what has happened; what the broker itself does is said on standard error."""
         if not isinstance(seen, Away | Back):
-            show_found(self._options, _objects(seen), lambda: self._lines(seen))
+            show_result(self._options, _objects(seen), lambda: self._lines(seen))
         elif self._options.quiet:
             return
         elif isinstance(seen, Away):

@@ -1,8 +1,7 @@
-"""What ends a client's waiting: signals, a timeout, a reader of standard output that goes away.
+"""Signals, timeouts and closed output, which end a command's wait.
 
-The first two become a descriptor that is readable then, so that they never cut a read or a write in two. The last is
-seen at standard output itself, which is waited for together with that. Until there is one of these, a signal for a goal
-that was sent early is held, by `plain`.
+A signal or a timeout makes a descriptor readable, so it never cuts a read or a write in two. Standard output is polled
+together with this descriptor. Until an `Interrupts` is entered, `plain` blocks the signals for a goal sent early.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import select
 import signal
 import sys
 
-from talkcli.cli.show import OUTPUT, give_up_output
+from talkcli.cli.show import STDOUT_FD, discard_output, reader_is_gone
 from talkcli.errors import EXIT_SIGNAL, EXIT_SIGPIPE, EXIT_TIMEOUT
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.polling import Interrupted
@@ -21,105 +20,120 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from types import FrameType, TracebackType
 
-_CAUGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-#: Three years: what the system's timer is sure to take.
-_LONGEST = 1e8
+_HANDLED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: Three years. The system's timer may not accept longer times.
+_MAX_TIMER_S = 1e8
 
 
-def give_up_unread() -> None:
-    """Have nothing shown on a standard output that nobody could read from the start: that matters to nothing."""
+def discard_unread_output() -> None:
+    """Discard all output if it had no reader from the start. The command works all the same."""
     if not has_reader():
-        give_up_output()
+        discard_output()
 
 
 def has_reader() -> bool:
-    """Whether standard output is open, and whatever it leads to has not gone away."""
-    # Not POLLNVAL, which is what macOS says of a terminal.
-    return sys.stdout is not None and not _condition() & (select.POLLERR | select.POLLHUP)
+    """Return whether standard output is open and something reads it."""
+    # POLLNVAL doesn't count, because macOS reports it for a terminal.
+    return sys.stdout is not None and not _poll_output() & (select.POLLERR | select.POLLHUP)
 
 
-def watched_output() -> dict[int, int]:
-    """Return what to wait for, as `connect.ready` takes it, so that a reader of standard output that goes ends it."""
-    return {} if _condition() & select.POLLNVAL else {OUTPUT: 0}  # that would end it at once
-
-
-def _condition() -> int:
-    """Return what poll says of standard output, unasked; 0 for nothing, as it always does of a file."""
+def _poll_output() -> int:
+    """Return the poll events of standard output. A file never has any."""
     poll = select.poll()
-    poll.register(OUTPUT, 0)
-    return next((found for _, found in poll.poll(0)), 0)
+    poll.register(STDOUT_FD, 0)
+    return next((events for _, events in poll.poll(0)), 0)
 
 
 class Interrupts:
-    """Catches SIGINT, SIGTERM and SIGHUP: `number` is the signal then. A second one ends the process at once, but for
-    SIGHUP: of a terminal that is closed the shell tells its commands, and then the system.
+    """A context in which SIGINT, SIGTERM, SIGHUP, a timeout or closed output end a wait.
 
-    `watched` has all that there is to wait for, as `connect.ready` takes it, a descriptor that becomes readable then
-    among it; it may change. That it ends the waiting ends the `with`, too; `exit_code` then says why.
+    Pass `watched` to `wait_ready` as `interrupt`. The context suppresses the Interrupted that is raised then, and
+    `exit_code` gives the reason. A second signal ends the process at once. Only SIGHUP doesn't, because the shell and
+    the system both send one when a terminal is closed.
     """
 
-    def __init__(self, timeout: float | None = None, held: Iterable[int] = (), *, output: bool = False) -> None:
-        """`timeout`: seconds after which it becomes readable by itself, and `late` true; counted from the `with`.
+    def __init__(self, timeout: float | None = None, blocked: Iterable[int] = (), *, output: bool = False) -> None:
+        """Prepare the context.
 
-        `held`: signals that were blocked until somebody should catch them; `output`: whether a reader of standard
-        output that goes away ends the waiting, too.
+        Args:
+            timeout: seconds from entering the context until the wait ends.
+            blocked: signals that were blocked earlier and can be handled now.
+            output: whether the wait ends if the reader of standard output goes away.
         """
-        self.number: int | None = None
-        self.late = False
-        #: whether the reader of standard output has gone away
-        self.gone = False
+        #: the signal that was received, or None
+        self.signal_number: int | None = None
+        self.timed_out = False
+        self.reader_gone = False
         self._timeout = timeout
-        self._held = held
+        self._blocked = blocked
         self._output = output
 
     @property
     def exit_code(self) -> int:
-        """The exit code for what has happened: the signal's, if there was one."""
-        if self.number is not None:
-            return EXIT_SIGNAL + self.number
-        return EXIT_SIGPIPE if self.gone else EXIT_TIMEOUT
+        """The exit code for what has ended the wait. A signal comes first."""
+        if self.signal_number is not None:
+            return EXIT_SIGNAL + self.signal_number
+        return EXIT_SIGPIPE if self.reader_gone else EXIT_TIMEOUT
 
     def __enter__(self) -> Interrupts:
         self._descriptor, self._write = os.pipe()
         os.set_blocking(self._write, False)
-        self.watched = {self._descriptor: select.POLLIN, **(watched_output() if self._output else {})}
-        # Python calls a handler between two steps of the main thread: a signal that comes in the last moment before
-        # that waits, or that the kernel gives another thread, would end no wait. What the system writes here does.
-        self._woken_before = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
-        # A shell starts background commands with SIGINT ignored: what is ignored stays so.
-        self._before = {
-            each: signal.signal(each, self._caught) for each in _CAUGHT if signal.getsignal(each) != signal.SIG_IGN
+        #: poll events by descriptor; may change while the context is open
+        self.watched = {self._descriptor: select.POLLIN}
+        if self._output and not _poll_output() & select.POLLNVAL:  # which would end every wait at once
+            self.watched[STDOUT_FD] = 0
+        # Python runs handlers later, in the main thread, so a handler alone might not end a wait that is just starting.
+        # The wakeup descriptor is written at once.
+        self._old_wakeup_fd = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        # A shell starts background commands with SIGINT ignored. Ignored signals stay ignored.
+        self._old_handlers = {
+            each: signal.signal(each, self._handle_signal)
+            for each in _HANDLED_SIGNALS
+            if signal.getsignal(each) != signal.SIG_IGN
         }
         if self._timeout is not None:
-            self._before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._expired)
-            signal.setitimer(signal.ITIMER_REAL, max(1e-6, min(self._timeout, _LONGEST)))  # 0 would be for never
-        if self._held:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, self._held)
+            self._old_handlers[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._handle_timeout)
+            signal.setitimer(signal.ITIMER_REAL, max(1e-6, min(self._timeout, _MAX_TIMER_S)))  # 0 would mean never
+        if self._blocked:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, self._blocked)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> bool:
         if kind is Interrupted:
-            self.look()
+            self.check_reader()
         if self._timeout is not None:
             signal.setitimer(signal.ITIMER_REAL, 0)
-        for each, handler in self._before.items():
+        for each, handler in self._old_handlers.items():
             signal.signal(each, handler)
-        signal.set_wakeup_fd(self._woken_before)
+        signal.set_wakeup_fd(self._old_wakeup_fd)
         os.close(self._descriptor)
         os.close(self._write)
         return kind is Interrupted
 
-    def look(self) -> None:
-        """Find out whether it was the reader of standard output that has ended the waiting."""
-        self.gone = self.gone or (OUTPUT in self.watched and not has_reader())
+    def check_reader(self) -> None:
+        """Set `reader_gone` if the reader of standard output has gone away."""
+        self.reader_gone = self.reader_gone or (STDOUT_FD in self.watched and not has_reader())
 
-    def clear(self) -> None:
-        """Have nothing end the waiting that has; of the signals, only a first one still will."""
-        signal.set_wakeup_fd(-1)  # a second SIGHUP means nothing
-        self.look()
-        self.watched.pop(OUTPUT, None)
+    def record(self, error: Interrupted | OSError) -> None:
+        """Record why the wait has ended, and discard all output if its reader is gone.
+
+        An error that is neither an interrupt, a timeout nor a missing reader is raised again.
+        """
+        if isinstance(error, OSError) and not isinstance(error, TimeoutError):
+            if not reader_is_gone(error):
+                raise error
+            self.reader_gone = True
+        self.check_reader()
+        if self.reader_gone:
+            discard_output()
+
+    def reset(self) -> None:
+        """Stop watching everything but the first signal, so that the command can clean up."""
+        signal.set_wakeup_fd(-1)  # so that a second SIGHUP does nothing
+        self.check_reader()
+        self.watched.pop(STDOUT_FD, None)
         os.set_blocking(self._descriptor, False)
         try:
             os.read(self._descriptor, 16)
@@ -127,20 +141,19 @@ class Interrupts:
             pass
 
     def _wake(self) -> None:
-        """Make the descriptor readable."""
         try:
             os.write(self._write, b"\0")
         except BlockingIOError:
-            pass  # it is readable, many times over
+            pass  # the pipe is full, so the descriptor is readable
 
-    def _caught(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        if self.number is not None:
+    def _handle_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        if self.signal_number is not None:
             if number == signal.SIGHUP:
                 return
             os._exit(EXIT_SIGNAL + number)
-        self.number = number
+        self.signal_number = number
         self._wake()
 
-    def _expired(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        self.late = True
+    def _handle_timeout(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        self.timed_out = True
         self._wake()

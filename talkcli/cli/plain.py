@@ -1,11 +1,11 @@
-"""Plain command lines, those that there is nothing to say about: read as click would, begun early, and carried out.
+"""A lightweight parser for plain command lines, which need no help text and no error message.
 
-Both read the same rows, and a value by the same function. Whatever this does not know for certain, it leaves to click:
-a word that is no option, flags in one word, a value that is none, options that contradict each other.
+It reads the same rows as click's parser, and reads values by the same function. Any line that it isn't sure about is
+left to click: unknown options, several flags in one word, invalid values, and options that contradict each other.
 
-A plain command is begun before the program that carries it out is imported. A request is sent early only where nothing
-can be wrong with it, so that no error is found after it was sent. It is the one that the client library sends for the
-same command: the library takes it for its own, see `SocketConnection`. A test shows that it is.
+For some commands the request is sent before the rest of the program is imported. This is only done if the request can't
+be wrong, so that no error is found after it was sent. It is the same request that the client library would send (a test
+compares them), and `SocketConnection` then continues with it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import _signal
 import time
 
-from talkcli.cli.command import COMMON, FILE, read_value
+from talkcli.cli.command import COMMON_OPTIONS, OUTPUT_FILE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.client.connect import ask, hello, reach, sender, stand_back
 from talkcli.frozen import TYPE_CHECKING, frozen
@@ -30,57 +30,57 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.option import Option
 
-    #: By each spelling: the option, and the value of a flag.
-    Spellings = dict[str, tuple[Option, bool]]
+    #: The option of each flag, with the value that the flag stands for if it takes none.
+    Flags = dict[str, tuple[Option, bool]]
 
-_COMMON = {each.name for each in COMMON}
+_COMMON_NAMES = {each.name for each in COMMON_OPTIONS}
 #: The commands whose request may be sent early.
-_EARLY = ("say", "cancel", "status", "pause", "resume")
+_EARLY_COMMANDS = ("say", "cancel", "status", "pause", "resume")
 
 
 @frozen
-class Plain:
-    """A command line that was read."""
+class PlainCommand:
+    """A parsed command line."""
 
     command: Command
-    #: the command's options and arguments, by their names
+    #: the values of the command's own options and of its argument, by name
     given: dict[str, Any]
-    #: those of every command that were given
+    #: the values of the common options on the command line, by name
     common: dict[str, Any]
-    #: the options that stand on the command line
+    #: the names of the command's own options on the command line
     typed: frozenset[str]
 
 
-def read(arguments: list[str], environment: Mapping[str, str]) -> Plain | None:
-    """Return what a command line says; None where click has to read it."""
+def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
+    """Parse a command line; None if click has to parse it."""
     try:
         return _read(arguments, environment)
-    except (ValueError, StopIteration):  # an option's value is none, or is missing
+    except (ValueError, StopIteration):  # an option's value is invalid or missing
         return None
 
 
-def _read(arguments: list[str], environment: Mapping[str, str]) -> Plain | None:
+def _read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
     command: Command | None = None
     words: list[str] = []
     given: dict[str, Any] = {}
-    options, rest = _spellings(COMMON), iter(arguments)
+    flags, rest = _flags(COMMON_OPTIONS), iter(arguments)
     for word in rest:
         if command is None and word in COMMANDS:
             command = COMMANDS[word]
-            options |= _spellings(command.options)
+            flags |= _flags(command.options)
         elif word == "--" and command:
             words += rest
         elif word[:1] != "-" or word == "-":
             words.append(word)
-        elif not _take(options, word, rest, given):
+        elif not _read_option(flags, word, rest, given):
             return None
         if command is None and words:
             return None
     return _complete(command, given, words, environment) if command and command.plain else None
 
 
-def _spellings(options: Iterable[Option]) -> Spellings:
-    found: Spellings = {}
+def _flags(options: Iterable[Option]) -> Flags:
+    found: Flags = {}
     for option in options:
         yes, _, no = option.flags.partition("/")
         found |= dict.fromkeys(yes.split(", "), (option, True))
@@ -89,13 +89,13 @@ def _spellings(options: Iterable[Option]) -> Spellings:
     return found
 
 
-def _take(options: Spellings, word: str, rest: Iterator[str], given: dict[str, Any]) -> bool:
-    """Take an option, whose value may be the next word; False where it isn't plain."""
+def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> bool:
+    """Read an option, whose value may be the next word, into `given`. Return whether it is a plain one."""
     name, equals, text = word.partition("=")
-    if name not in options or (equals and name[:2] != "--"):
+    if name not in flags or (equals and name[:2] != "--"):
         return False
-    option, value = options[name]
-    if option.kind is FILE or (option.kind is FLAG and equals):
+    option, value = flags[name]
+    if option.kind is OUTPUT_FILE or (option.kind is FLAG and equals):
         return False
     given[option.name] = value if option.kind is FLAG else read_value(option, text if equals else next(rest))
     return True
@@ -103,9 +103,9 @@ def _take(options: Spellings, word: str, rest: Iterator[str], given: dict[str, A
 
 def _complete(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
-) -> Plain | None:
-    """Fill in what was not given; None where something contradicts itself, is missing or too much."""
-    common = {name: given.pop(name) for name in _COMMON & given.keys()}
+) -> PlainCommand | None:
+    """Add the argument and the values that were not given; None if click has to report an error."""
+    common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:
         if option.name not in given:
@@ -114,62 +114,65 @@ def _complete(
     argument = command.argument
     if argument:
         many = argument.metavar.endswith("...")
-        if (len(words) > 1 and not many) or (
-            argument.choices and words[:1] not in ([each] for each in argument.choices)
-        ):
+        if (len(words) > 1 and not many) or (argument.choices and (not words or words[0] not in argument.choices)):
             return None
         given[argument.name] = tuple(words) if many else next(iter(words), None)
     elif words:
         return None
-    if command.fault(given, typed, common.get("robot"), common.get("socket"), common.get("connect_timeout")):
-        return None
-    return Plain(command, given, common, typed)
+    return None if command.usage_fault(given, typed, common) else PlainCommand(command, given, common, typed)
 
 
-def carry_out(plain: Plain) -> int:
-    """Carry out a plain command line, and return its exit code."""
-    began = time.monotonic()
+def run(plain: PlainCommand) -> int:
+    """Run a plain command, and return its exit code."""
+    started_at = time.monotonic()
     command, given = plain.command.name, plain.given
-    held: set[int] = set()
+    blocked: set[int] = set()
 
-    def hold() -> None:
-        # A goal that is on its way is this command's to cancel: a signal waits until there is somebody to do so.
-        asked = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if command == "say" else set()
-        held.update(asked - _signal.pthread_sigmask(_signal.SIG_BLOCK, asked))
+    def block_signals() -> None:
+        # After a goal was sent, a signal must cancel it, so it has to wait until the command can do that.
+        wanted = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if command == "say" else set()
+        blocked.update(wanted - _signal.pthread_sigmask(_signal.SIG_BLOCK, wanted))
 
     try:
-        begun = _begin(plain, hold) if asks_at_once(plain) else None
-        if begun and begun.sent and given.get("wait") and not given.get("feedback"):
-            begun = stand_back(begun, given["timeout"])
+        early = _connect_early(plain, block_signals) if may_send_early(plain) else None
+        if early and early.sent and given.get("wait") and not given.get("feedback"):
+            early = stand_back(early, given["timeout"])
     except KeyboardInterrupt:
         return 128 + int(_signal.SIGINT)  # nothing was sent
-    from talkcli.cli.show import Common, ended
+    from talkcli.cli.show import CommonOptions, run_command
 
-    options = Common(began=began, begun=begun, held=held, typed=plain.typed, **plain.common)
-    return ended(lambda: plain.command.carry_out(options, given), options)
+    options = CommonOptions(
+        started_at=started_at, early=early, blocked_signals=blocked, typed=plain.typed, **plain.common
+    )
+    return run_command(lambda: plain.command.run(options, given), options)
 
 
-def asks_at_once(plain: Plain) -> bool:
-    """Whether a command begins with a request to this machine's server, and reads no standard input before, which may
-    take any time.
+def may_send_early(plain: PlainCommand) -> bool:
+    """Return whether a command starts with a request to the local server.
+
+    It doesn't if it reads standard input first, because that can take any time.
     """
     if named_robot(plain.common.get("robot"), plain.common.get("socket")):
         return False
-    return plain.command.name in _EARLY and not plain.given.get("lines") and plain.given.get("text") != ("-",)
+    return plain.command.name in _EARLY_COMMANDS and not plain.given.get("lines") and plain.given.get("text") != ("-",)
 
 
-def _begin(plain: Plain, before: Callable[[], None]) -> Begun | None:
-    """Return the command's connection, as far as it comes in no time; `before`: called before its request is sent."""
-    begun = reach(named_socket(plain.common.get("socket")))
-    if begun.socket is None:
-        return begun
-    # After it has connected: the server greets meanwhile.
-    said = first(plain)
-    return ask(begun, *said, before) if said else begun
+def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> Begun | None:
+    """Connect to the server and send the request, as far as this takes no time.
+
+    Returns:
+        The connection and how far it has come, or None if it broke before anything was sent.
+    """
+    early = reach(named_socket(plain.common.get("socket")))
+    if early.socket is None:
+        return early
+    # The messages are made after connecting, because the server sends its greeting in the meantime.
+    messages = early_messages(plain)
+    return ask(early, *messages, before_sending) if messages else early
 
 
-def first(plain: Plain) -> tuple[JsonObject, JsonObject] | None:
-    """Return what a command says first, and its request; None where that may be refused, or only the library knows."""
+def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
+    """Return the hello and the request of a command; None if the request may be refused or needs the library."""
     command, name = plain.command, sender(plain.given.get("name"))
     request = _request(command.name, plain.given)
     if request is None or len(name or "") > MAX_NAME:
@@ -181,32 +184,32 @@ def _request(command: str, given: dict[str, Any]) -> JsonObject | None:
     from talkcli.protocol.lines import write_request
 
     if command == "say":
-        say = _say(given)
+        say = _say_request(given)
         return write_request(say) if say else None
     if command == "cancel":
         ids, before, key = given["ids"], given["before"], given["key"]
-        # More ids may be too many for a request, or the same.
-        if len(ids) > 1 or not all(map(_whole, [*ids, before or "-"])) or (key and bad_key(key)):
+        # Several ids may contain duplicates, or be too many for one request.
+        if len(ids) > 1 or not all(map(_is_full_id, [*ids, before or "-"])) or (key and bad_key(key)):
             return None
         return write_request(Cancel(ids or None, given["current"], before, key))
     goal_id = given.get("goal_id")
     if goal_id is None:
         return {"request": command}
-    return {"request": command, "id": goal_id} if _whole(goal_id) else None
+    return {"request": command, "id": goal_id} if _is_full_id(goal_id) else None
 
 
-def _whole(goal_id: str) -> bool:
-    """Whether an id is one as it stands; numbers stand for goals of a server that the library knows once it greets."""
+def _is_full_id(goal_id: str) -> bool:
+    """Return whether an id can be sent as it is. A bare number can't, because the library adds the server's boot id."""
     return 0 < len(goal_id) <= MAX_ID and not goal_id.isdecimal()
 
 
-def _say(given: dict[str, Any]) -> Say | None:
-    """Return a goal; None where its text isn't sent as it is, or may not fit into a request."""
+def _say_request(given: dict[str, Any]) -> Say | None:
+    """Return the request to say a text; None if the text must be changed or may be too long for a request."""
     options = {each.name: given[each.name] for each in Say.options if each.name in given}
     say = Say(**{**options, "text": " ".join(given["text"]), "wait": given["wait"] or given["feedback"]})
     try:
         say.text.encode()
     except UnicodeEncodeError:
         return None
-    # With as much escaped as can be, these and all that is shorter fit.
+    # A text of this length fits into a request even if each of its characters has to be escaped.
     return None if len(say.text) + len(say.voice or "") > MAX_CHARACTERS else say

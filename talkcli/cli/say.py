@@ -1,7 +1,7 @@
-"""`talk say`: one sentence is sent, waited for, and how it ended is told; or, with `-o`, written into a file.
+"""`talk say`: send a sentence and report how it ends, or write it into a file with `-o`.
 
-Of lines `stdin` takes care. It knows no click: plain command lines come here without it. What a file takes, which is by
-an engine of this command's own and knows no server, is imported for that alone.
+`stdin` handles lines. Plain command lines come here without click. Only `-o` imports the engine, because it needs no
+server.
 """
 
 from __future__ import annotations
@@ -9,29 +9,10 @@ from __future__ import annotations
 import os
 import time
 
-from talkcli.cli.command import read_value, readable
-from talkcli.cli.interrupts import Interrupts, give_up_unread
-from talkcli.cli.show import (
-    Feedback,
-    give_up_output,
-    note,
-    reader_is_gone,
-    show_error,
-    show_json,
-    standard_output,
-)
-from talkcli.cli.wait import (
-    feedback_for,
-    give_up,
-    introduce,
-    refuse,
-    regardless,
-    report,
-    rest,
-    show_if_possible,
-    timed_out,
-    until_ended,
-)
+from talkcli.cli.command import read_value, replace_bad_bytes
+from talkcli.cli.interrupts import Interrupts, discard_unread_output
+from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, show_json, standard_output
+from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error
 from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import SOUND
@@ -42,12 +23,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
 
-    from talkcli.cli.show import Common
+    from talkcli.cli.show import CommonOptions
     from talkcli.client.client import GoalHandle
 
 
 def say(
-    options: Common,
+    options: CommonOptions,
     text: tuple[str, ...],
     wait: bool,
     feedback: bool,
@@ -56,148 +37,151 @@ def say(
     lines: bool,
     ahead: int | None,
     output: str | None,
-    **chosen: Any,
+    **goal_options: Any,
 ) -> int:
-    """Speak a text, each line of standard input, or into a file, and return the exit code.
+    """Speak a text or each line of standard input, or write the text into a file. Return the exit code.
 
-    `text`: words, or "-" for standard input; `timeout`: seconds; `name`: what the sender calls itself; `chosen`: the
-    options of the goal, by their names.
+    Args:
+        options: the options of every command.
+        text: the words of the text, or "-" for standard input.
+        wait: whether to wait until it has ended.
+        feedback: whether to show each word as it is heard. This implies `wait`.
+        timeout: seconds for the whole command, or None for no limit.
+        name: the sender's name.
+        lines: whether to speak each line of standard input.
+        ahead: with `lines`, how many goals may be pending at once. None stands for the default.
+        output: the file to write, or None to speak.
+        goal_options: the options of the goal.
     """
     wait = wait or feedback
-    end = None if timeout is None else options.began + timeout
     if output is None:
-        give_up_unread()
+        discard_unread_output()
     if lines:
         from talkcli.cli.stdin import say_lines
 
-        return say_lines(options, name, chosen, wait, feedback, timeout, ahead)
+        return say_lines(options, name, goal_options, wait, feedback, timeout, ahead)
     sentence = " ".join(text)
     if text == ("-",):
-        from talkcli.cli.stdin import InputTooLong, read_text, rejected
+        from talkcli.cli.stdin import InputTooLong, read_text, rejected_goal
 
         try:
-            read = read_text(end, wait=wait, whole=output is not None)
+            read = read_text(options.deadline(timeout), wait=wait, whole=output is not None)
         except InputTooLong as error:
-            return regardless(refuse, rejected(str(error)), options, feedback_for(options, asked=feedback))
+            reporter = GoalReporter(options, feedback=feedback)
+            return retry_without_output(reporter.report_refused, rejected_goal(str(error)))
         if isinstance(read, int):
             return read  # nothing was sent
         sentence = read
     if output is not None:
-        return _render(output, sentence, chosen, rest(end), options)
-    return _say(_readable(sentence, options), chosen, name, timeout, options, wait=wait, feedback=feedback)
+        return _write_file(output, sentence, goal_options, timeout, options)
+    return _say(sentence, goal_options, name, timeout, options, wait=wait, feedback=feedback)
 
 
 def _say(
     text: str,
-    chosen: dict[str, Any],
+    goal_options: dict[str, Any],
     name: str | None,
     timeout: float | None,
-    options: Common,
+    options: CommonOptions,
     *,
     wait: bool,
     feedback: bool,
 ) -> int:
-    """Speak one text."""
-    end = None if timeout is None else options.began + timeout
-    with Interrupts(held=options.held, output=wait) as interrupts:
+    text, end = _without_bad_bytes(text, options), options.deadline(timeout)
+    with Interrupts(blocked=options.blocked_signals, output=wait) as interrupts:
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
-                if interrupts.number is not None and not (options.begun and options.begun.sent):
-                    raise Interrupted  # what has been sent is cancelled, once its id is known
-                goal = client.say(text, follow=wait, feedback=feedback, **chosen)
-                shown = feedback_for(options, asked=feedback)
-                if not wait or goal.state is State.REJECTED:
-                    return regardless(_tell, goal, options, shown)
-                return _wait(goal, interrupts, timeout, options, shown)
+                if interrupts.signal_number is not None and not (options.early and options.early.sent):
+                    raise Interrupted  # a goal that was already sent is cancelled below, when its id is known
+                goal = client.say(text, follow=wait, feedback=feedback, **goal_options)
+                reporter = GoalReporter(options, feedback=feedback)
+                if wait and goal.state is not State.REJECTED:
+                    return _wait(goal, interrupts, timeout, options, reporter)
+                return retry_without_output(_report_sent, goal, options, reporter)
         except Lost as error:
-            if interrupts.number is None:
+            if interrupts.signal_number is None:
                 if end is None or time.monotonic() < end:
                     raise
-                raise timed_out(timeout, error.message) from error
+                raise timeout_error(timeout, error.message) from error
             show_error(error, json=options.json)
     return interrupts.exit_code
 
 
-def _readable(text: str, options: Common) -> str:
-    """Return a text without the bytes in it that are no UTF-8, and tell of them."""
-    text, unreadable = readable(text)
-    if unreadable and not options.quiet:
-        note(unreadable)
+def _without_bad_bytes(text: str, options: CommonOptions) -> str:
+    """Return a text without bytes that aren't UTF-8, and print a note about them."""
+    text, problem = replace_bad_bytes(text)
+    if problem and not options.quiet:
+        note(problem)
     return text
 
 
-def _tell(goal: GoalHandle, options: Common, shown: Feedback) -> int:
-    """Tell of a goal that is not waited for: its id, or how it ended, if it has."""
+def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporter) -> int:
+    """Report a goal for which the command doesn't wait, and return the exit code."""
     if goal.state is State.REJECTED:
-        code = refuse(goal.goal, options, shown)
+        code = reporter.report_refused(goal.goal)
         if goal.goal.reason == "text_too_long" and not options.quiet:
             note("'talk say --lines' speaks standard input line by line, each line a goal of its own")
         return code
-    introduce(goal, options, shown)
-    code = report(goal.goal, options, shown)
+    reporter.show_accepted(goal)
+    code = reporter.report(goal.goal)
     return code if goal.state.terminal else EXIT_OK
 
 
-def _wait(goal: GoalHandle, interrupts: Interrupts, timeout: float | None, options: Common, shown: Feedback) -> int:
-    """Wait for a goal. It is this command's own: where it can't wait any longer, the goal ends too; unless another
-    `say` had sent it before, with the same id.
+def _wait(
+    goal: GoalHandle, interrupts: Interrupts, timeout: float | None, options: CommonOptions, reporter: GoalReporter
+) -> int:
+    """Wait for a goal, report its end, and return the exit code.
+
+    The goal belongs to this command, so it is cancelled if the wait ends first. A goal that an earlier command has sent
+    with the same id isn't cancelled.
     """
     try:
-        introduce(goal, options, shown)
-        until_ended([goal], rest(None if timeout is None else options.began + timeout), shown)
+        reporter.show_accepted(goal)
+        reporter.follow([goal], seconds_left(options.deadline(timeout)))
     except (Interrupted, OSError) as error:
-        if isinstance(error, OSError) and not isinstance(error, TimeoutError):
-            if not reader_is_gone(error):
-                raise
-            interrupts.gone = True
-        interrupts.look()
-        late = interrupts.number is None and not interrupts.gone
-        if interrupts.gone:
-            give_up_output()
-        if goal.attached:  # it is another's, and goes on
-            if late:
-                raise timed_out(timeout, f"{goal.id} goes on: it was sent before") from None
+        interrupts.record(error)
+        timed_out = interrupts.signal_number is None and not interrupts.reader_gone
+        code = interrupts.exit_code if goal.attached else reporter.cancel(goal, interrupts)
+        if not timed_out:
             return interrupts.exit_code
-        code = give_up(goal, interrupts, options, shown)
-        if not late:
-            return interrupts.exit_code
+        if goal.attached:
+            raise timeout_error(timeout, f"{goal.id} goes on: it was sent before") from None
         if goal.state is not State.SUCCEEDED:
-            raise timed_out(timeout) from None
+            raise timeout_error(timeout) from None
         return code
     finally:
-        regardless(shown.close)
-    return report(goal.goal, options, shown)
+        retry_without_output(reporter.feedback.close)
+    return reporter.report(goal.goal)
 
 
-def _render(path: str, text: str, chosen: Mapping[str, Any], timeout: float | None, options: Common) -> int:
-    """Write the text into the file, "-" for standard output, and return the exit code; what goes wrong is raised.
-
-    `chosen`: the options of a goal; those that the engine isn't told of mean nothing here. `timeout`: seconds.
-    """
+def _write_file(
+    path: str, text: str, goal_options: Mapping[str, Any], timeout: float | None, options: CommonOptions
+) -> int:
+    """Write the speech into a file, or to standard output for "-", and return the exit code."""
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
-    settings = _settings(chosen)
+    settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))
     if path in STANDARD_OUTPUT:
         if options.json:
             raise UsageError("--json prints to standard output, where the sound goes: leave one of them out")
         standard_output()
-    text = _readable(text, options)
+    text = _without_bad_bytes(text, options)
     with Interrupts() as interrupts:
         try:
-            seconds = render(text, path, timeout=timeout, interrupt=interrupts.watched, **settings)
+            seconds = render(text, path, timeout=seconds_at_most, interrupt=interrupts.watched, **settings)
         except Interrupted:
             return interrupts.exit_code
     if options.json:
-        done = {"output": path, "seconds": seconds, "text": text, **settings}
-        regardless(show_if_possible, show_json, done)  # the file is there
+        result = {"output": path, "seconds": seconds, "text": text, **settings}
+        retry_without_output(show_if_possible, show_json, result)  # the file has been written in any case
     return EXIT_OK
 
 
-def _settings(chosen: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what to speak with: the options, else the environment, as a server has its own; none that neither has."""
+def _sound_settings(goal_options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of the engine, from the options or else from the environment, as for a server."""
     found = {}
     for option in SOUND:
-        value, text = chosen[option.name], os.environ.get(option.env) if option.env else None
+        value, text = goal_options[option.name], os.environ.get(option.env) if option.env else None
         if value is None and text:
             import click
 

@@ -1,4 +1,4 @@
-"""`talk serve`: it runs the server, or has a systemd unit printed that does. No other module imports the server."""
+"""`talk serve`: run the server, or print a systemd unit for it. No other command imports the server."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from talkcli.terminal.text import printable
 if TYPE_CHECKING:
     from typing import Any
 
-    from talkcli.cli.show import Common
+    from talkcli.cli.show import CommonOptions
 
-#: What is said at the start where nothing could sound.
-NO_DEVICE = (
+#: The warning at the start if there is no sound device.
+_NO_DEVICE = (
     "no sound device is here, and no PulseAudio or PipeWire: plug in a loudspeaker, or hand it to the container ('talk "
     "doctor' says more); it is looked for with each sentence, which ends ABORTED until it is there; to speak without "
     "one: '--player file:PATH.wav', '--player null'"
 )
 
 
-def serve(options: Common, print_unit: str | None, **given: Any) -> int:
-    """Run the server, or print a unit that would; return the exit code. `given`: the other options, by their names."""
+def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
+    """Run the server, or print a systemd unit for it. Return the exit code. `given` are the other options, by name."""
     if print_unit:
-        units.print_server(options, print_unit, given)
+        units.print_server_unit(options, print_unit, given)
         return 0
     if not options.quiet:
-        _warn_of_sound(given["player"] or "", given["driver"])
+        _warn_about_sound(given["player"] or "", given["driver"])
     from talkcli.goals.options import SETTINGS, Set
     from talkcli.server import run
 
@@ -38,10 +38,10 @@ def serve(options: Common, print_unit: str | None, **given: Any) -> int:
     return run.serve(run.Settings(socket=paths.named_socket(options.socket), goals=goals, **given))
 
 
-def _warn_of_sound(player: str, driver: str | None) -> None:
-    """Tell what would be in the way of every sentence: no device, or a player that there isn't.
+def _warn_about_sound(player: str, driver: str | None) -> None:
+    """Warn if no sentence could be heard, because there is no sound device or no such player.
 
-    With a device and no player named it only looks at the names of files, so that the start is not kept waiting.
+    Without --player this only looks for certain files, so that the start isn't delayed.
     """
     from talkcli.engine.players import PACKAGES, has_no_output, is_silent
 
@@ -53,19 +53,19 @@ def _warn_of_sound(player: str, driver: str | None) -> None:
     from talkcli.engine.voices import is_own_driver
 
     if not is_own_driver(driver):
-        return  # it plays by itself, and the server says so
+        return  # this driver plays by itself, and the server says so
     if silent and (not player or player in PACKAGES):
-        note(NO_DEVICE)
+        note(_NO_DEVICE)
     if player:
-        _warn_of_player(player)
+        _warn_about_player(player)
 
 
-def _warn_of_player(player: str) -> None:
-    """Tell of a player that there isn't: a word that was mistyped, or a program that is not installed yet."""
+def _warn_about_player(player: str) -> None:
+    """Warn about a player that was mistyped or is not installed."""
     from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, player_commands
 
     if player in PLAYERS and player not in PACKAGES:
-        return  # it is no program
+        return  # it isn't a program
     try:
         player_commands(player, None, 0)
     except PlayerMissing as error:

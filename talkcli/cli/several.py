@@ -9,21 +9,30 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from talkcli.cli.command import readable
-from talkcli.cli.interrupts import Interrupts, give_up_unread
-from talkcli.cli.show import give_up_output, note, reader_is_gone, show, show_error, show_json
-from talkcli.cli.wait import SILENCE, regardless, rest, show_if_possible, timed_out
+from talkcli.cli.command import replace_bad_bytes
+from talkcli.cli.interrupts import Interrupts, discard_unread_output
+from talkcli.cli.show import (
+    discard_output,
+    note,
+    reader_is_gone,
+    retry_without_output,
+    show,
+    show_error,
+    show_if_possible,
+    show_json,
+)
+from talkcli.cli.wait import CANCEL_TIMEOUT_S, seconds_left, timeout_error
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.polling import Interrupted
 from talkcli.protocol.requests import Pause, Resume, Status, Wait
-from talkcli.terminal.goals import ending, setting_lines
+from talkcli.terminal.goals import describe_end, setting_lines
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from typing import Any
 
-    from talkcli.cli.show import Common
+    from talkcli.cli.show import CommonOptions
     from talkcli.fleet.desk.crowd import Round
     from talkcli.fleet.desk.outcome import Outcome
     from talkcli.protocol.requests import Request
@@ -33,7 +42,7 @@ _NAMES, _NOTES = 5, 10
 
 
 def say(
-    options: Common,
+    options: CommonOptions,
     text: tuple[str, ...],
     wait: bool,
     timeout: float | None,
@@ -41,8 +50,8 @@ def say(
     **chosen: Any,
 ) -> int:
     """Have all of them speak a text, and return the exit code; the arguments are as those of `say.say`."""
-    end = None if timeout is None else options.began + timeout
-    give_up_unread()
+    end = None if timeout is None else options.started_at + timeout
+    discard_unread_output()
     sentence = " ".join(text)
     if text == ("-",):
         from talkcli.cli.stdin import InputTooLong, read_text
@@ -54,72 +63,72 @@ def say(
         if isinstance(read, int):
             return read  # nothing was sent
         sentence = read
-    sentence, unreadable = readable(sentence)
+    sentence, unreadable = replace_bad_bytes(sentence)
     if unreadable and not options.quiet:
         note(unreadable)
     return _ask(options, Say(sentence, wait=wait, **chosen), timeout, name)
 
 
-def wait(options: Common, ids: tuple[str, ...], timeout: float | None) -> int:
+def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:
     """Wait until these goals have ended on all of them, or all of theirs; return the exit code."""
-    give_up_unread()
+    discard_unread_output()
     return _ask(options, Wait(ids or None), timeout)
 
 
-def cancel(options: Common, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
+def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
     """Cancel on all of them what these select, or everything; return the exit code."""
     return _ask(options, Cancel(ids or None, current, before, key))
 
 
-def status(options: Common, goal_id: str | None) -> int:
+def status(options: CommonOptions, goal_id: str | None) -> int:
     """Show how each stands, or one goal on each; return the exit code."""
     return _ask(options, Status(goal_id))
 
 
-def change(options: Common, **settings: Any) -> int:
+def change(options: CommonOptions, **settings: Any) -> int:
     """Change those settings of all of them that aren't None, or show them; return the exit code."""
     return _ask(options, Set(**settings))
 
 
-def pause(options: Common) -> int:
+def pause(options: CommonOptions) -> int:
     """Hold speech on all of them; return the exit code."""
     return _ask(options, Pause())
 
 
-def resume(options: Common) -> int:
+def resume(options: CommonOptions) -> int:
     """Go on where speech is held on any of them; return the exit code."""
     return _ask(options, Resume())
 
 
-def _ask(options: Common, request: Request, timeout: float | None = None, name: str | None = None) -> int:
+def _ask(options: CommonOptions, request: Request, timeout: float | None = None, name: str | None = None) -> int:
     """Ask all of them, show what becomes of it, and return the exit code; `timeout`: seconds for all of it."""
     owns = isinstance(request, Say) and request.wait
-    end = None if timeout is None else options.began + timeout
+    end = None if timeout is None else options.started_at + timeout
     found = _Tally(options, request)
     with (
         Interrupts(output=owns or isinstance(request, Wait)) as interrupts,
-        options.crowd(timeout, name=name, interrupt=interrupts.watched) as crowd,
+        options.connect_robots(timeout, name=name, interrupt=interrupts.watched) as crowd,
     ):
         asked = crowd.ask(request)
         late = False
         try:
-            found.take(asked, rest(end))
+            found.take(asked, seconds_left(end))
         except TimeoutError:
             late = True
         except (Interrupted, OSError) as error:
             if isinstance(error, OSError):
                 if not reader_is_gone(error):
                     raise
-                interrupts.gone = True
-            interrupts.look()
-        if not (late or interrupts.gone or interrupts.number is not None):
+                interrupts.reader_gone = True
+            interrupts.check_reader()
+        if not (late or interrupts.reader_gone or interrupts.signal_number is not None):
             return found.end(asked)
-        if interrupts.gone:
-            give_up_output()
+        if interrupts.reader_gone:
+            discard_output()
         if owns:
             _cancel(asked, interrupts, found)
         if late:
-            show_error(timed_out(timeout), json=options.json)
+            show_error(timeout_error(timeout), json=options.json)
         found.end(asked, "not known to be silent" if owns else "not done")
         return EXIT_TIMEOUT if late else interrupts.exit_code
     return interrupts.exit_code
@@ -127,11 +136,11 @@ def _ask(options: Common, request: Request, timeout: float | None = None, name: 
 
 def _cancel(asked: Round, interrupts: Interrupts, found: _Tally) -> None:
     """Cancel it wherever it has not ended, and wait a moment for silence."""
-    interrupts.clear()
+    interrupts.reset()
     try:
         if asked.open:
             asked.cancel()
-        regardless(found.take, asked, SILENCE)
+        retry_without_output(found.take, asked, CANCEL_TIMEOUT_S)
     except (Interrupted, TimeoutError):
         pass  # where it is not known, `end` tells
     except TalkError as error:
@@ -141,7 +150,7 @@ def _cancel(asked: Round, interrupts: Interrupts, found: _Tally) -> None:
 class _Tally:
     """Shows what becomes of it, and counts."""
 
-    def __init__(self, options: Common, request: Request) -> None:
+    def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
         #: what has become of it at each robot, by its name; the first that is no success, where there are several
         self._found: dict[str, Outcome] = {}
@@ -220,7 +229,7 @@ def _why(outcome: Outcome) -> str:
     """Return in words why a robot did not do it."""
     if outcome.error is not None:
         return outcome.error.message.removeprefix(f"{outcome.robot}: ")  # who it is stands before it
-    return ending(outcome.goal) if outcome.goal else outcome.state
+    return describe_end(outcome.goal) if outcome.goal else outcome.state
 
 
 class _Count:

@@ -1,6 +1,6 @@
-"""What all commands share: the options that say how, lines on standard output, notes on standard error, and their end.
+"""What all commands share: the common options, the connection to the server, output, notes and exit codes.
 
-Whatever a command raises becomes words on standard error and an exit code. What a goal's end means is not known here.
+Every error of a command becomes a message on standard error and an exit code.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from talkcli.frozen import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from collections.abc import Set as AbstractSet
-    from typing import Any, TextIO
+    from typing import Any, TextIO, TypeVar
 
     from talkcli.client.client import Client
     from talkcli.client.connect import Begun
@@ -29,20 +29,22 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import Event
     from talkcli.terminal.text import Screen
 
-#: Standard output's descriptor.
-OUTPUT = 1
-#: What writing says where there is no room, or the disk is broken.
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-#: Whether there was no room for what was to be shown: a command that went on without ends as one that failed.
-_failed = False
-#: Columns of a terminal that doesn't say how many it has.
-USUAL_WIDTH = 80
-#: Stands for a blank at which no line ends.
-_NO_BREAK = "\0"
+    _T = TypeVar("_T")
+
+#: The file descriptor of standard output.
+STDOUT_FD = 1
+#: Errors of writing to a full or broken disk.
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+#: Whether output was lost because of such an error. The command then fails even if it could go on.
+_output_lost = False
+#: The width of a terminal that doesn't report one.
+DEFAULT_COLUMNS = 80
+#: Stands for a space at which a line must not be broken.
+_NO_BREAK_SPACE = "\0"
 
 
-class Common:
-    """What every command is given: the options that all have, and what was done before it is carried out."""
+class CommonOptions:
+    """The options of every command, and what was done before the command is run."""
 
     socket: str | None = None
     robot: str | None = None
@@ -50,50 +52,60 @@ class Common:
     json = False
     quiet = False
     connect_timeout: float | None = None
-    #: how far its connection has come already, maybe with its request sent: see `plain`
-    begun: Begun | None = None
-    #: signals that wait for somebody to take them
-    held: Iterable[int] = ()
-    #: the options that stand on the command line
+    #: the connection that `plain` has made early; its request may have been sent
+    early: Begun | None = None
+    #: signals that stay blocked until the command can handle them
+    blocked_signals: Iterable[int] = ()
+    #: the names of the options on the command line
     typed: AbstractSet[str] = frozenset()
-    #: whether the command finds a place where the server is full
+    #: whether the command may connect to a server that has reached its client limit
     urgent = False
 
     def __init__(self, **given: Any) -> None:
-        #: when the command began, by the monotonic clock
-        self.began = time.monotonic()
+        #: the start of the command (monotonic)
+        self.started_at = time.monotonic()
         vars(self).update(given)
 
-    def connect(self, timeout: float | None = None, **options: Any) -> Client:
-        """Return a client connected to the server; see `SocketConnection` for the options.
+    def deadline(self, timeout: float | None) -> float | None:
+        """Return the monotonic time at which a timeout ends that has run since the start of the command."""
+        return None if timeout is None else self.started_at + timeout
 
-        `timeout`: seconds that all may take, and so the longest that an answer is waited for. The command's first
-        connection is tried again for `connect_timeout` seconds; TimeoutError if `timeout` is over before that.
+    def connect(self, timeout: float | None = None, **options: Any) -> Client:
+        """Connect to the server. The first call keeps trying for `connect_timeout` seconds.
+
+        Args:
+            timeout: seconds that the whole command may take. This also limits the wait for each answer.
+            options: further arguments of `SocketConnection`.
+
+        Raises:
+            TimeoutError: `timeout` is over, and `connect_timeout` isn't.
         """
         from talkcli.client.client import Client
         from talkcli.client.connect import ANSWER_LIMIT
 
-        began, end = time.monotonic(), None if timeout is None else self.began + timeout
+        began, end = time.monotonic(), self.deadline(timeout)
         options = {"patience": min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), "end": end, **options}
         connect_timeout, self.connect_timeout = self.connect_timeout, None
         if connect_timeout is None:
             return Client.over(self._connection(**options))
-        waits = connect_timeout if end is None else min(connect_timeout, max(0.0, end - began))
+        seconds = connect_timeout if end is None else min(connect_timeout, max(0.0, end - began))
         try:
-            return Client.over(self._connection(keep_trying=waits, **options))
+            return Client.over(self._connection(keep_trying=seconds, **options))
         except ServerUnavailable as error:
             now = time.monotonic()
-            if now < began + waits:  # it can't be expected to come
+            if now < began + seconds:  # waiting for this server is pointless
                 raise
-            words = f"waited for {round(waits, 1):g} s: {error.message}"
+            words = f"waited for {round(seconds, 1):g} s: {error.message}"
             if end is not None and now >= end:
                 raise TimeoutError(words) from None
             raise ServerUnavailable(words) from None
 
-    def crowd(self, timeout: float | None = None, **options: Any) -> Crowd:
-        """Return the robots of a fleet that were named, connected to their broker; the options are `Crowd`'s.
+    def connect_robots(self, timeout: float | None = None, **options: Any) -> Crowd:
+        """Connect to the broker, and return the robots that --robot selects.
 
-        `timeout`: seconds that all may take, and so the longest that an answer is waited for.
+        Args:
+            timeout: seconds that the whole command may take. This also limits the wait for each answer.
+            options: further arguments of `Crowd`.
         """
         from talkcli.client.connect import ANSWER_LIMIT
         from talkcli.fleet.desk.selection import Selection
@@ -105,28 +117,30 @@ class Common:
         return Crowd(broker, to, patience=min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), **options)
 
     def broker(self) -> Broker:
-        """Return the broker of the fleet; UsageError where that, or what it needs, is not there."""
+        """Return the address and login of the broker; UsageError if a setting or paho-mqtt is missing."""
         from talkcli.fleet.broker import from_environment, need_client
 
         need_client()
         return from_environment(os.environ, insecure=self.insecure)
 
     def _connection(self, **options: Any) -> Connection:
-        """Return a connection to the server of this machine, or to a robot of a fleet."""
         robot = paths.named_robot(self.robot, self.socket)
         if not robot:
             from talkcli.client.connection import SocketConnection
 
-            return SocketConnection(self.socket, begun=self.begun, **{"urgent": self.urgent, **options})
+            return SocketConnection(self.socket, begun=self.early, **{"urgent": self.urgent, **options})
         broker = self.broker()
         from talkcli.fleet.desk.robot import reach
 
-        options.pop("urgent", None)  # a broker keeps no places for that
+        options.pop("urgent", None)  # there is no client limit over a broker
         return reach(robot, broker, **options)
 
 
-def ended(command: Callable[[], object], options: Common) -> int:
-    """Run a command, and return its exit code: what it returns, if that is a number, else 0; or that of its error."""
+def run_command(command: Callable[[], object], options: CommonOptions) -> int:
+    """Run a command, and return its exit code. An error is reported first.
+
+    The exit code is the number that the command returns, 0 for any other value, or the code of its error.
+    """
     try:
         code = command()
         if sys.stdout:
@@ -142,98 +156,120 @@ def ended(command: Callable[[], object], options: Common) -> int:
         note(f"there is not enough memory for talk: {limits()}")
         return EXIT_ERROR
     except Exception as error:
-        given_up = give_up_failed(error)
-        if given_up is not None:
-            return given_up
+        output_code = handle_output_error(error)
+        if output_code is not None:
+            return output_code
         if os.environ.get("TALK_DEBUG"):
             raise
         note(f"a bug in talk {__version__}: {type(error).__name__}: {error} (TALK_DEBUG=1 shows where)")
         return EXIT_ERROR
-    return (code if isinstance(code, int) else 0) or (EXIT_ERROR if _failed else 0)
+    return (code if isinstance(code, int) else 0) or (EXIT_ERROR if _output_lost else 0)
 
 
-def give_up_output() -> None:
-    """Write nothing more to standard output, which takes nothing; not even at the interpreter's end."""
-    _discard(OUTPUT)
+def discard_output() -> None:
+    """Send all further output to /dev/null."""
+    _redirect_to_null(STDOUT_FD)
     if sys.stdout is None:
-        sys.stdout = open(OUTPUT, "w", closefd=False, encoding="utf-8")  # noqa: SIM115 - open as long as the process
+        # It stays open as long as the process runs.
+        sys.stdout = open(STDOUT_FD, "w", closefd=False, encoding="utf-8")  # noqa: SIM115
 
 
-def _discard(descriptor: int) -> None:
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, descriptor)
-    os.close(nowhere)
+def _redirect_to_null(descriptor: int) -> None:
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, descriptor)
+    os.close(null)
 
 
 def reader_is_gone(error: OSError) -> bool:
-    """Whether this error is from a standard output that nobody reads any more: a pipe, a terminal that is gone."""
-    if error.errno == errno.EIO:  # which a broken disk gives, too
-        return stat.S_ISCHR(os.fstat(OUTPUT).st_mode)
+    """Return whether this error means that nothing reads standard output any more."""
+    if error.errno == errno.EIO:  # a closed terminal, or a broken disk
+        return stat.S_ISCHR(os.fstat(STDOUT_FD).st_mode)
     return isinstance(error, BrokenPipeError)
 
 
-def give_up_failed(error: Exception) -> int | None:
-    """Write nothing more to standard output, if this error is from there, and return the exit code for that, or None.
+def handle_output_error(error: Exception) -> int | None:
+    """Discard all further output if it can't be written. A full or broken disk is reported.
 
-    Where there is no room for what is written, that is told, and the command ends as one that failed.
+    Returns:
+        The exit code for this error, or None if it has nothing to do with standard output.
     """
-    global _failed  # noqa: PLW0603 - as standard output is the process's
+    global _output_lost  # noqa: PLW0603 - the process has one standard output
     if not isinstance(error, OSError):
         return None
-    if reader_is_gone(error) or _is_for_reading(error):
-        give_up_output()
+    if reader_is_gone(error) or _is_read_only(error):
+        discard_output()
         return EXIT_SIGPIPE
-    if error.errno not in _FULL:
+    if error.errno not in _DISK_ERRORS:
         return None
-    _failed = True
-    give_up_output()
+    _output_lost = True
+    discard_output()
     note(f"standard output can't be written: {error.strerror}")
     return EXIT_ERROR
 
 
-def _is_for_reading(error: OSError) -> bool:
-    """Whether this error is from a standard output that is open for reading alone."""
+def _is_read_only(error: OSError) -> bool:
+    """Return whether this error means that standard output is open for reading only."""
     if error.errno != errno.EBADF:
         return False
     import fcntl
 
-    return fcntl.fcntl(OUTPUT, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
+    return fcntl.fcntl(STDOUT_FD, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
+
+
+def show_if_possible(put: Callable[..., None], *what: object) -> None:
+    """Call a function that writes output, and go on if the disk is full. It still raises if the reader is gone."""
+    try:
+        put(*what)
+    except OSError as error:
+        if reader_is_gone(error) or handle_output_error(error) is None:
+            raise
+
+
+def retry_without_output(act: Callable[..., _T], *given: Any) -> _T:
+    """Call a function. If the reader of its output is gone, call it again without output."""
+    try:
+        return act(*given)
+    except OSError as error:
+        if not reader_is_gone(error):
+            raise
+        discard_output()
+        return act(*given)
 
 
 def standard_output() -> TextIO:
-    """Return standard output; BrokenPipeError where it is closed."""
+    """Return standard output; BrokenPipeError if it is closed."""
     if sys.stdout is None:
         raise BrokenPipeError("standard output is closed")
     return sys.stdout
 
 
 def show(line: str) -> None:
-    """Write a line of data to standard output, at once; BrokenPipeError where that is closed."""
+    """Write a line to standard output; BrokenPipeError if it is closed."""
     stream = standard_output()
     stream.write(f"{line}\n")
     stream.flush()
 
 
 def show_json(message: JsonObject) -> None:
-    """Write an object as a line of JSON, in UTF-8 whatever the locale is; BrokenPipeError as `show`.
+    """Write an object as a line of JSON to standard output; BrokenPipeError if it is closed.
 
-    On a terminal what isn't plainly visible is escaped, as it is in all that is shown there.
+    JSON is always in UTF-8, whatever the locale is. On a terminal invisible characters are escaped.
     """
     _write_json(standard_output(), message)
 
 
-def show_found(options: Common, found: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """Show what was found: as it is, for programs, or in lines for people."""
+def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
+    """Show a result: the JSON objects with --json, else the lines."""
     if options.json:
-        for each in found:
-            show_json(each)
+        for item in items:
+            show_json(item)
     else:
         for line in lines():
             show(line)
 
 
 def _write_json(stream: TextIO, message: JsonObject) -> None:
-    from talkcli.protocol.lines import encode  # help and completion have nothing to do with JSON
+    from talkcli.protocol.lines import encode  # help and completion need no JSON
 
     line = encode(message)
     if stream.isatty():
@@ -246,48 +282,48 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 
 
 def note(words: str) -> None:
-    """Write something for people to standard error, if they are there; a terminal's lines end between two words."""
+    """Write a message to standard error. On a terminal it is wrapped between words."""
     lines = f"talk: {words}"
     if sys.stderr is not None and sys.stderr.isatty():
-        lines = _folded(lines)
-    end_line(lines)
+        lines = _wrap(lines)
+    write_error_line(lines)
 
 
-def end_line(words: str = "") -> None:
-    """End a line on standard error, with these words; one may have been begun by somebody else, a terminal for one."""
+def write_error_line(line: str = "") -> None:
+    """Write a line to standard error, if it is open. An empty one ends the line on which a terminal shows ^C."""
     if sys.stderr is not None:
-        # Whoever read it may have gone, and have taken standard output along: what is to be done is done all the same.
+        # The reader may be gone, together with that of standard output. The command does its work all the same.
         try:
-            sys.stderr.write(f"{words}\n")
+            sys.stderr.write(f"{line}\n")
             sys.stderr.flush()
         except OSError:
-            _discard(2)
+            _redirect_to_null(2)
 
 
-def columns(stream: TextIO) -> int:
-    """Return how many columns a terminal has; 0 where it doesn't say, and of what is none."""
+def terminal_columns(stream: TextIO) -> int:
+    """Return the width of a terminal. It is 0 if it is unknown or the stream is no terminal."""
     try:
         return os.get_terminal_size(stream.fileno()).columns
     except OSError:
         return 0
 
 
-def _folded(text: str) -> str:
-    """Return the text in lines that a terminal needs not break."""
-    width = columns(sys.stderr) or USUAL_WIDTH
-    if all(len(line) <= width for line in text.split("\n")):
+def _wrap(text: str) -> str:
+    """Return the text in lines that fit the terminal."""
+    columns = terminal_columns(sys.stderr) or DEFAULT_COLUMNS
+    if all(len(line) <= columns for line in text.split("\n")):
         return text
     import re
     import textwrap
 
-    from talkcli.terminal.text import NARROWEST
+    from talkcli.terminal.text import MIN_COLUMNS
 
-    fold = textwrap.TextWrapper(
-        max(width, NARROWEST), subsequent_indent="      ", break_long_words=False, break_on_hyphens=False
+    wrapper = textwrap.TextWrapper(
+        max(columns, MIN_COLUMNS), subsequent_indent="      ", break_long_words=False, break_on_hyphens=False
     )
-    # A command is not broken: it would be another one where it is copied from the terminal.
-    kept = re.sub(r"'[^'\n]*'|: (?:talk|sudo) .*", lambda found: found[0].replace(" ", _NO_BREAK), text)
-    return "\n".join(map(fold.fill, kept.split("\n"))).replace(_NO_BREAK, " ")
+    # A command stays on one line, so that it can be copied from the terminal.
+    kept = re.sub(r"'[^'\n]*'|: (?:talk|sudo) .*", lambda found: found[0].replace(" ", _NO_BREAK_SPACE), text)
+    return "\n".join(map(wrapper.fill, kept.split("\n"))).replace(_NO_BREAK_SPACE, " ")
 
 
 def show_error(error: TalkError, *, json: bool) -> None:
@@ -299,43 +335,43 @@ def show_error(error: TalkError, *, json: bool) -> None:
         try:
             _write_json(sys.stderr, {"error": fields})
         except OSError:
-            _discard(2)  # as in `end_line`
+            _redirect_to_null(2)  # as in `write_error_line`
 
 
 class Feedback:
-    """Shows what happens to goals: nothing, where that was not asked for. What shows something is in `feedback`."""
+    """Shows the events of goals. This base class shows nothing; `feedback` has the others."""
 
-    #: whether each event is shown, and so neither ids nor how a goal ended have to be
-    shows = False
+    #: whether each event is shown, so that the command itself needn't print ids and results
+    shows_events = False
 
     def begin(self, goals: Sequence[Goal]) -> None:
-        """Show how these goals stand, before their first event."""
+        """Show the present state of these goals, before their first event."""
 
     def show(self, goal: Goal, event: Event) -> None:
-        """Show an event of this goal's."""
+        """Show an event of this goal."""
 
-    def aside(self, words: str) -> None:
+    def note(self, words: str) -> None:
         """Write a note to standard error."""
         note(words)
 
     def close(self) -> None:
-        """Leave standard output so that something else can be written."""
+        """End the display, so that other output can follow."""
 
 
-def colourful() -> bool:
-    """Whether standard output takes colour."""
+def has_colour() -> bool:
+    """Return whether standard output is a terminal that may show colours."""
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
 def screen() -> Screen:
-    """Return what standard output is at this moment: how wide, if it is a terminal, and whether it takes colour."""
+    """Return the present width and the colours of standard output."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():
         return Screen()
-    # The terminal first: a COLUMNS that a shell once exported knows nothing of a window that was resized.
-    width = columns(sys.stdout)
+    # Ask the terminal first, because an exported COLUMNS stays the same when a window is resized.
+    width = terminal_columns(sys.stdout)
     if not width:
-        told = os.environ.get("COLUMNS", "")
-        width = int(told) if told.isascii() and told.isdecimal() else 0
-    return Screen(width or USUAL_WIDTH, colourful())
+        columns = os.environ.get("COLUMNS", "")
+        width = int(columns) if columns.isascii() and columns.isdecimal() else 0
+    return Screen(width or DEFAULT_COLUMNS, has_colour())

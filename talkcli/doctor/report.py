@@ -99,15 +99,15 @@ def next_step(findings: Sequence[Finding]) -> str | None:
 
 def lines(finding: Finding, screen: Screen) -> list[str]:
     """Return a finding as it is shown: in a pipe one line, on a terminal the next step has lines of its own."""
-    state = screen.painted(pad(finding.state, _STATE), _COLOURS[finding.state])
+    state = screen.coloured(pad(finding.state, _STATE), _COLOURS[finding.state])
     head = GAP.join((state, pad(finding.check, _CHECK), ""))
-    room = screen.room(len(_INDENT))
+    room = screen.columns_left(len(_INDENT))
     if room is None:
         return [head + finding.message + ("" if finding.next is None else f" {_ARROW}{finding.next}")]
     first, *rest = _wrapped(finding.message, room) or [""]
     steps = _wrapped(finding.next or "", room - len(_ARROW))
     arrows = (_ARROW if number == 0 else " " * len(_ARROW) for number in range(len(steps)))
-    rest += [arrow + screen.painted(each, None) for arrow, each in zip(arrows, steps, strict=True)]
+    rest += [arrow + screen.coloured(each, None) for arrow, each in zip(arrows, steps, strict=True)]
     return [head + first, *(_INDENT + each for each in rest)]
 
 
@@ -120,7 +120,7 @@ def verdict(findings: Sequence[Finding], screen: Screen, question: Question = HE
     step = next_step(findings)
     if step is None:
         return question.no
-    room = screen.room(len(_STEP))
+    room = screen.columns_left(len(_STEP))
     return "\n".join([f"{question.no}; do this next:", *(_STEP + each for each in _wrapped(step, room))])
 
 

@@ -22,7 +22,7 @@ from talkcli.frozen import TYPE_CHECKING, fields, frozen
 from talkcli.goals.options import told
 from talkcli.goals.states import State
 from talkcli.paths import ABSENT, DIRECTORY, FILE, FORBIDDEN, STALE
-from talkcli.terminal.goals import clock
+from talkcli.terminal.goals import clock_time
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
@@ -262,7 +262,7 @@ def _recent(log: Sequence[Goal], now: float, server: JsonObject) -> Finding:
         return ok(_RECENT, f"none of {many} failed" if len(log) > 1 else f"{many} did not fail")
     last = aborted[-1]
     words = (last.message or "").removeprefix("Talk aborted: ")
-    when = "" if last.ended_at is None else f", {span(now - last.ended_at)} ago ({clock(last.ended_at)})"
+    when = "" if last.ended_at is None else f", {span(now - last.ended_at)} ago ({clock_time(last.ended_at)})"
     who = f"{many} ABORTED, {last.id}" if len(log) == 1 else f"{len(aborted)} of {many} ABORTED, last {last.id}"
     told = f"{who}{when}: {last.reason}: {words}"
     after = [each for each in log[log.index(last) + 1 :] if each.state is State.SUCCEEDED]

@@ -1,5 +1,6 @@
-"""Goals, events and settings as words, in the columns of a terminal.
+"""Goals, events and settings as text for a terminal.
 
-Pure: objects go in, text comes out; nothing is printed here, and width and time come in as arguments. It may import
-protocol, goals and the ground. How something looks to people goes here; when it is shown is the cli's business.
+This package is pure: objects go in and lines come out. It prints nothing, and the caller passes the width of the
+terminal and the time. It may import `protocol`, `goals` and the modules of `talkcli` itself. This package decides how
+things look, and the command line decides when they are shown.
 """

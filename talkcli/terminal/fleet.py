@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
-from talkcli.terminal.goals import clock
-from talkcli.terminal.text import GAP, Screen, cut, id_room, pad, printable, shortened, width
-from talkcli.terminal.transcript import Columns, Transcript
+from talkcli.terminal.goals import clock_time
+from talkcli.terminal.text import GAP, Screen, cut, max_id_columns, pad, printable, shorten, width
+from talkcli.terminal.transcript import ColumnWidths, Transcript
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,8 +59,8 @@ def robot_lines(robots: Sequence[Robot], screen: Screen, now: float) -> list[str
     """
     rows = [_cells(each, screen, now) for each in robots]
     widths = {head: max(map(width, (head, *(cells[place][0] for cells in rows)))) for place, head in enumerate(HEADS)}
-    _fit(widths, screen.room(0))
-    lines = [screen.painted(_line({head: (head, None) for head in HEADS}, widths, Screen()), None)]
+    _fit(widths, screen.columns_left(0))
+    lines = [screen.coloured(_line({head: (head, None) for head in HEADS}, widths, Screen()), None)]
     return lines + [_line(dict(zip(HEADS, cells, strict=True)), widths, screen) for cells in rows]
 
 
@@ -68,7 +68,7 @@ def _cells(robot: Robot, screen: Screen, now: float) -> list[Cell]:
     """Return what stands in the columns of a robot's line."""
     serving = robot.online and robot.server is not None
     return [
-        (cut(printable(robot.name), id_room(screen)), None),
+        (cut(printable(robot.name), max_id_columns(screen)), None),
         ("yes", None) if robot.online else ("OFFLINE", State.LOST),
         _server(robot),
         _speaking(robot) if serving else _NOTHING,
@@ -129,9 +129,9 @@ def _line(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str
     for head, columns in widths.items():
         text, state = cells[head]
         if head == _SPEAKING and screen.width is not None:
-            text = shortened(text, columns)
+            text = shorten(text, columns)
         text = pad(text, columns)
-        shown.append(text if state is None else screen.painted(text, state))
+        shown.append(text if state is None else screen.coloured(text, state))
     return GAP.join(shown).rstrip()
 
 
@@ -141,7 +141,7 @@ class FleetTranscript:
     def __init__(self, *, full: bool) -> None:
         """`full`: as of `Transcript`."""
         self._full = full
-        self._columns = Columns()
+        self._columns = ColumnWidths()
         self._transcripts: dict[str, Transcript] = {}
 
     def begin(self, robots: Sequence[Robot], where: str, screen: Screen, now: float) -> list[str]:
@@ -153,12 +153,12 @@ class FleetTranscript:
         parts = [f"{len(robots)} robot{'' if len(robots) == 1 else 's'}"]
         parts += [f"{gone} OFFLINE"] if gone else []
         parts += [f"{alone} without a server"] if alone else []
-        return [cut(f"{clock(now)}{GAP}{', '.join(parts)}; {printable(where)}", screen.room(0))]
+        return [cut(f"{clock_time(now)}{GAP}{', '.join(parts)}; {printable(where)}", screen.columns_left(0))]
 
     def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
         """Return what is to be shown of an event of a robot's; `now`: as of `Transcript.lines`."""
         if name not in self._transcripts:
-            self._transcripts[name] = Transcript(full=self._full, words=False, robot=name, columns=self._columns)
+            self._transcripts[name] = Transcript(full=self._full, words=False, robot=name, widths=self._columns)
         return self._transcripts[name].lines(event, screen, now)
 
     def change(self, before: Robot | None, robot: Robot, screen: Screen, now: float) -> list[str]:
@@ -177,4 +177,4 @@ class FleetTranscript:
         else:
             word, state, more = "server", State.SUCCEEDED, server
         name, shown = self._columns.robot(robot.name, screen), pad(word, 10) if more else word
-        return [GAP.join((clock(now), name, screen.painted(shown, state), *filter(None, [more])))]
+        return [GAP.join((clock_time(now), name, screen.coloured(shown, state), *filter(None, [more])))]

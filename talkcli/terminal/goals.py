@@ -1,7 +1,7 @@
-"""Goals in words: one with all that is known, those of a status, who sent them, and what ended them; voices, settings.
+"""Goals, server status, settings and voices as lines of text.
 
-It prints nothing itself, so that any client can use it; how wide the terminal is, whether it has colour and what time
-it is, its caller says. Text from others always goes through `printable`. What happens as it happens is in `transcript`.
+The functions return lines and print nothing. The caller passes the width of the terminal and the time. `transcript` has
+the lines for events.
 """
 
 from __future__ import annotations
@@ -13,7 +13,18 @@ from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.option import figure
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
-from talkcli.terminal.text import GAP, LONGEST_ID, Screen, cut, fitted, folded, id_room, pad, printable, width
+from talkcli.terminal.text import (
+    GAP,
+    MAX_ID_COLUMNS,
+    Screen,
+    cut,
+    fit_columns,
+    max_id_columns,
+    pad,
+    printable,
+    width,
+    wrap,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,19 +32,19 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import By, Goal, JsonObject, Output, Sender
     from talkcli.protocol.events import ServerStatus
 
-#: Characters of a text that a list shows.
-MAX_TEXT = 200
-#: Columns of what stands before each line of `status`.
-_LABEL = 9
-#: Characters of a command line that are shown.
-MAX_COMMAND = 60
-#: Characters of a voice's name and of its language: of neural ones they stand in a stranger's file.
-_MAX_VOICE = 80
-#: Stands for the text of a goal that ended long ago.
-NOT_KEPT = "(text no longer kept)"
+#: Longer texts are cut in a list of goals.
+_LISTED_TEXT_CHARS = 200
+#: The width of the label in front of each line.
+_LABEL_COLUMNS = 9
+#: Longer command lines of senders are cut.
+_SENDER_COMMAND_CHARS = 60
+#: Longer names and languages of voices are cut. Those of neural voices come from files that anyone can write.
+_VOICE_NAME_CHARS = 80
+#: Shown instead of a text that the server no longer keeps.
+TEXT_NOT_KEPT = "(text no longer kept)"
 
-#: How a server's part is told that does not begin with its name, and which are left out where there is none.
-_ABOUT = {
+#: How to show fields of a server if it isn't by name and value.
+_FIELD_FORMATS = {
     "engine": "{}",
     "synthesizer": "{}",
     "lead_in": "lead-in {} ms",
@@ -41,14 +52,14 @@ _ABOUT = {
     "ttl": "ttl {} s",
     "preempt": "preempts",
 }
-_IF_ANY = frozenset({"synthesizer", "device", "lead_in", "ttl", "preempt"})
+#: Fields that are left out if they have no value.
+_OPTIONAL_FIELDS = frozenset({"synthesizer", "device", "lead_in", "ttl", "preempt"})
 
-_NOBODY = "nobody known"
-#: Programs that start another one, without their version: their options that take a value, their options after which no
-#: script follows, and the number of arguments before the program.
-_SHELL = ("o O rcfile init-file", "c s", 0)
-_STARTERS = {
-    **dict.fromkeys(("sh", "bash", "dash", "ash", "zsh", "ksh", "fish"), _SHELL),
+_UNKNOWN_SENDER = "nobody known"
+#: Programs that start another program or script, without their version. The values are the options with a value, the
+#: options after which no script follows, and the number of arguments before the script.
+_LAUNCHERS = {
+    **dict.fromkeys(("sh", "bash", "dash", "ash", "zsh", "ksh", "fish"), ("o O rcfile init-file", "c s", 0)),
     "python": ("W X", "c", 0),
     "perl": ("I", "e E", 0),
     "ruby": ("I r", "e", 0),
@@ -68,35 +79,32 @@ _STARTERS = {
     "timeout": ("s k signal kill-after", "", 1),
     "xargs": ("n P I L s d a E max-args max-procs arg-file", "", 0),
 }
-#: Arguments that are neither the program nor one of those before it: variables that are set.
+#: A variable that is set for the program that is started.
 _ASSIGNMENT = re.compile(r"\w+=.*")
-#: Paths of open files, which say nothing about the script.
-_DESCRIPTOR = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
+#: The path of an open file, which doesn't name the script.
+_DESCRIPTOR_PATH = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
 
 
-def ending(goal: Goal) -> str:
-    """Return how a goal ended, in one line for people."""
+def describe_end(goal: Goal) -> str:
+    """Return one line that says how a goal ended."""
     words = printable(goal.message or goal.state.name)
     if goal.by:
-        words += f" ({by_whom(goal.by)})"
+        words += f" ({_describe_cause(goal.by)})"
     return f"{printable(goal.id)}: {words}" if goal.id else words
 
 
 def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
-    """Return all that is known of one goal, a line each; on a terminal what is longer goes on under its beginning.
-
-    `now`: seconds since 1970, for how long something takes.
-    """
-    state = screen.painted(goal.state.name, goal.state)
+    """Return everything that is known about a goal, with one line for each field. `now` is in seconds since 1970."""
+    state = screen.coloured(goal.state.name, goal.state)
     rows = [
         ("id", printable(goal.id)),
         ("state", f"{state}, paused" if goal.paused and not goal.state.terminal else state),
         ("reason", goal.reason and printable(goal.reason)),
         ("message", goal.message and printable(goal.message)),
-        ("ended", by_whom(goal.by) if goal.by else None),
+        ("ended", _describe_cause(goal.by) if goal.by else None),
         ("text", None if goal.text is None else f'"{printable(goal.text)}"'),
         ("spoken", None if goal.spoken is None else f'"{printable(goal.spoken)}"'),
-        ("from", who(goal.client)),
+        ("from", _describe_sender(goal.client)),
         ("priority", str(goal.priority)),
         ("key", goal.key and f'"{printable(goal.key)}"'),
         ("ttl", goal.ttl and ", ".join(filter(None, (f"{figure(goal.ttl)} s", _left(goal, now))))),
@@ -111,44 +119,50 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
     lines = []
     for name, value in rows:
         if value:
-            # What is JSON is left to the terminal to break: copied from there it is the same still.
-            lines += folded(value.split(" "), f"{name:<{_LABEL}}", Screen() if name == "data" else screen)
+            # JSON isn't wrapped here, so that it stays valid when it is copied from the terminal.
+            lines += _labelled(name, value.split(" "), Screen() if name == "data" else screen)
     return lines
 
 
 def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
-    """Return what a server says, will say and said; `now`: as of `goal_lines`."""
+    """Return a server's settings and goals as lines. `now` is in seconds since 1970."""
     server = status.server
     uptime = server.get("uptime")
-    about = [
+    identity = [
         f"pid {_field(server, 'pid')} on {_field(server, 'socket')}",
-        f"up {span(float(uptime) if isinstance(uptime, int | float) else 0.0)}",
+        f"up {format_duration(float(uptime) if isinstance(uptime, int | float) else 0.0)}",
         f"{_field(server, 'clients')} of {_field(server, 'max_clients')} clients",
     ]
-    engine = _about(server, "engine", "driver", "synthesizer", "player", "device", "lead_in")
-    settings = _about(server, "rate", "volume", "pitch", "voice", "ttl", "preempt")
+    engine = _format_fields(server, "engine", "driver", "synthesizer", "player", "device", "lead_in")
+    settings = _format_fields(server, "rate", "volume", "pitch", "voice", "ttl", "preempt")
     lines = []
-    for label, parts in (("server", about), ("engine", engine), ("settings", settings)):
-        lines += folded([*(f"{each}," for each in parts[:-1]), parts[-1]], f"{label:<{_LABEL}}", screen)
+    for label, parts in (("server", identity), ("engine", engine), ("settings", settings)):
+        lines += _labelled(label, [*(f"{each}," for each in parts[:-1]), parts[-1]], screen)
     neural = server.get("neural_voices")
     for voice, found in neural.items() if isinstance(neural, dict) else ():
         state, why = (found.get(each) for each in ("state", "why"))
-        lines += folded(
-            printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), f"{'voice':<{_LABEL}}", screen
-        )
+        lines += _labelled("voice", printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), screen)
     if server.get("paused"):
-        lines.append(f"{'paused':<{_LABEL}}{screen.painted('speech is held', State.PREEMPTING)}: talk resume")
+        lines.append(f"{_label('paused')}{screen.coloured('speech is held', State.PREEMPTING)}: talk resume")
     active = [status.active] if status.active else []
     tables = (("now", active, "silent"), ("queue", status.pending, "nothing"), ("said", status.recent, "nothing"))
     widest = max((width(printable(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
-    id_columns = min(widest, id_room(screen) or LONGEST_ID)
+    id_columns = min(widest, max_id_columns(screen) or MAX_ID_COLUMNS)
     for label, goals, without in tables:
-        lines += _table(label, goals, id_columns, screen, now) if goals else [f"{label:<{_LABEL}}{without}"]
+        lines += _table(label, goals, id_columns, screen, now) if goals else [_label(label) + without]
     return lines
 
 
+def _labelled(label: str, pieces: Sequence[str], screen: Screen) -> list[str]:
+    return wrap(pieces, _label(label), screen)
+
+
+def _label(name: str) -> str:
+    return f"{name:<{_LABEL_COLUMNS}}"
+
+
 def setting_lines(settings: Mapping[str, object]) -> list[str]:
-    """Return a server's settings, a line each: the name of its option, and a value that this option takes."""
+    """Return one line for each setting: the name of its option, and a value that this option accepts."""
     shown = {"voice": "default", "ttl": 0}
     rows = [(name, shown.get(name, "-") if value is None else value) for name, value in settings.items()]
     longest = max((len(name) for name, _ in rows), default=0)
@@ -156,15 +170,15 @@ def setting_lines(settings: Mapping[str, object]) -> list[str]:
 
 
 def voice_lines(voices: list[JsonObject]) -> list[str]:
-    """Return the voices in columns: id, language, name, of which what is very long is cut."""
-    limits = {"id": None, "language": _MAX_VOICE, "name": _MAX_VOICE}
+    """Return one line for each voice: id, language and name."""
+    limits = {"id": None, "language": _VOICE_NAME_CHARS, "name": _VOICE_NAME_CHARS}
     rows = [[printable(str(each.get(name) or "-"), limit) for name, limit in limits.items()] for each in voices]
     widths = [max((width(row[place]) for row in rows), default=0) for place in (0, 1)]
     return [GAP.join((pad(row[0], widths[0]), pad(row[1], widths[1]), row[2])) for row in rows]
 
 
-def span(seconds: float) -> str:
-    """Return a length of time in its two largest units."""
+def format_duration(seconds: float) -> str:
+    """Return a duration in its two largest units, such as "2 h 5 min"."""
     whole = int(seconds)
     for size, name, smaller, small_name in ((86400, "d", 3600, "h"), (3600, "h", 60, "min"), (60, "min", 1, "s")):
         if whole >= size:
@@ -173,41 +187,42 @@ def span(seconds: float) -> str:
 
 
 def _table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
-    """Return a line for each goal in a status, that fits the terminal."""
+    """Return one line for each goal of a status, no wider than the terminal."""
     heads = [
-        f"{'' if number else label:<{_LABEL}}{_head(goal, id_columns, screen)}" for number, goal in enumerate(goals)
+        f"{'' if number else label:<{_LABEL_COLUMNS}}{_head(goal, id_columns, screen)}"
+        for number, goal in enumerate(goals)
     ]
     tails = [_tails(goal, now) for goal in goals]
-    texts = [quoted(goal, MAX_TEXT) for goal in goals]
-    room = screen.room(max(map(width, heads)))
-    if room is None:
+    texts = [quoted_text(goal, _LISTED_TEXT_CHARS) for goal in goals]
+    columns = screen.columns_left(max(map(width, heads)))
+    if columns is None:
         return [GAP.join([head + text, *tail[:1]]) for head, text, tail in zip(heads, texts, tails, strict=True)]
-    said = fitted(texts, [tail or [""] for tail in tails], weights=(1, 1), room=room)
-    return [head + words for head, words in zip(heads, said, strict=True)]
+    fitted = fit_columns(texts, [tail or [""] for tail in tails], weights=(1, 1), columns=columns)
+    return [head + words for head, words in zip(heads, fitted, strict=True)]
 
 
 def _head(goal: Goal, id_columns: int, screen: Screen) -> str:
-    """Return what stands before a goal's text."""
-    goal_id = pad(cut(printable(goal.id), id_room(screen)), id_columns)
-    head = f"{goal_id}{GAP}{screen.painted(pad(goal.state.name, 9), goal.state)}{GAP}"
-    return f"{clock(goal.ended_at)}{GAP}{head}" if goal.state.terminal else head
+    """Return the columns before a goal's text: the time of its end, its id and its state."""
+    goal_id = pad(cut(printable(goal.id), max_id_columns(screen)), id_columns)
+    head = f"{goal_id}{GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{GAP}"
+    return f"{clock_time(goal.ended_at)}{GAP}{head}" if goal.state.terminal else head
 
 
 def _tails(goal: Goal, now: float) -> list[str]:
-    """Return what stands after a goal's text, the longest form first."""
+    """Return the forms of the column after a goal's text, the longest first."""
     if goal.state.terminal:
-        return _muted(goal) if goal.state is State.SUCCEEDED else why_forms(goal)
-    # The sender first: what does not fit is cut at its end.
-    return [", ".join([f"from {each}", *_notes(goal, now)]) for each in who_forms(goal.client)]
+        return _muted(goal) if goal.state is State.SUCCEEDED else reason_forms(goal)
+    # The sender comes first, because a form that doesn't fit is cut at its end.
+    return [", ".join([f"from {each}", *_notes(goal, now)]) for each in sender_forms(goal.client)]
 
 
-def quoted(goal: Goal, limit: int | None = None) -> str:
-    """Return the text of a goal, cut after `limit` characters."""
-    return NOT_KEPT if goal.text is None else f'"{printable(goal.text, limit)}"'
+def quoted_text(goal: Goal, limit: int | None = None) -> str:
+    """Return the text of a goal in quotes, cut after `limit` characters."""
+    return TEXT_NOT_KEPT if goal.text is None else f'"{printable(goal.text, limit)}"'
 
 
 def _notes(goal: Goal, now: float) -> list[str]:
-    """Return what is worth knowing of a goal that has not ended, beside its text and its sender."""
+    """Return further details of a goal that has not ended, such as its priority and its key."""
     held = "held, " if goal.paused else ""
     notes = [
         None if goal.started_at is None else f"{held}for {max(0.0, now - goal.started_at):.1f} s",
@@ -219,17 +234,17 @@ def _notes(goal: Goal, now: float) -> list[str]:
 
 
 def _left(goal: Goal, now: float) -> str | None:
-    """Return how long a goal may still wait for its turn."""
+    """Return how long a pending goal may still wait, or None if it has no limit."""
     if goal.state is not State.PENDING or not goal.ttl or goal.queued_at is None:
         return None
     left = max(0.0, goal.queued_at + goal.ttl - now)
-    return f"{left:.1f} s left" if left < 60 else f"{span(left)} left"
+    return f"{left:.1f} s left" if left < 60 else f"{format_duration(left)} left"
 
 
-def who(sender: Sender | None) -> str:
-    """Return who sent something: the script that one looks for, and what it calls itself."""
+def _describe_sender(sender: Sender | None) -> str:
+    """Return everything that is known about a sender: its command, its process, its user and its name."""
     if sender is None:
-        return _NOBODY
+        return _UNKNOWN_SENDER
     numbers = {"pid": sender.pid, "uid": sender.uid}
     parts = [_program(sender), *(f"{name} {number}" for name, number in numbers.items() if number is not None)]
     if sender.name:
@@ -237,48 +252,48 @@ def who(sender: Sender | None) -> str:
     return ", ".join(parts)
 
 
-def who_forms(sender: Sender | None) -> list[str]:
-    """Return who sent something, for a column: the longest form first.
+def sender_forms(sender: Sender | None) -> list[str]:
+    """Return the forms of a column that names a sender, the longest first.
 
-    What it calls itself, in quotes, as it is a claim, comes before what it is, and stays where there is room for one.
+    The name that the sender gave itself comes first. It is in quotes because nobody has checked it.
     """
     if sender is None:
-        return [_NOBODY]
+        return [_UNKNOWN_SENDER]
     script = _script(sender)
     number = "" if sender.pid is None else f", pid {sender.pid}"
     forms = [f"{_program(sender)}{number}", f"{script}{number}", script]
     if sender.name:
-        claim = f'"{printable(sender.name)}"'
-        forms = [*(f"{claim} ({each})" for each in forms), claim]
+        name = f'"{printable(sender.name)}"'
+        forms = [*(f"{name} ({each})" for each in forms), name]
     return list(dict.fromkeys(forms))
 
 
-def by_whom(by: By) -> str:
-    """Return what ended a goal."""
-    return f"by {who(by.client) if by.goal is None else printable(by.goal)}"
+def _describe_cause(by: By) -> str:
+    """Return the goal or the client that ended a goal."""
+    return f"by {_describe_sender(by.client) if by.goal is None else printable(by.goal)}"
 
 
-def why_forms(goal: Goal) -> list[str]:
-    """Return why a goal ended and who ended it, for a column: the longest form first."""
+def reason_forms(goal: Goal) -> list[str]:
+    """Return the forms of a column that says why a goal ended and who ended it, the longest first."""
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())
     by = []
     if goal.by is not None:
-        by = [printable(goal.by.goal)] if goal.by.goal is not None else who_forms(goal.by.client)
+        by = [printable(goal.by.goal)] if goal.by.goal is not None else sender_forms(goal.by.client)
     forms = [f"{reason} by {each}" for each in by] or [reason]
-    words = _words(goal)
-    # Who ended it is worth more than the reason, of which the state says something already.
+    words = _details(goal)
+    # If there is little room, who ended the goal is worth more than the reason, because the state hints at the reason.
     shortest = f"by {by[-1]}" if by else reason
     if not words:
         return [*forms, shortest]
     forms = [f"{each}: {words}" for each in forms]
-    # What an engine or a player said is worth more than the reason alone, even if it is cut.
+    # The words of an engine or a player are worth more than the reason alone, even if they are cut.
     return forms if goal.state in {State.ABORTED, State.REJECTED} else [*forms, shortest]
 
 
-def _words(goal: Goal) -> str:
-    """Return what the goal's message says beyond its state, where that is more than reason and `by` say."""
+def _details(goal: Goal) -> str:
+    """Return the details in a goal's message. They are empty if the reason and `by` say the same."""
     if goal.state not in {State.ABORTED, State.REJECTED} and goal.by is not None:
         return ""
     head, colon, words = (goal.message or "").partition(": ")
@@ -291,30 +306,30 @@ def _output(output: Output) -> str:
 
 
 def _muted(goal: Goal) -> list[str]:
-    """Return what is said of a goal that nobody could hear, though it was played."""
+    """Return a note if the goal was played on a muted output."""
     return ["muted"] if goal.output and goal.output.muted else []
 
 
 def _program(sender: Sender) -> str:
-    return printable(sender.parent or sender.command or "a program", MAX_COMMAND)
+    return printable(sender.parent or sender.command or "a program", _SENDER_COMMAND_CHARS)
 
 
 def _script(sender: Sender) -> str:
-    """Return the name of the script, without its directory, its arguments and the programs that started it."""
+    """Return the name of the sender's script, without its directory, its arguments and its launchers."""
     words = (sender.parent or "").split()
     if not words:
         return _program(sender)
-    while started := _started(words):
-        words = started
-    return printable(_base(words[0]), MAX_COMMAND)
+    while launched := _launched(words):
+        words = launched
+    return printable(_base(words[0]), _SENDER_COMMAND_CHARS)
 
 
-def _started(words: list[str]) -> list[str]:
-    """Return the command that this command starts, empty if it starts none or a script without a name."""
+def _launched(words: list[str]) -> list[str]:
+    """Return the command that a launcher starts. It is empty for other commands and for scripts without a name."""
     name = _base(words[0]).rstrip("0123456789.")
-    if name not in _STARTERS:
+    if name not in _LAUNCHERS:
         return []
-    valued, nameless, arguments = _STARTERS[name]
+    valued, nameless, arguments = _LAUNCHERS[name]
     rest = iter(range(1, len(words)))
     for place in rest:
         word = words[place]
@@ -324,12 +339,12 @@ def _started(words: list[str]) -> list[str]:
                 if each in nameless.split():
                     return []
                 if each in valued.split():
-                    if number == len(options):  # else its value is the rest of this word
+                    if number == len(options):  # otherwise the rest of this word is the value
                         next(rest, None)
                     break
         elif not _ASSIGNMENT.fullmatch(word):
             if arguments == 0:
-                return [] if _DESCRIPTOR.fullmatch(word) else words[place:]
+                return [] if _DESCRIPTOR_PATH.fullmatch(word) else words[place:]
             arguments -= 1
     return []
 
@@ -338,10 +353,9 @@ def _base(path: str) -> str:
     return path.rstrip("/").rpartition("/")[2] or path
 
 
-def _about(server: JsonObject, *names: str) -> list[str]:
-    """Return what these are of a server, in a few words each."""
-    shown = [each for each in names if server.get(each) or each not in _IF_ANY]
-    return [_ABOUT.get(each, f"{each} {{}}").format(_field(server, each)) for each in shown]
+def _format_fields(server: JsonObject, *names: str) -> list[str]:
+    shown = [each for each in names if server.get(each) or each not in _OPTIONAL_FIELDS]
+    return [_FIELD_FORMATS.get(each, f"{each} {{}}").format(_field(server, each)) for each in shown]
 
 
 def _value(value: object) -> str:
@@ -350,8 +364,8 @@ def _value(value: object) -> str:
     return figure(value)
 
 
-def clock(seconds: float | None) -> str:
-    """Return a moment of today, in the local time zone."""
+def clock_time(seconds: float | None) -> str:
+    """Return the local time of day, or dashes for None."""
     return "--:--:--" if seconds is None else time.strftime("%H:%M:%S", time.localtime(seconds))
 
 
@@ -361,4 +375,4 @@ def _moment(seconds: float | None) -> str | None:
 
 def _field(server: JsonObject, name: str) -> str:
     value = server.get(name)
-    return "default" if value is None else printable(_value(value), MAX_TEXT)
+    return "default" if value is None else printable(_value(value), _LISTED_TEXT_CHARS)

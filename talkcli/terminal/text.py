@@ -1,7 +1,7 @@
-"""Text on a terminal: made fit to be shown, measured in columns, cut, padded, coloured, shared out; a word of it lit.
+"""Text on a terminal: escaping, measuring, cutting, padding and colouring.
 
-Text from others goes through `printable` first: it moves no cursor then, forges no line, turns no direction of reading.
-Pure: the terminal's width and whether it takes colour come from the caller.
+Text from other programs must go through `printable` first, so that it can't move the cursor, fake a line or change the
+reading direction. Everything here is pure: the caller says how wide the terminal is and whether it has colours.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from talkcli.goals.states import State
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-#: Between two columns.
+#: The space between two columns of a table.
 GAP = "  "
-#: An id of a client's own may have 64 characters; a column for all of them would leave nothing for the text.
-LONGEST_ID = 20
-#: A terminal that says it is narrower is not believed: a line of less would show nothing.
-NARROWEST = 40
-#: Stands for what is left out.
-MORE = "…"
+#: Ids chosen by a client can have 64 characters. A column that wide would leave no room for the text.
+MAX_ID_COLUMNS = 20
+#: A terminal that reports fewer columns is treated as this wide, because shorter lines would show nothing.
+MIN_COLUMNS = 40
+#: Marks a place where text was left out.
+ELLIPSIS = "…"
 
-#: East Asian wide and full-width characters, most emoji among them, take two columns.
-_WIDE = frozenset({"W", "F"})
-#: Marks that are drawn over the character before them.
-_OVER = frozenset({"Mn", "Me"})
-#: Asks for the character before it to be drawn as an emoji, which is two columns wide.
-_AS_EMOJI = "\ufe0f"
-#: Letters for flags: a terminal draws a pair of them, or each alone, in two columns.
+#: The East Asian width classes of characters that take two columns. They include most emoji.
+_WIDE_CLASSES = frozenset({"W", "F"})
+#: The categories of marks that are drawn over the character before them.
+_COMBINING_CATEGORIES = frozenset({"Mn", "Me"})
+#: This character turns the one before it into an emoji, which is two columns wide.
+_EMOJI_SELECTOR = "\ufe0f"
+#: The first and last of the letters that flags are made of. A terminal draws each of them in two columns.
 _FLAG_LETTERS = ("\U0001f1e6", "\U0001f1ff")
 
-#: Controls, format characters (bidi marks and overrides, zero-width), line and paragraph separators, halves of pairs,
-#: and what is not assigned.
-_ESCAPED = frozenset({"Cc", "Cf", "Zl", "Zp", "Cs", "Co", "Cn"})
+#: The categories of characters that are shown escaped: controls, format characters (such as bidi marks and zero-width
+#: characters), line and paragraph separators, surrogates, private characters and unassigned ones.
+_HIDDEN_CATEGORIES = frozenset({"Cc", "Cf", "Zl", "Zp", "Cs", "Co", "Cn"})
 
-_COLOURING = re.compile("\x1b\\[[0-9;]*m")
-_COLOURS = {
+_COLOUR_CODE = re.compile("\x1b\\[[0-9;]*m")
+_STATE_COLOURS = {
     State.PENDING: "36",
     State.ACTIVE: "1;32",
     State.PREEMPTING: "33",
@@ -54,190 +54,204 @@ _COLOURS = {
 
 @frozen
 class Screen:
-    """Where lines will be shown."""
+    """The width and the colours of the place where lines are shown."""
 
-    #: columns; None where it is no terminal, and nothing has to fit
+    #: columns, or None if it isn't a terminal and lines can have any length
     width: int | None = None
     colour: bool = False
 
-    def room(self, taken: int) -> int | None:
-        """Return the columns that are left beside those taken; None for any number."""
-        return None if self.width is None else max(self.width, NARROWEST) - taken
+    def columns_left(self, taken: int) -> int | None:
+        """Return the number of columns beside those already taken, or None for no limit."""
+        return None if self.width is None else max(self.width, MIN_COLUMNS) - taken
 
-    def painted(self, text: str, state: State | None) -> str:
-        """Return the text in the colour of a state."""
-        code = _COLOURS.get(state) if state is not None else "1"
+    def coloured(self, text: str, state: State | None) -> str:
+        """Return the text in the colour of a state, or in bold for None."""
+        code = _STATE_COLOURS.get(state) if state is not None else "1"
         return f"\x1b[{code}m{text}\x1b[0m" if self.colour and code else text
 
 
 def printable(text: str, limit: int | None = None) -> str:
-    """Return the text with everything that isn't plainly visible escaped, cut after `limit` characters with an …."""
+    """Return the text with all invisible characters escaped. After `limit` characters it is cut."""
     kept = text[:limit]
     if not (kept.isascii() and kept.isprintable() and "\\" not in kept):
-        kept = "".join(map(_shown, kept))
-    return kept if limit is None or len(text) <= limit else f"{kept}…"
+        kept = "".join(map(_escape, kept))
+    return kept if limit is None or len(text) <= limit else f"{kept}{ELLIPSIS}"
 
 
 def printable_json(line: str) -> str:
-    """Return a line of JSON, which stays the same JSON, with everything that isn't plainly visible escaped."""
+    """Return a line of JSON with all invisible characters escaped. It still means the same."""
     import json
 
-    # None of these characters stands outside of a string.
+    # These characters can only stand inside a JSON string.
     return "".join(json.dumps(each)[1:-1] if _is_hidden(each) else each for each in line)
 
 
 def width(text: str) -> int:
-    """Return how many columns the text takes; colours take none.
+    """Return how many columns the text takes. Colour codes take none.
 
-    Where that is in doubt it is the larger: a line that is too short looks odd, one that is too long breaks.
+    If a character's width is unclear, the larger one counts: a line that is too short looks odd, but a line that is too
+    long wraps.
     """
-    text = _COLOURING.sub("", text)
-    return len(text) if text.isascii() else sum(map(_columns, text))
+    text = _COLOUR_CODE.sub("", text)
+    return len(text) if text.isascii() else sum(map(_character_width, text))
 
 
 def cut(text: str, columns: int | None) -> str:
-    """Return the text, ended with an … where it is wider than so many columns; it must not be coloured."""
+    """Return the text, cut to this many columns and ended with an ellipsis. It must not contain colour codes."""
     if columns is None or width(text) <= columns:
         return text
-    kept = sum(end < columns for end in accumulate(map(_columns, text)))
-    return f"{text[:kept]}{MORE}" if columns > 0 else ""
+    kept = sum(end < columns for end in accumulate(map(_character_width, text)))
+    return f"{text[:kept]}{ELLIPSIS}" if columns > 0 else ""
 
 
-def shortened(text: str, columns: int | None) -> str:
-    """Return the text, cut to so many columns; one in quotes keeps the closing one."""
+def shorten(text: str, columns: int | None) -> str:
+    """Return the text, cut to this many columns. A quoted text keeps its closing quote."""
     if columns is None or not (len(text) > 1 and text[0] == text[-1] == '"'):
         return cut(text, columns)
     return f'"{cut(text[1:-1], columns - 2)}"'
 
 
-def id_room(screen: Screen) -> int | None:
-    """Return how many columns an id may take: on a terminal, a quarter of the line."""
-    room = screen.room(0)
-    return None if room is None else max(LONGEST_ID, room // 4)
+def max_id_columns(screen: Screen) -> int | None:
+    """Return how many columns an id may take: a quarter of the line, or None for no limit."""
+    columns = screen.columns_left(0)
+    return None if columns is None else max(MAX_ID_COLUMNS, columns // 4)
 
 
 def pad(text: str, columns: int) -> str:
-    """Return the text with blanks after it, so that it takes at least so many columns."""
+    """Return the text, padded with spaces to this many columns."""
     return text + " " * (columns - width(text))
 
 
-def longest_that_fits(forms: Sequence[str], columns: int | None) -> str:
-    """Return the first of the forms, longest first, that fits; the last one cut if none does."""
+def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
+    """Return the first form that fits, or the last one cut if none does. The longest form comes first."""
     return next((each for each in forms if columns is None or width(each) <= columns), cut(forms[-1], columns))
 
 
-def share(wanted: Sequence[int], weights: Sequence[int], room: int) -> list[int]:
-    """Return how many columns each gets: what it wants, or its share by weight of what the others leave."""
+def share_columns(wanted: Sequence[int], weights: Sequence[int], columns: int) -> list[int]:
+    """Divide the columns of a line, and return the width of each part.
+
+    Each part gets the width that it wants, or else its share by weight of the columns that the other parts leave.
+    """
     given = [0] * len(wanted)
-    left, weight_left = room, sum(weights)
-    for each in sorted(range(len(wanted)), key=lambda each: wanted[each] / weights[each]):
-        given[each] = max(0, min(wanted[each], left * weights[each] // weight_left))
-        left -= given[each]
-        weight_left -= weights[each]
+    left, weight_left = columns, sum(weights)
+    for part in sorted(range(len(wanted)), key=lambda part: wanted[part] / weights[part]):
+        given[part] = max(0, min(wanted[part], left * weights[part] // weight_left))
+        left -= given[part]
+        weight_left -= weights[part]
     return given
 
 
-def fitted(texts: Sequence[str], *others: Sequence[Sequence[str]], weights: Sequence[int], room: int) -> list[str]:
-    """Return a line for each text, in columns that take no more than `room` together.
+def fit_columns(
+    texts: Sequence[str], *others: Sequence[Sequence[str]], weights: Sequence[int], columns: int
+) -> list[str]:
+    """Return one line for each text, with the other columns of the table beside it.
 
-    `others`: what stands beside the texts, column by column: for each text its forms, the longest first. What they
-    leave of their share (by `weights`, the texts' first) is the texts'.
+    Args:
+        texts: the first column.
+        others: the other columns. Each cell is a list of forms, the longest first.
+        weights: the share of each column. Whatever the others don't use of theirs goes to the texts.
+        columns: the width of the whole line.
     """
-    room -= len(GAP) * len(others)
+    columns -= len(GAP) * len(others)
     longest = [max(map(width, texts)), *(max(width(forms[0]) for forms in column) for column in others)]
-    shares = share(longest, weights, room)[1:]
-    chosen = [
-        [longest_that_fits(forms, columns) for forms in column] for column, columns in zip(others, shares, strict=True)
-    ]
+    shares = share_columns(longest, weights, columns)[1:]
+    chosen = [[longest_fitting(forms, room) for forms in column] for column, room in zip(others, shares, strict=True)]
     widths = [max(map(width, column)) for column in chosen]
-    left = min(longest[0], room - sum(widths))
+    left = min(longest[0], columns - sum(widths))
     return [
-        GAP.join(map(pad, (shortened(text, left), *beside), (left, *widths))).rstrip()
+        GAP.join(map(pad, (shorten(text, left), *beside), (left, *widths))).rstrip()
         for text, *beside in zip(texts, *chosen, strict=True)
     ]
 
 
-def folded(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
-    """Return the pieces, joined by blanks, as lines that begin under the end of `first` and break between two pieces.
+def wrap(pieces: Sequence[str], first: str, screen: Screen) -> list[str]:
+    """Join the pieces with spaces and return them as lines that are broken between two pieces.
 
-    One that is wider than a line is left to the terminal to break.
+    `first` stands in front of the first line, and the other lines are indented by its width. A piece that is wider than
+    a line isn't broken.
     """
-    room = screen.room(width(first))
+    columns = screen.columns_left(width(first))
     lines = [pieces[0]]
     for piece in pieces[1:]:
-        if room is not None and width(lines[-1]) + 1 + width(piece) > room:
+        if columns is not None and width(lines[-1]) + 1 + width(piece) > columns:
             lines.append(piece)
         else:
             lines[-1] += f" {piece}"
     return [f"{' ' * width(first) if number else first}{each}" for number, each in enumerate(lines)]
 
 
-class Sentence:
-    """A text, measured once; `view` then cuts what fits out of it."""
+class MeasuredText:
+    """A text whose width is measured once, so that parts of it can be cut out quickly."""
 
     def __init__(self, text: str) -> None:
         self._shown = [printable(each) for each in text]
-        #: the column at which each character begins, and at last the one at which the text ends
+        #: the column at which each character begins, followed by the column at which the text ends
         self._columns = [0, *accumulate(map(width, self._shown))]
 
     @property
     def whole(self) -> str:
-        """The whole text, fit to be shown."""
+        """The whole text, escaped."""
         return "".join(self._shown)
 
     def split(self, heard: int) -> tuple[str, str]:
-        """Return the text up to a character that was heard, and the rest, both fit to be shown."""
+        """Return the first `heard` characters and the rest, both escaped."""
         return self._part(0, heard), self._part(heard, len(self._shown))
 
     def view(self, start: int, end: int, columns: int) -> tuple[str, str, str]:
-        """Return what fits into `columns` of the text, around the word from character `start` up to `end`.
+        """Return the part of the text around a word that fits into this many columns.
 
-        What was heard, the word, and what is still to come. The word keeps to the first third, so that what comes next
-        can be read before it is heard.
+        Args:
+            start: the index of the word's first character.
+            end: the index after its last character.
+            columns: the width of the view.
+
+        Returns:
+            The text before the word, the word, and the text after it. The word stays within the first third, so that
+            the next words can be read before they are heard.
         """
         last = len(self._shown)
         start = min(max(start, 0), last)
         end = min(max(end, start), last)
-        too_much = self._columns[last] - columns
-        if too_much > 0 and columns < 3:  # no room for a … at both ends and something between
+        excess = self._columns[last] - columns
+        if excess > 0 and columns < 3:  # no room for an ellipsis at both ends and a character between them
             return "", "", ""
-        first = self._first(min(self._columns[start] - columns // 3, too_much), start)
-        # One column at each end that is cut is the …'s own.
+        first = self._first_shown(min(self._columns[start] - columns // 3, excess), start)
+        # An ellipsis takes one column at each end that is cut.
         room = columns - (first > 0)
-        stop = self._upto(self._columns[first] + room)
+        stop = self._ending_by(self._columns[first] + room)
         if stop < last:
-            stop = self._upto(self._columns[first] + room - 1)
-        before = MORE if first > 0 else ""
-        after = MORE if stop < last else ""
+            stop = self._ending_by(self._columns[first] + room - 1)
+        before = ELLIPSIS if first > 0 else ""
+        after = ELLIPSIS if stop < last else ""
         start, end = min(start, stop), min(end, stop)
         return before + self._part(first, start), self._part(start, end), self._part(end, stop) + after
 
     def _part(self, start: int, end: int) -> str:
         return "".join(self._shown[start:end])
 
-    def _first(self, column: int, start: int) -> int:
-        """Return the first character to be shown, where so many columns are left out: no later than the word's."""
+    def _first_shown(self, column: int, start: int) -> int:
+        """Return the first character to show if the columns up to `column` are cut. It is `start` at the latest."""
         if column <= 0:
             return 0
-        # One column more, for the …; and no character that is drawn over the one before it.
+        # The ellipsis needs one more column. The first character must not be a mark drawn over the one before it.
         begins = (place for place in range(start) if column < self._columns[place] < self._columns[place + 1])
         return next(begins, start)
 
-    def _upto(self, column: int) -> int:
-        """Return the end of the characters that end at this column or earlier."""
+    def _ending_by(self, column: int) -> int:
+        """Return the number of characters that end at this column or before it."""
         return sum(each <= column for each in self._columns) - 1
 
 
 def _is_hidden(character: str) -> bool:
-    return unicodedata.category(character) in _ESCAPED
+    return unicodedata.category(character) in _HIDDEN_CATEGORIES
 
 
-def _shown(character: str) -> str:
+def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode() if character == "\\" or _is_hidden(character) else character
 
 
-def _columns(character: str) -> int:
-    if unicodedata.category(character) in _OVER:
-        return int(character == _AS_EMOJI)
-    wide = unicodedata.east_asian_width(character) in _WIDE or _FLAG_LETTERS[0] <= character <= _FLAG_LETTERS[1]
-    return 2 if wide else 1
+def _character_width(character: str) -> int:
+    if unicodedata.category(character) in _COMBINING_CATEGORIES:
+        return int(character == _EMOJI_SELECTOR)
+    is_flag = _FLAG_LETTERS[0] <= character <= _FLAG_LETTERS[1]
+    return 2 if is_flag or unicodedata.east_asian_width(character) in _WIDE_CLASSES else 1

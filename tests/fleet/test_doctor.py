@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import __version__
-from talkcli.cli.doctor import _examination
-from talkcli.cli.show import Common
+from talkcli.cli.ask import _examination
+from talkcli.cli.show import CommonOptions
 from talkcli.doctor import broker as judging
 from talkcli.doctor.broker import Allowed, Way
 from talkcli.errors import UsageError
@@ -104,7 +104,7 @@ def test_a_bridge_is_not_disturbed_if_its_own_user_runs_the_doctor(robot: Robot)
 
 def test_a_variable_names_the_robot_as_the_option_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TALK_ROBOT", "anna")
-    options = Common()
+    options = CommonOptions()
     assert isinstance(_examination(options, {}, silent=False), judging.Examination)
     options.socket = "/nowhere"
     assert not isinstance(_examination(options, {}, silent=False), judging.Examination)

@@ -15,7 +15,7 @@ from talkcli.frozen import replace
 from talkcli.goals.states import State
 from talkcli.protocol.events import StateChanged, from_json
 from talkcli.terminal.fleet import HEADS, FleetTranscript, Robot, robot_lines
-from talkcli.terminal.text import NARROWEST, Screen, printable, width
+from talkcli.terminal.text import MIN_COLUMNS, Screen, printable, width
 
 NOW = 1_000_000.0
 ANNA = Robot(
@@ -46,7 +46,7 @@ def cells(robot: Robot) -> list[str]:
 def test_no_line_is_wider_than_its_terminal(robots: list[Robot], columns: int, colour: bool) -> None:
     lines = robot_lines(robots, Screen(columns, colour), NOW)
     assert len(lines) == len(robots) + 1
-    assert max(map(width, lines)) <= max(columns, NARROWEST)
+    assert max(map(width, lines)) <= max(columns, MIN_COLUMNS)
     head, *lines = robot_lines(robots, Screen(), NOW)  # in a pipe nothing is cut
     assert head.split() == list(HEADS)
     for robot, line in zip(robots, lines, strict=True):

@@ -15,7 +15,7 @@ from hypothesis import given as given_any
 from hypothesis import strategies as st
 
 from talkcli import Client, Goal
-from talkcli.cli.command import MODE, read_value
+from talkcli.cli.command import FILE_MODE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.engine import protocol
 from talkcli.frozen import fields, replace
@@ -228,7 +228,7 @@ def test_a_server_that_is_told_nothing_is_what_its_command_says() -> None:
     assert server.pop("goals") == Set(**{name: row.default for name, row in rows.items() if row.setting})
     assert server.pop("socket") is None
     assert server == {
-        name: read_value(row, row.default) if row.kind is MODE else row.default
+        name: read_value(row, row.default) if row.kind is FILE_MODE else row.default
         for name, row in rows.items()
         if not row.setting and name != "print_unit"
     }
@@ -259,7 +259,7 @@ def test_a_refusal_says_what_a_value_may_be(option: Option, value: object, words
 @pytest.mark.parametrize("command", COMMANDS)
 def test_what_carries_a_command_out_takes_what_its_row_gives(command: str) -> None:
     row = COMMANDS[command]
-    module, _, name = row.runs.partition(":")
+    module, _, name = row.function.partition(":")
     function = getattr(importlib.import_module(f"talkcli.cli.{module}"), name)
     names = [each.name for each in row.options] + ([row.argument.name] if row.argument else [])
     bound = inspect.signature(function).bind(None, **dict.fromkeys(names))

@@ -13,8 +13,8 @@ from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import State
 from talkcli.protocol.events import Event, PausedChanged, ServerStatus, Snapshot, StateChanged, WordHeard
-from talkcli.terminal.goals import setting_lines, status_lines, who_forms, why_forms
-from talkcli.terminal.text import Screen, cut, share, width
+from talkcli.terminal.goals import reason_forms, sender_forms, setting_lines, status_lines
+from talkcli.terminal.text import Screen, cut, share_columns, width
 from talkcli.terminal.transcript import Transcript, log_lines
 
 PATROL = Sender(812, 1000, "talk", "/bin/bash /home/robot/bin/patrol.sh --fast", "night watch")
@@ -77,7 +77,7 @@ def test_cut_fits_and_is_no_shorter_than_it_must_be(text: str, room: int) -> Non
 @given(st.lists(st.tuples(st.integers(0, 200), st.integers(1, 5)), min_size=1, max_size=5), st.integers(0, 200))
 def test_shares_are_within_what_is_wanted_and_what_is_there(asked: list[tuple[int, int]], room: int) -> None:
     wanted, weights = zip(*asked, strict=True)
-    given_out = share(wanted, weights, room)
+    given_out = share_columns(wanted, weights, room)
     assert all(0 <= got <= each for got, each in zip(given_out, wanted, strict=True))
     assert sum(given_out) <= room
     if sum(wanted) <= room:
@@ -100,8 +100,8 @@ def test_a_log_fits_and_lines_up(goals: list[Goal], room: int) -> None:
 def test_a_log_without_a_terminal_is_whole(goals: list[Goal]) -> None:
     for line, goal in zip(log_lines(goals, Screen(), NOON), goals, strict=True):
         assert goal.id in line
-        assert who_forms(goal.client)[0].rstrip() in line
-        assert why_forms(goal)[0].rstrip() in line
+        assert sender_forms(goal.client)[0].rstrip() in line
+        assert reason_forms(goal)[0].rstrip() in line
 
 
 @given(st.lists(GOALS, max_size=4), GOALS, WIDTHS, st.booleans())
@@ -169,14 +169,14 @@ def test_words_are_lines_where_they_are_wanted(words: bool, count: int) -> None:
 
 
 def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
-    assert who_forms(PATROL) == [
+    assert sender_forms(PATROL) == [
         '"night watch" (/bin/bash /home/robot/bin/patrol.sh --fast, pid 812)',
         '"night watch" (patrol.sh, pid 812)',
         '"night watch" (patrol.sh)',
         '"night watch"',
     ]
-    assert who_forms(replace(PATROL, name=None))[1:] == ["patrol.sh, pid 812", "patrol.sh"]
-    assert who_forms(None) == ["nobody known"]
+    assert sender_forms(replace(PATROL, name=None))[1:] == ["patrol.sh, pid 812", "patrol.sh"]
+    assert sender_forms(None) == ["nobody known"]
 
 
 @pytest.mark.parametrize(
@@ -215,12 +215,12 @@ def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:
     ],
 )
 def test_a_sender_is_shown_by_the_script_that_it_runs(parent: str | None, script: str) -> None:
-    assert who_forms(Sender(parent=parent))[-1] == script
+    assert sender_forms(Sender(parent=parent))[-1] == script
 
 
 def test_why_a_goal_ended() -> None:
     def why(state: State, reason: str | None = None, by: By | None = None, message: str | None = None) -> list[str]:
-        return why_forms(replace(GOAL, state=state, reason=reason, by=by, message=message, duration=2.04))
+        return reason_forms(replace(GOAL, state=state, reason=reason, by=by, message=message, duration=2.04))
 
     assert why(State.SUCCEEDED) == ["2.0 s"]
     assert why(State.PREEMPTED, "preempted", By("4k7f-8"), "Talk preempted")[0] == "preempted by 4k7f-8"
