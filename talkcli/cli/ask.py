@@ -1,6 +1,7 @@
 """The commands that ask the server and show its answer: cancel, status, watch, log, voices, set, pause, resume, doctor.
 
-Plain command lines come here without click. Each command imports by itself what only it needs.
+This module must not need click, because plain command lines are run without it. Modules that only one command needs are
+imported by that command.
 """
 
 from __future__ import annotations
@@ -141,7 +142,7 @@ def _show_paused(options: CommonOptions, goal: Goal | None, *, paused: bool, wor
 
 
 def doctor(options: CommonOptions, silent: bool) -> int:
-    """Show the doctor's findings and the one thing to do next. Return the exit code."""
+    """Show the doctor's findings and the next step. Return the exit code."""
     from talkcli.cli.interrupts import Interrupts
     from talkcli.doctor.report import heard, lines, verdict
     from talkcli.goals.states import EXIT_CODES, State

@@ -116,7 +116,7 @@ def _argument(argument: Option) -> click.Argument:
 
 
 def _completer(name: str) -> Callable[..., list[CompletionItem]] | None:
-    """Return a function that calls the one of this name in `completion`; None for an empty name."""
+    """Return the function of this name in `completion`, which is only imported when called. None for an empty name."""
 
     def complete(*arguments: Any) -> list[CompletionItem]:
         from talkcli.cli import completion
@@ -141,7 +141,7 @@ class _HelpfulCommand(click.Command):
     common_heading = "Options of every command"
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return the completions. Of each help text, a shell has only room for the part before the first stop."""
+        """Return the completions, each with the first sentence of its help. A shell has no room for more."""
         found = super().shell_complete(ctx, incomplete)
         for each in found:
             each.help = re.split(r"[.;](?:\s|$)", each.help or "", maxsplit=1)[0] + "."
@@ -253,7 +253,7 @@ def talk(context: click.Context) -> None:
 
 
 def _first_screen(context: click.Context) -> str:
-    """Return what a new user needs first. Together with the next prompt it fits on a terminal of 24 lines."""
+    """Return the text for `talk` without a command. With the next prompt, it fits on a terminal of 24 lines."""
     formatter = context.make_formatter()
     formatter.write(f"{talk.help}\n")
     with formatter.indentation():
@@ -280,7 +280,7 @@ def _main(arguments: list[str], options: CommonOptions) -> object:
     except click.exceptions.Exit as end:  # after the help or the version
         return end.exit_code
     except KeyboardInterrupt:
-        write_error_line()  # the terminal has shown ^C on the present line
+        write_error_line()  # the terminal has shown ^C on the current line
         raise
     except click.ClickException as error:
         from talkcli.terminal.text import printable
@@ -309,7 +309,7 @@ def _complete(options: CommonOptions) -> int:
 
 
 def _write_lines(text: str, formatter: click.HelpFormatter) -> None:
-    """Write lines unchanged, with the present indentation of the formatter."""
+    """Write lines unchanged, with the formatter's current indentation."""
     for line in text.strip().splitlines():
         formatter.write(f"{'':{formatter.current_indent}}{line.strip()}\n")
 

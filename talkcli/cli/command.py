@@ -1,4 +1,4 @@
-"""A command as one row, from which help, completion, the tables in documents and both parsers are made.
+"""The row that describes a command. Help, completion, the tables in documents and both parsers are made from it.
 
 This module also reads the words of a command line: option values, and texts that may contain bytes that aren't UTF-8.
 The commands themselves are in `commands`. This module is pure. It is imported before anything is sent, without click.
@@ -88,7 +88,7 @@ class Command:
     unknown_option_hint: str = ""
     #: whether the lightweight parser in `plain` may read it, without click
     plain: bool = True
-    #: whether it is about a server, which can be that of a robot in a fleet
+    #: whether it uses a server; this can be the server of a robot in a fleet
     uses_server: bool = True
     #: whether it connects to a single server, for which --connect-timeout can wait
     connects: bool = True
@@ -159,7 +159,7 @@ class Command:
 
 
 def option(flags: str, kind: Kind, words: str, **more: Any) -> Option:
-    """Return an option of a command, named after its long flag. `words` is its help, and `more` are further fields."""
+    """Return an option of a command, named after its long flag. `words` is its help, and `more` has further fields."""
     name = flags.rpartition("--")[2].replace("-", "_")
     return Option(name, kind, flags=flags, help=words, **{"default": False if kind is FLAG else None, **more})
 
@@ -203,7 +203,7 @@ def read_value(option: Option, text: str) -> Any:
     """Return the value of an option from its text.
 
     Raises:
-        ValueError: the text is no valid value. The message says why.
+        ValueError: the text isn't a valid value. The message says why.
     """
     kind = option.kind
     if kind in (INTEGER, NUMBER, SECONDS):

@@ -1,4 +1,4 @@
-"""The commands, one row each: what it is for, its options, its exit codes, and the function that runs it.
+"""The commands. Each has a row with its purpose, its options, its exit codes, and the function that runs it.
 
 This module is imported before anything is sent, so it must import nothing heavy, and it must not run anything. The
 options of goals and servers are in `goals.options`. The functions here say which options can't be combined.
@@ -32,8 +32,13 @@ def _timeout(words: str) -> Option:
     return option("-t, --timeout", NUMBER, words, limits=(0, None), above=True, metavar="SEC")
 
 
+def _print_unit(names: tuple[str, ...]) -> Option:
+    words = f"Print a systemd unit with these options, and end. One of {', '.join(names)}; it says where it goes."
+    return option("--print-unit", TEXT, words, metavar="UNIT", choices=names)
+
+
 def _say_options() -> Iterator[Option]:
-    """Yield the options of a goal, with the command's own ones in between."""
+    """Yield the options of `say` in the order of the help: those of a goal, and those of the command itself."""
     for each in OPTIONS:
         if each.flags:
             yield replace(each, env="", help=f"{each.help}  [env var, with -o: {each.env}]") if each.env else each
@@ -127,13 +132,7 @@ _SERVE_OPTIONS = (
     option("--driver", TEXT, "A driver of pyttsx3's. [default: the one for this system]", metavar="NAME"),
     option("--socket-mode", FILE_MODE, "Who may connect: the socket's file mode.", default="0600"),
     option("--greeting", TEXT, "A sentence to speak at the start."),
-    option(
-        "--print-unit",
-        TEXT,
-        f"Print a systemd unit with these options, and end. One of {', '.join(SERVE_UNITS)}; it says where it goes.",
-        metavar="UNIT",
-        choices=SERVE_UNITS,
-    ),
+    _print_unit(SERVE_UNITS),
 )
 
 
@@ -158,13 +157,7 @@ _BRIDGE_OPTIONS = (
     ),
     option("--no-text", FLAG, "Leave what is said out of status and events."),
     option("--homeassistant", FLAG, "Be a device of Home Assistant's as well."),
-    option(
-        "--print-unit",
-        TEXT,
-        f"Print a systemd unit with these options, and end. One of {', '.join(BRIDGE_UNITS)}; it says where it goes.",
-        metavar="UNIT",
-        choices=BRIDGE_UNITS,
-    ),
+    _print_unit(BRIDGE_UNITS),
     option("--print-acl", FLAG, "Print who may do what on the broker; for mosquitto's acl_file."),
 )
 

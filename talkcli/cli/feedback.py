@@ -1,4 +1,4 @@
-"""What `--feedback` shows while goals are spoken: JSON objects, lines of words, or a sentence with the word lit up.
+"""The displays of `--feedback`: JSON objects, lines, or a sentence with each word lit up as it is heard.
 
 These classes only show the events that they are given. They never wait, and don't know which client owns a goal.
 """
@@ -44,7 +44,7 @@ def make_feedback(options: CommonOptions) -> Feedback:
 
 
 class _JsonFeedback(Feedback):
-    """Shows each event as a JSON object."""
+    """Feedback with a JSON object for each event."""
 
     shows_events = True
 
@@ -53,7 +53,7 @@ class _JsonFeedback(Feedback):
 
 
 class _LineFeedback(Feedback):
-    """Shows each event as a line of fields separated by spaces. Only the last field can contain spaces."""
+    """Feedback with a line for each event. Spaces separate the fields, so only the last field can contain spaces."""
 
     shows_events = True
 
@@ -81,9 +81,9 @@ class _LineFeedback(Feedback):
 
 
 class _TerminalFeedback(Feedback):
-    """Shows the sentence on one line of a terminal and lights up each word as it is heard.
+    """Feedback that shows the sentence on one line of a terminal and lights up each word as it is heard.
 
-    The line is rewritten in place, so it is never wider than the terminal. Of a long text only a part is shown. When
+    The line is rewritten in place and is never wider than the terminal, so only a part of a long text is shown. When
     the goal ends, the whole sentence is written.
     """
 
@@ -126,7 +126,7 @@ class _TerminalFeedback(Feedback):
         self._paint()
 
     def close(self) -> None:
-        """Write the whole sentence of the present line, and end it."""
+        """Write the whole sentence of the current line, and end it."""
         self._resizes.close()
         if self._line:
             self._write_whole(self._line)
@@ -163,9 +163,9 @@ class _TerminalFeedback(Feedback):
 
 
 class _ResizeWatcher(threading.Thread):
-    """Calls a function when the terminal is resized.
+    """A thread that calls a function when the terminal is resized.
 
-    A thread waits for the signal, because a signal handler would end the wait for goals (see `interrupts`). macOS
+    It waits for the signal, because a signal handler would end the wait for goals (see `interrupts`). macOS
     discards a signal without a handler, so there the next event shows the new size.
     """
 

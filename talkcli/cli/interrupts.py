@@ -1,7 +1,7 @@
 """Signals, timeouts and closed output, which end a command's wait.
 
-A signal or a timeout makes a descriptor readable, so it never cuts a read or a write in two. Standard output is polled
-together with this descriptor. Until an `Interrupts` is entered, `plain` blocks the signals for a goal sent early.
+A signal or a timeout makes a descriptor readable, so it never interrupts a read or a write halfway. Standard output is
+polled together with this descriptor. If a goal was sent early, `plain` blocks signals until `Interrupts` is entered.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MAX_TIMER_S = 1e8
 
 
 def discard_unread_output() -> None:
-    """Discard all output if it had no reader from the start. The command works all the same."""
+    """Discard all output if it has no reader. Commands call this before they write anything."""
     if not has_reader():
         discard_output()
 
@@ -45,11 +45,11 @@ def _poll_output() -> int:
 
 
 class Interrupts:
-    """A context in which SIGINT, SIGTERM, SIGHUP, a timeout or closed output end a wait.
+    """A context in which SIGINT, SIGTERM, SIGHUP, a timeout or closed output ends a wait.
 
     Pass `watched` to `wait_ready` as `interrupt`. The context suppresses the Interrupted that is raised then, and
-    `exit_code` gives the reason. A second signal ends the process at once. Only SIGHUP doesn't, because the shell and
-    the system both send one when a terminal is closed.
+    `exit_code` tells the reason. A second signal ends the process at once. A second SIGHUP is ignored, because the
+    shell and the system both send one when a terminal is closed.
     """
 
     def __init__(self, timeout: float | None = None, blocked: Iterable[int] = (), *, output: bool = False) -> None:
@@ -70,7 +70,7 @@ class Interrupts:
 
     @property
     def exit_code(self) -> int:
-        """The exit code for what has ended the wait. A signal comes first."""
+        """The exit code for the signal, the missing reader or the timeout that has ended the wait."""
         if self.signal_number is not None:
             return EXIT_SIGNAL + self.signal_number
         return EXIT_SIGPIPE if self.reader_gone else EXIT_TIMEOUT
@@ -80,7 +80,7 @@ class Interrupts:
         os.set_blocking(self._write, False)
         #: poll events by descriptor; may change while the context is open
         self.watched = {self._descriptor: select.POLLIN}
-        if self._output and not _poll_output() & select.POLLNVAL:  # which would end every wait at once
+        if self._output and not _poll_output() & select.POLLNVAL:  # this event would end every wait at once
             self.watched[STDOUT_FD] = 0
         # Python runs handlers later, in the main thread, so a handler alone might not end a wait that is just starting.
         # The wakeup descriptor is written at once.
@@ -93,7 +93,7 @@ class Interrupts:
         }
         if self._timeout is not None:
             self._old_handlers[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._handle_timeout)
-            signal.setitimer(signal.ITIMER_REAL, max(1e-6, min(self._timeout, _MAX_TIMER_S)))  # 0 would mean never
+            signal.setitimer(signal.ITIMER_REAL, max(1e-6, min(self._timeout, _MAX_TIMER_S)))  # 0 would stop the timer
         if self._blocked:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, self._blocked)
         return self

@@ -90,7 +90,7 @@ def _flags(options: Iterable[Option]) -> Flags:
 
 
 def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> bool:
-    """Read an option, whose value may be the next word, into `given`. Return whether it is a plain one."""
+    """Read an option and its value into `given`. Return False if click has to read it."""
     name, equals, text = word.partition("=")
     if name not in flags or (equals and name[:2] != "--"):
         return False
@@ -129,7 +129,7 @@ def run(plain: PlainCommand) -> int:
     blocked: set[int] = set()
 
     def block_signals() -> None:
-        # After a goal was sent, a signal must cancel it, so it has to wait until the command can do that.
+        # A signal must cancel a goal that was sent, so it has to wait until the command can do that.
         wanted = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if command == "say" else set()
         blocked.update(wanted - _signal.pthread_sigmask(_signal.SIG_BLOCK, wanted))
 
@@ -148,9 +148,9 @@ def run(plain: PlainCommand) -> int:
 
 
 def may_send_early(plain: PlainCommand) -> bool:
-    """Return whether a command starts with a request to the local server.
+    """Return whether the request of a command may be sent early.
 
-    It doesn't if it reads standard input first, because that can take any time.
+    The command must use the local server, and must not read standard input first, because that can take any time.
     """
     if named_robot(plain.common.get("robot"), plain.common.get("socket")):
         return False
@@ -158,10 +158,10 @@ def may_send_early(plain: PlainCommand) -> bool:
 
 
 def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> Begun | None:
-    """Connect to the server and send the request, as far as this takes no time.
+    """Connect to the server and send the request, but don't wait for a slow server.
 
     Returns:
-        The connection and how far it has come, or None if it broke before anything was sent.
+        The connection and its progress, or None if the connection broke before anything was sent.
     """
     early = reach(named_socket(plain.common.get("socket")))
     if early.socket is None:

@@ -1,7 +1,7 @@
 """`talk say`: send a sentence and report how it ends, or write it into a file with `-o`.
 
-`stdin` handles lines. Plain command lines come here without click. Only `-o` imports the engine, because it needs no
-server.
+`stdin` has the options that read standard input. This module must not need click, because plain command lines are run
+without it. Only `-o` imports the engine, because it needs no server.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def say(
     Args:
         options: the options of every command.
         text: the words of the text, or "-" for standard input.
-        wait: whether to wait until it has ended.
+        wait: whether to wait until the goal has ended.
         feedback: whether to show each word as it is heard. This implies `wait`.
         timeout: seconds for the whole command, or None for no limit.
         name: the sender's name.
@@ -178,7 +178,7 @@ def _write_file(
 
 
 def _sound_settings(goal_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of the engine, from the options or else from the environment, as for a server."""
+    """Return the settings for the engine. Like a server, take missing ones from the environment."""
     found = {}
     for option in SOUND:
         value, text = goal_options[option.name], os.environ.get(option.env) if option.env else None

@@ -1,4 +1,4 @@
-"""What all commands share: the common options, the connection to the server, output, notes and exit codes.
+"""Code shared by all commands: the common options, the connection to the server, output, notes and exit codes.
 
 Every error of a command becomes a message on standard error and an exit code.
 """
@@ -44,7 +44,7 @@ _NO_BREAK_SPACE = "\0"
 
 
 class CommonOptions:
-    """The options of every command, and what was done before the command is run."""
+    """The options that every command has, together with the connection that was made early."""
 
     socket: str | None = None
     robot: str | None = None
@@ -67,7 +67,7 @@ class CommonOptions:
         vars(self).update(given)
 
     def deadline(self, timeout: float | None) -> float | None:
-        """Return the monotonic time at which a timeout ends that has run since the start of the command."""
+        """Return the monotonic time at which a timeout ends. It is counted from the start of the command."""
         return None if timeout is None else self.started_at + timeout
 
     def connect(self, timeout: float | None = None, **options: Any) -> Client:
@@ -78,7 +78,7 @@ class CommonOptions:
             options: further arguments of `SocketConnection`.
 
         Raises:
-            TimeoutError: `timeout` is over, and `connect_timeout` isn't.
+            TimeoutError: `timeout` ended before a server was found. Only raised with `connect_timeout`.
         """
         from talkcli.client.client import Client
         from talkcli.client.connect import ANSWER_LIMIT
@@ -93,7 +93,7 @@ class CommonOptions:
             return Client.over(self._connection(keep_trying=seconds, **options))
         except ServerUnavailable as error:
             now = time.monotonic()
-            if now < began + seconds:  # waiting for this server is pointless
+            if now < began + seconds:  # it is no use to try this server again
                 raise
             words = f"waited for {round(seconds, 1):g} s: {error.message}"
             if end is not None and now >= end:
@@ -137,9 +137,9 @@ class CommonOptions:
 
 
 def run_command(command: Callable[[], object], options: CommonOptions) -> int:
-    """Run a command, and return its exit code. An error is reported first.
+    """Run a command, and return its exit code. Errors are reported on standard error.
 
-    The exit code is the number that the command returns, 0 for any other value, or the code of its error.
+    If the command returns a number, that is its exit code. Any other value stands for 0.
     """
     try:
         code = command()
@@ -181,7 +181,7 @@ def _redirect_to_null(descriptor: int) -> None:
 
 
 def reader_is_gone(error: OSError) -> bool:
-    """Return whether this error means that nothing reads standard output any more."""
+    """Return whether this error means that the reader of standard output is gone."""
     if error.errno == errno.EIO:  # a closed terminal, or a broken disk
         return stat.S_ISCHR(os.fstat(STDOUT_FD).st_mode)
     return isinstance(error, BrokenPipeError)
@@ -217,7 +217,7 @@ def _is_read_only(error: OSError) -> bool:
 
 
 def show_if_possible(put: Callable[..., None], *what: object) -> None:
-    """Call a function that writes output, and go on if the disk is full. It still raises if the reader is gone."""
+    """Call a function that writes output. A full disk is reported and ignored, but a missing reader is an error."""
     try:
         put(*what)
     except OSError as error:
@@ -226,7 +226,7 @@ def show_if_possible(put: Callable[..., None], *what: object) -> None:
 
 
 def retry_without_output(act: Callable[..., _T], *given: Any) -> _T:
-    """Call a function. If the reader of its output is gone, call it again without output."""
+    """Call a function. If the reader of its output is gone, discard all output and call it again."""
     try:
         return act(*given)
     except OSError as error:
@@ -282,7 +282,7 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 
 
 def note(words: str) -> None:
-    """Write a message to standard error. On a terminal it is wrapped between words."""
+    """Write a message to standard error. On a terminal, its lines are wrapped."""
     lines = f"talk: {words}"
     if sys.stderr is not None and sys.stderr.isatty():
         lines = _wrap(lines)
@@ -290,9 +290,9 @@ def note(words: str) -> None:
 
 
 def write_error_line(line: str = "") -> None:
-    """Write a line to standard error, if it is open. An empty one ends the line on which a terminal shows ^C."""
+    """Write a line to standard error if it is open."""
     if sys.stderr is not None:
-        # The reader may be gone, together with that of standard output. The command does its work all the same.
+        # If the reader is gone, the command still does its work.
         try:
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()
@@ -301,7 +301,7 @@ def write_error_line(line: str = "") -> None:
 
 
 def terminal_columns(stream: TextIO) -> int:
-    """Return the width of a terminal. It is 0 if it is unknown or the stream is no terminal."""
+    """Return the width of a terminal, or 0 if the stream isn't a terminal or its width is unknown."""
     try:
         return os.get_terminal_size(stream.fileno()).columns
     except OSError:
@@ -339,13 +339,13 @@ def show_error(error: TalkError, *, json: bool) -> None:
 
 
 class Feedback:
-    """Shows the events of goals. This base class shows nothing; `feedback` has the others."""
+    """Display of the events of goals. This base class shows nothing. The classes in `feedback` do."""
 
-    #: whether each event is shown, so that the command itself needn't print ids and results
+    #: whether events are shown; the command itself then doesn't print ids and results
     shows_events = False
 
     def begin(self, goals: Sequence[Goal]) -> None:
-        """Show the present state of these goals, before their first event."""
+        """Show the current state of these goals, before their first event."""
 
     def show(self, goal: Goal, event: Event) -> None:
         """Show an event of this goal."""
@@ -364,7 +364,7 @@ def has_colour() -> bool:
 
 
 def screen() -> Screen:
-    """Return the present width and the colours of standard output."""
+    """Return the current width and the colours of standard output."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 #: The size of one read: the capacity of a pipe.
 _READ_BYTES = 65_536
 #: The longest text, with the end of its line.
-_MAX_TEXT_BYTES = MAX_BYTES + len("\r\n")
+_MAX_INPUT_BYTES = MAX_BYTES + len("\r\n")
 #: How much input with a ttl is read before it can be sent.
 _MAX_BUFFERED_BYTES = 1_000_000
 #: How many goals may be pending without --ahead.
@@ -82,10 +82,10 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
     """
     data = bytearray()
     with Interrupts(output=wait) as interrupts:
-        while whole or len(data) <= _MAX_TEXT_BYTES:
+        while whole or len(data) <= _MAX_INPUT_BYTES:
             if not wait_ready({0: select.POLLIN}, seconds_left(end), interrupts.watched):
                 raise TimedOut("standard input has not ended within the time: nothing was sent")
-            more = _read_available(_READ_BYTES if whole else _MAX_TEXT_BYTES + 1 - len(data))
+            more = _read_available(_READ_BYTES if whole else _MAX_INPUT_BYTES + 1 - len(data))
             if more == b"":
                 return _decode(bytes(data))
             data += more or b""
@@ -94,7 +94,7 @@ def read_text(end: float | None, *, wait: bool = False, whole: bool = False) -> 
             "'talk say --lines' speaks it line by line"
         )
     if interrupts.signal_number == signal.SIGINT:
-        write_error_line()  # the terminal has shown ^C on the present line
+        write_error_line()  # the terminal has shown ^C on the current line
     return interrupts.exit_code
 
 
@@ -213,7 +213,7 @@ def say_lines(
 
 
 class _LineSpeaker:
-    """Sends the lines of standard input as goals, and follows these goals."""
+    """One run of `say --lines`: it sends lines as goals, and follows these goals."""
 
     def __init__(
         self,

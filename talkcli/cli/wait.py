@@ -1,7 +1,7 @@
 """Waiting for goals and reporting their ends, for `say` and `wait`, and the command `talk wait` itself.
 
-Goals are handled in the same way whether or not standard output can be written. Plain command lines come here without
-click.
+Goals are handled in the same way whether or not standard output can be written. This module must not need click,
+because plain command lines are run without it.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ def seconds_left(end: float | None) -> float | None:
 
 
 def timeout_error(timeout: float | None, words: str = "") -> TimedOut:
-    """Return the error of a command that --timeout has ended. `words` add details."""
+    """Return the error of a command that --timeout has ended. `words` are added to its message."""
     return TimedOut(f"timed out after {figure(timeout or 0)} s{words and f': {words}'}")
 
 
 class GoalReporter:
-    """Shows ids, events and results of goals, as the options say."""
+    """The output of a command about its goals: ids, events and results, as the options demand."""
 
     def __init__(self, options: CommonOptions, *, feedback: bool) -> None:
         """`feedback`: whether to show each event."""
@@ -72,13 +72,13 @@ class GoalReporter:
             show_if_possible(self.feedback.show, goal.goal, event)
 
     def report_refused(self, goal: Goal, prefix: str = "") -> int:
-        """Report a goal that no server has accepted, and return its exit code. `prefix` begins a note."""
+        """Report a goal that no server has accepted, and return its exit code. A note starts with `prefix`."""
         if self._options.json:
             show_if_possible(self.feedback.show, goal, Result(goal))
         return self.report(goal, prefix)
 
     def report(self, goal: Goal, prefix: str = "") -> int:
-        """Report a goal's end or its present state, and return its exit code. `prefix` begins a note."""
+        """Report a goal's end or its current state, and return its exit code. A note starts with `prefix`."""
         if self._options.json and not self.feedback.shows_events:
             show_if_possible(show_json, goal.to_json())
         muted = goal.output is not None and goal.output.muted
@@ -94,7 +94,7 @@ class GoalReporter:
     def cancel(self, goal: GoalHandle, interrupts: Interrupts) -> int:
         """Cancel a goal, wait a moment for silence, report the goal's end, and return its exit code.
 
-        Output may fail: Ctrl-C may have ended its reader, too, and after SIGHUP the terminal is gone.
+        Output may fail, because Ctrl-C may have ended its reader, too, and SIGHUP means that the terminal is gone.
         """
         interrupts.reset()
         try:
@@ -108,7 +108,7 @@ class GoalReporter:
         return retry_without_output(self.report, goal.goal)
 
     def _wait_for_silence(self, goal: GoalHandle) -> str:
-        """Wait a moment for a cancelled goal to end. If it isn't known to be silent then, return why."""
+        """Wait a moment for a cancelled goal to end. Return a note if it may not be silent, else an empty text."""
         try:
             retry_without_output(self.follow, [goal], CANCEL_TIMEOUT_S)
         except TimeoutError:

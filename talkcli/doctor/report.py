@@ -9,7 +9,7 @@ import textwrap
 
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
-from talkcli.terminal.text import GAP, Screen, pad, printable
+from talkcli.terminal.text import COLUMN_GAP, Screen, pad, printable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,7 +24,7 @@ SENTENCE = "sentence"
 _SHOWN = 4
 #: Columns of the state, and of the check's name: of the longest of each.
 _STATE, _CHECK = 7, 12
-_INDENT = " " * (_STATE + _CHECK + 2 * len(GAP))
+_INDENT = " " * (_STATE + _CHECK + 2 * len(COLUMN_GAP))
 _ARROW = "-> "
 #: Before the next step, at the end.
 _STEP = "  "
@@ -100,7 +100,7 @@ def next_step(findings: Sequence[Finding]) -> str | None:
 def lines(finding: Finding, screen: Screen) -> list[str]:
     """Return a finding as it is shown: in a pipe one line, on a terminal the next step has lines of its own."""
     state = screen.coloured(pad(finding.state, _STATE), _COLOURS[finding.state])
-    head = GAP.join((state, pad(finding.check, _CHECK), ""))
+    head = COLUMN_GAP.join((state, pad(finding.check, _CHECK), ""))
     room = screen.columns_left(len(_INDENT))
     if room is None:
         return [head + finding.message + ("" if finding.next is None else f" {_ARROW}{finding.next}")]

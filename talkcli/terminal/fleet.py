@@ -8,7 +8,7 @@ from __future__ import annotations
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.states import State
 from talkcli.terminal.goals import clock_time
-from talkcli.terminal.text import GAP, Screen, cut, max_id_columns, pad, printable, shorten, width
+from talkcli.terminal.text import COLUMN_GAP, Screen, cut, max_id_columns, pad, printable, shorten, width
 from talkcli.terminal.transcript import ColumnWidths, Transcript
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def _fit(widths: dict[str, int], room: int | None) -> None:
     for head in (None, *_LEFT_OUT):
         if head is not None:
             del widths[head]
-        left = room - len(GAP) * (len(widths) - 1) - (sum(widths.values()) - widths[_SPEAKING])
+        left = room - len(COLUMN_GAP) * (len(widths) - 1) - (sum(widths.values()) - widths[_SPEAKING])
         widths[_SPEAKING] = max(0, min(longest, left))
         if left >= min(longest, _LEAST_TEXT):
             return
@@ -132,7 +132,7 @@ def _line(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str
             text = shorten(text, columns)
         text = pad(text, columns)
         shown.append(text if state is None else screen.coloured(text, state))
-    return GAP.join(shown).rstrip()
+    return COLUMN_GAP.join(shown).rstrip()
 
 
 class FleetTranscript:
@@ -153,7 +153,7 @@ class FleetTranscript:
         parts = [f"{len(robots)} robot{'' if len(robots) == 1 else 's'}"]
         parts += [f"{gone} OFFLINE"] if gone else []
         parts += [f"{alone} without a server"] if alone else []
-        return [cut(f"{clock_time(now)}{GAP}{', '.join(parts)}; {printable(where)}", screen.columns_left(0))]
+        return [cut(f"{clock_time(now)}{COLUMN_GAP}{', '.join(parts)}; {printable(where)}", screen.columns_left(0))]
 
     def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
         """Return what is to be shown of an event of a robot's; `now`: as of `Transcript.lines`."""
@@ -177,4 +177,4 @@ class FleetTranscript:
         else:
             word, state, more = "server", State.SUCCEEDED, server
         name, shown = self._columns.robot(robot.name, screen), pad(word, 10) if more else word
-        return [GAP.join((clock_time(now), name, screen.coloured(shown, state), *filter(None, [more])))]
+        return [COLUMN_GAP.join((clock_time(now), name, screen.coloured(shown, state), *filter(None, [more])))]

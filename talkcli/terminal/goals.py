@@ -14,7 +14,7 @@ from talkcli.goals.option import figure
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
 from talkcli.terminal.text import (
-    GAP,
+    COLUMN_GAP,
     MAX_ID_COLUMNS,
     Screen,
     cut,
@@ -38,7 +38,7 @@ _LISTED_TEXT_CHARS = 200
 _LABEL_COLUMNS = 9
 #: Longer command lines of senders are cut.
 _SENDER_COMMAND_CHARS = 60
-#: Longer names and languages of voices are cut. Those of neural voices come from files that anyone can write.
+#: Longer names and languages of voices are cut. Those of neural voices come from files of unknown origin.
 _VOICE_NAME_CHARS = 80
 #: Shown instead of a text that the server no longer keeps.
 TEXT_NOT_KEPT = "(text no longer kept)"
@@ -125,7 +125,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
 
 
 def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
-    """Return a server's settings and goals as lines. `now` is in seconds since 1970."""
+    """Return the lines of `talk status`. `now` is in seconds since 1970."""
     server = status.server
     uptime = server.get("uptime")
     identity = [
@@ -166,7 +166,7 @@ def setting_lines(settings: Mapping[str, object]) -> list[str]:
     shown = {"voice": "default", "ttl": 0}
     rows = [(name, shown.get(name, "-") if value is None else value) for name, value in settings.items()]
     longest = max((len(name) for name, _ in rows), default=0)
-    return [f"{printable(name):<{longest}}{GAP}{printable(_value(value))}" for name, value in rows]
+    return [f"{printable(name):<{longest}}{COLUMN_GAP}{printable(_value(value))}" for name, value in rows]
 
 
 def voice_lines(voices: list[JsonObject]) -> list[str]:
@@ -174,7 +174,7 @@ def voice_lines(voices: list[JsonObject]) -> list[str]:
     limits = {"id": None, "language": _VOICE_NAME_CHARS, "name": _VOICE_NAME_CHARS}
     rows = [[printable(str(each.get(name) or "-"), limit) for name, limit in limits.items()] for each in voices]
     widths = [max((width(row[place]) for row in rows), default=0) for place in (0, 1)]
-    return [GAP.join((pad(row[0], widths[0]), pad(row[1], widths[1]), row[2])) for row in rows]
+    return [COLUMN_GAP.join((pad(row[0], widths[0]), pad(row[1], widths[1]), row[2])) for row in rows]
 
 
 def format_duration(seconds: float) -> str:
@@ -196,7 +196,7 @@ def _table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, n
     texts = [quoted_text(goal, _LISTED_TEXT_CHARS) for goal in goals]
     columns = screen.columns_left(max(map(width, heads)))
     if columns is None:
-        return [GAP.join([head + text, *tail[:1]]) for head, text, tail in zip(heads, texts, tails, strict=True)]
+        return [COLUMN_GAP.join([head + text, *tail[:1]]) for head, text, tail in zip(heads, texts, tails, strict=True)]
     fitted = fit_columns(texts, [tail or [""] for tail in tails], weights=(1, 1), columns=columns)
     return [head + words for head, words in zip(heads, fitted, strict=True)]
 
@@ -204,15 +204,15 @@ def _table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, n
 def _head(goal: Goal, id_columns: int, screen: Screen) -> str:
     """Return the columns before a goal's text: the time of its end, its id and its state."""
     goal_id = pad(cut(printable(goal.id), max_id_columns(screen)), id_columns)
-    head = f"{goal_id}{GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{GAP}"
-    return f"{clock_time(goal.ended_at)}{GAP}{head}" if goal.state.terminal else head
+    head = f"{goal_id}{COLUMN_GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{COLUMN_GAP}"
+    return f"{clock_time(goal.ended_at)}{COLUMN_GAP}{head}" if goal.state.terminal else head
 
 
 def _tails(goal: Goal, now: float) -> list[str]:
-    """Return the forms of the column after a goal's text, the longest first."""
+    """Return several wordings for the column after a goal's text, the longest first."""
     if goal.state.terminal:
         return _muted(goal) if goal.state is State.SUCCEEDED else reason_forms(goal)
-    # The sender comes first, because a form that doesn't fit is cut at its end.
+    # The sender comes first, because a wording that doesn't fit is cut at its end.
     return [", ".join([f"from {each}", *_notes(goal, now)]) for each in sender_forms(goal.client)]
 
 
@@ -253,7 +253,7 @@ def _describe_sender(sender: Sender | None) -> str:
 
 
 def sender_forms(sender: Sender | None) -> list[str]:
-    """Return the forms of a column that names a sender, the longest first.
+    """Return several wordings that name a sender, the longest first. A column shows the first one that fits.
 
     The name that the sender gave itself comes first. It is in quotes because nobody has checked it.
     """
@@ -274,7 +274,7 @@ def _describe_cause(by: By) -> str:
 
 
 def reason_forms(goal: Goal) -> list[str]:
-    """Return the forms of a column that says why a goal ended and who ended it, the longest first."""
+    """Return several wordings that say why a goal ended and who ended it, the longest first."""
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())
@@ -283,7 +283,7 @@ def reason_forms(goal: Goal) -> list[str]:
         by = [printable(goal.by.goal)] if goal.by.goal is not None else sender_forms(goal.by.client)
     forms = [f"{reason} by {each}" for each in by] or [reason]
     words = _details(goal)
-    # If there is little room, who ended the goal is worth more than the reason, because the state hints at the reason.
+    # With little room, show who ended the goal instead of the reason, because the state hints at the reason.
     shortest = f"by {by[-1]}" if by else reason
     if not words:
         return [*forms, shortest]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 #: The space between two columns of a table.
-GAP = "  "
+COLUMN_GAP = "  "
 #: Ids chosen by a client can have 64 characters. A column that wide would leave no room for the text.
 MAX_ID_COLUMNS = 20
 #: A terminal that reports fewer columns is treated as this wide, because shorter lines would show nothing.
@@ -123,7 +123,7 @@ def pad(text: str, columns: int) -> str:
 
 
 def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
-    """Return the first form that fits, or the last one cut if none does. The longest form comes first."""
+    """Return the first of several wordings that fits, or else the last one, cut. The longest comes first."""
     return next((each for each in forms if columns is None or width(each) <= columns), cut(forms[-1], columns))
 
 
@@ -148,18 +148,18 @@ def fit_columns(
 
     Args:
         texts: the first column.
-        others: the other columns. Each cell is a list of forms, the longest first.
+        others: the other columns. Each cell has several wordings, the longest first.
         weights: the share of each column. Whatever the others don't use of theirs goes to the texts.
         columns: the width of the whole line.
     """
-    columns -= len(GAP) * len(others)
+    columns -= len(COLUMN_GAP) * len(others)
     longest = [max(map(width, texts)), *(max(width(forms[0]) for forms in column) for column in others)]
     shares = share_columns(longest, weights, columns)[1:]
     chosen = [[longest_fitting(forms, room) for forms in column] for column, room in zip(others, shares, strict=True)]
     widths = [max(map(width, column)) for column in chosen]
     left = min(longest[0], columns - sum(widths))
     return [
-        GAP.join(map(pad, (shorten(text, left), *beside), (left, *widths))).rstrip()
+        COLUMN_GAP.join(map(pad, (shorten(text, left), *beside), (left, *widths))).rstrip()
         for text, *beside in zip(texts, *chosen, strict=True)
     ]
 

@@ -13,7 +13,7 @@ from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Snapshot, StateChanged, WordHeard, unfinished
 from talkcli.terminal.goals import clock_time, quoted_text, reason_forms, sender_forms
 from talkcli.terminal.text import (
-    GAP,
+    COLUMN_GAP,
     MAX_ID_COLUMNS,
     Screen,
     cut,
@@ -69,7 +69,7 @@ class ColumnWidths:
 
 
 class Transcript:
-    """Turns the events of one server into lines."""
+    """The lines for the events of one server, one event after the other."""
 
     def __init__(
         self, *, full: bool, words: bool, robot: str | None = None, widths: ColumnWidths | None = None
@@ -99,7 +99,7 @@ class Transcript:
         if isinstance(event, PausedChanged):
             return [self._pause_line(event, screen, now)]
         if isinstance(event, WordHeard) and self._with_words:
-            word = f"{printable(event.word)}{GAP}{event.time:.2f} s"
+            word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
             return [self._head(event.at or now, "word", None, event.id, screen) + word]
         return []  # only clients that wait for a goal get its result
 
@@ -113,7 +113,7 @@ class Transcript:
         place = f"server {printable(str(status.server.get('pid')))} on {printable(str(status.server.get('socket')))}"
         waiting = f", {len(status.pending)} waiting" if status.pending else ""
         activity = "paused" if self._paused else "speaking" if status.active else "silent"
-        head = f"{clock_time(now)}{GAP}{pad('watching', 10)}{GAP}{activity}{waiting}; {place}"
+        head = f"{clock_time(now)}{COLUMN_GAP}{pad('watching', 10)}{COLUMN_GAP}{activity}{waiting}; {place}"
         lines = [cut(head, screen.columns_left(0))]
         for goal in goals:
             since = goal.queued_at if goal.started_at is None else goal.started_at
@@ -153,31 +153,31 @@ class Transcript:
             forms = [f"{forms[0]}, from {each}" for each in sender_forms(goal.client)] + forms
         columns = screen.columns_left(width(head))
         if columns is None:
-            return [(head + pad(quoted_text(goal), _TEXT_COLUMNS) + GAP + forms[0]).rstrip()]
+            return [(head + pad(quoted_text(goal), _TEXT_COLUMNS) + COLUMN_GAP + forms[0]).rstrip()]
         tail_columns = columns // 3
-        # Who ended a goal must stay readable. Its sender doesn't matter here, because an earlier line has named it.
+        # The shortest wording lacks the reason. If no other one fits, the end gets more room in `_long_end_lines`.
         complete = forms[:-1] if ended and goal.by is not None and len(forms) > 1 else forms
         if ended and all(width(each) > tail_columns for each in complete):
             return self._long_end_lines(head, goal, complete, screen)
         tail = longest_fitting(complete, tail_columns)
-        text_columns = columns - tail_columns - len(GAP)
-        return [(head + pad(shorten(quoted_text(goal), text_columns), text_columns) + GAP + tail).rstrip()]
+        text_columns = columns - tail_columns - len(COLUMN_GAP)
+        return [(head + pad(shorten(quoted_text(goal), text_columns), text_columns) + COLUMN_GAP + tail).rstrip()]
 
     def _long_end_lines(self, head: str, goal: Goal, forms: list[str], screen: Screen) -> list[str]:
         """Return the end of a goal whose reason is too long for its column: beside the text if it fits, else below."""
         text = quoted_text(goal)
         columns = screen.columns_left(width(head)) or 0
-        beside = columns - len(GAP) - min(width(text), _MIN_TEXT_COLUMNS)
+        beside = columns - len(COLUMN_GAP) - min(width(text), _MIN_TEXT_COLUMNS)
         tail = next((each for each in forms if width(each) <= beside), None)
         if tail is not None:
-            return [head + shorten(text, columns - len(GAP) - width(tail)) + GAP + tail]
+            return [head + shorten(text, columns - len(COLUMN_GAP) - width(tail)) + COLUMN_GAP + tail]
         tail = longest_fitting(forms, screen.columns_left(_INDENT_COLUMNS))
         return [head + shorten(text, columns), " " * _INDENT_COLUMNS + tail]
 
     def _head(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
         robot = [] if self._robot is None else [self._widths.robot(self._robot, screen)]
         cells = (screen.coloured(pad(word, 10), state), self._widths.goal_id(goal_id, screen))
-        return GAP.join((clock_time(at), *robot, *cells, ""))
+        return COLUMN_GAP.join((clock_time(at), *robot, *cells, ""))
 
 
 def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
@@ -191,17 +191,17 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
     texts = [quoted_text(goal) for goal in goals]
     senders = [sender_forms(goal.client) for goal in goals]
     reasons = [reason_forms(goal) for goal in goals]
-    columns = screen.columns_left(sum(widths) + 3 * len(GAP))
+    columns = screen.columns_left(sum(widths) + 3 * len(COLUMN_GAP))
     if columns is None:
         # Most lines are aligned. A longer line isn't cut, so its last columns are not.
         details = [
-            GAP.join((pad(text, _TEXT_COLUMNS), pad(sender[0], _TEXT_COLUMNS), reason[0])).rstrip()
+            COLUMN_GAP.join((pad(text, _TEXT_COLUMNS), pad(sender[0], _TEXT_COLUMNS), reason[0])).rstrip()
             for text, sender, reason in zip(texts, senders, reasons, strict=True)
         ]
     else:
         details = fit_columns(texts, senders, reasons, weights=(4, 2, 3), columns=columns) if goals else []
     return [
-        GAP.join(
+        COLUMN_GAP.join(
             (f"{when:>{widths[0]}}", screen.coloured(pad(state, widths[1]), goal.state), pad(goal_id, widths[2]), words)
         )
         for goal, (when, state, goal_id), words in zip(goals, heads, details, strict=True)
