@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 class _BusyEngine:
     """An engine that accepts every goal and reports nothing."""
 
-    def say(self, goal: protocol.Say) -> None:
+    def say(self, goal: protocol.Speak) -> None:
         """Do nothing."""
 
-    def follow(self, goal_id: str, followed: bool, by_neural: bool) -> None:
+    def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
         """Do nothing."""
 
 

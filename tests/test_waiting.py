@@ -305,7 +305,7 @@ class _Written:
     def __init__(self, written: list[str]) -> None:
         self.written = written
 
-    def say(self, goal: protocol.Say) -> None:
+    def say(self, goal: protocol.Speak) -> None:
         self.written.append(f"say {goal.text}")
 
     def stop(self, _: str) -> None:
@@ -376,7 +376,7 @@ async def test_engine_gets_its_next_task_before_clients_get_events() -> None:
     served.subscribers.changed = changed  # type: ignore[assignment, method-assign]
     for text, preempt in (("first", False), ("second", True)):
         served.apply(served.scheduler.submit(Say(text, preempt=preempt), Sender(), served.now()).effects)
-    served.report(protocol.Ended("4k7f-1", protocol.STOPPED))
+    served.report(protocol.Ended("4k7f-1", protocol.OUTCOME_STOPPED))
     await asyncio.sleep(0)
     assert written == [
         *("say first", "PENDING first", "ACTIVE first"),

@@ -19,7 +19,7 @@ from talkcli.doctor.report import Finding, failed, ok, some, warning
 from talkcli.doctor.sound import asked
 from talkcli.doctor.voice import fault
 from talkcli.engine import models, protocol
-from talkcli.engine.parent.process import Conversation, EngineFailed
+from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.engine.voices import NEURAL
 from talkcli.frozen import frozen
 
@@ -133,9 +133,9 @@ def _parted(words: str) -> tuple[str, str]:
 def _try(used: str, env: Mapping[str, str] | None, limit: float, interrupt: Mapping[int, int] | None) -> Tried:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
-        configure = protocol.Configure(os.getpid(), None, None, None, None, list_voices=False, output=nowhere)
-        with Conversation(configure, env=env, deadline=time.monotonic() + limit, interrupt=interrupt) as engine:
-            engine.until(protocol.Ready)
+        configure = protocol.Configure(os.getpid(), None, None, None, None, list_voices=False, output_fd=nowhere)
+        with PrivateEngine(configure, env=env, deadline=time.monotonic() + limit, interrupt=interrupt) as engine:
+            engine.wait_for(protocol.Ready)
             return _timed(engine, used)
     except EngineFailed as error:
         return Tried(words=fault(error)[1], step=_CHOOSE)
@@ -145,26 +145,26 @@ def _try(used: str, env: Mapping[str, str] | None, limit: float, interrupt: Mapp
         os.close(nowhere)
 
 
-def _timed(engine: Conversation, used: str) -> Tried:
+def _timed(engine: PrivateEngine, used: str) -> Tried:
     """Have a sound spoken, for which the voice is loaded, then a sentence; nobody hears them."""
     ended, loaded = _spoken(engine, used, "a")
     began = time.monotonic()
-    if ended.outcome == protocol.COMPLETED:
+    if ended.outcome == protocol.OUTCOME_COMPLETED:
         ended, _ = _spoken(engine, used, _TEXT)
-    if ended.outcome != protocol.COMPLETED or ended.duration is None:
+    if ended.outcome != protocol.OUTCOME_COMPLETED or ended.duration is None:
         return Tried(None, None, None, *_parted(ended.message or f"the sentence ended {ended.outcome}"))
     speed = ended.duration / (time.monotonic() - began)
     return Tried(loaded, speed, _memory(engine._process.pid))
 
 
-def _spoken(engine: Conversation, used: str, text: str) -> tuple[protocol.Ended, float | None]:
+def _spoken(engine: PrivateEngine, used: str, text: str) -> tuple[protocol.Ended, float | None]:
     """Have a text spoken, and return how that ended, and the seconds for which the voice was loaded before it."""
     loaded = None
     # It insists on the voice, so that espeak does not speak in its place.
-    engine.say(protocol.Say(text, text, _RATE, 1.0, used, 50, voice_only=True))
+    engine.speak(protocol.Speak(text, text, _RATE, 1.0, used, 50, voice_only=True))
     while True:
         event = next(engine.events)
-        if isinstance(event, protocol.Loaded):
+        if isinstance(event, protocol.VoiceLoaded):
             loaded = event.seconds
         elif isinstance(event, protocol.Ended):
             return event, loaded

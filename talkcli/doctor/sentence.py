@@ -142,11 +142,11 @@ def by_engine(text: str, setting: Setting, volume: float, limit: float) -> Playe
     """Play a sentence by an engine process, in at most `limit` seconds, and return how that went."""
     try:
         with conversation(setting, limit) as engine:
-            player = engine.until(protocol.Ready).player
+            player = engine.wait_for(protocol.Ready).player
             rate = _RATE if volume else _SILENT_RATE
-            engine.say(protocol.Say("doctor", text, rate, volume, setting.voice, 50))
-            ended = engine.until(protocol.Ended)
-            if ended.outcome == protocol.COMPLETED:
+            engine.speak(protocol.Speak("doctor", text, rate, volume, setting.voice, 50))
+            ended = engine.wait_for(protocol.Ended)
+            if ended.outcome == protocol.OUTCOME_COMPLETED:
                 return Played(State.SUCCEEDED, duration=ended.duration, player=ended.player or player)
             return Played(State.ABORTED, ended.reason, ended.message or ended.outcome, player=player)
     except EngineFailed as error:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from talkcli import install
 from talkcli.doctor.report import Finding, failed, ok, warning
 from talkcli.engine import protocol
-from talkcli.engine.parent.process import Conversation, EngineFailed
+from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.engine.voices import is_neural
 from talkcli.frozen import frozen, replace
 
@@ -86,9 +86,9 @@ def look(setting: Setting) -> Engine:
     found = Engine()
     try:
         with conversation(setting) as engine:
-            ready = engine.until(protocol.Ready)
+            ready = engine.wait_for(protocol.Ready)
             found = Engine(ready.driver, ready.version, player=ready.player, voice=ready.voice)
-            voices = engine.until(protocol.Voices).voices
+            voices = engine.wait_for(protocol.VoiceList).voices
             return replace(found, voices=len(voices), neural=sum(is_neural(each.id) for each in voices))
     except EngineFailed as error:
         if found.driver is None or error.reason == "engine_crashed":
@@ -97,19 +97,19 @@ def look(setting: Setting) -> Engine:
     return found  # it is ready; that it lists no voices is for who judges
 
 
-def conversation(setting: Setting, limit: float = math.inf) -> Conversation:
+def conversation(setting: Setting, limit: float = math.inf) -> PrivateEngine:
     """Return what talks to an engine process of these settings, for at most `limit` seconds."""
     configure = protocol.Configure(
-        os.getpid(), setting.driver, setting.player, setting.device, setting.voice, worked=setting.worked
+        os.getpid(), setting.driver, setting.player, setting.device, setting.voice, last_player=setting.worked
     )
     deadline = time.monotonic() + limit
-    return Conversation(configure, env=setting.env, deadline=deadline, interrupt=setting.interrupt)
+    return PrivateEngine(configure, env=setting.env, deadline=deadline, interrupt=setting.interrupt)
 
 
 def fault(error: EngineFailed) -> tuple[str, str]:
     """Return why an engine process failed, for programs and in words; whether it was ready yet makes no difference."""
-    if error.silent is not None:
-        return "engine_hung", f"the engine process said nothing for {error.silent:g} s"
+    if error.silent_s is not None:
+        return "engine_hung", f"the engine process said nothing for {error.silent_s:g} s"
     return error.reason, str(error)
 
 

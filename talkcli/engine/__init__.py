@@ -1,6 +1,7 @@
-"""The engine speaks the goals, one at a time.
+"""The engine, which speaks the goals, one at a time.
 
 `parent` runs in the server: it starts the engine process, sends it goals and watches it. `child` runs in the engine
-process: the driver, the players and the synthesizers. They exchange the messages in `protocol`. The engine may import
-the layers below the client.
+process: the driver, the synthesizers and the players. They exchange the messages in `protocol` and import nothing of
+each other. The other modules here are tables for both, and for the server, doctor and the commands: `voices`, `models`
+and `players`.
 """

@@ -1,13 +1,13 @@
-"""What the server's engine thread and the engine process say to each other: one JSON object a line, over a socket pair.
+"""The messages between the server's engine thread and the engine process: one JSON object per line, over a socket pair.
 
-The server's half of the pair is the thread's, the other half is the process's standard input (file descriptor 0, both
-directions). This module holds only the form of the messages: it opens, reads and starts nothing, so that a scripted
-engine process can be written against it.
+The engine thread has one end of the socket pair. The other end is the standard input of the engine process (file
+descriptor 0), which it reads and writes. This module only defines the messages and opens nothing, so tests can use it
+to write a scripted engine process.
 
-Order, as the process must keep it: `Configure` comes in once, first. Then `Ready` goes out, or `StartFailed` and the
-process ends. After that each `Say` gets one `Started`, any number of `Word`, `Alive`, `Output`, `Speaks` and `Paused`,
-and exactly one `Ended`; each `Load` gets a `Loaded`, at any time. Where the server's half is closed, the sentence being
-spoken is stopped and the process ends.
+The engine process must keep this order. It first receives one `Configure`. It then sends `Ready`, or it sends
+`StartFailed` and ends. For each `Speak` it sends one `Started`, then any number of `Word`, `Alive`, `OutputChanged`,
+`VoiceChosen` and `Held`, then exactly one `Ended`. It answers each `LoadVoice` with a `VoiceLoaded`, at any time. If
+the server closes its end, the engine process stops the current sentence and ends.
 """
 
 from __future__ import annotations
@@ -24,209 +24,208 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import JsonObject
 
-#: Seconds between two messages of an engine process that has a goal in hand, or loads a voice. Far below `HANG_AFTER`,
-#: so that one late message is not taken for a hang; nothing is sent while idle, so that an idle robot is not woken.
-ALIVE_EVERY = 0.5
+#: Longest time between two messages of an engine process that is speaking or loading a voice. It is far below
+#: `HANG_LIMIT_S`, so one late message doesn't count as a hang. An idle process sends nothing, to let the robot sleep.
+ALIVE_INTERVAL_S = 0.5
 
-#: Names, in the environment, the descriptor that the player must inherit: by its end the server sees that process and
-#: player are gone.
+#: Environment variable with the number of the liveness pipe's writing end, which the player must inherit. When the pipe
+#: is closed, the server knows that the process and the player are gone.
 LIVENESS_VARIABLE = "TALK_LIVENESS_FD"
 
-# How long an engine process may take for what it has to do, whoever watches it: server, `say -o`, `talk doctor`.
+#: Name of the player that writes to `Configure.output_fd`, as it appears in the messages of `Ended`.
+OUTPUT_STREAM_NAME = "the output"
 
-#: Seconds until a process that was started must be ready: a cold start from an SD card takes two or three.
-START_LIMIT = 10.0
-#: Seconds without a sign of life from a process that has a goal in hand, or loads a voice; it sends one each
-#: `ALIVE_EVERY`.
-HANG_AFTER = 3.0
-#: Seconds after which a neural voice is given up that is being loaded: it takes three on a small machine.
-LOAD_LIMIT = 60.0
-#: Seconds after which a stop that isn't confirmed becomes a kill.
-STOP_LIMIT = 0.15
-#: Seconds after a kill in which process and player must be gone.
-SILENCE_LIMIT = 2.0
-#: Seconds after which a pause that isn't confirmed becomes a kill, twice what a client waits for it: a driver that is
-#: not ours may finish its word first, or more.
-PAUSE_LIMIT = 4.0
+# Time limits for the engine process. The server, `say -o` and `talk doctor` all use them.
 
-# How a `Say` ended.
-COMPLETED = "completed"  # every sample was played and the player ended well
-STOPPED = "stopped"  # ended by a `Stop`, and silent now
-FAILED = "failed"  # ended by an error: `reason` and `message` say which
+#: Limit for a new process to become ready. A cold start from an SD card takes two or three seconds.
+START_LIMIT_S = 10.0
+#: Longest silence of a process that is speaking or loading a voice, before it counts as hung.
+HANG_LIMIT_S = 3.0
+#: Limit for loading a neural voice. It takes three seconds on a small machine.
+LOAD_LIMIT_S = 60.0
+#: Limit for confirming a stop, after which the process is killed.
+STOP_LIMIT_S = 0.15
+#: Limit for a killed process and its player to be gone.
+KILL_LIMIT_S = 2.0
+#: Limit for confirming a hold, after which the process is killed. It is twice as long as a client waits for a pause,
+#: because a foreign driver may first finish its word or more.
+HOLD_LIMIT_S = 4.0
+
+# Outcomes of a `Speak`.
+OUTCOME_COMPLETED = "completed"  # the player took every sample and ended well
+OUTCOME_STOPPED = "stopped"  # a `Stop` ended it, and it is silent now
+OUTCOME_FAILED = "failed"  # an error ended it; `reason` and `message` describe the error
 
 
 @frozen
 class Configure:
-    """What an engine process is told at its start."""
+    """The settings of a new engine process."""
 
-    #: process id of the server: a process whose parent is another one has been orphaned already, and ends.
-    server: int
-    #: name of a pyttsx3 driver, or None for the one that fits this system (`talk`'s own on Linux).
+    #: process id of the server. If the process has another parent, the server is gone and the process ends.
+    server_pid: int
+    #: name of a pyttsx3 driver; None for the usual one (`talk`'s own on Linux)
     driver: str | None
-    #: "aplay", "pacat", "pw-cat", "null", "file:PATH", a command line, or None to take what is there and works.
+    #: "aplay", "pacat", "pw-cat", "null", "file:PATH" or a command line; None to try the installed ones
     player: str | None
-    #: device by the player's own name for it, or None for its default.
+    #: device in the player's own notation; None for its default
     device: str | None
-    #: voice to check at the start, by id, name or language; None for the driver's default.
+    #: voice to check at the start, by id, name or language; None for the driver's default
     voice: str | None
-    #: milliseconds of silence before a sentence when the device has been idle.
+    #: milliseconds of silence before a sentence if the device was idle
     lead_in: int = 0
-    #: whether the server doesn't know the voices yet: `Voices` then comes right after `Ready`, else never.
+    #: whether to send a `VoiceList` right after `Ready`
     list_voices: bool = True
-    #: a descriptor that the process inherits: it gets a WAV file of all sentences, and nothing is played.
-    output: int | None = None
-    #: whether a sentence fails whose output is muted, where it doesn't say so itself.
+    #: inherited descriptor to write a WAV file of all sentences to instead of playing them
+    output_fd: int | None = None
+    #: whether a sentence fails if the output is muted, unless its `Speak` says otherwise
     audible: bool = False
-    #: the program that is tried first where no player is named; None for the usual order.
-    worked: str | None = None
+    #: program that worked last, which is tried first if `player` is None; None for the usual order
+    last_player: str | None = None
 
 
 @frozen
-class Say:
-    """Speak `text`. Settings are absolute; None leaves the driver's default."""
+class Speak:
+    """Speak a text. Settings are absolute."""
 
     id: str
     text: str
     rate: int  # words per minute, 80 to 450
     volume: float  # 0.0 to 1.0
-    voice: str | None  # id, name or language
-    pitch: int  # 0 to 100, 50 is the voice's own
-    followed: bool = False  # whether another goal waits behind it
-    by_neural: bool = False  # whether that one asks for a neural voice
-    lead_in: int | None = None  # milliseconds of silence before it, whatever the output did; None for `Configure`'s
-    audible: bool | None = None  # whether it fails where its output is muted; None for `Configure`'s
-    voice_only: bool = False  # whether it waits for a neural voice that is not loaded, and fails without it
+    voice: str | None  # id, name or language; None for the driver's default
+    pitch: int  # 0 to 100; 50 is the voice's own
+    next_waits: bool = False  # whether another goal waits behind this one
+    next_is_neural: bool = False  # whether the waiting goal asks for a neural voice
+    lead_in: int | None = None  # milliseconds of silence before it, even if the device wasn't idle; None as configured
+    audible: bool | None = None  # whether it fails if the output is muted; None as configured
+    voice_only: bool = False  # whether it waits for its neural voice to load, and fails without it
 
 
 @frozen
 class Stop:
-    """Be silent now. A stop for a goal that is not being spoken is ignored: it ended before the stop arrived."""
+    """Be silent now. Ignored if this goal is not being spoken, because it may have ended before the stop arrived."""
 
     id: str
 
 
 @frozen
-class Pause:
-    """Hold the sentence where it is; `Paused` comes when it is silent. Ignored where the goal isn't being spoken."""
+class Hold:
+    """Hold the sentence where it is and send `Held` once it is silent. Ignored if this goal is not being spoken."""
 
     id: str
-    number: int  # of the pause in the goal, from 1
+    number: int  # of the hold within the goal, from 1
 
 
 @frozen
-class Resume:
-    """Go on where the sentence was held. Ignored where it is not held."""
+class Continue:
+    """Go on where the sentence was held. Ignored if it is not held."""
 
     id: str
 
 
 @frozen
-class Followed:
-    """Another goal waits behind the one that is being spoken, or no longer does."""
+class NextGoal:
+    """Note whether another goal waits behind the one being spoken."""
 
-    id: str
-    followed: bool
-    by_neural: bool = False  # whether that one asks for a neural voice
-
-
-@frozen
-class Load:
-    """Load a neural voice beside what is spoken; `Loaded` comes once for each."""
-
-    voice: str  # its id, without a speaker
+    id: str  # of the goal being spoken
+    next_waits: bool
+    next_is_neural: bool = False  # whether the waiting goal asks for a neural voice
 
 
 @frozen
-class Drop:
-    """Keep a neural voice no longer; one that speaks is kept until it has spoken. `Grown` comes if that is known."""
+class LoadVoice:
+    """Load a neural voice while speech goes on. Answered by one `VoiceLoaded`."""
 
-    voice: str  # its id, without a speaker
+    voice: str  # id without a speaker
+
+
+@frozen
+class DropVoice:
+    """Remove a neural voice from memory, after the current sentence if that uses it. Answered by `VoiceMemory`."""
+
+    voice: str  # id without a speaker
 
 
 @frozen
 class Voice:
-    """One voice of the driver's."""
+    """A voice of the driver."""
 
     id: str
     language: str | None
     name: str
-    quality: str | None = None  # of a neural one, as its maker calls it: "medium"
-    #: of a neural one that has several, what each is called, by its number; the engine process, which speaks by
-    #: pyttsx3's own list, doesn't tell them
+    quality: str | None = None  # of a neural voice, in its maker's word: "medium"
+    #: names of a neural voice's speakers, in the order of their numbers; None from the engine process, because
+    #: pyttsx3's list has no room for them
     speakers: tuple[str, ...] | None = None
 
 
 @frozen
 class Ready:
-    """The engine is initialised and takes a `Say`."""
+    """The engine is initialised and accepts a `Speak`."""
 
     driver: str
-    version: str | None  # of the synthesiser, for people: "eSpeak NG 1.51 (system)"
-    player: str | None  # what will be tried first, for people
-    voice: str | None = None  # id of the neural voice that `Configure.voice` names; None for any other voice
+    version: str | None  # of the synthesizer, for people: "eSpeak NG 1.51 (system)"
+    player: str | None  # player that is tried first, for people
+    voice: str | None = None  # id of the neural voice named by `Configure.voice`; None for any other voice
 
 
 @frozen
 class StartFailed:
-    """The engine cannot start; the process ends after this."""
+    """The engine can't start. The process ends after this message."""
 
     reason: str  # "engine_failed" or "unknown_voice"
     message: str  # names what is missing and what to install
-    lasting: bool = True  # whether the next start will fail for it, too, if nobody changes something
-    usage: bool = False  # whether it was asked for by an option, and can't be had
+    permanent: bool = True  # whether the next start will fail too unless somebody changes something
+    usage_error: bool = False  # whether an option asked for something that doesn't exist
 
 
 @frozen
-class Voices:
-    """All voices of the driver; sent once, right after `Ready`, where `Configure` asks for it."""
+class VoiceList:
+    """All voices of the driver. Sent once, right after `Ready`, if `Configure` asks for it."""
 
     voices: tuple[Voice, ...]
 
 
 @frozen
-class Loaded:
-    """A neural voice can be spoken with from now on, or can't."""
+class VoiceLoaded:
+    """A neural voice is loaded, or can't be loaded."""
 
-    voice: str  # its id, without a speaker
-    seconds: float  # that it took
-    error: str | None = None  # why it can't, for people
-
-
-@frozen
-class Unloaded:
-    """A neural voice is not loaded any more: its files are others than they were."""
-
-    voice: str  # its id, without a speaker
+    voice: str  # id without a speaker
+    seconds: float  # time it took
+    error: str | None = None  # reason why it can't be loaded, for people; None if it is loaded
 
 
 @frozen
-class Grown:
-    """The process has another size than was told; before `Loaded`, and after sentences and `Drop`."""
+class VoiceUnloaded:
+    """A neural voice is no longer loaded because its files have changed."""
 
-    voice: str  # what it is due to: the voice that was loaded or has spoken, by its id without a speaker; "" for `Drop`
+    voice: str  # id without a speaker
+
+
+@frozen
+class VoiceMemory:
+    """Memory taken by neural voices. Sent when it changes: before `VoiceLoaded`, after a sentence or a `DropVoice`."""
+
+    voice: str  # id, without a speaker, of the voice that was loaded or has spoken; "" after `DropVoice`
     memory: int  # bytes by which the process has grown since before its first neural voice
 
 
 @frozen
 class Started:
-    """The `Say` was taken in hand."""
+    """The engine process has begun with the goal."""
 
     id: str
 
 
 @frozen
 class Alive:
-    """A sign of life from a process that has a goal in hand, or loads a voice.
-
-    At most `ALIVE_EVERY` seconds after the last message.
-    """
+    """A sign of life from a process that is speaking or loading a voice, `ALIVE_INTERVAL_S` after its last message."""
 
     id: str  # of the goal; "" if there is none
 
 
 @frozen
 class Word:
-    """A word begins to be heard, now, by the playback clock."""
+    """A word is beginning to be heard now, according to the playback clock."""
 
     id: str
     start: int  # character offset in the text
@@ -236,72 +235,74 @@ class Word:
 
 
 @frozen
-class Output:
-    """Where the sentence goes, and how loud; as soon as that is known, and whenever it changes."""
+class OutputChanged:
+    """Where the sentence is played and how loud. Sent once that is known and whenever it changes."""
 
     id: str
-    output: JsonObject | None  # as a goal has it; None where another player goes on that can't tell
+    output: JsonObject | None  # in the form that a goal has; None if the player in use can't tell
 
 
 @frozen
-class Speaks:
-    """The sentence is heard by this voice; once more where that changes before it begins."""
+class VoiceChosen:
+    """The voice that speaks the sentence. Sent again if another voice takes over before the first word."""
 
     id: str
-    voice: str  # its id
-    why: str | None = None  # why it is another than was asked for, for people
+    voice: str  # id of the voice
+    fallback_reason: str | None = None  # why it isn't the voice that was asked for, for people; None if it is
 
 
 @frozen
-class Paused:
-    """The sentence is held and silent, until `Resume` or `Stop`."""
+class Held:
+    """The sentence is held and silent, until `Continue` or `Stop`."""
 
     id: str
-    number: int  # of the pause that it answers
+    number: int  # of the `Hold` that this answers
 
 
 @frozen
 class Ended:
-    """The `Say` is over, and it is silent: the player is reaped, or its stream is closed."""
+    """The `Speak` is over and silent. Its player is reaped or its stream is closed."""
 
     id: str
-    outcome: str  # COMPLETED, STOPPED or FAILED
-    reason: str | None = None  # of FAILED: audio_device, audio_lost, audio_stalled, no_player, nothing_to_say, …
-    message: str | None = None  # of FAILED: the player's or engine's own words
-    duration: float | None = None  # seconds of audio, where all of it was synthesised
-    gaps: int = 0  # times that it was silent in its midst, as its sound was not made in time
-    gap_seconds: float = 0.0  # for so long in all
-    player: str | None = None  # what took the sound, where no player is named
+    outcome: str  # OUTCOME_COMPLETED, OUTCOME_STOPPED or OUTCOME_FAILED
+    reason: str | None = None  # of a failure: audio_device, audio_lost, audio_stalled, no_player, nothing_to_say, …
+    message: str | None = None  # of a failure: the message of the player or the engine
+    duration: float | None = None  # seconds of audio; None if part of it wasn't synthesized
+    gaps: int = 0  # number of silences within it because its sound was not made in time
+    gap_seconds: float = 0.0  # total length of these silences
+    player: str | None = None  # player that took the sound, if `Configure` names none
 
 
-Command = Configure | Say | Stop | Pause | Resume | Followed | Load | Drop
-Event = (
-    Ready | StartFailed | Voices | Loaded | Unloaded | Grown | Started | Alive | Word | Output | Speaks | Paused | Ended
-)
-#: The events that belong to a goal, by its `id`.
-OF_A_GOAL = (Started, Alive, Word, Output, Speaks, Paused, Ended)
+Command = Configure | Speak | Stop | Hold | Continue | NextGoal | LoadVoice | DropVoice
+#: Events that belong to the goal given by their `id`.
+GoalEvent = Started | Alive | Word | OutputChanged | VoiceChosen | Held | Ended
+Event = Ready | StartFailed | VoiceList | VoiceLoaded | VoiceUnloaded | VoiceMemory | GoalEvent
 
-#: What goes in and what comes out; in a line a message is called as its class is.
-COMMANDS: dict[str, type[Command]] = {each.__name__: each for each in Command.__args__}
-EVENTS: dict[str, type[Event]] = {each.__name__: each for each in Event.__args__}
+#: Classes of the messages in each direction, by name. A line has the name as its "kind".
+COMMAND_CLASSES: dict[str, type[Command]] = {each.__name__: each for each in Command.__args__}
+EVENT_CLASSES: dict[str, type[Event]] = {each.__name__: each for each in Event.__args__}
 
-# Made once: `json.dumps` makes another for each line that isn't written in its own way, and `json.loads` guesses at the
-# encoding of each; together that is a third of what the two ends of this socket do for a line.
-_ENCODER = json.JSONEncoder(default=fields)
-_DECODER = json.JSONDecoder()
+# Created once. `json.dumps` creates an encoder for each line with a `default`, and `json.loads` guesses the encoding of
+# each line. Together that is a third of the cost of a line at both ends of the socket.
+_JSON_ENCODER = json.JSONEncoder(default=fields)
+_JSON_DECODER = json.JSONDecoder()
 
 
 def encode(message: Command | Event) -> bytes:
-    """Return the message as a line."""
-    return _ENCODER.encode({"kind": type(message).__name__, **fields(message)}).encode() + b"\n"
+    """Return a message as a line."""
+    return _JSON_ENCODER.encode({"kind": type(message).__name__, **fields(message)}).encode() + b"\n"
 
 
-def decode(line: bytes, kinds: Mapping[str, type[_M]]) -> _M:
-    """Return the message in a line, one of `COMMANDS` or `EVENTS`; ValueError, TypeError or KeyError if it has none."""
-    fields = _DECODER.decode(line.decode())
-    if not isinstance(fields, dict):
+def decode(line: bytes, classes: Mapping[str, type[_M]]) -> _M:
+    """Return the message in a line, as one of `COMMAND_CLASSES` or `EVENT_CLASSES`.
+
+    Raises:
+        ValueError, TypeError, KeyError: the line is no such message.
+    """
+    content = _JSON_DECODER.decode(line.decode())
+    if not isinstance(content, dict):
         raise TypeError("a message is a JSON object")
-    kind = kinds[fields.pop("kind")]
-    if kind is Voices:
-        fields["voices"] = tuple(Voice(**each) for each in fields["voices"])
-    return kind(**fields)
+    message_class = classes[content.pop("kind")]
+    if message_class is VoiceList:
+        content["voices"] = tuple(Voice(**each) for each in content["voices"])
+    return message_class(**content)

@@ -16,7 +16,7 @@ from talkcli.terminal.text import printable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from talkcli.engine.protocol import Loaded, Ready
+    from talkcli.engine.protocol import Ready, VoiceLoaded
     from talkcli.goals.goal import By, Sender
     from talkcli.goals.record import Record
 
@@ -46,7 +46,7 @@ def ready(engine: Ready, for_player: Sequence[str]) -> None:
     line(words)
 
 
-def loaded(voice: Loaded) -> None:
+def loaded(voice: VoiceLoaded) -> None:
     """Write the line of a neural voice that can be spoken with from now on, or can't."""
     if voice.error is None:
         line(f"voice {shown(voice.voice)} loaded in {voice.seconds:.1f} s")

@@ -17,7 +17,7 @@ from talkcli.daemon import log
 from talkcli.daemon.systemd import Systemd
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import Supervisor
-from talkcli.engine.protocol import START_LIMIT
+from talkcli.engine.protocol import START_LIMIT_S
 from talkcli.engine.voices import is_neural
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, limits
 from talkcli.frozen import frozen, replace
@@ -161,7 +161,7 @@ class Server:
             if voice or settings.driver:
                 # Who asked for what can't be had is told so, and nothing else.
                 with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT)
+                    await asyncio.wait_for(speech.engine_known.wait(), START_LIMIT_S)
             if not self._scheduler.closing:
                 self._systemd.ready()
                 log.line(f"ready on {self._listener.path} (pid {os.getpid()})")

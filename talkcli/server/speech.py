@@ -109,16 +109,16 @@ class Speech:
         self._takes: dict[type[Report], Callable[[Any], None]] = {
             protocol.Ready: self._ready,
             protocol.StartFailed: self._start_failed,
-            protocol.Voices: self._voices_known,
-            protocol.Loaded: self._loaded,
-            protocol.Unloaded: self._unloaded,
-            protocol.Grown: self._grown,
-            protocol.Speaks: self._speaks,
+            protocol.VoiceList: self._voices_known,
+            protocol.VoiceLoaded: self._loaded,
+            protocol.VoiceUnloaded: self._unloaded,
+            protocol.VoiceMemory: self._grown,
+            protocol.VoiceChosen: self._speaks,
             protocol.Word: self._word,
-            protocol.Output: self._output,
-            protocol.Paused: self._paused,
+            protocol.OutputChanged: self._output,
+            protocol.Held: self._paused,
             protocol.Ended: self._ended,
-            EngineSaid: lambda said: log.line(f"engine: {log.shown(said.words)}"),
+            EngineSaid: lambda said: log.line(f"engine: {log.shown(said.line)}"),
             EngineDied: self._died,
             EngineMissing: self._missing,
             ThreadDied: self._thread_died,
@@ -191,7 +191,7 @@ class Speech:
         goals = (self._asked(each) for each in self.scheduler.unfinished() if each.voice is None)
         return list(filter(is_neural, dict.fromkeys(map(model_of, goals))))
 
-    def _loaded(self, loaded: protocol.Loaded) -> None:
+    def _loaded(self, loaded: protocol.VoiceLoaded) -> None:
         server_log.loaded(loaded)
         self.voices.warm = self.voices.warm or loaded.seconds > 0
         self.voices.loaded(loaded.voice, loaded.error, elapsed())
@@ -199,7 +199,7 @@ class Speech:
         self._drop_excess()
         self.apply(self.scheduler.tick(self._now()))
 
-    def _grown(self, grown: protocol.Grown) -> None:
+    def _grown(self, grown: protocol.VoiceMemory) -> None:
         self.voices.grown(grown.voice, grown.memory)
         self._drop_excess()
         self._load_next()
@@ -219,18 +219,18 @@ class Speech:
         if words:
             log.line(log.shown(words))
 
-    def _unloaded(self, unloaded: protocol.Unloaded) -> None:
+    def _unloaded(self, unloaded: protocol.VoiceUnloaded) -> None:
         self.voices.unloaded(unloaded.voice, self._needed())
         if unloaded.voice in self.voices.neural:
             self.scheduler.loading.wait_for(unloaded.voice)
         self._load_next()
 
-    def _speaks(self, speaks: protocol.Speaks) -> None:
+    def _speaks(self, speaks: protocol.VoiceChosen) -> None:
         active = self.scheduler.active
         if active is not None and active.id == speaks.id:
             self.scheduler.spoken_by(speaks.id, speaks.voice)
-            if speaks.why:
-                log.line(log.shown(f"{speaks.id} is spoken by {speaks.voice}: {speaks.why}"))
+            if speaks.fallback_reason:
+                log.line(log.shown(f"{speaks.id} is spoken by {speaks.voice}: {speaks.fallback_reason}"))
             self._load_next()  # its own may be dropped now
 
     def for_silence(self, record: Record) -> Place:
@@ -322,17 +322,19 @@ class Speech:
             chosen["voice_only"] = False
         elif chosen["voice_only"]:
             if why := self.voices.failure(model_of(chosen["voice"])):
-                self.report(protocol.Ended(record.id, protocol.FAILED, "voice_failed", why))
+                self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, "voice_failed", why))
                 return
             chosen["pitch"] = INITIAL.pitch  # another is for voices that have one
-        self.engine.say(protocol.Say(record.id, record.text or "", followed=followed, by_neural=by_neural, **chosen))
+        self.engine.say(
+            protocol.Speak(record.id, record.text or "", next_waits=followed, next_is_neural=by_neural, **chosen)
+        )
 
     def _tell_followed(self) -> None:
         """Have the engine know that a goal waits behind the one it speaks: it makes good what the change will take."""
         active, following = self.scheduler.active, self._following()
         if active and following != self._followed:
             self._followed = following
-            self.engine.follow(active.id, *following)
+            self.engine.announce_next(active.id, *following)
 
     def _following(self) -> tuple[bool, bool]:
         """Return whether a goal waits, and whether it asks for a neural voice."""
@@ -383,7 +385,7 @@ class Speech:
         self._reports_due = True
         self._loop.call_soon(self._take_reports)
 
-    def _voices_known(self, voices: protocol.Voices) -> None:
+    def _voices_known(self, voices: protocol.VoiceList) -> None:
         self.voices.listed = voices.voices
         go_on(self.for_voices)
 
@@ -393,10 +395,10 @@ class Speech:
         if given_up:
             log.line(log.shown(f"voice {given_up} is left alone: {self.voices.failure(given_up)}"))
         self._set_timer()
-        self._engine_fails(died.words)
+        self._engine_fails(died.message)
 
     def _missing(self, missing: EngineMissing) -> None:
-        self.apply(self.scheduler.engine_missing(missing.words, self.now()))
+        self.apply(self.scheduler.engine_missing(missing.message, self.now()))
 
     def _ready(self, ready: protocol.Ready) -> None:
         if self.ready is None and ready.voice is not None:
@@ -411,11 +413,11 @@ class Speech:
         self.apply(self.scheduler.engine_ready(now))
 
     def _start_failed(self, failed: protocol.StartFailed) -> None:
-        if failed.usage and self.ready is None:
+        if failed.usage_error and self.ready is None:
             self.lost(UsageError(failed.message))
             return
         self._engine_fails(failed.message)
-        if failed.lasting:
+        if failed.permanent:
             self.engine_known.set()
             # None will come: goals need not wait to be told.
             self.apply(self.scheduler.engine_ready(self.now()))
@@ -429,10 +431,12 @@ class Speech:
 
     def _thread_died(self, died: ThreadDied) -> None:
         """End: there is nothing left that could speak, and a supervisor will start another server."""
-        self._engine_fails(died.words)
-        self.lost(TalkError(died.words))
+        self._engine_fails(died.message)
+        self.lost(TalkError(died.message))
         if self.scheduler.active:
-            self.apply(self.scheduler.failed(self.scheduler.active.id, "engine_failed", died.words, None, self._now()))
+            self.apply(
+                self.scheduler.failed(self.scheduler.active.id, "engine_failed", died.message, None, self._now())
+            )
 
     def _ended(self, ended: protocol.Ended) -> None:
         now = self.now()
@@ -441,9 +445,9 @@ class Speech:
             return  # it was given up before the engine came to its end, perhaps just now
         if self.ready and ended.player:  # status shows what plays, not what was tried first
             self.ready = replace(self.ready, player=ended.player)
-        if ended.outcome == protocol.COMPLETED:
+        if ended.outcome == protocol.OUTCOME_COMPLETED:
             effects = self.scheduler.completed(ended.id, ended.duration, now, ended.gaps, ended.gap_seconds)
-        elif ended.outcome == protocol.STOPPED and active.stop_since is not None:
+        elif ended.outcome == protocol.OUTCOME_STOPPED and active.stop_since is not None:
             effects = self.scheduler.stopped(ended.id, now)
         else:
             reason, words = ended.reason or "engine_failed", ended.message or "the engine stopped by itself"
@@ -458,12 +462,12 @@ class Speech:
         text = (record.text or "")[word.start : word.end]
         self.news.tell([partial(self.subscribers.heard, word, text, time.time())])
 
-    def _output(self, told: protocol.Output) -> None:
+    def _output(self, told: protocol.OutputChanged) -> None:
         active = self.scheduler.active
         if active is not None and active.id == told.id:
             self.scheduler.goes_to(told.id, Output.from_json(told.output))
 
-    def _paused(self, paused: protocol.Paused) -> None:
+    def _paused(self, paused: protocol.Held) -> None:
         active = self.scheduler.active
         if active is not None and active.id == paused.id and active.paused and active.holds == paused.number:
             self.silent = active

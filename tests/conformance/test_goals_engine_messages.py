@@ -47,13 +47,13 @@ def does(word, said):
     elif name == "stop?":
         assert isinstance(next(arriving), protocol.Stop)
 
-commands = (protocol.decode(line.rstrip(b"\\n"), protocol.COMMANDS) for line in open(0, "rb", closefd=False))
-arriving = (each for each in commands if not isinstance(each, protocol.Followed))
+commands = (protocol.decode(line.rstrip(b"\\n"), protocol.COMMAND_CLASSES) for line in open(0, "rb", closefd=False))
+arriving = (each for each in commands if not isinstance(each, protocol.NextGoal))
 for command in arriving:
     if isinstance(command, protocol.Configure):
         send(protocol.Ready("scripted", None, None))
-        send(protocol.Voices(()))
-    elif isinstance(command, protocol.Say):
+        send(protocol.VoiceList(()))
+    elif isinstance(command, protocol.Speak):
         for word in command.text.split():
             does(word, command)
 """

@@ -88,7 +88,7 @@ class Spawned:
         self.liveness, inherited = os.pipe()
         settings = "".join(f"playback.{name} = {value}\n" for name, value in (limits or {}).items())
         if alive_every is not None:
-            settings += f"from talkcli.engine import protocol\nprotocol.ALIVE_EVERY = {alive_every}\n"
+            settings += f"from talkcli.engine import protocol\nprotocol.ALIVE_INTERVAL_S = {alive_every}\n"
         path = f"import sys\nsys.path[:] = {sys.path!r}\n"
         code = f"{path}{before}\nfrom talkcli.engine.child import playback\n{settings}"
         with theirs:
@@ -124,7 +124,7 @@ class Spawned:
 
     def send(self, *commands: protocol.Command) -> None:
         """Send commands in one piece, so that they are read at once."""
-        self._unfinished.update(each.id for each in commands if isinstance(each, protocol.Say))
+        self._unfinished.update(each.id for each in commands if isinstance(each, protocol.Speak))
         self._socket.sendall(b"".join(map(protocol.encode, commands)))
 
     def leave(self) -> None:
@@ -144,24 +144,26 @@ class Spawned:
         voice: str | None = None,
         pitch: int = 50,
         lead_in: int | None = None,
-        followed: bool = False,
+        next_waits: bool = False,
         voice_only: bool | None = None,
     ) -> None:
         if voice_only is None:
             voice_only = voice is not None and is_neural(voice)  # what is asked for is heard, or it fails
         rate = rate or self._rate
-        self.send(protocol.Say(goal, text, rate, 1.0, voice, pitch, followed, lead_in=lead_in, voice_only=voice_only))
+        self.send(
+            protocol.Speak(goal, text, rate, 1.0, voice, pitch, next_waits, lead_in=lead_in, voice_only=voice_only)
+        )
 
     def pause(self, goal: str = "g1") -> float:
         """Hold the sentence and return the seconds until the process said that it is silent."""
         asked = time.monotonic()
         self._pauses += 1
-        self.send(protocol.Pause(goal, self._pauses))
-        assert self.until(protocol.Paused) == protocol.Paused(goal, self._pauses)
+        self.send(protocol.Hold(goal, self._pauses))
+        assert self.until(protocol.Held) == protocol.Held(goal, self._pauses)
         return time.monotonic() - asked
 
     def resume(self, goal: str = "g1") -> None:
-        self.send(protocol.Resume(goal))
+        self.send(protocol.Continue(goal))
 
     def until_word(self, number: int = 1) -> protocol.Word:
         """Return the word of this number, or the first one after it."""
@@ -174,7 +176,7 @@ class Spawned:
         asked = time.monotonic()
         self.send(protocol.Stop(goal))
         ended = self.until(protocol.Ended)
-        assert (ended.id, ended.outcome) == (goal, protocol.STOPPED), ended
+        assert (ended.id, ended.outcome) == (goal, protocol.OUTCOME_STOPPED), ended
         return time.monotonic() - asked
 
     def event(self) -> protocol.Event | None:
@@ -187,7 +189,7 @@ class Spawned:
                 return None
             self._rest += data
         line, self._rest = self._rest.split(b"\n", 1)
-        event = protocol.decode(line, protocol.EVENTS)
+        event = protocol.decode(line, protocol.EVENT_CLASSES)
         self.events.append(event)
         if isinstance(event, protocol.Ended):
             self._unfinished.discard(event.id)
@@ -245,7 +247,7 @@ class Shared:
         if self._engine is None or not self._engine.idle or failed != self._failed:
             self.close()
             self._engine, self._failed = self._stack.enter_context(self._start()), failed
-            self._engine.until(protocol.Voices)
+            self._engine.until(protocol.VoiceList)
         self._engine.events.clear()
         return self._engine
 

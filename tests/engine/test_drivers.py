@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.child.players.base import Interest
-    from talkcli.engine.child.session import Session
+    from talkcli.engine.child.runner import GoalRunner
     from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings, Synthesizer
 
 #: The parts of a driver that all have here: it has no properties, and puts itself among pyttsx3's.
@@ -119,14 +119,14 @@ def test_the_dummy_driver_lists_its_voices() -> None:
     with Spawned(driver="dummy") as engine:
         ready = engine.until(protocol.Ready)
         assert (ready.driver, ready.player) == ("dummy", None)
-        assert engine.until(protocol.Voices).voices[0].id == "dummy.voice1"
+        assert engine.until(protocol.VoiceList).voices[0].id == "dummy.voice1"
 
 
 @pytest.mark.parametrize(("driver", "before"), [("dummy", ""), ("slow", SLOW_DRIVER)])
 def test_a_driver_is_stepped_to_the_end_of_each_sentence_and_reports_words(driver: str, before: str) -> None:
     with Spawned(driver=driver, before=before) as engine:
         for goal in ("g1", "g2"):
-            assert engine.spoken("battery low", goal).outcome == protocol.COMPLETED
+            assert engine.spoken("battery low", goal).outcome == protocol.OUTCOME_COMPLETED
             assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
 
 
@@ -143,10 +143,10 @@ def test_an_option_that_the_driver_lacks_fails_the_goal(
     engine: Spawned, more: dict[str, Any], reason: str, message: str
 ) -> None:
     ended = engine.spoken("yes", **more)
-    assert (ended.outcome, ended.reason) == (protocol.FAILED, reason)
+    assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, reason)
     assert ended.message is not None
     assert message in ended.message
-    assert engine.spoken("yes", "g2", rate=150, lead_in=0).outcome == protocol.COMPLETED
+    assert engine.spoken("yes", "g2", rate=150, lead_in=0).outcome == protocol.OUTCOME_COMPLETED
 
 
 @limits()
@@ -157,12 +157,12 @@ def test_a_stop_of_a_slow_driver_ends_when_it_says_so_and_an_error_of_it_fails_i
         assert_within(engine.stop(), 0.15, "the stop")
         ended = engine.spoken("raise", "g2")
         assert (ended.reason, ended.message) == ("engine_failed", "RuntimeError: no tongue")
-        assert engine.spoken("yes", "g3").outcome == protocol.COMPLETED
+        assert engine.spoken("yes", "g3").outcome == protocol.OUTCOME_COMPLETED
 
 
 def _timed(text: str = "battery low, please come home") -> Spawned:
     engine = Spawned(driver="timed", before=TIMED_DRIVER, alive_every=0.3)
-    engine.until(protocol.Voices)
+    engine.until(protocol.VoiceList)
     engine.say(text)
     return engine
 
@@ -180,7 +180,7 @@ def test_a_driver_without_a_pause_goes_on_from_the_last_word_each_time() -> None
             assert engine.pause() >= 0.2, "it is silent only when the driver says so"
             assert isinstance(engine.event(), protocol.Alive)
             engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert [word.start for word in engine.words()] == [0, 8, 13, 20, 25]
         assert [word.number for word in engine.words()] == [1, 2, 3, 4, 5]
         assert engine.words()[-1].time < 0.5 + 2 * (0.2 + 0.1 + 0.15), "the pauses do not count"
@@ -192,7 +192,7 @@ def test_a_driver_that_has_not_said_a_word_says_all_of_it_after_a_pause() -> Non
         engine.until(protocol.Started)
         engine.pause()
         engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert len(engine.words()) == 5
         assert set(_texts(engine)) == {"battery low, please come home"}
 
@@ -200,11 +200,11 @@ def test_a_driver_that_has_not_said_a_word_says_all_of_it_after_a_pause() -> Non
 def test_a_driver_that_is_resumed_before_it_is_silent_goes_on_when_it_is() -> None:
     with _timed() as engine:
         engine.until(protocol.Word)
-        engine.send(protocol.Pause("g1", 1))
+        engine.send(protocol.Hold("g1", 1))
         engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert len(engine.words()) == 5
-        assert not any(isinstance(event, protocol.Paused) for event in engine.events)
+        assert not any(isinstance(event, protocol.Held) for event in engine.events)
 
 
 @pytest.mark.parametrize("silent", [True, False])
@@ -214,26 +214,28 @@ def test_a_stop_ends_a_driver_that_is_paused(silent: bool) -> None:
         if silent:
             engine.pause()
         else:
-            engine.send(protocol.Pause("g1", 1))
+            engine.send(protocol.Hold("g1", 1))
         engine.send(protocol.Stop("g1"))
-        assert engine.until(protocol.Ended) == protocol.Ended("g1", protocol.STOPPED)
-        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+        assert engine.until(protocol.Ended) == protocol.Ended("g1", protocol.OUTCOME_STOPPED)
+        assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
         assert _texts(engine) == ["battery low, please come home", "yes"]
 
 
 @limits()
 def test_a_driver_that_never_ends_shows_no_sign_of_life_after_a_while() -> None:
-    patience = "from talkcli.engine.child import session\nsession.PATIENCE, session.WORDS_A_CHARACTER = 0.7, 0\n"
+    patience = (
+        "from talkcli.engine.child import runner\nrunner.DRIVER_LIMIT_S, runner.MAX_WORDS_PER_CHARACTER = 0.7, 0\n"
+    )
     never = "Driver.stop = lambda self: None\nDriver.END = 1e9\n"
     with Spawned(driver="slow", before=patience + SLOW_DRIVER + never) as engine:
-        engine.until(protocol.Voices)
+        engine.until(protocol.VoiceList)
         engine.say("battery low")
         engine.until_word(2)
         began = time.monotonic()
         alive = 0
-        while select.select([engine._socket], [], [], 2 * protocol.ALIVE_EVERY + 0.2)[0]:
+        while select.select([engine._socket], [], [], 2 * protocol.ALIVE_INTERVAL_S + 0.2)[0]:
             assert isinstance(engine.event(), protocol.Alive)
-            assert_within(time.monotonic() - began, 0.7 + protocol.ALIVE_EVERY + 0.2, "the last sign of life")
+            assert_within(time.monotonic() - began, 0.7 + protocol.ALIVE_INTERVAL_S + 0.2, "the last sign of life")
             alive += 1
         assert alive == 1
         assert _processor(engine.process.pid) < 0.5, "it spins"
@@ -253,7 +255,7 @@ def test_the_wheels_library_serves_if_the_system_has_none() -> None:
         version = engine.until(protocol.Ready).version
         assert version is not None
         assert version.endswith("(espeakng-loader)")
-        assert engine.spoken("yes").outcome == protocol.COMPLETED
+        assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
 
 
 #: A library that has not even talk's own voice.
@@ -274,30 +276,34 @@ espeak.load = without_english
         (
             {"before": NO_LIBRARY + "sys.modules['espeakng_loader'] = None"},
             ["libespeak-ng is missing (libespeak-ng.so.1: ", f"): {install.espeak_library()}"],
-            {"lasting": True},
+            {"permanent": True},
         ),
         (
             {"before": WITHOUT_ENGLISH},
             ['the driver "talk_espeak" cannot be started: UnknownVoice: en'],
-            {"lasting": False},
+            {"permanent": False},
         ),
         (
             {"before": "sys.modules['pyttsx3'] = None"},
             ["pyttsx3 is missing (", f"): {install.command('pyttsx3')}"],
-            {"lasting": True},
+            {"permanent": True},
         ),
-        ({"driver": "parrot"}, ['unknown driver "parrot": there are ', "dummy"], {"usage": True}),
-        ({"driver": "nsss"}, ["the driver \"nsss\" cannot be loaded: No module named 'objc'"], {"usage": True}),
+        ({"driver": "parrot"}, ['unknown driver "parrot": there are ', "dummy"], {"usage_error": True}),
+        ({"driver": "nsss"}, ["the driver \"nsss\" cannot be loaded: No module named 'objc'"], {"usage_error": True}),
         (
             {"driver": "slow", "before": SLOW_DRIVER + "\nDriver.iterate = lambda self: None"},
             ['the driver "slow" cannot be stepped', "leave --driver out"],
-            {"usage": True},
+            {"usage_error": True},
         ),
-        ({"voice": "en-uss"}, ["did you mean 'en-us'"], {"reason": "unknown_voice", "lasting": True, "usage": True}),
+        (
+            {"voice": "en-uss"},
+            ["did you mean 'en-us'"],
+            {"reason": "unknown_voice", "permanent": True, "usage_error": True},
+        ),
         (
             {"driver": "dummy", "voice": "piper/en_US-joe-medium"},
             ['"piper/en_US-joe-medium" is a neural voice, and the driver "dummy" has none: leave --driver out'],
-            {"reason": "unknown_voice", "lasting": True, "usage": True},
+            {"reason": "unknown_voice", "permanent": True, "usage_error": True},
         ),
     ],
 )
@@ -316,7 +322,7 @@ def test_a_start_that_fails_says_what_to_install_or_to_change(
 def test_espeak_means_talks_own_driver() -> None:
     with Spawned(driver="espeak") as engine:
         assert engine.until(protocol.Ready).driver == "espeak"
-        assert engine.spoken("yes").outcome == protocol.COMPLETED
+        assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
 
 
 # -- our own driver
@@ -340,8 +346,8 @@ class Told:
         self.at_word: Callable[[], None] = lambda: None
         self.at_wait: Callable[[], None] = lambda: None
         self.players = PlayerChooser(protocol.Configure(0, None, player, None, None))
-        self.held = 0
-        register(_NAME, synthesizer or Scripted(), cast("Session", self))
+        self.hold_number = 0
+        register(_NAME, synthesizer or Scripted(), cast("GoalRunner", self))
         self.engine: Any = Engine(_NAME)
         for topic in ("started-utterance", "started-word", "finished-utterance", "error"):
             self.engine.connect(topic, self._note(topic))
@@ -363,7 +369,7 @@ class Told:
         poll.poll(None if until is None else max(0.0, until - time.monotonic()) * 1000)
         self.at_wait()
 
-    def tell_voice(self, _voice: str, _why: str | None) -> None:
+    def report_voice(self, _voice: str, _why: str | None) -> None:
         pass
 
     def spoken(self, text: str, name: str) -> list[tuple[str, dict[str, Any]]]:

@@ -96,22 +96,26 @@ def _engine(place: Path, player: str = "null", sink: Mapping[str, str] | None = 
 
 
 def _failed(ended: protocol.Ended, reason: str = "voice_failed") -> str:
-    assert (ended.outcome, ended.reason) == (protocol.FAILED, reason), ended
+    assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, reason), ended
     return ended.message or ""
 
 
-def _loaded(engine: Spawned) -> list[protocol.Loaded]:
-    return [each for each in engine.events if isinstance(each, protocol.Loaded)]
+def _loaded(engine: Spawned) -> list[protocol.VoiceLoaded]:
+    return [each for each in engine.events if isinstance(each, protocol.VoiceLoaded)]
 
 
 def _speaks(engine: Spawned, goal: str) -> list[tuple[str, str | None]]:
-    return [(each.voice, each.why) for each in engine.events if isinstance(each, protocol.Speaks) and each.id == goal]
+    return [
+        (each.voice, each.fallback_reason)
+        for each in engine.events
+        if isinstance(each, protocol.VoiceChosen) and each.id == goal
+    ]
 
 
 def test_a_neural_voice_speaks_with_its_words_and_espeak_before_and_after(engine: Spawned) -> None:
     for number, voice in enumerate([None, VOICE, "en-us", VOICE[:8], None]):
         ended = engine.spoken(TEXT, f"g{number}", voice=voice)
-        assert ended.outcome == protocol.COMPLETED, ended
+        assert ended.outcome == protocol.OUTCOME_COMPLETED, ended
         words = [TEXT[each.start : each.end] for each in engine.words(f"g{number}")]
         assert words == ["battery", "low", "please", "come", "home"]
 
@@ -122,7 +126,7 @@ def test_any_rate_of_samples_goes_into_a_file(place: Path, tmp_path: Path, rate:
     target = tmp_path / "out.wav"
     with _engine(place, f"file:{target}") as engine:
         ended = engine.spoken(TEXT, voice="piper/other")
-    assert ended.outcome == protocol.COMPLETED
+    assert ended.outcome == protocol.OUTCOME_COMPLETED
     with wave.open(str(target)) as file:
         assert file.getframerate() == rate
         assert file.getnframes() / rate == pytest.approx(ended.duration, abs=0.01)
@@ -131,7 +135,7 @@ def test_any_rate_of_samples_goes_into_a_file(place: Path, tmp_path: Path, rate:
 def test_a_speaker_is_named_behind_the_voice(place: Path, engine: Spawned) -> None:
     tiny_voice.put(place, "many", tiny_voice.model(speakers=3), tiny_voice.description(speakers=3))
     for number, voice in enumerate(["piper/many", "piper/many#2", "piper/many#p1"]):
-        assert engine.spoken("a", f"g{number}", voice=voice).outcome == protocol.COMPLETED
+        assert engine.spoken("a", f"g{number}", voice=voice).outcome == protocol.OUTCOME_COMPLETED
     message = _failed(engine.spoken("a", "g8", voice="piper/many#3"), "unknown_voice")
     assert 'it has no speaker "3": it has 3 speakers, 0 to 2' in message
     message = _failed(engine.spoken("a", "g9", voice=f"{VOICE}#1"), "unknown_voice")
@@ -142,7 +146,7 @@ def test_a_voice_that_is_put_there_while_it_runs_is_found(place: Path, engine: S
     message = _failed(engine.spoken("a", "g1", voice="piper/late"), "unknown_voice")
     assert 'unknown voice "piper/late"' in message
     tiny_voice.put(place, "late")
-    assert engine.spoken("a", "g2", voice="piper/late").outcome == protocol.COMPLETED
+    assert engine.spoken("a", "g2", voice="piper/late").outcome == protocol.OUTCOME_COMPLETED
 
 
 def test_a_name_is_no_path(place: Path, engine: Spawned) -> None:
@@ -155,10 +159,10 @@ def test_a_name_is_no_path(place: Path, engine: Spawned) -> None:
 def test_the_json_of_a_voice_is_read_again_with_each_load(place: Path, engine: Spawned) -> None:
     """It is no secret kept by the process: a voice that is dropped is another when it is loaded again."""
     tiny_voice.put(place, "changes")
-    assert engine.spoken("a", "g1", voice="piper/changes").outcome == protocol.COMPLETED
+    assert engine.spoken("a", "g1", voice="piper/changes").outcome == protocol.OUTCOME_COMPLETED
     (place / "changes.onnx.json").write_text(json.dumps({"audio": {}}))
-    assert engine.spoken("a", "g2", voice="piper/changes").outcome == protocol.COMPLETED
-    engine.send(protocol.Drop("piper/changes"))
+    assert engine.spoken("a", "g2", voice="piper/changes").outcome == protocol.OUTCOME_COMPLETED
+    engine.send(protocol.DropVoice("piper/changes"))
     assert "does not describe a voice" in _failed(engine.spoken("a", "g3", voice="piper/changes"))
 
 
@@ -168,10 +172,10 @@ def test_unknown_sounds_are_left_out_and_a_text_of_nothing_else_fails(place: Pat
     about["phoneme_id_map"] = {"_": [0], "^": [1], "$": [2], "a": [3], "\u00e6": [4]}
     tiny_voice.put(place, "few", beside=about)
     text = "Cat! " + "See! " * 12 + "Cat!"
-    assert engine.spoken(text, "g1", voice="piper/few").outcome == protocol.COMPLETED
+    assert engine.spoken(text, "g1", voice="piper/few").outcome == protocol.OUTCOME_COMPLETED
     # It lacks the first sound of "cat", and all of "see". A sentence of which a part is heard tells all of its words.
     assert [text[each.start : each.end] for each in engine.words("g1")] == ["Cat", "Cat"]
-    assert engine.spoken("See a cat see.", "g3", voice="piper/few").outcome == protocol.COMPLETED
+    assert engine.spoken("See a cat see.", "g3", voice="piper/few").outcome == protocol.OUTCOME_COMPLETED
     told = [each.time for each in engine.words("g3")]
     assert len(told) == 4
     assert told == sorted(told)
@@ -188,8 +192,8 @@ import atexit, sys
 atexit.register(lambda: sys.stderr.write(repr([each for each in {NEURAL_MODULES!r} if each in sys.modules])))
 """
     with _engine(place, before=report) as engine:
-        assert VOICE in {each.id for each in engine.until(protocol.Voices).voices}
-        assert engine.spoken("yes").outcome == protocol.COMPLETED
+        assert VOICE in {each.id for each in engine.until(protocol.VoiceList).voices}
+        assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
         assert engine.errors() == "[]"
 
@@ -202,10 +206,10 @@ def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package:
         message = _failed(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
         assert f"{VOICE} is listed, but it cannot be loaded" in message
         assert install.neural() in message
-        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+        assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
     with _engine(tmp_path / "voices", before=before, voice=VOICE) as engine:
         failed = engine.until(protocol.StartFailed)
-        assert failed.usage
+        assert failed.usage_error
         assert install.neural() in failed.message
 
 
@@ -237,15 +241,15 @@ def _put_wrong(place: Path, wrong: str) -> str:
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_fault_of_a_voices_files_ends_one_goal_in_words(place: Path, engine: Spawned, wrong: str) -> None:
     """And it is no reason to be silent for ever: the process lives, and a file that is mended is taken at once."""
-    engine.send(protocol.Drop("piper/wrong"))
+    engine.send(protocol.DropVoice("piper/wrong"))
     words = _put_wrong(place, wrong)
     message = _failed(engine.spoken(TEXT, "g1", voice="piper/wrong"))
     assert words in message
     assert str(place / "wrong.onnx") in message
-    assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
+    assert engine.spoken(TEXT, "g2").outcome == protocol.OUTCOME_COMPLETED
     assert words in _failed(engine.spoken(TEXT, "g3", voice="piper/wrong"))
     tiny_voice.put(place, "wrong")
-    assert engine.spoken(TEXT, "g4", voice="piper/wrong").outcome == protocol.COMPLETED
+    assert engine.spoken(TEXT, "g4", voice="piper/wrong").outcome == protocol.OUTCOME_COMPLETED
 
 
 @pytest.mark.parametrize(("wrong", "instead"), [("silent", "gmw/en-US"), ("unknown language", "gmw/en")])
@@ -253,12 +257,12 @@ def test_a_voice_that_fails_at_once_is_no_reason_for_silence(
     place: Path, engine: Spawned, wrong: str, instead: str
 ) -> None:
     """Nor is it given up for that: the next text may be another."""
-    engine.send(protocol.Drop("piper/wrong"))
+    engine.send(protocol.DropVoice("piper/wrong"))
     _put_wrong(place, wrong)
-    engine.send(protocol.Load("piper/wrong"))
-    assert engine.until(protocol.Loaded).error is None
+    engine.send(protocol.LoadVoice("piper/wrong"))
+    assert engine.until(protocol.VoiceLoaded).error is None
     for goal in ("g1", "g2"):
-        assert engine.spoken(TEXT, goal, voice="piper/wrong", voice_only=False).outcome == protocol.COMPLETED
+        assert engine.spoken(TEXT, goal, voice="piper/wrong", voice_only=False).outcome == protocol.OUTCOME_COMPLETED
         (first, why), (second, words) = _speaks(engine, goal)
         assert (first, why, second) == ("piper/wrong", None, instead)
         assert words is not None
@@ -270,15 +274,15 @@ def test_a_machine_without_memory_for_a_model_says_so_and_speaks_on(real: dict[s
     """With espeak at once, and with the voice when there is memory again. The cached halves stay."""
     target = f"file:{tmp_path / 'out.wav'}"
     with Spawned(target, environment=real) as engine:
-        assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.COMPLETED
+        assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
         kept = _kept(real)
     with Spawned(target, environment=real) as engine:
         with _little_memory(engine, 350 << 20):
             message = _failed(engine.spoken(TEXT, "g1", voice=REAL_VOICE))
             assert "there is no memory for it; end another program" in message
             assert "en_US-joe-medium.onnx" in message
-            assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
-        assert engine.spoken("a", "g3", voice=REAL_VOICE).outcome == protocol.COMPLETED
+            assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
+        assert engine.spoken("a", "g3", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
     assert kept == _kept(real)
 
 
@@ -312,12 +316,12 @@ def test_little_memory_ends_a_sentence_once_and_the_next_is_espeaks(tmp_path: Pa
         except AssertionError:
             engine.process.wait(20)
             return
-        if ended.outcome == protocol.COMPLETED:
+        if ended.outcome == protocol.OUTCOME_COMPLETED:
             assert megabytes > 300, "so much it takes"
         else:
             message = _failed(ended)
             assert "there is no memory for it; end another program" in message or install.neural() in message
-        assert engine.spoken(TEXT, "g2").outcome == protocol.COMPLETED
+        assert engine.spoken(TEXT, "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
 # -- stop and pause
@@ -328,19 +332,19 @@ def test_a_voice_is_held_and_stopped_while_it_is_loaded_and_then_speaks(place: P
     with _engine(place, before=SLOW_TO_LOAD, alive_every=SOON) as engine:
         engine.say(TEXT, voice=VOICE)
         engine.until(protocol.Alive)
-        assert_within(engine.pause(), protocol.STOP_LIMIT, "a pause while the voice is loaded")
+        assert_within(engine.pause(), protocol.STOP_LIMIT_S, "a pause while the voice is loaded")
         held_until = time.monotonic() + 1.2  # past the loading
         while time.monotonic() < held_until:
-            assert isinstance(engine.event(), protocol.Alive | protocol.Grown | protocol.Loaded)
+            assert isinstance(engine.event(), protocol.Alive | protocol.VoiceMemory | protocol.VoiceLoaded)
         engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-        engine.send(protocol.Drop(VOICE))
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+        engine.send(protocol.DropVoice(VOICE))
         engine.say(TEXT, "g2", voice=VOICE)
         for _ in range(3):
             engine.until(protocol.Alive)
-        assert_within(engine.stop("g2"), protocol.STOP_LIMIT, "a stop while the voice is loaded")
-        assert engine.spoken("espeak", "g3").outcome == protocol.COMPLETED
-        assert engine.spoken(TEXT, "g4", voice=VOICE).outcome == protocol.COMPLETED
+        assert_within(engine.stop("g2"), protocol.STOP_LIMIT_S, "a stop while the voice is loaded")
+        assert engine.spoken("espeak", "g3").outcome == protocol.OUTCOME_COMPLETED
+        assert engine.spoken(TEXT, "g4", voice=VOICE).outcome == protocol.OUTCOME_COMPLETED
 
 
 @limits()
@@ -350,7 +354,7 @@ def test_a_voice_is_stopped_and_held_while_the_sounds_of_a_text_are_looked_up(pl
     text = "Go. Dr. Who. " + "电池电量低正在返回充电站" * 800
     tells = f"arguments[0] in seen or seen.append(arguments[0]) or print({asked!r}, file=sys.stderr, flush=True)"
     with _engine(place, before=first(f"synthesizers.espeak:Spelling.{asked}", tells)) as engine:
-        assert engine.spoken("Go. Go", "g0", voice=VOICE).outcome == protocol.COMPLETED
+        assert engine.spoken("Go. Go", "g0", voice=VOICE).outcome == protocol.OUTCOME_COMPLETED
         assert engine.errors_line() == asked
         for number in range(1, 5):
             goal = f"g{number}"
@@ -359,7 +363,7 @@ def test_a_voice_is_stopped_and_held_while_the_sounds_of_a_text_are_looked_up(pl
             if number % 2:
                 assert_within(engine.pause(goal), 0.1, "a pause while sounds are looked up")
             assert_within(engine.stop(goal), 0.02, "a stop while sounds are looked up")
-        assert engine.spoken("espeak", "g20").outcome == protocol.COMPLETED
+        assert engine.spoken("espeak", "g20").outcome == protocol.OUTCOME_COMPLETED
 
 
 @limits()
@@ -368,13 +372,13 @@ def test_a_real_voice_is_held_and_stopped_in_mid_sentence_and_ends_well(
 ) -> None:
     """A thread that is left in an inference would have the process abort, and the log tell of a crash."""
     with Spawned(environment=real) as engine:
-        assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.COMPLETED
+        assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
         engine.say("word " * 500, "g1", voice=REAL_VOICE)
         engine.until(protocol.Word)
         assert_within(engine.pause("g1"), 0.2, "a pause")
         engine.resume("g1")
         engine.until(protocol.Word)
-        assert_within(engine.stop("g1"), protocol.STOP_LIMIT, "a stop")
+        assert_within(engine.stop("g1"), protocol.STOP_LIMIT_S, "a stop")
         engine.say("word " * 500, "g2", voice=REAL_VOICE)
         engine.until(protocol.Word)  # seconds of it are still to be made, ahead of what is heard
         engine.hang_up()
@@ -398,8 +402,8 @@ def test_a_program_that_plays_gets_each_sample_once_whether_it_is_held_or_not(pl
             engine.until(protocol.Alive)
         engine.resume()
         ended = engine.until(protocol.Ended)
-        assert ended.outcome == protocol.COMPLETED
-        assert ended.gap_seconds < protocol.ALIVE_EVERY, "it was held, and that is no gap"
+        assert ended.outcome == protocol.OUTCOME_COMPLETED
+        assert ended.gap_seconds < protocol.ALIVE_INTERVAL_S, "it was held, and that is no gap"
         assert [each.number for each in engine.words()] == [*range(1, 7)]
         heard = player.heard.read_bytes()
         assert len(heard) > len(sentence)
@@ -419,7 +423,7 @@ def test_the_gaps_that_are_heard_are_told_and_words_when_they_are_heard(place: P
         while not isinstance(event := engine.event(), protocol.Ended):
             if isinstance(event, protocol.Word):
                 told.append((time.monotonic(), event.time))
-        assert event.outcome == protocol.COMPLETED
+        assert event.outcome == protocol.OUTCOME_COMPLETED
         recording.wait_until_quiet(0.3)
         # It hums all the time, so any silence is a gap.
         loud = [at for at, each in enumerate(recording.samples) if abs(int(each)) > 1000]
@@ -447,14 +451,14 @@ def test_a_processor_at_a_fifth_of_its_time_speaks_on_with_gaps(real: dict[str, 
             began = time.monotonic()
             ended = engine.spoken(text, voice=REAL_VOICE, rate=200)
             took = time.monotonic() - began
-        assert ended.outcome == protocol.COMPLETED
+        assert ended.outcome == protocol.OUTCOME_COMPLETED
         assert ended.duration is not None
         words = [text[each.start : each.end] for each in engine.words()]
         assert words == text.replace(",", "").rstrip(".").split()
         assert ended.gaps > 2
         first = next(each for each in engine.words()).time
         assert 0.5 < ended.gap_seconds < took - ended.duration + first
-        assert engine.spoken("espeak", "g2").outcome == protocol.COMPLETED
+        assert engine.spoken("espeak", "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
 @contextlib.contextmanager
@@ -482,7 +486,7 @@ def test_a_real_voice_says_a_sentence_with_its_words_in_time(real: dict[str, str
     text = "Battery low. Please come home. I am stuck."
     target = tmp_path / "out.wav"
     with Spawned(f"file:{target}", environment=real) as engine:
-        assert engine.spoken(text, rate=200, voice=REAL_VOICE).outcome == protocol.COMPLETED
+        assert engine.spoken(text, rate=200, voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
         starts = [each.time for each in engine.words() if text[each.start - 2 : each.start] in {"", ". "}]
     with wave.open(str(target)) as file:
         rate, samples = file.getframerate(), array("h", file.readframes(file.getnframes()))
@@ -503,9 +507,9 @@ def test_voices_are_loaded_one_at_a_time_beside_the_speech_and_told_once_each(pl
     tiny_voice.put(place, "second")
     with _engine(place, before=slow) as engine:
         for voice in ("piper/second", VOICE, "piper/second", "piper/nobody", VOICE):
-            engine.send(protocol.Load(voice))
-        assert engine.spoken(TEXT, voice="en", rate=150).outcome == protocol.COMPLETED
-        loaded = [engine.until(protocol.Loaded) for _ in range(3 - len(_loaded(engine)))]
+            engine.send(protocol.LoadVoice(voice))
+        assert engine.spoken(TEXT, voice="en", rate=150).outcome == protocol.OUTCOME_COMPLETED
+        loaded = [engine.until(protocol.VoiceLoaded) for _ in range(3 - len(_loaded(engine)))]
         assert len(loaded) < 3, "some came while it spoke"
     assert [each.voice for each in _loaded(engine)] == ["piper/second", VOICE, "piper/nobody"]
     assert [each.error for each in _loaded(engine)] == [None, None, "piper/nobody: its file is not there any more"]
@@ -518,21 +522,24 @@ def test_a_voice_that_is_not_loaded_or_was_dropped_is_spoken_by_espeak_in_its_la
     _put_wrong(place, "silent")
     with _engine(place) as engine:
         for voice, speaker in [(VOICE, "gmw/en-US"), ("piper/deutsch", "gmw/de"), ("piper/wrong", "gmw/en-US")]:
-            assert engine.spoken(TEXT, voice, voice=voice, voice_only=False).outcome == protocol.COMPLETED
+            assert engine.spoken(TEXT, voice, voice=voice, voice_only=False).outcome == protocol.OUTCOME_COMPLETED
             assert _speaks(engine, voice) == [(speaker, f"{voice} is not loaded")]
             assert len(engine.words(voice)) > 3
         assert _loaded(engine) == [], "espeak in its place loads nothing: that is the server's to decide"
         for voice in (VOICE, "piper/second"):
-            engine.send(protocol.Load(voice))
-            assert engine.until(protocol.Loaded).error is None
-            assert engine.spoken("a", f"{voice} loaded", voice=voice, voice_only=False).outcome == protocol.COMPLETED
+            engine.send(protocol.LoadVoice(voice))
+            assert engine.until(protocol.VoiceLoaded).error is None
+            assert (
+                engine.spoken("a", f"{voice} loaded", voice=voice, voice_only=False).outcome
+                == protocol.OUTCOME_COMPLETED
+            )
             assert _speaks(engine, f"{voice} loaded") == [(voice, None)]
-        engine.send(protocol.Drop(VOICE))
+        engine.send(protocol.DropVoice(VOICE))
         for goal, voice, told in [
             ("dropped", VOICE, ("gmw/en-US", f"{VOICE} is not loaded")),
             ("kept", "piper/second", ("piper/second", None)),
         ]:
-            assert engine.spoken("a", goal, voice=voice, voice_only=False).outcome == protocol.COMPLETED
+            assert engine.spoken("a", goal, voice=voice, voice_only=False).outcome == protocol.OUTCOME_COMPLETED
             assert _speaks(engine, goal) == [told]
 
 
@@ -551,13 +558,13 @@ inference.Model.__init__ = heavier
     tiny_voice.put(place, "second")
     with _engine(place, before=heavy) as engine:
         for voice in (VOICE, "piper/second"):
-            engine.send(protocol.Load(voice))
-            assert engine.until(protocol.Grown).voice == voice
-            assert engine.until(protocol.Loaded).error is None
-        assert engine.spoken("yes").outcome == protocol.COMPLETED  # the thread that loaded it has ended by then
-        engine.send(protocol.Drop("piper/second"))
-        assert engine.until(protocol.Grown).voice == ""
-        sizes = [each.memory for each in engine.events if isinstance(each, protocol.Grown)]
+            engine.send(protocol.LoadVoice(voice))
+            assert engine.until(protocol.VoiceMemory).voice == voice
+            assert engine.until(protocol.VoiceLoaded).error is None
+        assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED  # the thread that loaded it has ended by then
+        engine.send(protocol.DropVoice("piper/second"))
+        assert engine.until(protocol.VoiceMemory).voice == ""
+        sizes = [each.memory for each in engine.events if isinstance(each, protocol.VoiceMemory)]
     assert sizes[0] > 42e6
     assert sizes[1] - sizes[0] > 40e6
     assert sizes[1] - sizes[2] > 35e6, "of each piece its whole pages"
@@ -565,12 +572,12 @@ inference.Model.__init__ = heavier
 
 def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path) -> None:
     hangs = first("synthesizers.inference:Model.__init__", '"other" in arguments[1] and threading.Event().wait()')
-    hangs = f"from talkcli.engine import protocol\nprotocol.LOAD_LIMIT = 0.6\n{hangs}"
+    hangs = f"from talkcli.engine import protocol\nprotocol.LOAD_LIMIT_S = 0.6\n{hangs}"
     tiny_voice.put(place, "other")
     with _engine(place, before=hangs) as engine:
-        engine.send(protocol.Load("piper/other"))
-        engine.send(protocol.Load(VOICE))
-        hung, loaded = engine.until(protocol.Loaded), engine.until(protocol.Loaded)
+        engine.send(protocol.LoadVoice("piper/other"))
+        engine.send(protocol.LoadVoice(VOICE))
+        hung, loaded = engine.until(protocol.VoiceLoaded), engine.until(protocol.VoiceLoaded)
         assert hung.error == "piper/other was not loaded within 0.6 s: are its files on a slow disk?"
         assert (loaded.voice, loaded.error) == (VOICE, None)
         engine.leave()

@@ -84,7 +84,7 @@ def _spoken(texts: Iterable[str], place: Path, env: dict[str, str]) -> Tally:
 def _count(tally: Tally, text: str, ended: protocol.Ended, words: list[protocol.Word]) -> None:
     shown = f"{text[:200]!a} ({len(text)})"
     tally.outcomes[ended.reason or ended.outcome] += 1
-    if ended.outcome == protocol.FAILED:
+    if ended.outcome == protocol.OUTCOME_FAILED:
         if ended.reason != "nothing_to_say" or words:
             tally.faults.append(f"{ended.reason}: {ended.message}: {shown}")
         return
@@ -105,7 +105,7 @@ def _assert_well(tally: Tally, texts: int) -> None:
     assert not tally.faults, tally.faults
     assert not tally.deaths, tally.deaths
     assert tally.outcomes.total() == texts
-    assert tally.outcomes[protocol.COMPLETED] > texts // 2
+    assert tally.outcomes[protocol.OUTCOME_COMPLETED] > texts // 2
 
 
 def test_odd_texts_have_one_end_each(tmp_path: Path, real: dict[str, str]) -> None:

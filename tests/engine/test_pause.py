@@ -39,7 +39,7 @@ time.sleep(max(0, began + taken / 44100 - time.monotonic()))
 
 
 def _say_to_word(engine: Spawned, number: int = 1) -> None:
-    engine.until(protocol.Voices)
+    engine.until(protocol.VoiceList)
     engine.say(TEXT)
     engine.until_word(number)
 
@@ -47,7 +47,7 @@ def _say_to_word(engine: Spawned, number: int = 1) -> None:
 def _go_on_to_the_end(engine: Spawned) -> protocol.Ended:
     engine.resume()
     ended = engine.until(protocol.Ended)
-    assert ended.outcome == protocol.COMPLETED
+    assert ended.outcome == protocol.OUTCOME_COMPLETED
     return ended
 
 
@@ -56,8 +56,8 @@ def _go_on_to_the_end(engine: Spawned) -> protocol.Ended:
 def test_words_stand_still_in_a_pause_and_signs_of_life_go_on(player: Player, program: bool) -> None:
     alive_every = 0.2
     command = player.plays() if program else "null"
-    with Spawned(command, limits={"RELEASE_AFTER": 10.0 if program else 0.3}, alive_every=alive_every) as engine:
-        engine.until(protocol.Voices)
+    with Spawned(command, limits={"RELEASE_DELAY_S": 10.0 if program else 0.3}, alive_every=alive_every) as engine:
+        engine.until(protocol.VoiceList)
         engine.say(TEXT)
         late, before, held = [], 0, 0.0
         while not isinstance(event := engine.event(), protocol.Ended):
@@ -72,7 +72,7 @@ def test_words_stand_still_in_a_pause_and_signs_of_life_go_on(player: Player, pr
                     assert_within(time.monotonic() - last, alive_every + 0.2, "a sign of life")
                     held, last = held + time.monotonic() - last, time.monotonic()
                 engine.resume()
-        assert event.outcome == protocol.COMPLETED
+        assert event.outcome == protocol.OUTCOME_COMPLETED
         assert min(late[before:]) > max(late[:before]) + held - 0.05, "a word came before it was heard"
         assert_within(max(late[before:]), min(late[:before]) + held + 0.3, "a word after the pause")
         times = [word.time for word in engine.words()]
@@ -83,21 +83,21 @@ def test_words_stand_still_in_a_pause_and_signs_of_life_go_on(player: Player, pr
 
 def test_pausing_twice_and_resuming_for_nothing_is_harmless(player: Player) -> None:
     with Spawned(player.plays(), alive_every=SOON) as engine:
-        engine.until(protocol.Voices)
+        engine.until(protocol.VoiceList)
         engine.resume()
         engine.say(TEXT)
         engine.resume()
         engine.until_word()
-        engine.send(protocol.Pause("g0", 1))
+        engine.send(protocol.Hold("g0", 1))
         engine.pause()
-        engine.send(protocol.Pause("g1", 1))
-        engine.send(protocol.Resume("g0"))
+        engine.send(protocol.Hold("g1", 1))
+        engine.send(protocol.Continue("g0"))
         assert isinstance(engine.event(), protocol.Alive)
         engine.resume()
         _go_on_to_the_end(engine)
-        assert sum(isinstance(event, protocol.Paused) for event in engine.events) == 1
-        engine.send(protocol.Pause("g1", 1))
-        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+        assert sum(isinstance(event, protocol.Held) for event in engine.events) == 1
+        engine.send(protocol.Hold("g1", 1))
+        assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
 def test_resuming_before_it_is_silent_loses_nothing(player: Player) -> None:
@@ -105,8 +105,8 @@ def test_resuming_before_it_is_silent_loses_nothing(player: Player) -> None:
         _say_to_word(engine)
         for _ in range(3):
             engine.until_word()
-            engine.send(protocol.Pause("g1", 1), protocol.Resume("g1"))
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+            engine.send(protocol.Hold("g1", 1), protocol.Continue("g1"))
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
     assert player.heard.read_bytes() == sound(TEXT)
 
 
@@ -139,7 +139,7 @@ def test_a_player_that_dies_in_a_pause_and_cannot_be_replaced_fails_the_sentence
         assert children(engine.process.pid) == []
         engine.resume()
         ended = engine.until(protocol.Ended)
-        assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_device")
+        assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "audio_device")
         assert ended.message == "audio open error: Connection refused"
 
 
@@ -173,10 +173,10 @@ def test_a_frozen_player_is_ended_by_a_pause(player: Player) -> None:
 @pytest.mark.parametrize("together", [True, False], ids=["with the sentence", "before the player took anything"])
 def test_a_pause_before_the_first_sound_holds_the_whole_sentence(player: Player, together: bool) -> None:
     with Spawned(player.command(NEVER_READS), alive_every=SOON) as engine:
-        engine.until(protocol.Voices)
+        engine.until(protocol.VoiceList)
         if together:
-            engine.send(protocol.Say("g1", TEXT, FAST, 1.0, None, 50), protocol.Pause("g1", 1))
-            engine.until(protocol.Paused)
+            engine.send(protocol.Speak("g1", TEXT, FAST, 1.0, None, 50), protocol.Hold("g1", 1))
+            engine.until(protocol.Held)
         else:
             engine.say(TEXT)
             engine.until(protocol.Alive)
@@ -189,7 +189,7 @@ def test_a_pause_before_the_first_sound_holds_the_whole_sentence(player: Player,
 
 @pytest.mark.parametrize("release", [0.2, 10.0])
 def test_a_stop_ends_a_paused_sentence_at_once(player: Player, release: float) -> None:
-    with limits(), Spawned(player.plays(), limits={"RELEASE_AFTER": release}, alive_every=SOON) as engine:
+    with limits(), Spawned(player.plays(), limits={"RELEASE_DELAY_S": release}, alive_every=SOON) as engine:
         _say_to_word(engine, 3)
         engine.pause()
         while release < 1 and children(engine.process.pid):
@@ -200,7 +200,7 @@ def test_a_stop_ends_a_paused_sentence_at_once(player: Player, release: float) -
         heard = player.heard.read_bytes().rstrip(b"\0")
         assert sound(TEXT).startswith(heard)
         assert len(heard) < len(sound(TEXT).rstrip(b"\0"))
-        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+        assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
 def test_a_pause_when_only_the_end_is_left_lets_it_end(player: Player) -> None:
@@ -209,9 +209,9 @@ def test_a_pause_when_only_the_end_is_left_lets_it_end(player: Player) -> None:
         engine.say("yes")
         while not mark.exists():
             time.sleep(0.002)  # what another process does is no event
-        engine.send(protocol.Pause("g1", 1))
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
-        assert not any(isinstance(event, protocol.Paused) for event in engine.events)
+        engine.send(protocol.Hold("g1", 1))
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+        assert not any(isinstance(event, protocol.Held) for event in engine.events)
 
 
 @pytest.mark.parametrize("held", ["before", "within"])
@@ -219,13 +219,13 @@ def test_no_silence_is_written_to_a_file(tmp_path: Path, held: str) -> None:
     text, rate = TEXT if held == "before" else " ".join([TEXT] * 60), 200  # at which it is made the quickest
     target = tmp_path / "paused.wav"
     with Spawned(f"file:{target}", alive_every=SOON) as engine:
-        engine.until(protocol.Voices)
-        pause = protocol.Pause("g1", 1)
-        engine.send(protocol.Say("g1", text, rate, 1.0, None, 50), *([pause] if held == "before" else []))
+        engine.until(protocol.VoiceList)
+        pause = protocol.Hold("g1", 1)
+        engine.send(protocol.Speak("g1", text, rate, 1.0, None, 50), *([pause] if held == "before" else []))
         if held == "within":
             engine.until_word()
             engine.send(pause)
-        engine.until(protocol.Paused)
+        engine.until(protocol.Held)
         assert target.exists() == (held == "within")
         size = target.stat().st_size if target.exists() else 0
         assert isinstance(engine.event(), protocol.Alive)
@@ -237,10 +237,10 @@ def test_no_silence_is_written_to_a_file(tmp_path: Path, held: str) -> None:
 # -- another player that goes on with it
 
 #: A player is let go of at once if the sentence is held.
-AT_ONCE = {"RELEASE_AFTER": 0.0}
+AT_ONCE = {"RELEASE_DELAY_S": 0.0}
 
 
-def _held(engine: Spawned) -> list[protocol.Output]:
+def _held(engine: Spawned) -> list[protocol.OutputChanged]:
     """Begin a sentence, hold it behind its second word and return the events about the output."""
     engine.say(TEXT)
     engine.until_word(2)
@@ -248,8 +248,8 @@ def _held(engine: Spawned) -> list[protocol.Output]:
     return _told(engine)
 
 
-def _told(engine: Spawned) -> list[protocol.Output]:
-    return [each for each in engine.events if isinstance(each, protocol.Output)]
+def _told(engine: Spawned) -> list[protocol.OutputChanged]:
+    return [each for each in engine.events if isinstance(each, protocol.OutputChanged)]
 
 
 def test_an_output_that_was_muted_for_a_part_of_the_sentence_stays_so(sink: Sink) -> None:
@@ -261,7 +261,7 @@ def test_an_output_that_was_muted_for_a_part_of_the_sentence_stays_so(sink: Sink
             assert told.output == muted
             sink.pactl("set-sink-mute", "null", "0")
             engine.resume()
-            assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+            assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
             assert _told(engine) == [told]
     finally:
         sink.pactl("set-sink-mute", "null", "0")
@@ -281,5 +281,7 @@ def test_nothing_is_told_of_a_program_that_goes_on_with_it(
         assert told.output["player"] == "pulse"
         os.unlink(path)
         engine.resume()
-        assert engine.until(protocol.Ended).outcome == (protocol.COMPLETED if goes_on else protocol.FAILED)
+        assert engine.until(protocol.Ended).outcome == (
+            protocol.OUTCOME_COMPLETED if goes_on else protocol.OUTCOME_FAILED
+        )
         assert [each.output for each in _told(engine)[1:]] == ([None] if goes_on else [])

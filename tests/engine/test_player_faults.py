@@ -50,13 +50,13 @@ def _plays(during: str = "pass", after: str = "") -> str:
 def _failure(command: str, **limits: float) -> tuple[str | None, str | None]:
     with Spawned(command, limits=limits) as engine:
         ended = engine.spoken("battery low, please come home")  # so long that its end can be too early
-        assert ended.outcome == protocol.FAILED
+        assert ended.outcome == protocol.OUTCOME_FAILED
         assert children(engine.process.pid) == []
         return ended.reason, ended.message
 
 
 def _assert_all_taken(player: Player, ended: protocol.Ended) -> None:
-    assert ended.outcome == protocol.COMPLETED
+    assert ended.outcome == protocol.OUTCOME_COMPLETED
     assert ended.duration is not None
     assert player.heard.stat().st_size == round(ended.duration * 22050) * 2
 
@@ -84,10 +84,10 @@ def test_a_good_player_gets_every_sample_and_underruns_are_no_error(player: Play
             _plays("if taken > 8000: os.close(0); time.sleep(100)"),
             *(None, "audio_lost", "player closed its input before the sound was over"),
         ),
-        (NEVER_READS, "FIRST_WITHIN", "audio_stalled", "player took no sound for 0.4 s"),
+        (NEVER_READS, "FIRST_SOUND_LIMIT_S", "audio_stalled", "player took no sound for 0.4 s"),
         (
             _plays("if taken > 8000: time.sleep(100)"),
-            *("STALLED_AFTER", "audio_stalled", "player took no sound for 0.4 s"),
+            *("STALL_LIMIT_S", "audio_stalled", "player took no sound for 0.4 s"),
         ),
     ],
 )
@@ -100,7 +100,7 @@ def test_a_player_that_fails_fails_the_sentence_in_words(
 
 
 def test_hangs_in_drain(player: Player) -> None:
-    reason, message = _failure(player.plays(after="time.sleep(100)"), DRAIN_WITHIN=0.3)
+    reason, message = _failure(player.plays(after="time.sleep(100)"), DRAIN_LIMIT_S=0.3)
     assert (reason, message) == ("audio_stalled", "player did not end 0.3 s after the sound")
 
 
@@ -123,8 +123,8 @@ def test_a_device_that_is_busy_is_tried_again_for_a_while(player: Player, tmp_pa
         before, began = tries.stat().st_size, time.monotonic()
         ended = engine.spoken(TEXT, "g1")
         assert (ended.reason, ended.message) == ("audio_device", "aplay: audio open error: Device or resource busy")
-        assert time.monotonic() - began >= playback.BUSY_FOR
-        assert_within(time.monotonic() - began, playback.BUSY_FOR + 1, "the end of a goal whose device is held")
+        assert time.monotonic() - began >= playback.BUSY_LIMIT_S
+        assert_within(time.monotonic() - began, playback.BUSY_LIMIT_S + 1, "the end of a goal whose device is held")
         assert tries.stat().st_size > before + 2
         engine.say(TEXT, "g2")
         engine.until(protocol.Alive)
@@ -201,7 +201,7 @@ def test_the_next_player_is_tried_with_the_whole_sentence(player: Player, tmp_pa
         assert ended.player == "pacat"
         # It worked, so it is the first next time: the failing one would have left a mark.
         player.program(f"open({str(tmp_path / 'mark')!r}, 'w')", "aplay")
-        assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+        assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
         assert not (tmp_path / "mark").exists()
 
 
@@ -234,7 +234,7 @@ def test_no_player_at_all_says_what_to_install(tmp_path: Path) -> None:
 
 def test_no_descriptor_is_left_over(player: Player) -> None:
     with Spawned(player.command("raise SystemExit(1)")) as engine:
-        engine.until(protocol.Voices)  # they are read from files, once
+        engine.until(protocol.VoiceList)  # they are read from files, once
         engine.spoken(TEXT, "g0")
         before = os.listdir(f"/proc/{engine.process.pid}/fd")
         for number in range(1, 6):
@@ -414,7 +414,7 @@ def test_a_player_finds_enough_to_begin_and_then_a_piece_at_a_time(at_start: int
 def test_no_memory_is_copied_for_it_and_it_starts_before_the_text_is_read(player: Player) -> None:
     """A fork takes 3 ms, the synthesis 2, and the player itself 5 to 15: together, not one after the other."""
     with Spawned(player.plays(), before=_WATCHED) as engine:
-        assert engine.spoken("battery low").outcome == protocol.COMPLETED
+        assert engine.spoken("battery low").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
         assert engine.errors().split() == ["os.posix_spawn", "text"]
 
@@ -437,7 +437,7 @@ espeak.load = lambda: (*load()[:2], 16_000)
     rates = player.heard.with_name("rates")
     program = player.plays(f"open({str(rates)!r}, 'a').write(sys.argv[2] + ' ')")
     with Spawned(f"{program} {{rate}}", before=before) as engine:
-        assert engine.spoken("battery low").outcome == protocol.COMPLETED
+        assert engine.spoken("battery low").outcome == protocol.OUTCOME_COMPLETED
     assert set(rates.read_text().split()) == {"22050"}
     assert player.heard.read_bytes() == played(render(["battery low"], rate=FAST)[0]).tobytes()
 

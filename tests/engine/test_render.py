@@ -29,7 +29,7 @@ from talkcli.doctor.sentence import Played
 from talkcli.doctor.voice import Engine, Setting
 from talkcli.engine import protocol
 from talkcli.engine.parent import process
-from talkcli.engine.parent.process import Conversation, EngineFailed, engine_command
+from talkcli.engine.parent.process import EngineFailed, PrivateEngine, engine_command
 from talkcli.engine.parent.render import CannotWrite, RenderFailed, pieces, render
 from talkcli.errors import TalkError, UsageError
 from talkcli.goals.states import State
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 TEXT = "battery low, please recharge"
 #: Some seconds of work.
-LONGEST = "one two three. " * 666
+LONG_TEXT = "one two three. " * 666
 BEFORE = b"what was there before"
 
 
@@ -88,7 +88,7 @@ def test_the_file_has_espeak_ngs_own_samples_by_the_settings_of_a_goal(tmp_path:
 
 def test_a_text_longer_than_a_goal_is_rendered_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "x.wav"
-    monkeypatch.setattr("talkcli.engine.parent.render.LONGEST_PIECE", 500)
+    monkeypatch.setattr("talkcli.engine.parent.render.MAX_PIECE_CHARS", 500)
     sentences = [f"This is number {number}, and so on." for number in range(20)]
     text = f"{' '.join(sentences)}\n\n{'... ' * 200}"  # and what is silent is no failure
     first, second, *rest = pieces(text)
@@ -98,7 +98,7 @@ def test_a_text_longer_than_a_goal_is_rendered_in_pieces(tmp_path: Path, monkeyp
     spoken = reference([Sentence(first, 450), Sentence(second, 450)])
     assert samples(path) == b"".join(each.tobytes() for each in spoken)
     assert seconds == pytest.approx(len(samples(path)) / RATE / 2, abs=1e-3)
-    monkeypatch.setattr("talkcli.engine.parent.render.LONGEST_PIECE", 10_000)
+    monkeypatch.setattr("talkcli.engine.parent.render.MAX_PIECE_CHARS", 10_000)
     assert seconds == pytest.approx(render(first + second, str(path), rate=450), abs=0.02)
 
 
@@ -226,7 +226,7 @@ def have_engines_run(monkeypatch: pytest.MonkeyPatch, before: str) -> None:
 
 def test_a_reader_that_takes_its_time_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """More than a pipe holds, and it is read later than a player that is stuck would be given up."""
-    limits = "from talkcli.engine.child import playback; playback.FIRST_WITHIN = playback.STALLED_AFTER = 0.1"
+    limits = "from talkcli.engine.child import playback; playback.FIRST_SOUND_LIMIT_S = playback.STALL_LIMIT_S = 0.1"
     have_engines_run(monkeypatch, limits)
     text = TEXT * 4
     (expected,) = reference([text])
@@ -266,7 +266,7 @@ def test_a_reader_that_goes_away_is_told(tmp_path: Path) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
     failures: list[TalkError] = []
-    thread = threading.Thread(target=lambda: failures.append(failed(LONGEST, path)))
+    thread = threading.Thread(target=lambda: failures.append(failed(LONG_TEXT, path)))
     thread.start()
     with path.open("rb") as pipe:
         pipe.read(44)
@@ -383,10 +383,10 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path, interrupt: di
     path.write_bytes(BEFORE)
     began = time.monotonic()
     with pytest.raises(TimeoutError, match="the text was not rendered in time"):
-        render(LONGEST, str(path), timeout=0.3)
+        render(LONG_TEXT, str(path), timeout=0.3)
     assert time.monotonic() - began < 2
     with pytest.raises(Interrupted):
-        render(LONGEST, str(path), interrupt=interrupt)
+        render(LONG_TEXT, str(path), interrupt=interrupt)
     assert path.read_bytes() == BEFORE
 
 
@@ -396,12 +396,12 @@ def test_a_timeout_and_an_interrupt_end_it_at_once(tmp_path: Path, interrupt: di
         ("import time; time.sleep(60)", "engine_failed", "the engine was not ready after 0.3 s"),
         ("raise RuntimeError('no tongue')", "engine_crashed", "RuntimeError: no tongue"),
         (
-            "import os; from talkcli.engine.child import session; session.Session._say = lambda *_: os.abort()",
+            "import os; from talkcli.engine.child import runner; runner.GoalRunner._speak = lambda *_: os.abort()",
             "engine_crashed",
             'the engine crashed while it spoke with the voice "en-us": it was killed by SIGABRT',
         ),
         (
-            "import time; from talkcli.engine.child import session; session.Session._say = lambda *_: time.sleep(60)",
+            "import time; from talkcli.engine.child import runner; runner.GoalRunner._speak = lambda *_: time.sleep(9)",
             "engine_hung",
             'the engine gave no sign of life for 0.5 s while it spoke with the voice "en-us"',
         ),
@@ -411,8 +411,8 @@ def test_a_useless_engine_is_told_and_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, reason: str, words: str
 ) -> None:
     have_engines_run(monkeypatch, before)
-    monkeypatch.setattr(process, "START_LIMIT", 0.3 if reason == "engine_failed" else 10)
-    monkeypatch.setattr(process, "HANG_AFTER", 0.5)
+    monkeypatch.setattr(process, "START_LIMIT_S", 0.3 if reason == "engine_failed" else 10)
+    monkeypatch.setattr(process, "HANG_LIMIT_S", 0.5)
     error = failed("yes", tmp_path / "x.wav", voice="en-us")
     assert error.code == reason
     assert words in str(error)
@@ -463,27 +463,27 @@ def test_a_kill_at_any_moment_leaves_no_half_file(tmp_path: Path, how: signal.Si
 
 
 CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None, list_voices=False)
-SAY = protocol.Say("1", "length=0", 200, 1.0, None, 50)
+SAY = protocol.Speak("1", "length=0", 200, 1.0, None, 50)
 
 
 @pytest.mark.usefixtures("scripted_process")
 def test_saying_something_to_a_process_that_has_died_raises_how_it_died() -> None:
-    with Conversation(CONFIGURE) as engine:
+    with PrivateEngine(CONFIGURE) as engine:
         events = engine.events
         assert isinstance(next(events), protocol.Ready)
         os.kill(engine._process.pid, 9)
         os.waitid(os.P_PID, engine._process.pid, os.WEXITED | os.WNOWAIT)
         with pytest.raises(EngineFailed, match=r"^it was killed by SIGKILL$") as failed:
-            engine.say(SAY)
+            engine.speak(SAY)
         assert failed.value.reason == "engine_crashed"
 
 
 @pytest.mark.usefixtures("scripted_process")
 def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None:
-    with Conversation(CONFIGURE, deadline=time.monotonic() + 0.7) as engine:
+    with PrivateEngine(CONFIGURE, deadline=time.monotonic() + 0.7) as engine:
         heard: list[protocol.Event] = []
         assert isinstance(next(engine.events), protocol.Ready)
-        engine.say(protocol.Say("1", "never-ends", 200, 1.0, None, 50))
+        engine.speak(protocol.Speak("1", "never-ends", 200, 1.0, None, 50))
         with pytest.raises(TimeoutError):
             heard.extend(engine.events)
         assert any(isinstance(event, protocol.Word) for event in heard)
@@ -494,13 +494,13 @@ def test_a_deadline_ends_a_conversation_in_which_there_is_much_to_hear() -> None
 
 @pytest.mark.usefixtures("scripted_process")
 def test_doctor_tells_silence_alike_before_and_after_the_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(process, "HANG_AFTER", 0.4)
+    monkeypatch.setattr(process, "HANG_LIMIT_S", 0.4)
     hung = Played(State.ABORTED, "engine_hung", "the engine process said nothing for 0.4 s")
     assert sentence.by_engine("hang", Setting(), 1.0, 20.0) == hung
     behaviour = tmp_path / "start"
     behaviour.write_text("hang")
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
-    monkeypatch.setattr(process, "START_LIMIT", 0.3)
+    monkeypatch.setattr(process, "START_LIMIT_S", 0.3)
     words = "the engine process said nothing for 0.3 s"
     assert voice.look(Setting()) == Engine(reason="engine_hung", words=words)
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
+from talkcli.engine.child.feed import MAX_QUIET_LEVEL, SentenceSamples
 from talkcli.engine.child.players import chooser
 from talkcli.engine.child.players.chooser import MAX_CUT_S, MAX_HANDOVER_S, MAX_HANDOVERS, HandoverTimes
-from talkcli.engine.child.stream import QUIET, Samples
 from tests.engine.programs import SWALLOWS, Player
 from tests.engine.spawned import FAST, SOON, Spawned
 from tests.support.processes import children
@@ -38,7 +38,7 @@ def _sentence() -> bytes:
 
 
 def _idle_after(seconds: float) -> str:
-    return f"from talkcli.engine.child.players import chooser\nchooser.IDLE_AFTER = {seconds}"
+    return f"from talkcli.engine.child.players import chooser\nchooser.IDLE_AFTER_S = {seconds}"
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_a_player_gets_the_lead_in_uncounted_and_words_wait_for_it(
             assert told >= lead + first - 0.02, "the word is told before it is heard"
             assert_within(told, lead + first + 0.25, "the first word")
             ended = engine.until(protocol.Ended)
-            assert ended.outcome == protocol.COMPLETED
+            assert ended.outcome == protocol.OUTCOME_COMPLETED
             duration = len(sentence) / RATE / 2
             assert ended.duration == pytest.approx(duration, abs=1e-4)
             assert time.monotonic() - began >= duration + lead - 0.1
@@ -84,9 +84,9 @@ def test_a_lead_in_comes_again_after_a_pause_if_the_device_was_idle(
     player: Player, own: int | None, idle_after: float, again: int
 ) -> None:
     """The device is idle as soon as it was let go of, for as long as it has played silence."""
-    before, constants = _idle_after(idle_after), {"RELEASE_AFTER": 0.3}
+    before, constants = _idle_after(idle_after), {"RELEASE_DELAY_S": 0.3}
     with Spawned(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=SOON) as engine:
-        engine.until(protocol.Voices)
+        engine.until(protocol.VoiceList)
         engine.say(TEXT, lead_in=own)
         engine.until_word()
         engine.pause()
@@ -94,7 +94,7 @@ def test_a_lead_in_comes_again_after_a_pause_if_the_device_was_idle(
             assert isinstance(engine.event(), protocol.Alive)
         held = player.heard.stat().st_size
         engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
     heard, sentence, first = player.heard.read_bytes(), _sentence(), len(_silence(LEAD_IN if own is None else own))
     assert heard[held:].startswith(_silence(again))
     rest = heard[held + len(_silence(again)) :]
@@ -124,7 +124,7 @@ def test_a_sentence_held_in_its_lead_in_begins_with_all_of_it_again(player: Play
         engine.pause()
         held = player.heard.stat().st_size
         engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
     assert player.heard.read_bytes()[held:] == _silence(800) + _sentence()
 
 
@@ -136,7 +136,7 @@ def test_a_pause_within_the_lead_in_loses_nothing(player: Player) -> None:
         engine.pause()
         assert engine.words() == []
         engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
     heard, sentence = player.heard.read_bytes(), _sentence()
     assert heard.endswith(sentence)
     assert len(heard) > len(_silence(LEAD_IN) + sentence)
@@ -155,7 +155,7 @@ def test_a_player_that_ends_within_the_lead_in_did_not_say_the_sentence(player: 
         began = time.monotonic()
         ended = engine.spoken("yes")
         assert_within(time.monotonic() - began, 1.5, "the end of the sentence")
-        assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_lost")
+        assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "audio_lost")
 
 
 def test_a_device_is_idle_some_time_after_it_was_let_go_of(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +178,8 @@ TEXTS = ["battery low", "coming home", "please help"]
 #: Seconds that are left out in some tests, and their bytes: even a fast sentence ends in as much silence.
 LEFT_OUT = 0.02
 _BYTES = int(LEFT_OUT * RATE) * 2
-_SAYS_SO = f"from talkcli.engine.child.players.chooser import HandoverTimes\nGap.silence_to_cut = lambda *_: {LEFT_OUT}"
+_CUTS = "from talkcli.engine.child.players import chooser\nchooser.HandoverTimes.silence_to_cut = lambda *_: {}"
+_SAYS_SO = _CUTS.format(LEFT_OUT)
 
 
 def _all_played(rate: int = FAST) -> list[bytes]:
@@ -246,17 +247,17 @@ def test_a_start_without_a_goal_that_waited_is_no_change() -> None:
 
 
 def test_silence_is_counted_from_the_end_to_the_last_sample_that_is_louder() -> None:
-    samples = Samples()
-    samples.add(array("h", [0] * 100 + [QUIET + 1] + [0, QUIET, -QUIET] * 10).tobytes())
-    assert samples.quiet_end(1000) == 60
-    assert samples.quiet_end(40) == 40
+    samples = SentenceSamples()
+    samples.add(array("h", [0] * 100 + [MAX_QUIET_LEVEL + 1] + [0, MAX_QUIET_LEVEL, -MAX_QUIET_LEVEL] * 10).tobytes())
+    assert samples.trailing_silence(1000) == 60
+    assert samples.trailing_silence(40) == 40
     samples.add(array("h", [0] * 5).tobytes())
-    assert samples.quiet_end(1000) == 70
-    samples.add(array("h", [-QUIET - 1]).tobytes())
-    assert samples.quiet_end(1000) == 0
-    samples.forget(260)
+    assert samples.trailing_silence(1000) == 70
+    samples.add(array("h", [-MAX_QUIET_LEVEL - 1]).tobytes())
+    assert samples.trailing_silence(1000) == 0
+    samples.drop_until(260)
     samples.add(bytes(10))
-    assert (samples.begin, samples.end, samples.quiet_end(1000)) == (260, 284, 10)
+    assert (samples.begin, samples.end, samples.trailing_silence(1000)) == (260, 284, 10)
 
 
 def test_a_sentence_behind_which_a_goal_waits_ends_sooner_by_silence_alone(player: Player) -> None:
@@ -265,8 +266,8 @@ def test_a_sentence_behind_which_a_goal_waits_ends_sooner_by_silence_alone(playe
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
         ended = []
         for number, text in enumerate(TEXTS):
-            ended.append(engine.spoken(text, f"g{number}", followed=number < 2))
-    assert [each.outcome for each in ended] == [protocol.COMPLETED] * 3
+            ended.append(engine.spoken(text, f"g{number}", next_waits=number < 2))
+    assert [each.outcome for each in ended] == [protocol.OUTCOME_COMPLETED] * 3
     assert player.heard.read_bytes() == first[:-_BYTES] + second[:-_BYTES] + third
     assert not any(first[-_BYTES:] + second[-_BYTES:])
     seconds = [len(each) / 2 / RATE for each in (first[:-_BYTES], second[:-_BYTES], third)]
@@ -278,18 +279,18 @@ def test_a_goal_that_waits_counts_if_it_does_at_the_end_of_a_sentence(player: Pl
     """A goal that comes while the sentence is spoken counts; a goal that is recalled does not."""
     first = _all_played()[0]
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
-        engine.say(TEXTS[0], "g0", followed=not followed)
+        engine.say(TEXTS[0], "g0", next_waits=not followed)
         engine.until(protocol.Word)
-        engine.send(protocol.Followed("another", not followed))
-        engine.send(protocol.Followed("g0", followed))
-        assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+        engine.send(protocol.NextGoal("another", not followed))
+        engine.send(protocol.NextGoal("g0", followed))
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
     assert player.heard.read_bytes() == (first[:-_BYTES] if followed else first)
 
 
 def test_no_sample_that_is_sound_is_left_out(player: Player) -> None:
-    louder_than_nothing = f"{_SAYS_SO}\nfrom talkcli.engine.child import stream\nstream.QUIET = -1"
+    louder_than_nothing = f"{_SAYS_SO}\nfrom talkcli.engine.child import feed\nfeed.MAX_QUIET_LEVEL = -1"
     with Spawned(player.plays(), before=louder_than_nothing) as engine:
-        assert engine.spoken(TEXTS[0], followed=True).outcome == protocol.COMPLETED
+        assert engine.spoken(TEXTS[0], next_waits=True).outcome == protocol.OUTCOME_COMPLETED
     assert player.heard.read_bytes() == _all_played()[0]
 
 
@@ -297,8 +298,8 @@ def test_a_file_gets_every_sample_and_no_lead_in(tmp_path: Path) -> None:
     target = tmp_path / "speech.wav"
     with Spawned(f"file:{target}", before=_SAYS_SO, lead_in=LEAD_IN) as engine:
         for number, text in enumerate(TEXTS):
-            ended = engine.spoken(text, f"g{number}", followed=True, lead_in=LEAD_IN)
-            assert ended.outcome == protocol.COMPLETED
+            ended = engine.spoken(text, f"g{number}", next_waits=True, lead_in=LEAD_IN)
+            assert ended.outcome == protocol.OUTCOME_COMPLETED
     assert target.read_bytes()[44:] == b"".join(each.tobytes() for each in render(TEXTS, rate=FAST))
 
 
@@ -306,21 +307,23 @@ def test_a_player_that_ends_too_early_is_seen_if_silence_is_left_out(player: Pla
     """A sentence may not end much sooner than its whole length, the omitted silence included."""
     rate = 200  # at which the silence at the end is that long
     length = len(_all_played(rate)[0]) / 2 / RATE
-    before = "from talkcli.engine.child.players.chooser import HandoverTimes\nGap.silence_to_cut = lambda *_: 0.2"
-    with Spawned(player.command(SWALLOWS), before=before, limits={"EARLY_END": length - 0.2}) as engine:
-        ended = engine.spoken(TEXTS[0], followed=True, rate=rate)
-        assert (ended.outcome, ended.reason) == (protocol.FAILED, "audio_lost")
+    before = (
+        "from talkcli.engine.child.players.chooser import HandoverTimes\nHandoverTimes.silence_to_cut = lambda *_: 0.2"
+    )
+    with Spawned(player.command(SWALLOWS), before=before, limits={"EARLY_END_LIMIT_S": length - 0.2}) as engine:
+        ended = engine.spoken(TEXTS[0], next_waits=True, rate=rate)
+        assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "audio_lost")
 
 
 def test_a_sentence_that_is_held_and_goes_on_leaves_out_no_more(player: Player) -> None:
     first = _all_played()[0]
     with Spawned(player.plays(), before=_SAYS_SO) as engine:
-        engine.say(TEXTS[0], "g0", followed=True)
+        engine.say(TEXTS[0], "g0", next_waits=True)
         engine.until(protocol.Word)
         engine.pause("g0")
         engine.resume("g0")
         ended = engine.until(protocol.Ended)
-        assert ended.outcome == protocol.COMPLETED
+        assert ended.outcome == protocol.OUTCOME_COMPLETED
         assert ended.duration == pytest.approx((len(first) - _BYTES) / 2 / RATE, abs=1e-4)
     heard = player.heard.read_bytes()
     assert heard.endswith(first[-_BYTES - 2000 : -_BYTES])
@@ -331,7 +334,7 @@ def test_the_engine_measures_what_a_change_takes(player: Player) -> None:
     sentences = _all_played()
     with Spawned(player.plays()) as engine:
         for number, text in enumerate(TEXTS):
-            assert engine.spoken(text, f"g{number}", followed=True).outcome == protocol.COMPLETED
+            assert engine.spoken(text, f"g{number}", next_waits=True).outcome == protocol.OUTCOME_COMPLETED
     left_out = len(b"".join(sentences)) - player.heard.stat().st_size
     assert 0 < left_out <= 2 * 2 * MAX_CUT_S * RATE
     assert player.heard.read_bytes().startswith(sentences[0])

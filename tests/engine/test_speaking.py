@@ -71,17 +71,17 @@ def test_a_process_gets_ready_and_lists_its_voices() -> None:
         assert ready.version.startswith("eSpeak NG ")
         engine.say("yes")
         told = engine.event()
-        assert isinstance(told, protocol.Voices)
+        assert isinstance(told, protocol.VoiceList)
         assert any(voice.language == "en-us" and voice.id == "gmw/en-US" for voice in told.voices)
         assert isinstance(engine.event(), protocol.Started)
 
 
 def test_voices_that_are_known_are_not_listed() -> None:
     with Spawned(list_voices=False) as engine:
-        assert engine.spoken("yes").outcome == protocol.COMPLETED
+        assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
         assert engine.event() is None
-        assert not any(isinstance(event, protocol.Voices) for event in engine.events)
+        assert not any(isinstance(event, protocol.VoiceList) for event in engine.events)
 
 
 @pytest.mark.parametrize("text", ["battery low. Please come home", "..."])
@@ -140,13 +140,13 @@ def test_a_goal_in_hand_is_told_to_be_alive(engine: Spawned) -> None:
 def test_a_text_without_anything_to_say_ends_with_nothing_to_say(engine: Spawned) -> None:
     for text in ("", "  \n", "...", "\x01\x02", "«»"):
         ended = engine.spoken(text, f"goal {text!a}")
-        assert (ended.outcome, ended.reason) == (protocol.FAILED, "nothing_to_say")
-    assert engine.spoken("yes", "g2").outcome == protocol.COMPLETED
+        assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "nothing_to_say")
+    assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
 def test_control_characters_are_no_commands_and_keep_the_offsets(writing: Spawned) -> None:
     plain = _length(writing.spoken("a    b one two", "g1"))
-    assert writing.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.COMPLETED
+    assert writing.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.OUTCOME_COMPLETED
     assert writing.words("g1")[-1].start == writing.words("g2")[-1].start == len("a    b one ")
     # 0x01 would have made it speak at 80 words per minute
     assert _length(writing.spoken("a \x0180Sb one two", "g3")) < plain * 2.5
@@ -161,11 +161,11 @@ def test_settings_belong_to_their_goal(writing: Spawned) -> None:
 
 def test_an_unknown_voice_fails_with_near_matches_and_the_next_goal_is_spoken(engine: Spawned) -> None:
     ended = engine.spoken("yes", voice="en-uss")
-    assert (ended.outcome, ended.reason) == (protocol.FAILED, "unknown_voice")
+    assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "unknown_voice")
     assert ended.message is not None
     assert "'en-us'" in ended.message
     assert "talk voices" in ended.message
-    assert engine.spoken("yes", "g2", voice="en-us").outcome == protocol.COMPLETED
+    assert engine.spoken("yes", "g2", voice="en-us").outcome == protocol.OUTCOME_COMPLETED
 
 
 # -- stops
@@ -176,12 +176,12 @@ def test_a_stop_for_another_goal_is_ignored(engine: Spawned) -> None:
     engine.say("yes")
     engine.until(protocol.Started)
     engine.send(protocol.Stop("g0"))
-    assert engine.until(protocol.Ended).outcome == protocol.COMPLETED
+    assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
 
 
 def test_a_stop_that_comes_with_the_sentence_is_obeyed(engine: Spawned) -> None:
-    engine.send(protocol.Say("g1", "one two three four five", 200, 1.0, None, 50), protocol.Stop("g1"))
-    assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+    engine.send(protocol.Speak("g1", "one two three four five", 200, 1.0, None, 50), protocol.Stop("g1"))
+    assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_STOPPED
     assert engine.words() == []
 
 
@@ -194,7 +194,7 @@ def test_a_crash_leaves_no_core(engine: Spawned) -> None:
 
 
 def test_an_idle_process_does_not_wake_up(engine: Spawned) -> None:
-    assert engine.spoken("a").outcome == protocol.COMPLETED
+    assert engine.spoken("a").outcome == protocol.OUTCOME_COMPLETED
     time.sleep(0.05)  # it goes to rest, and says nowhere when it has
     before = _switches(engine.process.pid)
     time.sleep(4 * ALIVE_EVERY)  # the time that is looked at
@@ -229,7 +229,7 @@ def test_the_end_of_the_connection_stops_the_sentence_and_ends_the_process() -> 
         engine.say("one two three four five", rate=FAST)
         engine.until_word()
         engine.leave()
-        assert engine.until(protocol.Ended).outcome == protocol.STOPPED
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_STOPPED
         assert engine.event() is None
         assert engine.process.wait(5) == 0
         assert engine.errors() == ""

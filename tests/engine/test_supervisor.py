@@ -22,22 +22,23 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.engine.parent import supervisor
-from talkcli.engine.parent.inbox import NEVER, Inbox
-from talkcli.engine.parent.process import LONGEST, EngineProcess
+from talkcli.engine.parent.process import MAX_STDERR_LINE_BYTES, EngineProcess
+from talkcli.engine.parent.supervisor import ENGINE_WAIT_LIMIT_S as WAITED
 from talkcli.engine.parent.supervisor import (
-    BACK_OFF,
-    LINES,
-    SHORT_LIFE,
-    WHILE,
+    MAX_STDERR_LINES,
+    MIN_LIFETIME_S,
+    NEVER,
+    RESTART_DELAYS_S,
+    STDERR_PERIOD_S,
+    ActionQueue,
     EngineDied,
     EngineMissing,
     EngineSaid,
-    Handed,
-    Restarts,
+    RestartPolicy,
+    SupervisedGoal,
     Supervisor,
 )
-from talkcli.engine.parent.supervisor import PATIENCE as WAITED
-from talkcli.engine.protocol import COMPLETED, FAILED, SILENCE_LIMIT, STOPPED
+from talkcli.engine.protocol import KILL_LIMIT_S, OUTCOME_COMPLETED, OUTCOME_FAILED, OUTCOME_STOPPED
 from talkcli.polling import wait_ready
 from tests.engine.threads import CONFIGURE, PATIENCE, Thread, answering
 
@@ -48,14 +49,14 @@ if TYPE_CHECKING:
     from talkcli.engine.parent.supervisor import Report
     from tests.engine.threads import Start
 
-YES = protocol.Say("g1", "yes", 200, 1.0, None, 50)
+YES = protocol.Speak("g1", "yes", 200, 1.0, None, 50)
 #: How "yes" ends.
-SPOKEN = protocol.Ended("g1", COMPLETED, duration=0.1)
+SPOKEN = protocol.Ended("g1", OUTCOME_COMPLETED, duration=0.1)
 
 
 def _pauses(thread: Thread) -> int:
     """Return how many pauses were confirmed."""
-    return sum(isinstance(each, protocol.Paused) for each in thread.seen)
+    return sum(isinstance(each, protocol.Held) for each in thread.seen)
 
 
 def _hold(thread: Thread, text: str) -> None:
@@ -75,40 +76,40 @@ def _process(thread: Thread) -> EngineProcess:
 
 
 def test_a_goal_is_held_beyond_any_limit_and_goes_on_where_it_was(start: Start) -> None:
-    thread = start(HANG_AFTER=0.7, PAUSE_LIMIT=0.7)
+    thread = start(HANG_LIMIT_S=0.7, HOLD_LIMIT_S=0.7)
     began = time.monotonic()
     _hold(thread, "length=0.4 slow-pause=0.1 two three four")
-    assert thread.until(protocol.Paused).id == "g1"
+    assert thread.until(protocol.Held).id == "g1"
     assert thread.next(1.0) is None
     thread.engine.resume("g1")
-    assert thread.until(protocol.Ended).outcome == COMPLETED
+    assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
     assert time.monotonic() - began >= 0.4 + 1.0
     assert [each.number for each in thread.seen if isinstance(each, protocol.Word)] == [1, 2, 3, 4, 5]
 
 
 def test_a_pause_has_no_limit_once_the_goal_goes_on(start: Start) -> None:
-    thread = start(PAUSE_LIMIT=0.2)
+    thread = start(HOLD_LIMIT_S=0.2)
     _hold(thread, "length=0.5 ignore-pause")
     thread.engine.resume("g1")
-    assert thread.until(protocol.Ended).outcome == COMPLETED
+    assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
     assert not _pauses(thread)
 
 
 def test_a_pause_that_is_not_confirmed_ends_the_process(start: Start) -> None:
-    thread = start(PAUSE_LIMIT=0.3)
+    thread = start(HOLD_LIMIT_S=0.3)
     asked = time.monotonic()
     _hold(thread, "never-ends ignore-pause")
     ended = thread.until(protocol.Ended)
     assert time.monotonic() - asked >= 0.3
     assert (ended.reason, ended.message) == ("engine_hung", "the engine did not confirm a pause within 0.3 s")
-    assert thread.spoken("yes", "g2").outcome == COMPLETED
+    assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
 def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(start: Start) -> None:
     thread = start()
     asked = time.monotonic()
     _hold(thread, "length=0.7 slow-pause=0.3")
-    thread.until(protocol.Paused)
+    thread.until(protocol.Held)
     assert time.monotonic() - asked >= 0.3
     thread.engine.resume("g1")
     thread.engine.pause("g1", 2)
@@ -122,7 +123,7 @@ def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Start) ->
     _hold(thread, "length=0.6 stale-pause slow-pause=0.2")
     thread.engine.resume("g1")
     thread.engine.pause("g1", 2)
-    assert thread.until(protocol.Paused) == protocol.Paused("g1", 2)
+    assert thread.until(protocol.Held) == protocol.Held("g1", 2)
     thread.engine.resume("g1")
     thread.until(protocol.Ended)
     assert _pauses(thread) == 1
@@ -132,12 +133,12 @@ def test_a_goal_that_waits_for_a_process_is_held_by_the_thread(start: Start) -> 
     thread = start("slow=0.4")
     thread.say("two words")
     thread.engine.pause("g1", 1)
-    assert thread.next() == protocol.Paused("g1", 1)
-    thread.until(protocol.Voices)
+    assert thread.next() == protocol.Held("g1", 1)
+    thread.until(protocol.VoiceList)
     assert thread.next(0.4) is None
     thread.engine.resume("g1")
     assert isinstance(thread.next(), protocol.Word)
-    assert thread.until(protocol.Ended).outcome == COMPLETED
+    assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
 
 
 def test_a_goal_that_is_held_by_the_thread_is_stopped_at_once(start: Start) -> None:
@@ -145,18 +146,18 @@ def test_a_goal_that_is_held_by_the_thread_is_stopped_at_once(start: Start) -> N
     thread.say("two words")
     thread.engine.pause("g1", 1)
     thread.engine.stop("g1")
-    assert [thread.next(), thread.next()] == [protocol.Paused("g1", 1), protocol.Ended("g1", STOPPED)]
-    assert thread.spoken("the next is not held", "g2") == protocol.Ended("g2", COMPLETED, duration=0.1)
+    assert [thread.next(), thread.next()] == [protocol.Held("g1", 1), protocol.Ended("g1", OUTCOME_STOPPED)]
+    assert thread.spoken("the next is not held", "g2") == protocol.Ended("g2", OUTCOME_COMPLETED, duration=0.1)
 
 
 @pytest.mark.parametrize("on_stop", ["", "on-stop=crash"])
 def test_a_paused_goal_is_stopped(start: Start, on_stop: str) -> None:
     thread = start()
     _hold(thread, f"never-ends {on_stop}")
-    thread.until(protocol.Paused)
+    thread.until(protocol.Held)
     thread.engine.stop("g1")
     thread.engine.pause("g1", 1)
-    assert thread.until(protocol.Ended).outcome == STOPPED
+    assert thread.until(protocol.Ended).outcome == OUTCOME_STOPPED
     assert _pauses(thread) == 1
 
 
@@ -164,9 +165,9 @@ def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: Start) -> No
     thread = start()
     _hold(thread, "length=0.2 at=0.9 crash slow-pause=5")
     ended = thread.until(protocol.Ended)
-    assert (ended.outcome, ended.reason) == (FAILED, "engine_crashed")
+    assert (ended.outcome, ended.reason) == (OUTCOME_FAILED, "engine_crashed")
     thread.engine.resume("g1")
-    assert thread.spoken("yes", "g2").outcome == COMPLETED
+    assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
 def test_a_pause_or_resume_of_another_goal_changes_nothing(start: Start) -> None:
@@ -175,7 +176,7 @@ def test_a_pause_or_resume_of_another_goal_changes_nothing(start: Start) -> None
     thread.say("length=0.2")
     thread.engine.pause("g0", 1)
     thread.engine.resume("g1")
-    assert thread.until(protocol.Ended).outcome == COMPLETED
+    assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
     assert not _pauses(thread)
 
 
@@ -196,21 +197,21 @@ def answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callabl
 
 @pytest.mark.parametrize("followed", [True, False])
 def test_the_process_is_told_whether_a_goal_follows(answers: Callable[..., Thread], followed: bool) -> None:
-    told = 'protocol.Ended(command.id, protocol.COMPLETED, f"{command.followed} {command.by_neural}")'
+    told = 'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, f"{command.next_waits} {command.next_is_neural}")'
     thread = answers("tell(protocol.Started(command.id))", f"tell({told})")
-    thread.engine.follow("g1", followed, by_neural=True)  # there is none yet that could be told
+    thread.engine.announce_next("g1", followed, next_is_neural=True)  # there is none yet that could be told
     thread.until(protocol.Ready)
     thread.say("battery low")
-    thread.engine.follow("g1", followed, by_neural=True)
-    assert thread.until(protocol.Ended) == protocol.Ended("g1", COMPLETED, f"{followed} True")
+    thread.engine.announce_next("g1", followed, next_is_neural=True)
+    assert thread.until(protocol.Ended) == protocol.Ended("g1", OUTCOME_COMPLETED, f"{followed} True")
 
 
 def test_a_goal_behind_another_wakes_the_thread_once(
     monkeypatch: pytest.MonkeyPatch, answers: Callable[..., Thread]
 ) -> None:
     """By its answer, which comes in one piece: it was begun and played."""
-    monkeypatch.setattr(supervisor, "HANG_AFTER", 600.0)  # so that no goal is slow enough on any machine
-    thread = answers("tell(protocol.Started(command.id), protocol.Ended(command.id, protocol.COMPLETED))")
+    monkeypatch.setattr(supervisor, "HANG_LIMIT_S", 600.0)  # so that no goal is slow enough on any machine
+    thread = answers("tell(protocol.Started(command.id), protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))")
     process = _process(thread)
     thread.spoken("the first may find it asleep for longer", "g0")
     woken: list[list[int]] = []
@@ -223,7 +224,7 @@ def test_a_goal_behind_another_wakes_the_thread_once(
 
     monkeypatch.setattr(thread.engine._selector, "select", counted)
     for number in range(1, 51):
-        assert thread.spoken("yes", f"g{number}") == protocol.Ended(f"g{number}", COMPLETED)
+        assert thread.spoken("yes", f"g{number}") == protocol.Ended(f"g{number}", OUTCOME_COMPLETED)
     # By the messages of the process, and by nothing else; its answer to the first may have come to a `select` before.
     assert {each for fds in woken for each in fds} == {process.socket.fileno()}
     # A thread that was not asleep yet looks once more; if it is, that is one for a goal.
@@ -231,11 +232,11 @@ def test_a_goal_behind_another_wakes_the_thread_once(
 
 
 def test_a_process_that_hangs_is_noticed_although_nobody_woke_the_thread(start: Start) -> None:
-    thread = start(HANG_AFTER=0.5)
-    assert thread.spoken("length=0").outcome == COMPLETED
+    thread = start(HANG_LIMIT_S=0.5)
+    assert thread.spoken("length=0").outcome == OUTCOME_COMPLETED
     # handed over while the thread dozes
     assert thread.spoken("length=0.05 hang", "g2").reason == "engine_hung"
-    assert thread.spoken("yes", "g3").outcome == COMPLETED
+    assert thread.spoken("yes", "g3").outcome == OUTCOME_COMPLETED
     assert thread.next(0.7) is None  # it does not doze any more
     assert thread.spoken("length=0.05 hang", "g4").reason == "engine_hung"
 
@@ -250,22 +251,22 @@ def test_the_answer_to_a_goal_is_understood_before_the_goal_is_noted(monkeypatch
         return True
 
     # It answers before anybody looks.
-    swift = SimpleNamespace(send=send, receive=lambda: [protocol.Ended("g1", COMPLETED)] * said.count(YES))
-    for name in ("_process", "_open"):
+    swift = SimpleNamespace(send=send, receive=lambda: [protocol.Ended("g1", OUTCOME_COMPLETED)] * said.count(YES))
+    for name in ("_process", "_direct_process"):
         monkeypatch.setattr(engine, name, swift)
     engine.say(YES)
-    engine._hear(cast("EngineProcess", swift))
-    assert posted == [protocol.Ended("g1", COMPLETED)]
-    engine._inbox.close()
+    engine._receive(cast("EngineProcess", swift))
+    assert posted == [protocol.Ended("g1", OUTCOME_COMPLETED)]
+    engine._actions.close()
 
 
 @pytest.mark.parametrize("takes", [True, False], ids=["taken by the system", "refused"])
 def test_a_goal_sent_to_a_lost_process_is_spoken_by_the_next(
     start: Start, monkeypatch: pytest.MonkeyPatch, takes: bool
 ) -> None:
-    thread = start(HANG_AFTER=1.0)  # so long a thread may doze that nothing wakes
+    thread = start(HANG_LIMIT_S=1.0)  # so long a thread may doze that nothing wakes
     thread.until(protocol.Ready)
-    monkeypatch.setattr(thread.engine, "_open", SimpleNamespace(send=lambda _: takes))
+    monkeypatch.setattr(thread.engine, "_direct_process", SimpleNamespace(send=lambda _: takes))
     assert thread.spoken("yes") == SPOKEN
     assert not any(isinstance(each, EngineDied) for each in thread.seen)
 
@@ -275,7 +276,7 @@ def test_a_process_that_takes_no_goal_is_ended(start: Start, monkeypatch: pytest
     thread = start()
     monkeypatch.setattr(_process(thread), "send", lambda _: False)
     thread.say("yes")
-    assert thread.until(EngineDied).words == "the engine takes no commands"
+    assert thread.until(EngineDied).message == "the engine takes no commands"
     assert thread.until(protocol.Ended) == SPOKEN
 
 
@@ -287,15 +288,15 @@ def test_a_goal_that_is_sent_to_a_process_in_its_death_is_spoken_by_the_next(sta
         assert process is not None
         os.kill(process.pid, signal.SIGKILL)
         ended = thread.spoken("length=0.01", f"g{number}")
-        assert ended == protocol.Ended(f"g{number}", COMPLETED, duration=0.01)
+        assert ended == protocol.Ended(f"g{number}", OUTCOME_COMPLETED, duration=0.01)
 
 
 def test_a_goal_for_which_two_processes_die_before_they_begin_with_it_ends(start: Start) -> None:
     thread = start()
     ended = thread.spoken("silent-start length=0 crash")
-    assert (ended.outcome, ended.reason) == (FAILED, "engine_crashed")
+    assert (ended.outcome, ended.reason) == (OUTCOME_FAILED, "engine_crashed")
     assert sum(isinstance(each, EngineDied) for each in thread.seen) == 2
-    assert thread.spoken("yes", "g2").outcome == COMPLETED
+    assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
 def test_a_process_that_was_given_up_gets_no_other_goal(start: Start) -> None:
@@ -304,7 +305,7 @@ def test_a_process_that_was_given_up_gets_no_other_goal(start: Start) -> None:
     thread.until(protocol.Word)
     lost = thread.engine._process
     thread.engine.give_up("g1")
-    assert thread.spoken("yes", "g2") == protocol.Ended("g2", COMPLETED, duration=0.1)
+    assert thread.spoken("yes", "g2") == protocol.Ended("g2", OUTCOME_COMPLETED, duration=0.1)
     assert thread.engine._process is not lost
 
 
@@ -316,7 +317,7 @@ def test_a_goal_that_ended_before_it_was_given_up_costs_no_process(start: Start)
     for number in (2, 3):
         assert thread.spoken("yes", f"g{number}").id == f"g{number}"
     assert thread.engine._process is process
-    assert thread.engine._open is process
+    assert thread.engine._direct_process is process
 
 
 def test_a_closed_process_takes_no_command(start: Start) -> None:
@@ -361,20 +362,20 @@ def test_a_thread_that_stood_still_hears_the_engine_first(start: Start, monkeypa
             return time.monotonic()
 
     words: list[protocol.Word] = []
-    thread = start(HANG_AFTER=0.5)
+    thread = start(HANG_LIMIT_S=0.5)
     monkeypatch.setattr(supervisor, "time", Clock())
     thread.say("length=1.1 b c d e f g h i j k")
     words.append(thread.until(protocol.Word))
-    assert thread.until(protocol.Ended).outcome == COMPLETED
+    assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
     assert not standing
 
 
 def test_the_voices_are_listed_by_the_first_process_alone(start: Start) -> None:
     thread = start()
     thread.spoken("crash")
-    assert thread.spoken("yes", "g2").outcome == COMPLETED
+    assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
     assert sum(isinstance(each, protocol.Ready) for each in thread.seen) == 2
-    assert sum(isinstance(each, protocol.Voices) for each in thread.seen) == 1
+    assert sum(isinstance(each, protocol.VoiceList) for each in thread.seen) == 1
 
 
 def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_while(
@@ -383,23 +384,23 @@ def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_wh
     behaviour = tmp_path / "start"
     behaviour.write_text("hang")
     monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
-    thread = start(START_LIMIT=0.3, PATIENCE=0.5, BACK_OFF=(0.0,))
+    thread = start(START_LIMIT_S=0.3, ENGINE_WAIT_LIMIT_S=0.5, RESTART_DELAYS_S=(0.0,))
     began = time.monotonic()
     words = "the engine was not ready after 0.3 s"
-    assert thread.spoken("battery low") == protocol.Ended("g1", FAILED, "engine_failed", words)
+    assert thread.spoken("battery low") == protocol.Ended("g1", OUTCOME_FAILED, "engine_failed", words)
     assert time.monotonic() - began >= 3 * 0.3, "only a start that began after the time of patience costs a goal"
     assert thread.until(EngineMissing) == EngineMissing(words), "no goal is in hand: who hands them in has to end one"
     thread.say("coming home", "g2")
     behaviour.write_text("")
-    monkeypatch.setattr(supervisor, "START_LIMIT", 10.0)
-    assert thread.until(protocol.Ended).outcome == COMPLETED
+    monkeypatch.setattr(supervisor, "START_LIMIT_S", 10.0)
+    assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
 
 
 class Undying:
     """Stands for a process that is ready, and that no kill ends for long."""
 
     def __init__(self) -> None:
-        self.ready, self.used, self.failed, self.gone_by = True, False, None, 0.0
+        self.ready, self.had_goal, self.start_failure, self.gone_by = True, False, None, 0.0
         self.socket, self._other = socket.socketpair()
         self.stderr = self._other.fileno()
         self.liveness = os.dup(self.stderr)
@@ -428,16 +429,16 @@ def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
 def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool) -> None:
     process = cast("EngineProcess", Undying())
     engine = _watching(process, [])
-    engine._restarts.failed(0.0, 0.0, None)
+    engine._restarts.start_failed(0.0, 0.0, None)
     if spoken:
-        engine._goal = Handed(YES, heard_at=0.0)
-        engine._note(process, SPOKEN)
-    engine._note(process, protocol.Alive(""))  # as one does that loads a voice
+        engine._goal = SupervisedGoal(YES, last_sign_at=0.0)
+        engine._handle_event(process, SPOKEN)
+    engine._handle_event(process, protocol.Alive(""))  # as one does that loads a voice
     before = time.monotonic()
     engine._lose_process("it is killed", "engine_crashed")
-    assert (engine._restarts.due_at - before < BACK_OFF[1]) == spoken
-    engine._bury(process)
-    engine._inbox.close()
+    assert (engine._restarts.next_start_at - before < RESTART_DELAYS_S[1]) == spoken
+    engine._release_process(process)
+    engine._actions.close()
 
 
 @pytest.mark.parametrize("in_time", [True, False])
@@ -446,24 +447,24 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pyt
     undying = Undying()
     process = cast("EngineProcess", undying)
     engine = _watching(process, posted)
-    monkeypatch.setattr(engine, "_start", lambda: None)
-    engine._goal = Handed(YES, heard_at=0.0, started=True)
+    monkeypatch.setattr(engine, "_start_process", lambda: None)
+    engine._goal = SupervisedGoal(YES, last_sign_at=0.0, started=True)
     engine._lose_process("it hangs", "engine_hung")
     due = process.gone_by
-    engine._keep_limits(due - SILENCE_LIMIT / 2)
+    engine._check_deadlines(due - KILL_LIMIT_S / 2)
     assert [type(each).__name__ for each in posted] == ["EngineDied"]
     assert undying.kills == 1
     if not in_time:
-        engine._keep_limits(due)
+        engine._check_deadlines(due)
         assert undying.kills == 2
-        engine._keep_limits(due + 1)
+        engine._check_deadlines(due + 1)
         assert undying.kills == 2, "it was overdue once"
-    engine._bury(process)
+    engine._release_process(process)
     reason = "engine_hung" if in_time else "not_silent"
     assert [each.reason for each in posted[1:] if isinstance(each, protocol.Ended)] == [reason]
     assert len(posted) == 2
     assert not engine._dying
-    engine._inbox.close()
+    engine._actions.close()
 
 
 # -- when it is started again
@@ -472,44 +473,44 @@ LACKING = "no library"
 
 
 def test_the_wait_grows_with_each_process_that_never_got_ready_or_died_as_soon_as_it_was() -> None:
-    failing, dying, now = Restarts(100.0), Restarts(100.0), 100.0
-    for wait in (*BACK_OFF, BACK_OFF[-1], BACK_OFF[-1]):
-        failing.failed(now, now, LACKING)
-        dying.died(now, age=SHORT_LIFE / 2, had_goal=False)
-        assert failing.due_at == dying.due_at == now + wait
-        now = failing.due_at
+    failing, dying, now = RestartPolicy(100.0), RestartPolicy(100.0), 100.0
+    for wait in (*RESTART_DELAYS_S, RESTART_DELAYS_S[-1], RESTART_DELAYS_S[-1]):
+        failing.start_failed(now, now, LACKING)
+        dying.process_died(now, age_s=MIN_LIFETIME_S / 2, had_goal=False)
+        assert failing.next_start_at == dying.next_start_at == now + wait
+        now = failing.next_start_at
 
 
-@pytest.mark.parametrize(("age", "had_goal"), [(SHORT_LIFE / 2, True), (SHORT_LIFE * 2, False)])
+@pytest.mark.parametrize(("age", "had_goal"), [(MIN_LIFETIME_S / 2, True), (MIN_LIFETIME_S * 2, False)])
 def test_a_process_that_was_of_use_costs_no_wait_and_resets_it(age: float, had_goal: bool) -> None:
-    restarts = Restarts(100.0)
+    restarts = RestartPolicy(100.0)
     for _ in range(4):
-        restarts.failed(100.0, 100.0, None)
-    restarts.died(200.0, age=age, had_goal=had_goal)
-    assert restarts.due_at == 200.0
-    restarts.failed(200.0, 200.0, None)
-    assert restarts.due_at == 200.0 + BACK_OFF[0]
+        restarts.start_failed(100.0, 100.0, None)
+    restarts.process_died(200.0, age_s=age, had_goal=had_goal)
+    assert restarts.next_start_at == 200.0
+    restarts.start_failed(200.0, 200.0, None)
+    assert restarts.next_start_at == 200.0 + RESTART_DELAYS_S[0]
 
 
 def test_a_cause_that_stays_is_an_error_until_the_next_start_says_otherwise() -> None:
-    restarts = Restarts(100.0)
-    assert not restarts.failed(100.0, 100.0, LACKING)
-    assert restarts.error == LACKING
-    restarts.error = None
-    restarts.died(200.0, age=SHORT_LIFE * 2, had_goal=False)
-    restarts.failed(200.0, 200.0, LACKING)
-    assert restarts.failed(200.0 + WAITED, 200.0 + WAITED, None), "goals wait again, and not for ever"
-    assert restarts.error is None
+    restarts = RestartPolicy(100.0)
+    assert not restarts.start_failed(100.0, 100.0, LACKING)
+    assert restarts.permanent_error == LACKING
+    restarts.permanent_error = None
+    restarts.process_died(200.0, age_s=MIN_LIFETIME_S * 2, had_goal=False)
+    restarts.start_failed(200.0, 200.0, LACKING)
+    assert restarts.start_failed(200.0 + WAITED, 200.0 + WAITED, None), "goals wait again, and not for ever"
+    assert restarts.permanent_error is None
 
 
 def test_a_start_costs_a_goal_only_if_it_began_long_after_there_was_a_process() -> None:
-    restarts = Restarts(100.0)
-    assert not restarts.failed(100.0 + WAITED + 5, 100.0 + WAITED - 0.1, None)
-    assert restarts.failed(100.0 + WAITED, 100.0 + WAITED, None)
-    assert restarts.failed(100.0 + WAITED + 10, 100.0 + WAITED + 10, None)
-    restarts.died(300.0, age=SHORT_LIFE * 2, had_goal=False)
-    assert not restarts.failed(300.0, 300.0, None)
-    assert restarts.failed(300.0 + WAITED, 300.0 + WAITED, None)
+    restarts = RestartPolicy(100.0)
+    assert not restarts.start_failed(100.0 + WAITED + 5, 100.0 + WAITED - 0.1, None)
+    assert restarts.start_failed(100.0 + WAITED, 100.0 + WAITED, None)
+    assert restarts.start_failed(100.0 + WAITED + 10, 100.0 + WAITED + 10, None)
+    restarts.process_died(300.0, age_s=MIN_LIFETIME_S * 2, had_goal=False)
+    assert not restarts.start_failed(300.0, 300.0, None)
+    assert restarts.start_failed(300.0 + WAITED, 300.0 + WAITED, None)
 
 
 # -- standard error of the process
@@ -521,7 +522,7 @@ def _complaining(script: str) -> tuple[list[str], str]:
     process = EngineProcess(CONFIGURE, lines.append, command=[sys.executable, "-c", f"import os\n{script}"])
     while process.stderr in wait_ready({process.stderr: select.POLLIN}, 20.0) and process.read_stderr():
         pass
-    words = process.last_words()
+    words = process.describe_exit()
     process.close()
     return lines, words
 
@@ -530,7 +531,9 @@ def test_lines_are_passed_on_when_they_are_whole_and_the_last_is_a_crashs_own() 
     lines, words = _complaining("for each in (b'one\\ntw', b'o\\n\\n  \\n thr\\xffee'): os.write(2, each)")
     assert lines == ["one", "two", " thr\ufffdee"]
     assert words == "it exited with status 0 (thr\ufffdee)"
-    assert _complaining("for _ in range(100): os.write(2, b'x' * 65536)")[0] == ["x" * LONGEST], "one that never ends"
+    assert _complaining("for _ in range(100): os.write(2, b'x' * 65536)")[0] == ["x" * MAX_STDERR_LINE_BYTES], (
+        "one that never ends"
+    )
 
 
 def test_lines_that_are_too_many_are_counted_and_told_with_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -539,14 +542,18 @@ def test_lines_that_are_too_many_are_counted_and_told_with_the_next(monkeypatch:
     monkeypatch.setattr(time, "monotonic", lambda: now)
     for number in range(100):
         now = 1000.0 + number / 10
-        engine._complain("x")
-    assert passed == [EngineSaid("x")] * LINES
-    for later in (WHILE - 0.1, WHILE, 2 * WHILE):
+        engine._report_stderr("x")
+    assert passed == [EngineSaid("x")] * MAX_STDERR_LINES
+    for later in (STDERR_PERIOD_S - 0.1, STDERR_PERIOD_S, 2 * STDERR_PERIOD_S):
         now = 1000.0 + later
-        engine._complain(f"{later}")
-    told = [f"({100 + 1 - LINES} lines were left out)", f"{WHILE}", f"{2 * WHILE}"]
-    assert passed[LINES:] == [EngineSaid(each) for each in told]
-    engine._inbox.close()
+        engine._report_stderr(f"{later}")
+    told = [
+        f"({100 + 1 - MAX_STDERR_LINES} lines were left out)",
+        f"{STDERR_PERIOD_S}",
+        f"{2 * STDERR_PERIOD_S}",
+    ]
+    assert passed[MAX_STDERR_LINES:] == [EngineSaid(each) for each in told]
+    engine._actions.close()
 
 
 def test_standard_error_is_posted_and_a_traceback_before_the_crash(answers: Callable[..., Thread]) -> None:
@@ -556,7 +563,7 @@ for word in command.text.split():
         raise ValueError("no tongue")
     sys.stderr.write(word + "\\n")
 sys.stderr.flush()
-tell(protocol.Ended(command.id, protocol.COMPLETED))
+tell(protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))
 """
     thread = answers(complains)
     thread.say("one two")
@@ -564,13 +571,13 @@ tell(protocol.Ended(command.id, protocol.COMPLETED))
         assert thread.next() is not None
     thread.say("raise", "g2")
     died = thread.until(EngineDied)
-    assert died.words == "the engine crashed: it exited with status 1 (ValueError: no tongue)"
-    said = [each.words for each in thread.seen if isinstance(each, EngineSaid)]
+    assert died.message == "the engine crashed: it exited with status 1 (ValueError: no tongue)"
+    said = [each.line for each in thread.seen if isinstance(each, EngineSaid)]
     assert said[:3] == ["one", "two", "Traceback (most recent call last):"]
     assert said[-1] == "ValueError: no tongue"
 
 
-# -- its inbox: actions are done in order, and wake the thread only if they must
+# -- its queue: actions are done in order, and wake the thread only if they must
 
 
 Sleepers = Callable[[float], "Sleeper"]
@@ -580,21 +587,21 @@ class Sleeper:
     """A thread that does nothing but wait for actions; `wakes` counts the bytes that were written to wake it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, doze: float) -> None:
-        self.inbox = Inbox(doze)
+        self.queue = ActionQueue(doze)
         self.wakes = 0
         self.asleep = threading.Event()
         self._ending = False
-        select, write = self.inbox.selector.select, os.write
+        select, write = self.queue.selector.select, os.write
 
         def told(timeout: float | None = None) -> object:
             self.asleep.set()
             return select(timeout)
 
         def counted(descriptor: int, data: bytes) -> int:
-            self.wakes += descriptor == self.inbox._wake
+            self.wakes += descriptor == self.queue._writer
             return write(descriptor, data)
 
-        monkeypatch.setattr(self.inbox.selector, "select", told)
+        monkeypatch.setattr(self.queue.selector, "select", told)
         monkeypatch.setattr("os.write", counted)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -602,7 +609,7 @@ class Sleeper:
 
     def _run(self) -> None:
         while not self._ending:
-            self.inbox.wait(NEVER)
+            self.queue.wait(NEVER)
 
     def do(self, action: Callable[[], None]) -> None:
         """Have an action done, and wait for that and for the thread to sleep again."""
@@ -613,15 +620,15 @@ class Sleeper:
             self.asleep.clear()
             done.set()
 
-        self.inbox.call(act)
+        self.queue.call(act)
         assert done.wait(PATIENCE)
         assert self.asleep.wait(PATIENCE)
 
     def close(self) -> None:
-        self.inbox.call(lambda: setattr(self, "_ending", True))
+        self.queue.call(lambda: setattr(self, "_ending", True))
         self._thread.join(PATIENCE)
         assert not self._thread.is_alive()
-        self.inbox.close()
+        self.queue.close()
 
 
 @pytest.fixture
@@ -638,7 +645,7 @@ def test_an_action_does_not_wake_a_thread_that_dozes_and_is_done_in_order(
     sleeper.do(lambda: None)
     wakes = sleeper.wakes
     for each in ("first", "second"):
-        sleeper.inbox.call(lambda each=each: done.append(each), by=time.monotonic() + 1000)  # type: ignore[misc]
+        sleeper.queue.call(lambda each=each: done.append(each), by=time.monotonic() + 1000)  # type: ignore[misc]
     assert sleeper.wakes == wakes
     sleeper.do(lambda: done.append("third"))
     assert done == ["first", "second", "third"]
@@ -649,7 +656,7 @@ def test_an_action_that_is_due_before_the_thread_would_wake_wakes_it(sleepers: S
     sleeper, done = sleepers(0.0), threading.Event()
     sleeper.do(lambda: None)
     wakes = sleeper.wakes
-    sleeper.inbox.call(done.set, by=time.monotonic() + 1000)  # it does not doze, so it would sleep for ever
+    sleeper.queue.call(done.set, by=time.monotonic() + 1000)  # it does not doze, so it would sleep for ever
     assert done.wait(PATIENCE)
     assert sleeper.wakes == wakes + 1
 
@@ -660,7 +667,7 @@ def test_a_thread_that_dozes_does_its_actions_before_it_sleeps_on(
     sleeper, done = sleepers(0.2), threading.Event()
     sleeper.do(lambda: None)
     wakes = sleeper.wakes
-    sleeper.inbox.call(done.set, by=time.monotonic() + 1000)
+    sleeper.queue.call(done.set, by=time.monotonic() + 1000)
     assert done.wait(PATIENCE)
     assert sleeper.wakes <= wakes + 1  # one, where this test itself came later than the doze was long
 
@@ -674,7 +681,7 @@ def test_nothing_is_lost_and_nothing_overtakes_if_several_threads_hand_in(
     def hand_in(who: int) -> None:
         for number in range(count):
             by = 0.0 if number % 3 else time.monotonic() + 0.002 * (number % 2)
-            sleeper.inbox.call(lambda number=number: done.append((who, number)), by)  # type: ignore[misc]
+            sleeper.queue.call(lambda number=number: done.append((who, number)), by)  # type: ignore[misc]
 
     threads = [threading.Thread(target=hand_in, args=(who,)) for who in range(3)]
     for each in threads:
@@ -687,19 +694,19 @@ def test_nothing_is_lost_and_nothing_overtakes_if_several_threads_hand_in(
 
 
 def test_nothing_is_done_once_no_more_is_taken() -> None:
-    inbox, done = Inbox(0.0), list[str]()
-    inbox.close()
-    inbox.call(lambda: done.append("late"))
-    inbox.run()
+    queue, done = ActionQueue(0.0), list[str]()
+    queue.close()
+    queue.call(lambda: done.append("late"))
+    queue.run()
     assert done == []
 
 
-def test_an_inbox_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_queue_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """The descriptor could be another file's by then, and get the byte."""
-    inbox, closed, write = Inbox(0.0), threading.Event(), os.write
+    queue, closed, write = ActionQueue(0.0), threading.Event(), os.write
 
     def close() -> None:
-        inbox.close()
+        queue.close()
         closed.set()
 
     def slowly(descriptor: int, data: bytes) -> int:
@@ -708,7 +715,7 @@ def test_an_inbox_is_not_closed_under_a_thread_that_wakes_it(monkeypatch: pytest
         return write(descriptor, data)
 
     monkeypatch.setattr(os, "write", slowly)
-    monkeypatch.setattr(inbox, "_sleeps_until", NEVER)
-    inbox.call(lambda: None)
+    monkeypatch.setattr(queue, "_sleeps_until", NEVER)
+    queue.call(lambda: None)
     assert closed.wait(PATIENCE)
-    inbox.call(lambda: None)  # nothing happens
+    queue.call(lambda: None)  # nothing happens

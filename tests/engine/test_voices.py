@@ -48,7 +48,7 @@ NEURAL = (
 def listed() -> tuple[Voice, ...]:
     """Return espeak's voices; the installed neural ones stand behind them."""
     with Spawned() as engine:
-        voices = engine.until(protocol.Voices).voices
+        voices = engine.until(protocol.VoiceList).voices
     own = tuple(each for each in voices if not each.id.startswith("piper/"))
     assert voices[: len(own)] == own
     return own
@@ -105,7 +105,7 @@ def test_every_voice_can_be_spoken_with_under_each_of_its_words(tmp_path: Path) 
         for number, word in enumerate(words):
             ended = engine.spoken("a", f"g{number}", voice=word, rate=450)
             # In the wheel's library one voice has nothing for this text.
-            assert ended.outcome == protocol.COMPLETED or ended.reason == "nothing_to_say", (word, ended)
+            assert ended.outcome == protocol.OUTCOME_COMPLETED or ended.reason == "nothing_to_say", (word, ended)
 
 
 # -- by the names that people type

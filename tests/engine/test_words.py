@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from talkcli.engine.child.synthesizers import espeak
-from talkcli.engine.child.words import TimedWord, WordClock, Words, letters
+from talkcli.engine.child.words import TimedWord, WordClock, WordFinder, count_letters
 from tests.support.reference import Sentence, render_with_words
 
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ def test_an_event_has_the_size_of_the_librarys_with_pointers_of_4_and_8_bytes() 
 
 
 def reported(text: str, places: Iterable[tuple[int, int]]) -> list[str]:
-    words = Words(text)
-    found = [each for each in (words.next(start, length) for start, length in places) if each is not None]
+    words = WordFinder(text)
+    found = [each for each in (words.find(start, length) for start, length in places) if each is not None]
     assert [number for _, _, number in found] == list(range(1, len(found) + 1))
     assert all(end <= start for (_, end, _), (start, _, _) in itertools.pairwise(found))
     return [text[start:end] for start, end, _ in found]
@@ -70,12 +70,12 @@ def test_the_words_of_a_sentence_are_those_that_libespeak_itself_tells(number: i
     """All are rendered in one process, whose words are the same each time."""
     _, text, words = SENTENCES[number]
     rendering = render_with_words([Sentence(text, voice=voice) for voice, text, _ in SENTENCES])[number]
-    places = ((start, end - start or letters(text, start)) for start, end, _ in rendering.words)
+    places = ((start, end - start or count_letters(text, start)) for start, end, _ in rendering.words)
     assert reported(text, [(start, length) for start, length in places if length > 0]) == words.split()
 
 
 def test_a_word_without_a_length_goes_as_far_as_its_letters() -> None:
-    assert [letters("«né» 日本e\u0301", place) for place in range(-1, 11)] == [0, 0, 2, 1, 0, 0, 4, 3, 2, 1, 0, 0]
+    assert [count_letters("«né» 日本e\u0301", place) for place in range(-1, 11)] == [0, 0, 2, 1, 0, 0, 4, 3, 2, 1, 0, 0]
 
 
 def test_a_place_that_is_repeated_behind_or_outside_is_none() -> None:
@@ -87,10 +87,10 @@ def test_a_place_that_is_repeated_behind_or_outside_is_none() -> None:
 
 @given(st.text(max_size=40), st.lists(st.tuples(st.integers(-3, 45), st.integers(-1, 10)), max_size=30))
 def test_words_go_forward_within_the_text_whatever_is_reported(text: str, places: list[tuple[int, int]]) -> None:
-    words = Words(text)
+    words = WordFinder(text)
     end = 0
     for location, length in places:
-        found = words.next(location, length)
+        found = words.find(location, length)
         if found is not None:
             before, (start, end, _) = end, found
             assert before <= start < end <= len(text)
@@ -105,75 +105,75 @@ def test_the_clock_stands_until_it_is_started_and_is_held_back_by_the_player() -
     first, second = TimedWord(0, 1, 0.0), TimedWord(2, 1, 0.5)
     clock.add(first)
     clock.add(second)
-    assert clock.due(100.0) == []
-    assert clock.next_due() is None
+    assert clock.take_begun(100.0) == []
+    assert clock.next_word_at() is None
     clock.start(100.0)
-    assert clock.due(100.0) == [first]
-    assert clock.next_due() == 100.5
-    clock.hold(100.4, 0.1)
+    assert clock.take_begun(100.0) == [first]
+    assert clock.next_word_at() == 100.5
+    clock.limit_elapsed(100.4, 0.1)
     assert clock.elapsed(100.4) == pytest.approx(0.1)
-    assert clock.due(100.6) == []
-    assert clock.next_due() == pytest.approx(100.8)
-    clock.hold(100.5, 10.0)
-    assert clock.next_due() == pytest.approx(100.8)
-    assert clock.rest() == [second]
-    assert clock.due(200.0) == []
+    assert clock.take_begun(100.6) == []
+    assert clock.next_word_at() == pytest.approx(100.8)
+    clock.limit_elapsed(100.5, 10.0)
+    assert clock.next_word_at() == pytest.approx(100.8)
+    assert clock.take_rest() == [second]
+    assert clock.take_begun(200.0) == []
 
 
 def test_silence_in_the_stream_moves_the_words_after_it_and_is_not_heard() -> None:
     clock = WordClock()
     before, at, after = TimedWord(0, 1, 0.4), TimedWord(2, 1, 0.5), TimedWord(4, 1, 1.0)
-    clock.begin(0.0)
-    clock.insert(0.0, 0.25)
+    clock.reset(0.0)
+    clock.add_silence(0.0, 0.25)
     clock.start(100.0)
     clock.add(before)
     clock.add(at)
-    assert clock.heard(100.125) == 0.0
-    assert clock.heard(100.5) == 0.25
-    assert clock.next_due() == pytest.approx(100.65)
-    clock.insert(0.5, 1.0)
-    clock.insert(0.5, 1.0)
+    assert clock.heard_position(100.125) == 0.0
+    assert clock.heard_position(100.5) == 0.25
+    assert clock.next_word_at() == pytest.approx(100.65)
+    clock.add_silence(0.5, 1.0)
+    clock.add_silence(0.5, 1.0)
     clock.add(after)
-    assert clock.next_due() == pytest.approx(100.65)
-    assert clock.due(102.5) == [before]
-    assert clock.heard(102.5) == 0.5
-    assert clock.next_due() == pytest.approx(102.75)
-    assert clock.due(102.76) == [at]
-    assert clock.heard(103.0) == pytest.approx(0.75)
-    assert clock.next_due() == pytest.approx(103.25)
+    assert clock.next_word_at() == pytest.approx(100.65)
+    assert clock.take_begun(102.5) == [before]
+    assert clock.heard_position(102.5) == 0.5
+    assert clock.next_word_at() == pytest.approx(102.75)
+    assert clock.take_begun(102.76) == [at]
+    assert clock.heard_position(103.0) == pytest.approx(0.75)
+    assert clock.next_word_at() == pytest.approx(103.25)
 
 
 def test_another_stream_begins_where_the_audio_goes_on() -> None:
     clock = WordClock()
     missed, word = TimedWord(0, 1, 1.0), TimedWord(2, 1, 2.5)
     clock.start(100.0)
-    clock.insert(0.5, 3.0)
-    clock.begin(2.0)
+    clock.add_silence(0.5, 3.0)
+    clock.reset(2.0)
     clock.add(missed)
     clock.add(word)
-    assert clock.next_due() is None
-    assert clock.heard(200.0) == 2.0
-    clock.insert(2.0, 0.25)
+    assert clock.next_word_at() is None
+    assert clock.heard_position(200.0) == 2.0
+    clock.add_silence(2.0, 0.25)
     clock.start(200.0)
-    assert clock.due(200.0) == [missed]
-    assert clock.next_due() == pytest.approx(200.75)
-    assert clock.heard(200.5) == pytest.approx(2.25)
+    assert clock.take_begun(200.0) == [missed]
+    assert clock.next_word_at() == pytest.approx(200.75)
+    assert clock.heard_position(200.5) == pytest.approx(2.25)
 
 
 def test_the_outputs_own_clock_stands_until_something_is_heard() -> None:
     clock = WordClock()
     clock.add(TimedWord(0, 1, 0.5))
     clock.start(100.0)
-    clock.tell(100.2, 0.0)
-    assert (clock.elapsed(100.2), clock.next_due()) == (0.0, None)
-    clock.tell(100.4, 0.1)
+    clock.set_elapsed(100.2, 0.0)
+    assert (clock.elapsed(100.2), clock.next_word_at()) == (0.0, None)
+    clock.set_elapsed(100.4, 0.1)
     assert clock.elapsed(100.4) == pytest.approx(0.1)
-    assert clock.next_due() == pytest.approx(100.8)
+    assert clock.next_word_at() == pytest.approx(100.8)
 
 
 def test_words_in_zeros_that_are_left_out_begin_with_the_sound() -> None:
     clock = WordClock()
     for position in (0.0, 0.2):
         clock.add(TimedWord(0, 1, position))
-    clock.leave_out(0.1)
-    assert [each.position for each in clock.rest()] == [0.1, 0.2]
+    clock.skip_until(0.1)
+    assert [each.position for each in clock.take_rest()] == [0.1, 0.2]

@@ -31,10 +31,10 @@ from talkcli.engine import protocol
 def tell(*events):
     os.write(0, b"".join(map(protocol.encode, events)))
 for line in os.fdopen(0, "rb"):
-    command = protocol.decode(line, protocol.COMMANDS)
+    command = protocol.decode(line, protocol.COMMAND_CLASSES)
     if isinstance(command, protocol.Configure):
         tell(protocol.Ready("answers", None, None))
-    elif isinstance(command, protocol.Say):
+    elif isinstance(command, protocol.Speak):
         {say}
     else:
         {other}
@@ -59,7 +59,7 @@ class Thread:
         self.engine.thread.start()
 
     def say(self, text: str, goal: str = "g1") -> None:
-        self.engine.say(protocol.Say(goal, text, 200, 1.0, None, 50))
+        self.engine.say(protocol.Speak(goal, text, 200, 1.0, None, 50))
 
     def next(self, seconds: float = PATIENCE) -> Report | None:
         """Return the next report, None if there is none for so long."""

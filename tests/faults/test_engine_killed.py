@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.child.playback import GONE_WITHIN, STALLED_AFTER
-from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT
+from talkcli.engine.child.playback import PLAYER_KILL_LIMIT_S, STALL_LIMIT_S
+from talkcli.engine.protocol import HANG_LIMIT_S, KILL_LIMIT_S
 from tests.conformance.hearing import (
     LONG,
     LOW,
@@ -223,7 +223,7 @@ HELD = 20.0
 #: A library that never comes back from a sentence with a certain word in it, and a shorter limit for that.
 STUCK_SYNTHESIS = """
 from talkcli.engine import protocol
-protocol.HANG_AFTER = {limit}
+protocol.HANG_LIMIT_S = {limit}
 import sys, time
 if "talkcli.engine.child.main" in "".join(sys.orig_argv):
     from pyttsx3.drivers import _espeak
@@ -237,16 +237,16 @@ if "talkcli.engine.child.main" in "".join(sys.orig_argv):
 
 #: What happens to a goal whose player cannot be reaped once it is killed, and the limit for its end in seconds.
 STUCK: dict[str, tuple[Callable[[Talk], object], float]] = {
-    "its engine killed": (lambda talk: os.kill(engine_process(talk), signal.SIGKILL), SILENCE_LIMIT + SLACK),
+    "its engine killed": (lambda talk: os.kill(engine_process(talk), signal.SIGKILL), KILL_LIMIT_S + SLACK),
     "stopped": (lambda talk: talk.request("cancel"), CANCEL),
     "its player killed": (
         lambda talk: os.kill(player_process(talk), signal.SIGKILL),
-        STALLED_AFTER + GONE_WITHIN + SILENCE_LIMIT + SLACK,
+        STALL_LIMIT_S + PLAYER_KILL_LIMIT_S + KILL_LIMIT_S + SLACK,
     ),
 }
 
 
-@pytest.mark.parametrize("limit", [1.5, pytest.param(HANG_AFTER, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("limit", [1.5, pytest.param(HANG_LIMIT_S, marks=pytest.mark.slow)])
 def test_synthesis_without_progress(make_talk: MakeTalk, sink: Sink, tmp_path: Path, limit: float) -> None:
     write(tmp_path / "sitecustomize.py", STUCK_SYNTHESIS.format(limit=limit))
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import espeakng_loader
 import pytest
 
-from talkcli.engine.parent.supervisor import BACK_OFF
+from talkcli.engine.parent.supervisor import RESTART_DELAYS_S
 from tests.conformance.bareserve import SERVE, environment, run
 from tests.conformance.hearing import LONG, LOW, assert_aborted, begin, engine_process, send
 from tests.faults.broken import assert_answers, heard_again, python_path, write
@@ -123,7 +123,7 @@ TOO_FEW = 12
 #: Shortens the waits of a server whose engine can't start: no second, but tenths.
 HASTY = """
 from talkcli.engine.parent import supervisor
-supervisor.BACK_OFF, supervisor.PATIENCE = (0.0, 0.05, 0.1), {patience}
+supervisor.RESTART_DELAYS_S, supervisor.ENGINE_WAIT_LIMIT_S = (0.0, 0.05, 0.1), {patience}
 """
 
 
@@ -209,10 +209,10 @@ def test_an_engine_that_was_killed_while_idle_costs_no_goal_that_comes_at_once(m
 
 
 def test_engines_that_have_spoken_and_are_killed_while_idle_are_replaced_at_once(scripted: Talk) -> None:
-    assert BACK_OFF == WAITS
-    assert BACK_OFF[-1] > PATIENCE, "a goal that has to wait so long is not awaited"
+    assert RESTART_DELAYS_S == WAITS
+    assert RESTART_DELAYS_S[-1] > PATIENCE, "a goal that has to wait so long is not awaited"
     engine = _scripted_engine(scripted)
-    for _ in range(2 * len(BACK_OFF)):
+    for _ in range(2 * len(RESTART_DELAYS_S)):
         engine = _replaced(scripted, engine)
         assert _ends(scripted, [send(scripted, "length=0")]) == [("SUCCEEDED", None)]
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 
-from talkcli.engine.child.playback import DRAIN_WITHIN, FIRST_WITHIN, LOOK_EVERY, STALLED_AFTER
+from talkcli.engine.child.playback import DRAIN_LIMIT_S, FIRST_SOUND_LIMIT_S, PROGRESS_CHECK_INTERVAL_S, STALL_LIMIT_S
 from talkcli.engine.child.players.pulse import READY_WITHIN, SUSPENDED_FOR
 from tests.conformance.hearing import (
     HOME,
@@ -49,8 +49,8 @@ AGAIN = 10.0
 #: Seconds from the fault, or the beginning of a goal, to its end: if the player is told that the sound is lost,
 #: and the waits for a player that takes none, with the looks and messages in between.
 TOLD = 1.0
-STALLED = STALLED_AFTER + LOOK_EVERY + 0.2
-NEVER_TAKEN = FIRST_WITHIN + LOOK_EVERY + 0.2
+STALLED = STALL_LIMIT_S + PROGRESS_CHECK_INTERVAL_S + 0.2
+NEVER_TAKEN = FIRST_SOUND_LIMIT_S + PROGRESS_CHECK_INTERVAL_S + 0.2
 SUSPENDED = SUSPENDED_FOR + 0.5
 NO_ANSWER = READY_WITHIN + 0.2
 
@@ -207,14 +207,17 @@ BROKEN = {
         End("audio_lost", LENGTH + SLACK, "player was killed by SIGKILL"),
     ),
     "exits 0 too early": ("cat > /dev/null", End("audio_lost", SLACK, " s before the sound did")),
-    "never reads": ("exec sleep 100", End("audio_stalled", FIRST_WITHIN + SLACK, "player took no sound for 5 s")),
+    "never reads": (
+        "exec sleep 100",
+        End("audio_stalled", FIRST_SOUND_LIMIT_S + SLACK, "player took no sound for 5 s"),
+    ),
     "reads a byte at a time": (
         "while dd bs=1 count=1 of=/dev/null; do sleep 0.3; done 2> /dev/null",
-        End("audio_stalled", STALLED_AFTER + SLACK, "player took no sound for 3 s"),
+        End("audio_stalled", STALL_LIMIT_S + SLACK, "player took no sound for 3 s"),
     ),
     "hangs in drain": (
         f"{PLAY}; exec sleep 100",
-        End("audio_stalled", LENGTH + DRAIN_WITHIN + SLACK, "player did not end 3 s after the sound"),
+        End("audio_stalled", LENGTH + DRAIN_LIMIT_S + SLACK, "player did not end 3 s after the sound"),
     ),
 }
 #: The slowest of the players. The others are tested side by side, as the engine waits for some until a limit.

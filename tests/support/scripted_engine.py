@@ -30,7 +30,7 @@ _LINGER = "import time; time.sleep({seconds})"
 class Goal:
     """The current goal: its script, and a plan of actions with their monotonic times."""
 
-    def __init__(self, say: protocol.Say) -> None:
+    def __init__(self, say: protocol.Speak) -> None:
         self.id = say.id
         self.script = script.Script(say.text)
         self.length = self.script.number("length", 0.1)
@@ -76,13 +76,13 @@ class Engine:
                     return
                 *lines, self._buffer = (self._buffer + data).split(b"\n")
                 for line in lines:
-                    self._take(protocol.decode(line, protocol.COMMANDS))
+                    self._take(protocol.decode(line, protocol.COMMAND_CLASSES))
             self._work()
 
     def _patience(self) -> float | None:
         if self._goal is None:
             return None
-        goal, due = self._goal, self._last + protocol.ALIVE_EVERY
+        goal, due = self._goal, self._last + protocol.ALIVE_INTERVAL_S
         if self._unconfirmed and goal.silent_at is not None:
             due = min(due, goal.silent_at)
         if goal.plan and not goal.held(time.monotonic()):
@@ -93,15 +93,15 @@ class Engine:
         goal = self._goal
         if isinstance(command, protocol.Configure):
             self._start(command.list_voices)
-        elif isinstance(command, protocol.Say):
+        elif isinstance(command, protocol.Speak):
             self._say(command)
-        elif goal is None or not isinstance(command, protocol.Stop | protocol.Pause | protocol.Resume):
+        elif goal is None or not isinstance(command, protocol.Stop | protocol.Hold | protocol.Continue):
             pass  # of no importance without sound
         elif goal.id != command.id or goal.stopped:
             pass
         elif isinstance(command, protocol.Stop):
             self._stop(goal)
-        elif isinstance(command, protocol.Pause):
+        elif isinstance(command, protocol.Hold):
             self._pause(goal, command.number)
         else:
             goal.resume(time.monotonic())
@@ -118,9 +118,9 @@ class Engine:
             self._act(what, value or "0")
         self._send(protocol.Ready("scripted", "scripted engine", "none"))
         if voices:
-            self._send(protocol.Voices((protocol.Voice("en", "en", "scripted"),)))
+            self._send(protocol.VoiceList((protocol.Voice("en", "en", "scripted"),)))
 
-    def _say(self, say: protocol.Say) -> None:
+    def _say(self, say: protocol.Speak) -> None:
         if self._goal:
             sys.exit(f"told to say {say.id} during {self._goal.id}")
         goal = self._goal = Goal(say)
@@ -134,7 +134,7 @@ class Engine:
             self._send(protocol.Started(goal.id))
         self._report(goal)
         if "muted" in asked and say.audible:
-            self._send(protocol.Ended(goal.id, protocol.FAILED, "muted", "the output is muted: card"))
+            self._send(protocol.Ended(goal.id, protocol.OUTCOME_FAILED, "muted", "the output is muted: card"))
             self._goal = None
             return
         spans = [] if "silent-start" in asked else asked.spans[: int(asked.number("words", len(asked.spans)))]
@@ -146,16 +146,16 @@ class Engine:
         if act:
             goal.then(began + goal.length * asked.number("at", 0.5), lambda: self._act(act))
         elif "never-ends" not in asked:
-            goal.then(began + goal.length, lambda: self._end(protocol.COMPLETED))
+            goal.then(began + goal.length, lambda: self._end(protocol.OUTCOME_COMPLETED))
 
     def _report(self, goal: Goal) -> None:
         """Report the voice and the output if the script says so."""
         asked = goal.script
         if "voice" in asked:
-            self._send(protocol.Speaks(goal.id, asked.text("voice")))
+            self._send(protocol.VoiceChosen(goal.id, asked.text("voice")))
         if "volume" in asked or "muted" in asked:
             output = {"volume": asked.number("volume", 1.0), "muted": "muted" in asked}
-            self._send(protocol.Output(goal.id, {"player": "scripted", "device": "card", **output}))
+            self._send(protocol.OutputChanged(goal.id, {"player": "scripted", "device": "card", **output}))
 
     def _stop(self, goal: Goal) -> None:
         if "ignore-stop" in goal.script:
@@ -163,7 +163,7 @@ class Engine:
         goal.stopped, goal.silent_at, self._unconfirmed = True, None, None
         goal.plan.clear()
         act = goal.script.text("on-stop")
-        action = (lambda: self._act(act)) if act else (lambda: self._end(protocol.STOPPED))
+        action = (lambda: self._act(act)) if act else (lambda: self._end(protocol.OUTCOME_STOPPED))
         goal.then(time.monotonic() + goal.script.number("slow-stop"), action)
 
     def _pause(self, goal: Goal, number: int) -> None:
@@ -172,15 +172,15 @@ class Engine:
         goal.silent_at = time.monotonic() + goal.script.number("slow-pause")
         self._unconfirmed = number
         if "stale-pause" in goal.script and number > 1:
-            self._send(protocol.Paused(goal.id, number - 1))
+            self._send(protocol.Held(goal.id, number - 1))
 
     def _work(self) -> None:
         while (goal := self._goal) and goal.due(time.monotonic()):
             goal.plan.pop(0)[1]()
         if goal and self._unconfirmed and goal.held(time.monotonic()):
-            self._send(protocol.Paused(goal.id, self._unconfirmed))
+            self._send(protocol.Held(goal.id, self._unconfirmed))
             self._unconfirmed = None
-        if self._goal and time.monotonic() - self._last >= protocol.ALIVE_EVERY:
+        if self._goal and time.monotonic() - self._last >= protocol.ALIVE_INTERVAL_S:
             self._send(protocol.Alive(self._goal.id))
 
     def _act(self, what: str, value: str = "") -> None:
@@ -193,19 +193,19 @@ class Engine:
         elif what == "hang":
             _hang()
         elif what in ("fail", "complete"):
-            self._end(protocol.FAILED if what == "fail" else protocol.COMPLETED)
+            self._end(protocol.OUTCOME_FAILED if what == "fail" else protocol.OUTCOME_COMPLETED)
         else:
             sys.exit(f"unknown behaviour: {what!r}")
 
     def _end(self, outcome: str) -> None:
         goal, self._goal, self._unconfirmed = self._goal, None, None
         assert goal
-        if outcome == protocol.FAILED:
+        if outcome == protocol.OUTCOME_FAILED:
             reason = goal.script.text("fail") or "engine_failed"
             message = goal.script.text("message").replace("_", " ") or f"scripted {reason}"
             self._send(protocol.Ended(goal.id, outcome, reason, message))
         else:
-            length = goal.length if outcome == protocol.COMPLETED else None
+            length = goal.length if outcome == protocol.OUTCOME_COMPLETED else None
             self._send(protocol.Ended(goal.id, outcome, duration=length))
 
     def _send(self, event: protocol.Event) -> None:

@@ -27,7 +27,7 @@ from unittest import mock
 
 from talkcli.engine import protocol
 from talkcli.engine.parent import process
-from talkcli.engine.parent.process import Conversation, EngineFailed
+from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.goals.text import fault
 
 if TYPE_CHECKING:
@@ -312,15 +312,15 @@ def speak_all(texts: Iterable[Case], *, guarded: bool, seconds: float = float("i
 
 def _speak_until_death(texts: Iterator[Case], end: float, path: str, tally: Tally) -> bool:
     """Speak texts in one engine process; return whether it died."""
-    with Conversation(protocol.Configure(os.getpid(), None, f"file:{path}", None, None)) as engine:
-        engine.until(protocol.Ready)
+    with PrivateEngine(protocol.Configure(os.getpid(), None, f"file:{path}", None, None)) as engine:
+        engine.wait_for(protocol.Ready)
         # The first text is spoken even if the start took all the time.
         for number, case in enumerate(texts):
             tally.texts += 1
             goal = f"f{number}"
             try:
-                engine.say(protocol.Say(goal, case.text, _RATE, 1.0, case.voice, 50))
-                ended = engine.until(protocol.Ended)
+                engine.speak(protocol.Speak(goal, case.text, _RATE, 1.0, case.voice, 50))
+                ended = engine.wait_for(protocol.Ended)
             except EngineFailed as error:
                 death = f"{error}: {case.voice} {case.text!a}"
                 tally.deaths.append(death)
@@ -340,8 +340,8 @@ def _speak_until_death(texts: Iterator[Case], end: float, path: str, tally: Tall
 
 def list_voices() -> list[str]:
     configure = protocol.Configure(os.getpid(), None, "null", None, None, list_voices=True)
-    with Conversation(configure) as engine:
-        return [each.id for each in engine.until(protocol.Voices).voices if not each.id.startswith("+")]
+    with PrivateEngine(configure) as engine:
+        return [each.id for each in engine.wait_for(protocol.VoiceList).voices if not each.id.startswith("+")]
 
 
 def main() -> int:

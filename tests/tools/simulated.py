@@ -61,17 +61,17 @@ class SilentEngine:
         self._report, self._begun = report, begun
         self._goal = ""
 
-    def say(self, say: protocol.Say) -> None:
+    def say(self, say: protocol.Speak) -> None:
         self._begun(say.id, say.text)
         found = _LENGTH.search(say.text)
         length = float(found.group(1)) if found else _USUAL_LENGTH_S
         self._goal = say.id
-        asyncio.get_running_loop().call_later(length, self._end, say.id, protocol.COMPLETED, length)
+        asyncio.get_running_loop().call_later(length, self._end, say.id, protocol.OUTCOME_COMPLETED, length)
 
     def stop(self, goal_id: str) -> None:
-        self._end(goal_id, protocol.STOPPED, None)
+        self._end(goal_id, protocol.OUTCOME_STOPPED, None)
 
-    def follow(self, goal_id: str, followed: bool, by_neural: bool) -> None:
+    def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
         pass
 
     def _end(self, goal_id: str, outcome: str, length: float | None) -> None:
@@ -90,7 +90,7 @@ class Server:
         self._speech = speech = Speech(self._scheduler)
         speech.engine = cast("Any", SilentEngine(speech.report, begun))
         speech.report(protocol.Ready("simulated", None, "none"))
-        speech.report(protocol.Voices((protocol.Voice("en", "en", "simulated"),)))
+        speech.report(protocol.VoiceList((protocol.Voice("en", "en", "simulated"),)))
         self._requests = Requests(speech, self._describe)
         self.handle, self.owes, self.left = self._requests.handle, self._requests.owes, self._requests.left
         self.greeting = encode(greeting(__version__, os.getpid(), boot))

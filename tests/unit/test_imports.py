@@ -246,10 +246,18 @@ def test_only_the_engine_imports_its_process() -> None:
             assert not {name for name, _ in inside(module) if name.startswith("engine.child")}, module
 
 
+def test_the_two_sides_of_the_engine_import_nothing_of_each_other() -> None:
+    """They share the modules of `engine` itself, above all the protocol, and those import neither side."""
+    for module in [each for each in sources() if each.startswith("engine.")]:
+        side = module.split(".")[1]
+        other = {"parent": "engine.child", "child": "engine.parent"}.get(side, ("engine.child", "engine.parent"))
+        assert not {name for name, _ in inside(module) if name.startswith(other)}, module
+
+
 #: Other modules that may end the process on the spot, as the server does on its second signal.
 ENDING = {"server.run": {"os._exit"}, "engine.child.main": {"os._exit"}}
 #: Other modules that may write to standard error: the log, and the engine process, whose server reads it.
-COMPLAINING = {"daemon.log", "engine.child.main", "engine.child.session"}
+COMPLAINING = {"daemon.log", "engine.child.main", "engine.child.runner"}
 
 
 def test_only_the_cli_prints_and_exits() -> None:

@@ -179,9 +179,9 @@ def test_what_the_library_takes_is_what_the_rows_say() -> None:
 
 
 def test_what_a_goal_shows_and_what_the_engine_is_told_are_what_the_rows_say() -> None:
-    goal, say, engine = annotated(Goal), annotated(Say), annotated(protocol.Say)
+    goal, say, engine = annotated(Goal), annotated(Say), annotated(protocol.Speak)
     assert {name: goal[name] for name in SHOWN} == {name: say[name] for name in SHOWN}
-    told = {name: kind for name, kind in engine.items() if name not in {"id", "text", "followed", "by_neural"}}
+    told = {name: kind for name, kind in engine.items() if name not in {"id", "text", "next_waits", "next_is_neural"}}
     assert set(told) == set(FOR_ENGINE)
     assert {name: kind.removesuffix(" | None") for name, kind in told.items()} == {
         name: say[name].removesuffix(" | None") for name in FOR_ENGINE

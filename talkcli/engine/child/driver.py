@@ -1,6 +1,7 @@
-"""pyttsx3's engine: its driver, a goal's settings as its properties, and our own driver in front of a synthesizer.
+"""pyttsx3's engine: starting its driver, setting the properties for a goal, and `talk`'s own driver.
 
-It starts no goal. What is missing is an answer that says what to install, and no traceback.
+`talk`'s own driver puts a synthesizer and the players behind pyttsx3's interface. If something is missing, the error
+says what to install.
 """
 
 from __future__ import annotations
@@ -12,20 +13,12 @@ import types
 from importlib import import_module
 
 from talkcli import install
+from talkcli.engine import voices
 from talkcli.engine.child.playback import Playback
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers.base import NotInstalled, SpeechSettings
 from talkcli.engine.protocol import Ready, StartFailed
-from talkcli.engine.voices import (
-    SYNTHESIZERS,
-    UnknownVoice,
-    find_voice,
-    is_neural,
-    is_own_driver,
-    language_of,
-    list_voices,
-    unknown_voice,
-)
+from talkcli.engine.voices import SYNTHESIZERS, UnknownVoice, is_neural, is_own_driver
 from talkcli.frozen import TYPE_CHECKING, fields, replace
 from talkcli.goals.options import model_of
 
@@ -33,84 +26,100 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from typing import Any
 
-    from talkcli.engine.child.session import Session
+    from talkcli.engine.child.runner import GoalRunner
     from talkcli.engine.child.synthesizers.base import Synthesizer
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.child.words import TimedWord
-    from talkcli.engine.protocol import Configure, Say, Voice
+    from talkcli.engine.protocol import Configure, Speak, Voice
 
-#: The drivers of macOS that speak in Apple's run loop, which somebody has to run.
+#: Drivers of macOS that speak in Apple's run loop, which this process has to run.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
 
 
 class CannotStart(Exception):
-    """The engine cannot start: the text names what to install or to change, `failed` is what the server is told."""
+    """The engine can't start. `failure` is the message for the server; it says what to install or to change."""
 
     def __init__(self, message: str, reason: str = "engine_failed", **more: bool) -> None:
-        """`more`: as in `StartFailed`."""
+        """Build the message for the server. `more` are further fields of `StartFailed`."""
         super().__init__(message)
-        self.failed = StartFailed(reason, message, **more)
+        self.failure = StartFailed(reason, message, **more)
 
 
-def start(configure: Configure, session: Session) -> Ready:
-    """Build the engine, with its loop started, and hand it to the session; CannotStart."""
+def start(configure: Configure, runner: GoalRunner) -> Ready:
+    """Build the engine, start its loop, and attach it to the runner.
+
+    Raises:
+        CannotStart: something is missing or unknown.
+    """
     try:
         import pyttsx3
     except ModuleNotFoundError as error:
         raise CannotStart(f"pyttsx3 is missing ({error}): {install.command('pyttsx3')}") from error
     own = is_own_driver(configure.driver)
-    shown = configure.driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
-    name = f"talk_{shown}" if own else shown
-    made = _register_own(shown, name, session) if own else None
-    engine = _init(pyttsx3, name, named=configure.driver is not None)
-    settings = Settings(engine, shown)
-    _start_loop(engine, name)
+    driver = configure.driver or (next(iter(SYNTHESIZERS)) if own else pyttsx3.engine.default_engine_by_sys_platform())
+    name = f"talk_{driver}" if own else driver
+    synthesizer = _register_own(driver, name, runner) if own else None
+    engine = _start_engine(pyttsx3, name, named=configure.driver is not None)
+    properties = DriverProperties(engine, driver)
     try:
-        settings.set_voice(configure.voice)
-        voice = settings.driver_id(configure.voice) if configure.voice else ""
+        properties.set_voice(configure.voice)
+        voice = properties.voice_id(configure.voice) if configure.voice else ""
     except CannotSpeak as error:
         unknown = error.reason == "unknown_voice"
-        raise CannotStart(str(error), error.reason, lasting=unknown, usage=unknown) from error
-    session.open(engine, settings.apply, None if own else _pump(name), made)
-    neural = voice if is_neural(voice) else None
-    return Ready(shown, made.version if made else None, session.players.first_player() if own else None, neural)
+        raise CannotStart(str(error), error.reason, permanent=unknown, usage_error=unknown) from error
+    runner.attach_engine(engine, properties.apply, None if own else _pump(name), synthesizer)
+    return Ready(
+        driver,
+        version=synthesizer.version if synthesizer else None,
+        player=runner.players.first_player() if own else None,
+        voice=voice if is_neural(voice) else None,
+    )
 
 
-def _register_own(synthesizer: str, driver: str, session: Session) -> CombinedSynthesizer:
-    """Make a synthesizer, and put a driver for it among pyttsx3's."""
+def _register_own(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:
+    """Make a synthesizer and register a driver for it."""
+    module, _, function = SYNTHESIZERS[synthesizer_name].partition(":")
     try:
-        module, _, function = SYNTHESIZERS[synthesizer].partition(":")
-        made: CombinedSynthesizer = getattr(import_module(f"talkcli.engine.child.synthesizers.{module}"), function)()
+        synthesizer: CombinedSynthesizer = getattr(
+            import_module(f"talkcli.engine.child.synthesizers.{module}"), function
+        )()
     except NotInstalled as error:
         raise CannotStart(str(error)) from error
-    except UnknownVoice as error:  # not even its own: a part of it is missing
-        raise CannotStart(_cannot_be_started(driver, error), lasting=False) from error
-    register(driver, made, session)
-    return made
+    except UnknownVoice as error:  # even its own voice is missing
+        raise CannotStart(_start_error(driver_name, error), permanent=False) from error
+    register(driver_name, synthesizer, runner)
+    return synthesizer
 
 
-def register(name: str, synthesizer: Synthesizer, session: Session) -> None:
-    """Put a driver among pyttsx3's own, so that `pyttsx3.init(name)` finds it."""
+def register(name: str, synthesizer: Synthesizer, runner: GoalRunner) -> None:
+    """Add a driver to pyttsx3's own, so that `pyttsx3.init(name)` finds it."""
     module: Any = types.ModuleType(f"pyttsx3.drivers.{name}")
-    module.buildDriver = lambda proxy: Driver(proxy, synthesizer, session)
+    module.buildDriver = lambda proxy: Driver(proxy, synthesizer, runner)
     sys.modules[module.__name__] = module
 
 
-def _init(pyttsx3: Any, name: str, *, named: bool) -> Any:
-    """Return the engine of a driver; `named`: whether an option has named it."""
+def _start_engine(pyttsx3: Any, name: str, *, named: bool) -> Any:
+    """Return pyttsx3's engine for a driver, with its loop started. `named` says that an option named the driver."""
     try:
-        return pyttsx3.init(name)
+        engine = pyttsx3.init(name)
     except ModuleNotFoundError as error:
         if error.name == f"pyttsx3.drivers.{name}":
-            words = f'unknown driver "{name}": there are {", ".join(_driver_names(pyttsx3))}'
-            raise CannotStart(words, usage=named) from error
-        raise CannotStart(f'the driver "{name}" cannot be loaded: {error}', usage=named) from error
+            message = f'unknown driver "{name}": there are {", ".join(_driver_names(pyttsx3))}'
+            raise CannotStart(message, usage_error=named) from error
+        raise CannotStart(f'the driver "{name}" cannot be loaded: {error}', usage_error=named) from error
     except Exception as error:
-        raise CannotStart(_cannot_be_started(name, error), lasting=False) from error
+        raise CannotStart(_start_error(name, error), permanent=False) from error
+    try:
+        engine.startLoop(False)
+        engine.iterate()  # fails with some drivers, which would hang at the first goal
+    except TypeError as error:
+        message = f'the driver "{name}" cannot be stepped (its iterate() is no generator): leave --driver out'
+        raise CannotStart(message, usage_error=True) from error
+    return engine
 
 
-def _cannot_be_started(driver: str, error: Exception) -> str:
-    return f'the driver "{driver}" cannot be started: {type(error).__name__}: {error}'
+def _start_error(driver_name: str, error: Exception) -> str:
+    return f'the driver "{driver_name}" cannot be started: {type(error).__name__}: {error}'
 
 
 def _driver_names(pyttsx3: Any) -> list[str]:
@@ -121,73 +130,67 @@ def _driver_names(pyttsx3: Any) -> list[str]:
     return sorted(found | SYNTHESIZERS.keys())
 
 
-def _start_loop(engine: Any, name: str) -> None:
-    """Start the loop and take its first step: some drivers cannot, and would hang at the first goal."""
-    try:
-        engine.startLoop(False)
-        engine.iterate()
-    except TypeError as error:
-        text = f'the driver "{name}" cannot be stepped (its iterate() is no generator)'
-        raise CannotStart(f"{text}: leave --driver out", usage=True) from error
-
-
-def _pump(name: str) -> Callable[[], None]:
-    if sys.platform != "darwin" or name not in _RUN_LOOP_DRIVERS:
+def _pump(driver_name: str) -> Callable[[], None]:
+    """Return the function that lets a foreign driver go on between two steps."""
+    if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
     from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
 
-    def run_loop() -> None:
-        NSRunLoop.currentRunLoop().runUntilDate_(NSDate.dateWithTimeIntervalSinceNow_(0))
-
-    return run_loop
+    return lambda: NSRunLoop.currentRunLoop().runUntilDate_(NSDate.dateWithTimeIntervalSinceNow_(0))
 
 
-class Settings:
-    """A goal's settings as properties of one engine, by what they were last set to.
+class DriverProperties:
+    """The properties of the engine, set for each goal.
 
-    A property is set only where it differs from what the driver has: a foreign driver may not know a property that
-    nobody asked for. A voice is always set by an id that the driver itself lists.
+    A property is only set if its value changes, because a foreign driver may not know a property that nobody asked
+    for. A voice is always set by an id that the driver itself lists.
     """
 
     def __init__(self, engine: Any, driver: str) -> None:
         self._engine = engine
         self._driver = driver
-        self._set = fields(SpeechSettings())  # what pyttsx3's drivers set themselves
+        self._values = fields(SpeechSettings())  # the initial values of pyttsx3's drivers
         self._default_voice: Any = None
         self._voices: tuple[Voice, ...] = ()
         self._voice: str | None = None
         self._error: Exception | None = None
-        engine.connect("error", self._note)
+        engine.connect("error", self._note_error)
 
-    def apply(self, say: Say) -> str | None:
-        """Set what the goal wants; CannotSpeak if that cannot be had.
+    def apply(self, command: Speak) -> str | None:
+        """Set the properties for a goal, and return why another voice speaks; None if none does.
 
-        A neural voice that is gone, since the goal was accepted or the server was told to speak by it, is no reason for
-        silence: the driver's own speaks then, in its language if it can, and why is returned.
+        A neural voice may have disappeared since the goal was accepted. Then, unless the goal is to be spoken by that
+        voice only, the driver speaks with a voice of its own, in the same language if possible.
+
+        Raises:
+            CannotSpeak: the driver doesn't have the voice or the property.
         """
-        why = None
+        fallback_reason = None
         try:
-            self.set_voice(say.voice)
+            self.set_voice(command.voice)
         except CannotSpeak as error:
-            if say.voice_only or not is_neural(say.voice or ""):
+            if command.voice_only or not is_neural(command.voice or ""):
                 raise
-            why = str(error)
-            self._set_language(language_of(say.voice or ""))
-        wanted = fields(say)
-        for name in self._set:
-            value = wanted[name]
-            if self._set[name] != value:
-                self._put(name, value, f"{name} to {value}")
-                self._set[name] = value
-        return why
+            fallback_reason = str(error)
+            self._set_language(voices.language_of(command.voice or ""))
+        wanted = fields(command)
+        for name, value in self._values.items():
+            if wanted[name] != value:
+                self._set(name, wanted[name], f"{name} to {wanted[name]}")
+                self._values[name] = wanted[name]
+        return fallback_reason
 
     def set_voice(self, wanted: str | None) -> None:
-        """Set the voice; None is the one that the driver started with. CannotSpeak if there is no such voice."""
+        """Set a voice, or with None the driver's default.
+
+        Raises:
+            CannotSpeak: there is no such voice.
+        """
         if wanted == self._voice:
             return
         if self._voice is None:
             self._default_voice = self._engine.getProperty("voice")
-        self._put("voice", self._default_voice if wanted is None else self.driver_id(wanted), f"the voice {wanted}")
+        self._set("voice", self._default_voice if wanted is None else self.voice_id(wanted), f"the voice {wanted}")
         self._voice = wanted
 
     def _set_language(self, language: str) -> None:
@@ -197,59 +200,63 @@ class Settings:
                 return
         self.set_voice(None)
 
-    def driver_id(self, wanted: str) -> str:
-        """Return the id of a voice; CannotSpeak if there is no such voice."""
-        found = find_voice(wanted, self._voices)
+    def voice_id(self, wanted: str) -> str:
+        """Return the id of the voice that the user's word means.
+
+        Raises:
+            CannotSpeak: there is no such voice.
+        """
+        found = voices.find_voice(wanted, self._voices)
         if found is not None and is_neural(found.id) and model_of(wanted) != model_of(found.id):
-            found = None  # a part of its name: another voice may have been put there since that it means
-        if found is None:  # not each time: it takes some milliseconds, and what is new is seldom asked for
-            self._voices = list_voices(self._engine)
-            found = find_voice(wanted, self._voices)
+            found = None  # only a part of its name matches, so a voice added since then may match better
+        if found is None:  # listing takes some milliseconds, so it is only done for voices that are not known yet
+            self._voices = voices.list_voices(self._engine)
+            found = voices.find_voice(wanted, self._voices)
         if found is None:
             foreign = None if is_own_driver(self._driver) else self._driver
-            raise CannotSpeak("unknown_voice", unknown_voice(wanted, self._voices, foreign))
+            raise CannotSpeak("unknown_voice", voices.unknown_voice(wanted, self._voices, foreign))
         return found.id
 
-    def _put(self, name: str, value: Any, shown: str) -> None:
-        """Set a property; what goes wrong pyttsx3 reports by a notification, not by an exception."""
+    def _set(self, name: str, value: Any, shown: str) -> None:
+        """Set a property. pyttsx3 reports errors by a notification instead of an exception."""
         self._error = None
         self._engine.setProperty(name, value)
         error, self._error = self._error, None
         if isinstance(error, UnknownVoice):
-            text = f"the voice {value} is listed, but it cannot be loaded: {error}"
-            raise CannotSpeak("unknown_voice", text) from error
+            message = f"the voice {value} is listed, but it cannot be loaded: {error}"
+            raise CannotSpeak("unknown_voice", message) from error
         if error is not None:
             why = str(error.args[0] if error.args else error) or type(error).__name__
             raise CannotSpeak("bad_option", f"the driver {self._driver} cannot set {shown}: {why}") from error
 
-    def _note(self, exception: Exception, **_: object) -> None:
+    def _note_error(self, exception: Exception, **_: object) -> None:
         self._error = exception
 
 
 class Driver:
-    """Our driver; its methods are those that pyttsx3's DriverProxy calls for an engine whose loop is another's.
+    """`talk`'s own driver, with the methods that pyttsx3's DriverProxy calls.
 
-    What it speaks is played, stopped, held, and told word by word. It speaks inside `iterate()`; the synthesizer writes
-    to the playback in the same thread, and that waits for the player. It must not let an exception out: pyttsx3 would
-    lose the sentence without a word.
+    It plays what a synthesizer makes. It can stop and hold, and it reports each word. It speaks inside `iterate`, where
+    the synthesizer writes to the playback in the same thread, and the playback waits for the player. No exception may
+    leave it, because pyttsx3 would lose the sentence silently.
 
-    Its notifications are pyttsx3's, keyword for keyword; what else there is to be told stands in the session. More than
-    pyttsx3 asks for: the property "pitch" (0 to 100).
+    Its notifications are pyttsx3's. Anything else is set as an attribute of the runner. Beyond pyttsx3's interface, it
+    has the property "pitch" (0 to 100).
     """
 
-    def __init__(self, proxy: Any, synthesizer: Synthesizer, session: Session) -> None:
+    def __init__(self, proxy: Any, synthesizer: Synthesizer, runner: GoalRunner) -> None:
         self._proxy = proxy
         self._synthesizer = synthesizer
-        self._session = session
+        self._runner = runner
         self._sound = SpeechSettings()
         self._text: str | None = None
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Speak what was said since the last step, to its end."""
+        """Speak the waiting text, if there is one, and yield. pyttsx3 takes one step at a time."""
         while True:
             if self._text is None:
-                self._proxy.setBusy(False)  # pyttsx3 starts busy; this hands over what waits, by a call of `say`
+                self._proxy.setBusy(False)  # pyttsx3 starts busy; this makes it call `say` with a text that waits
             if self._text is None:
                 yield
                 continue
@@ -257,7 +264,7 @@ class Driver:
             self._speak(text)
 
     def say(self, text: str) -> None:
-        """Take a sentence; the next step of `iterate` speaks it."""
+        """Take a text to be spoken by the next step of `iterate`."""
         self._proxy.setBusy(True)
         self._text = text
 
@@ -267,11 +274,15 @@ class Driver:
         if self._playback is not None:
             self._playback.stop()
 
-    #: Called when the proxy goes away.
+    #: Called when the proxy is deleted.
     destroy = stop
 
     def getProperty(self, name: str) -> Any:  # noqa: N802 - pyttsx3's name
-        """Return a property; KeyError if it is unknown."""
+        """Return a property.
+
+        Raises:
+            KeyError: it is unknown.
+        """
         if name == "voices":
             from pyttsx3.voice import Voice
 
@@ -280,7 +291,12 @@ class Driver:
         return self._synthesizer.voice if name == "voice" else fields(self._sound)[name]
 
     def setProperty(self, name: str, value: Any) -> None:  # noqa: N802 - pyttsx3's name
-        """Set a property; KeyError if it is unknown, UnknownVoice."""
+        """Set a property.
+
+        Raises:
+            KeyError: it is unknown.
+            UnknownVoice: the voice can't be loaded.
+        """
         if name == "voice":
             self._synthesizer.load(str(value))
         else:
@@ -288,26 +304,26 @@ class Driver:
             self._sound = replace(self._sound, **{name: kind(value)})
 
     def _speak(self, text: str) -> None:
-        """Speak the text, with exactly one finished-utterance at its end."""
-        session = self._session
+        """Speak a text, and notify pyttsx3 exactly once that it is finished."""
+        runner = self._runner
         self._proxy.notify("started-utterance")
-        self._playback = playback = Playback(session, self._word_heard)
+        self._playback = playback = Playback(runner, self._report_word)
         failure: Exception | None = None
-        session.duration = None
+        runner.duration = None
         try:
             self._synthesizer.speak(text, self._sound, playback)
-            session.duration = playback.finish()
-            session.gaps = playback.gaps
+            runner.duration = round(playback.finish(), 6)
+            runner.gaps = playback.gaps
         except Stopped:
             pass
-        except Exception as error:  # noqa: BLE001 - whatever it is, pyttsx3 would swallow it: it is told instead
+        except Exception as error:  # noqa: BLE001 - pyttsx3 would drop it, whatever it is
             failure = error
         playback.silence()
         self._playback = None
         if failure is not None:
             self._proxy.notify("error", exception=failure)
-        self._proxy.notify("finished-utterance", completed=session.duration is not None)
+        self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
-    def _word_heard(self, word: TimedWord) -> None:
-        self._session.position = word.position
+    def _report_word(self, word: TimedWord) -> None:
+        self._runner.position = word.position
         self._proxy.notify("started-word", location=word.location, length=word.length)

@@ -1,9 +1,6 @@
-"""The words of a sentence: which of its text are reported, and when each is heard, by the clock of its playback.
+"""The words of a sentence: which parts of its text are reported as words, and when each word is heard.
 
-Pure: the time comes in as an argument (monotonic seconds). The clock counts the seconds of one player's stream: it
-starts with the first samples that the player takes and runs by itself; it is held back while the player takes less than
-the clock says, so that no word is reported before it is heard. Where the output has a clock of its own, it goes by
-that, and stands until something is heard. Silence that is put into the stream moves what follows.
+Pure: the time is an argument, in monotonic seconds.
 """
 
 from __future__ import annotations
@@ -14,20 +11,20 @@ from collections import deque
 
 from talkcli.frozen import frozen, replace
 
-#: What goes on behind a letter without a report of its own: "it's", "well-known", "U.S.A".
-_GOES_ON = re.compile(r"(?:['’-][^\W\d_]\w*|\.[^\W\d_](?!\w))+")
+#: The rest of a word after a letter, which synthesizers don't report: "it's", "well-known", "U.S.A".
+_WORD_REST = re.compile(r"(?:['’-][^\W\d_]\w*|\.[^\W\d_](?!\w))+")
 _LETTER = re.compile(r"[^\W\d_]")
-#: … and behind a number's comma: "1," of "1,000".
-_NUMBER_GOES_ON = re.compile(r"\d+(?:[.,]\d+)*")
-#: What ends a clause is no part of its last word.
-_STOPS = ".,;:!?…"
+#: The rest of a number after a comma or a dot: "000" of "1,000".
+_NUMBER_REST = re.compile(r"\d+(?:[.,]\d+)*")
+#: Marks at the end of a clause, which don't belong to its last word.
+_END_MARKS = ".,;:!?…"
 
 
-def letters(text: str, start: int) -> int:
-    """Return how many letters and digits, with their accents, stand there in a row.
+def count_letters(text: str, start: int) -> int:
+    """Return the number of consecutive letters and digits from `start` on, including their accents.
 
-    It is the length of a word that a synthesiser reports with none: libespeak-ng does so before a sign that is no ASCII
-    ("hello" of "«hello»"), and also where there is no word at all.
+    It replaces the length of a word that is reported with length 0. libespeak-ng does that before a character outside
+    ASCII ("hello" of "«hello»"), and also if there is no word at all.
     """
     end = start
     while 0 <= end < len(text) and (text[end].isalnum() or unicodedata.category(text[end]).startswith("M")):
@@ -35,55 +32,54 @@ def letters(text: str, start: int) -> int:
     return end - start
 
 
-class Words:
-    """The words of one text, taken in order, and only ever forward.
+class WordFinder:
+    """A converter from a synthesizer's reports to the words of one text.
 
-    A synthesiser repeats a place, jumps back, reports blanks and lengths that reach over the next word, and only the
-    first half of "it's"; what comes out of here is a word of the text, after the last one. Neighbours that are spoken
-    as one ("in the") are reported by the first of them: nobody knows about the second until the word after it is
-    reported.
+    Synthesizers repeat places, jump back, report blanks, give lengths that reach into the next word, and report only
+    the first half of "it's". Each word found here is a whole word of the text, after the previous one. Words spoken as
+    one ("in the") are found by the first of them, because the end of the pair is only known at the next report.
     """
 
     def __init__(self, text: str) -> None:
         self._text = text
         self._end = 0
-        self._number = 0
+        self._count = 0
 
-    def next(self, location: int, length: int) -> tuple[int, int, int] | None:
-        """Return where the word that is reported there begins and ends, and its number in the sentence, from 1.
+    def find(self, location: int, length: int) -> tuple[int, int, int] | None:
+        """Return the start, the end and the number of the word reported there. The first word has number 1.
 
-        None if nothing new is there.
+        Returns None if no new word is there.
         """
         if location < self._end:
             return None
-        piece = self._text[location : location + max(length, 0)]
-        if piece.isspace() and self._text[self._end : location].strip():
-            # Behind a stop it is the word that follows, short of its place by one ("I go. this one is"). Right behind
-            # the last word it is that one's second half ("smiling face" of a picture), and the next is still to come.
-            piece = self._text[location:]
-        start = location + len(piece) - len(piece.lstrip())
-        parts = piece.split(maxsplit=1)
+        reported = self._text[location : location + max(length, 0)]
+        if reported.isspace() and self._text[self._end : location].strip():
+            # After a full stop, the place of the next word is reported one too low ("I go. this one is"). A blank right
+            # after the previous word is that word's second half ("smiling face" of a picture), and no new word.
+            reported = self._text[location:]
+        start = location + len(reported) - len(reported.lstrip())
+        parts = reported.split(maxsplit=1)
         if not parts:
             return None
-        self._end = self._whole(start, start + len(parts[0]))
-        self._number += 1
-        return start, self._end, self._number
+        self._end = self._whole_end(start, start + len(parts[0]))
+        self._count += 1
+        return start, self._end, self._count
 
-    def _whole(self, start: int, end: int) -> int:
-        """Return where a word ends of which this was reported."""
+    def _whole_end(self, start: int, end: int) -> int:
+        """Return the end of the whole word of which the part from `start` to `end` was reported."""
         text = self._text
         if end == len(text) or text[end].isspace():
-            return start + len(text[start:end].rstrip(_STOPS) or text[start:end])
+            return start + len(text[start:end].rstrip(_END_MARKS) or text[start:end])
         if _LETTER.match(text, end - 1):
-            goes_on = _GOES_ON.match(text, end)
+            rest = _WORD_REST.match(text, end)
         else:
-            goes_on = _NUMBER_GOES_ON.match(text, end) if text[end - 1] in ".," and text[start].isdecimal() else None
-        return goes_on.end() if goes_on else end
+            rest = _NUMBER_REST.match(text, end) if text[end - 1] in ".," and text[start].isdecimal() else None
+        return rest.end() if rest else end
 
 
 @frozen
 class TimedWord:
-    """A word of the text and where in the audio it begins."""
+    """A word of the text, with the position in the audio at which it begins."""
 
     location: int  # character offset in the text
     length: int  # in characters
@@ -91,45 +87,60 @@ class TimedWord:
 
 
 class WordClock:
-    """Tells how much was heard, and which words have begun."""
+    """The clock of one player's stream, which tells how much of the audio was heard and which words have begun.
+
+    It starts with the first samples that the player takes, and then runs by itself. It is held back if the player takes
+    less than the clock expects, so that no word is reported before it is heard. An output with a clock of its own sets
+    it. Silence inserted into the stream delays what follows.
+    """
 
     def __init__(self) -> None:
         self._waiting: deque[TimedWord] = deque()
+        #: when the stream began to be heard; None while the clock is stopped
         self._zero: float | None = None
         self._begin = 0.0
-        #: silence in the stream: the position in the audio that it stands before, and its seconds; in order
+        #: silences in the stream, each with the position of the audio that follows it and its seconds
         self._silences: list[tuple[float, float]] = []
 
     def add(self, word: TimedWord) -> None:
-        """Add a word; positions never decrease."""
+        """Add a word. Positions never decrease."""
         self._waiting.append(word)
 
-    def leave_out(self, until: float) -> None:
-        """Have the words that would begin before that position begin there."""
-        self._waiting = deque(replace(each, position=max(until, each.position)) for each in self._waiting)
+    def skip_until(self, position: float) -> None:
+        """Move the words before this position to it, because the audio before it is left out."""
+        self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
-    def begin(self, position: float) -> None:
-        """Prepare for another stream, which begins at that position of the audio; the clock stands."""
+    def reset(self, position: float) -> None:
+        """Stop the clock and prepare for another stream, which begins at this position of the audio."""
         self._begin = position
         self._zero = None
         self._silences.clear()
 
     def start(self, now: float) -> None:
-        """Let the stream begin now. A second start begins anew, with the words that are still waiting."""
+        """Start the clock at the beginning of the stream. It may be started again."""
         self._zero = now
 
-    def insert(self, position: float, seconds: float) -> None:
-        """Take note of silence in the stream before that position of the audio; positions never decrease."""
+    def add_silence(self, position: float, seconds: float) -> None:
+        """Note that silence was put into the stream before this position of the audio. Positions never decrease."""
         if self._silences and self._silences[-1][0] == position:
             seconds += self._silences.pop()[1]
         self._silences.append((position, seconds))
 
+    def set_elapsed(self, now: float, elapsed: float) -> None:
+        """Set the seconds of the stream that were heard, as the output tells. With 0, the clock is stopped."""
+        self._zero = now - elapsed if elapsed > 0 else None
+
+    def limit_elapsed(self, now: float, elapsed: float) -> None:
+        """Set the clock back to this many seconds if it is ahead."""
+        if self._zero is not None and now - self._zero > elapsed:
+            self._zero = now - elapsed
+
     def elapsed(self, now: float) -> float:
-        """Return the seconds of the stream that have been heard, silence included; 0 before the start."""
+        """Return the seconds of the stream that were heard, including silence."""
         return 0.0 if self._zero is None else now - self._zero
 
-    def heard(self, now: float) -> float:
-        """Return the position in the audio up to which it has been heard."""
+    def heard_position(self, now: float) -> float:
+        """Return the position up to which the audio was heard."""
         position = self._begin + self.elapsed(now)
         for before, seconds in self._silences:
             if position <= before:
@@ -137,32 +148,23 @@ class WordClock:
             position = max(before, position - seconds)
         return position
 
-    def tell(self, now: float, elapsed: float) -> None:
-        """Go by a better clock: so many seconds of the stream have been heard; as long as it is none, ours stands."""
-        self._zero = now - elapsed if elapsed > 0 else None
-
-    def hold(self, now: float, elapsed: float) -> None:
-        """Move the clock back to `elapsed` seconds if it is ahead of that: no more can have been heard."""
-        if self._zero is not None and now - self._zero > elapsed:
-            self._zero = now - elapsed
-
-    def due(self, now: float) -> list[TimedWord]:
-        """Take out the words that have begun by now."""
-        words = []
-        while (due := self.next_due()) is not None and due <= now:
-            words.append(self._waiting.popleft())
-        return words
-
-    def rest(self) -> list[TimedWord]:
-        """Take out all words that are left: the sound is over, so they were heard."""
-        words = list(self._waiting)
-        self._waiting.clear()
-        return words
-
-    def next_due(self) -> float | None:
-        """Return when the next word begins; None if there is none, or the clock stands."""
+    def next_word_at(self) -> float | None:
+        """Return when the next word begins; None if there is none or the clock is stopped."""
         if self._zero is None or not self._waiting:
             return None
         position = self._waiting[0].position
         silence = sum(seconds for before, seconds in self._silences if before <= position)
         return self._zero + position - self._begin + silence
+
+    def take_begun(self, now: float) -> list[TimedWord]:
+        """Remove and return the words that have begun."""
+        words = []
+        while (begins_at := self.next_word_at()) is not None and begins_at <= now:
+            words.append(self._waiting.popleft())
+        return words
+
+    def take_rest(self) -> list[TimedWord]:
+        """Remove and return all remaining words, because all of the sound was heard."""
+        words = list(self._waiting)
+        self._waiting.clear()
+        return words

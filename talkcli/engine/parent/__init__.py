@@ -1,1 +1,1 @@
-"""The server's side of the engine: it starts the engine process, sends it goals, watches it and replaces it."""
+"""The engine thread of the server, which starts the engine process, sends it goals, watches it and replaces it."""

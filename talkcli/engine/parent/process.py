@@ -1,12 +1,10 @@
-"""One engine process as its parent sees it: started, written to, read, killed, reaped; and a conversation with it.
+"""The engine process as its parent sees it: starting it, sending to it, reading from it and killing it.
 
-It decides nothing. The supervisor watches a process among other things, for months; who has but a text or two waits for
-one of his own, in a conversation.
+`EngineProcess` makes no decisions. The supervisor watches one of them beside other things, for months. `PrivateEngine`
+is for a caller that only wants to have a few texts spoken and waits for them.
 
-What makes "silent" provable is one pipe that nobody writes to: the engine process and its player inherit the writing
-end, so its reading end shows end of file exactly when both are gone, however they went.
-
-What the process writes to standard error comes out of here as whole lines; the last one is a crash's own words.
+One pipe proves that the engine is silent. The engine process and its player inherit the writing end, and nobody writes
+to it. The reading end therefore reports end of file exactly when both are gone, however they ended.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import peers
 from talkcli.engine import protocol
-from talkcli.engine.protocol import HANG_AFTER, SILENCE_LIMIT, START_LIMIT
+from talkcli.engine.protocol import HANG_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S
 from talkcli.polling import wait_ready
 from talkcli.processes import close, kill, kill_holders, open_pipes, processes, signal_name
 from talkcli.protocol.lines import LineSplitter
@@ -34,14 +32,14 @@ if TYPE_CHECKING:
 
     _E = TypeVar("_E", bound=protocol.Event)
 
-#: Variables of the server's own supervisor, which its children must not answer to.
+#: Environment variables that systemd sets for the server alone.
 _NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
-#: Bytes that may wait to be read by the process: the longest text, escaped, fits several times.
-_SEND_BUFFER = 512 * 1024
-#: Seconds a process that closed its connection is given to end by itself, so that its own exit status is seen.
-_LAST_BREATH = 0.2
-#: Bytes of a line of standard error that are kept, of one that never ends as well.
-LONGEST = 1000
+#: Size of the socket's send buffer. The longest text, escaped, fits several times.
+_SEND_BUFFER_BYTES = 512 * 1024
+#: Time to let a process that closed its connection exit by itself, so that its own exit status is seen.
+_EXIT_WAIT_S = 0.2
+#: Longest line of standard error that is kept. The rest of a longer line is dropped.
+MAX_STDERR_LINE_BYTES = 1000
 
 
 def engine_command() -> list[str]:
@@ -51,35 +49,39 @@ def engine_command() -> list[str]:
 
 
 class EngineProcess:
-    """A running engine process, with the descriptors that the engine thread has to watch.
-
-    OSError from the constructor if it cannot be started.
-    """
+    """A running engine process, and the descriptors to watch for it."""
 
     def __init__(
         self,
         configure: protocol.Configure,
-        on_line: Callable[[str], None] = lambda _: None,
+        on_stderr_line: Callable[[str], None] = lambda _: None,
         env: Mapping[str, str] | None = None,
         command: list[str] | None = None,
     ) -> None:
-        """`on_line` is called with each line that is read of its standard error.
+        """Start the process.
 
-        `env`: if not this process's; `command`: its command line, if not `engine_command`'s.
+        Args:
+            configure: its settings.
+            on_stderr_line: called with each line that it writes to standard error.
+            env: its environment, or None for a copy of this process's.
+            command: its command line, or None for `engine_command()`.
+
+        Raises:
+            OSError: it can't be started.
         """
         self.ready = False
-        #: whether it has said anything of a goal; for who watches over it
-        self.used = False
-        #: what the process said itself of why it cannot start
-        self.failed: protocol.StartFailed | None = None
-        #: the monotonic time by which it must be gone, once it was killed; for who watches over it
+        #: whether it has reported anything about a goal; set by the supervisor
+        self.had_goal = False
+        #: its own reason for not starting; set by the supervisor
+        self.start_failure: protocol.StartFailed | None = None
+        #: monotonic time by which it must be gone, once it was killed; set by the supervisor
         self.gone_by = float("inf")
-        # Held for a send that doesn't wait: the descriptor must not be closed, and be another's, in the middle of one.
+        # Held while sending, so that the descriptor isn't closed and reused by another thread in the meantime.
         self._sending = threading.Lock()
         self._lines = LineSplitter()
-        self._stderr_lines = LineSplitter(LONGEST)
-        self._last_line = ""
-        self._on_line = on_line
+        self._stderr_lines = LineSplitter(MAX_STDERR_LINE_BYTES)
+        self._last_stderr_line = ""
+        self._on_stderr_line = on_stderr_line
         environment = {name: value for name, value in (env or os.environ).items() if name not in _NOT_INHERITED}
         with contextlib.ExitStack() as kept, contextlib.ExitStack() as handed_over:
             self.socket, theirs = socket.socketpair()
@@ -90,15 +92,15 @@ class EngineProcess:
             handed_over.callback(close, liveness, stderr)
             os.set_blocking(self.stderr, False)
             self.socket.setblocking(False)
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
             self._process: subprocess.Popen[bytes] = subprocess.Popen(
                 command or engine_command(),
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,
                 env={**environment, protocol.LIVENESS_VARIABLE: str(liveness)},
-                pass_fds=[liveness] if configure.output is None else [liveness, configure.output],
-                # Ctrl-C in the server's terminal must not reach it, and one kill reaches all of its group.
+                pass_fds=[each for each in (liveness, configure.output_fd) if each is not None],
+                # Ctrl-C in the server's terminal must not reach it, and one kill must reach its whole process group.
                 start_new_session=True,
             )
             kept.pop_all()
@@ -109,18 +111,21 @@ class EngineProcess:
         return self._process.pid
 
     def send(self, command: protocol.Command) -> bool:
-        """Write a command, from any thread; False if the process is gone or takes nothing any more."""
+        """Send a command without waiting, from any thread. Return False if the process can't take it."""
         line = protocol.encode(command)
         with self._sending:
             if self.socket.fileno() < 0:
                 return False  # closed
             try:
                 return self.socket.send(line) == len(line)
-            except OSError:  # gone, full, or the system has no memory for it: it has no whole line of it
+            except OSError:  # the process is gone, the buffer is full, or the system is out of memory
                 return False
 
     def receive(self) -> Iterator[protocol.Event | None]:
-        """Return what the process said; None as the last one if it closed the connection or said what can't be read."""
+        """Read once without waiting and yield the events, with a final None if the conversation is over.
+
+        It is over if the process has closed the connection or sent a malformed message.
+        """
         try:
             data = self.socket.recv(65536)
         except BlockingIOError:
@@ -131,96 +136,90 @@ class EngineProcess:
             yield None
         for line in self._lines.feed(data):
             try:
-                yield protocol.decode(line, protocol.EVENTS)
+                yield protocol.decode(line, protocol.EVENT_CLASSES)
             except (ValueError, TypeError, KeyError):
                 yield None
                 return
 
     def read_stderr(self) -> bool:
-        """Read what the process wrote to standard error; False once that is closed."""
+        """Read what the process wrote to standard error. Return False once that is closed."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
             return True
-        self._complain(data or b"\n")
+        self._pass_on_stderr(data or b"\n")
         return bool(data)
 
-    def _complain(self, data: bytes) -> None:
+    def _pass_on_stderr(self, data: bytes) -> None:
         for line in self._stderr_lines.feed(data):
-            words = line.decode(errors="replace").rstrip()
-            if words:
-                self._last_line = words.lstrip()
-                self._on_line(words)
+            text = line.decode(errors="replace").rstrip()
+            if text:
+                self._last_stderr_line = text.lstrip()
+                self._on_stderr_line(text)
 
     def kill(self) -> None:
-        """Kill the process, its player, and what that has started.
+        """Kill the process, its player, and everything that the player has started.
 
-        The process isn't reaped yet, so its group and its session can't be anybody else's. What left both is known by
-        the pipe that it holds.
+        As long as the process isn't reaped, no other process can have its group or session id. Processes that left both
+        are found by the liveness pipe.
         """
         if self._process.returncode is None:
             kill([-self.pid])
-            # A player leads a group of its own; it dies with the engine process, but a pipeline that it has started
-            # would not.
+            # A player has a process group of its own. It dies with the engine process, but the programs of a pipeline
+            # started by the player would survive.
             kill(pid for pid in processes() if peers.stat_of(pid)[3:4] == [b"%d" % self.pid])
             kill_holders(self.liveness)
 
-    def last_words(self) -> str:
-        """Return how a process that closed its connection ended, for people; what it started is killed.
-
-        Waits a moment for it to be gone.
-        """
-        self._await_exit()
-        self.kill()  # before it is reaped: from then on its group could be another's
+    def describe_exit(self) -> str:
+        """Return how a process ended that has closed its connection, for people. Whatever is left of it is killed."""
+        end = time.monotonic() + _EXIT_WAIT_S
+        # macOS has no waitid before Python 3.13. There, the status may be that of the kill below.
+        while hasattr(os, "waitid") and time.monotonic() < end:
+            if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None:
+                break
+            time.sleep(0.001)
+        self.kill()  # before it is reaped, because its group id may be reused afterwards
         try:
-            status = self._process.wait(_LAST_BREATH)
+            status = self._process.wait(_EXIT_WAIT_S)
         except subprocess.TimeoutExpired:
             return "it closed its connection"
         self.read_stderr()
-        self._complain(b"\n")  # that was its last
+        self._pass_on_stderr(b"\n")  # completes the last line
         how = f"it was killed by {signal_name(-status)}" if status < 0 else f"it exited with status {status}"
-        return f"{how} ({self._last_line})" if self._last_line else how
+        return f"{how} ({self._last_stderr_line})" if self._last_stderr_line else how
 
-    def _await_exit(self) -> None:
-        """Let the process end by itself, so that its own exit status is seen; it stays to be reaped."""
-        if not hasattr(os, "waitid"):
-            return  # macOS before Python 3.13: the status seen may be that of the kill
-        end = time.monotonic() + _LAST_BREATH
-        pid = self._process.pid
-        while os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None and time.monotonic() < end:
-            time.sleep(0.001)
-
-    def silent(self) -> bool:
-        """Whether process and player are gone. Call where `liveness` is readable: nothing is ever written there."""
+    def is_gone(self) -> bool:
+        """Return whether the process and its player are gone. Call this only if `liveness` is readable."""
         return os.read(self.liveness, 1) == b""
 
     def close(self) -> None:
-        """Reap the process, which must be gone or ignore a kill, and close the descriptors."""
+        """Reap the process and close the descriptors. A process that ignores a kill is left to the system."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_LAST_BREATH)
+            self._process.wait(_EXIT_WAIT_S)
         with self._sending:
             self.socket.close()
         close(self.liveness, self.stderr)
 
 
 class EngineFailed(Exception):
-    """The engine process failed: `reason` is for programs, as a goal has it. For `engine_crashed` the text says how.
+    """The engine process failed.
 
-    `silent`: for how many seconds it has said nothing, where that is why.
+    Attributes:
+        reason: the reason as a goal has it, for programs. For "engine_crashed" the text says how the process ended.
+        silent_s: how many seconds the process has been silent if that is the failure, else None.
     """
 
-    def __init__(self, reason: str, words: str, silent: float | None = None) -> None:
-        super().__init__(words)
+    def __init__(self, reason: str, message: str, silent_s: float | None = None) -> None:
+        super().__init__(message)
         self.reason = reason
-        self.silent = silent
+        self.silent_s = silent_s
 
 
-class Conversation:
-    """A conversation with one engine process of one's own, for a text or a few in their order: `say -o`, `talk doctor`.
+class PrivateEngine:
+    """An engine process for one caller, which has texts spoken one after the other and waits for each.
 
-    From the `with` to its end; EngineFailed where it can't be started. It waits in the caller's thread and keeps the
-    limits of `protocol`. When it is over, however that came, the process and its player are gone. Which text comes
-    next, and what an end means, is for who asks.
+    `say -o` and `talk doctor` use it, as a context manager. It waits in the caller's thread and enforces the time
+    limits of `protocol`. On exit the process and its player are gone, even after an error.
     """
 
     def __init__(
@@ -231,69 +230,80 @@ class Conversation:
         deadline: float = float("inf"),
         interrupt: Mapping[int, int] | None = None,
     ) -> None:
-        """`env`: the process's environment, if not this one's; `deadline`: the monotonic time by which all is over.
+        """Start the engine process.
 
-        `interrupt`: what ends any waiting with Interrupted, as in `connect.ready`.
+        Args:
+            configure: its settings.
+            env: its environment, or None for a copy of this process's.
+            deadline: monotonic time at which any wait ends with a TimeoutError.
+            interrupt: descriptors that end any wait with Interrupted, as in `polling.wait_ready`.
+
+        Raises:
+            EngineFailed: it can't be started.
         """
-        self._configure = configure
-        self._env = env
-        self._deadline = deadline
-        self._interrupt = interrupt
-
-    def __enter__(self) -> Conversation:
         try:
-            self._process = EngineProcess(self._configure, env=self._env)
+            self._process = EngineProcess(configure, env=env)
         except OSError as error:
             raise EngineFailed("engine_failed", f"the engine process cannot be started: {error}") from error
-        self._heard_at = time.monotonic()
-        #: what the process says, without an end; raises as `until`
-        self.events = self._listen()
+        self._deadline = deadline
+        self._interrupt = interrupt
+        self._last_event_at = time.monotonic()
+        #: endless iterator over the events of the process, which raises the errors of `wait_for`
+        self.events = self._receive_events()
+
+    def __enter__(self) -> PrivateEngine:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Kill the process and see it gone: it could write to its file once more."""
+        """Kill the process and wait until it is gone, so that it can't write to its file any more."""
         self._process.kill()
-        wait_ready({self._process.liveness: select.POLLIN}, SILENCE_LIMIT)
+        wait_ready({self._process.liveness: select.POLLIN}, KILL_LIMIT_S)
         self._process.close()
 
-    def say(self, say: protocol.Say) -> None:
-        """Have a text spoken; the process must be ready, and have ended the one before."""
-        self._heard_at = time.monotonic()
-        if not self._process.send(say):
-            for _ in self._received():
-                pass  # where it is dead, it is known how it died
+    def speak(self, command: protocol.Speak) -> None:
+        """Have a text spoken. The process must be ready, and the text before must have ended."""
+        self._last_event_at = time.monotonic()
+        if not self._process.send(command):
+            for _ in self._read_events():
+                pass  # raises a better error if the process is dead
             raise EngineFailed("engine_hung", "the engine takes no commands")
 
-    def until(self, kind: type[_E]) -> _E:
-        """Return the next of such events; EngineFailed, TimeoutError past the deadline, Interrupted."""
-        return next(event for event in self.events if isinstance(event, kind))
+    def wait_for(self, event_class: type[_E]) -> _E:
+        """Return the next event of this class.
 
-    def _listen(self) -> Iterator[protocol.Event]:
+        Raises:
+            EngineFailed: the process failed, or exceeded a time limit.
+            TimeoutError: the deadline has passed.
+            Interrupted: one of the descriptors in `interrupt` became ready.
+        """
+        return next(event for event in self.events if isinstance(event, event_class))
+
+    def _receive_events(self) -> Iterator[protocol.Event]:
         process = self._process
         watched = {process.socket.fileno(): select.POLLIN, process.stderr: select.POLLIN}
         while True:
-            limit = HANG_AFTER if process.ready else START_LIMIT
-            due = min(self._heard_at + limit, self._deadline)
-            found = wait_ready(watched, due - time.monotonic(), self._interrupt)
-            if process.stderr in found and not process.read_stderr():
+            limit = HANG_LIMIT_S if process.ready else START_LIMIT_S
+            due = min(self._last_event_at + limit, self._deadline)
+            ready = wait_ready(watched, due - time.monotonic(), self._interrupt)
+            if process.stderr in ready and not process.read_stderr():
                 del watched[process.stderr]
-            # Before the limits: who was stopped by Ctrl-Z finds all that was said meanwhile, and the limits long past.
-            if process.socket.fileno() in found:
-                yield from self._received()
+            # Read before checking the limits. After a Ctrl-Z they are long past, but the events are all there.
+            if process.socket.fileno() in ready:
+                yield from self._read_events()
             now = time.monotonic()
             if now >= self._deadline:
                 raise TimeoutError
-            if now < self._heard_at + limit:
+            if now < self._last_event_at + limit:
                 continue
             if process.ready:
                 raise EngineFailed("engine_hung", f"the engine gave no sign of life for {limit:g} s", limit)
             raise EngineFailed("engine_failed", f"the engine was not ready after {limit:g} s", limit)
 
-    def _received(self) -> Iterator[protocol.Event]:
+    def _read_events(self) -> Iterator[protocol.Event]:
         for event in self._process.receive():
-            self._heard_at = time.monotonic()
+            self._last_event_at = time.monotonic()
             if event is None:
-                raise EngineFailed("engine_crashed", self._process.last_words())
+                raise EngineFailed("engine_crashed", self._process.describe_exit())
             if isinstance(event, protocol.StartFailed):
                 raise EngineFailed(event.reason, event.message)
             if isinstance(event, protocol.Ready):

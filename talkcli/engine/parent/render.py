@@ -1,9 +1,9 @@
-"""Renders one text into a WAV file, in an engine process of its own: what `say -o` does, with or without a server.
+"""Rendering of a text into a WAV file, for `say -o`, in an engine process of its own, with or without a server.
 
-It is no goal: nothing is queued, nobody else sees it, and the text may have any length. FILE appears whole or not at
-all: the engine writes beside it, under a hidden name, and only what it says it has completed is renamed. It must leave
-neither that hidden file nor a process behind, whatever interrupts it; one that is killed outright leaves the hidden
-file at most. Standard output, a named pipe, a device get the sound as it is made.
+A rendering is not a goal. It isn't queued, no other client sees it, and its text may have any length. A regular file
+appears complete or not at all: the engine writes to a hidden file beside it, which is renamed once the engine reports
+that it is complete. Neither the hidden file nor a process may be left behind, whatever interrupts the rendering. Only
+after a SIGKILL may the hidden file remain. Standard output, a named pipe or a device receives the sound as it is made.
 """
 
 from __future__ import annotations
@@ -17,46 +17,45 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
-from talkcli.engine.child.players.builtin import WavStreamPlayer
-from talkcli.engine.parent.process import Conversation, EngineFailed
+from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
 from talkcli.goals.options import MAX_CHARACTERS
+from talkcli.goals.states import EXIT_CODES, State
 from talkcli.polling import wait_ready
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-#: The exit codes of a goal that is REJECTED or ABORTED, for the same reasons here.
-_EXIT_REJECTED, _EXIT_ABORTED = 5, 4
+#: Reasons with the exit code of a rejected goal. All others have that of an aborted one.
 _REJECTED = frozenset({"invalid_text", "unknown_voice", "bad_option"})
-#: Reasons that come from the player; the only one here is the file.
-_FROM_FILE = frozenset({"audio_device", "audio_lost"})
-#: What stands for standard output, which is written to as it is: the shell has opened it.
+#: Reasons that come from the player. The only player here is the file.
+_FILE_REASONS = frozenset({"audio_device", "audio_lost"})
+#: Paths that mean standard output. It is used as the shell has opened it.
 STANDARD_OUTPUT = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
-#: Seconds between two looks whether somebody has opened a named pipe to read it: nothing tells of that.
-_READER_LOOK = 0.05
-#: Characters of a piece, as many as a goal may have: the engine says nothing while it prepares them.
-LONGEST_PIECE = MAX_CHARACTERS
-#: Where a text may be cut and sounds as if it were whole: behind the end of a sentence, or of a line.
+#: Interval for checking whether a named pipe has a reader, because no event reports that.
+_READER_CHECK_INTERVAL_S = 0.05
+#: Longest piece of text sent at once: as long as a goal may be, because the engine is silent while it prepares one.
+MAX_PIECE_CHARS = MAX_CHARACTERS
+#: Ends of sentences and lines. A text that is cut there sounds the same as the whole text.
 _SENTENCE_END = re.compile(r"""[.!?…]["')\]»”’]*\s+|[。！？।]|\n\s*""")
 _BLANK = re.compile(r"\s+")
 
 
 class RenderFailed(TalkError):
-    """There is no file: `code` has the reasons that a goal has, or `cannot_write`."""
+    """The text was not rendered, and there is no file. `code` is a goal's reason or "cannot_write"."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code = code
-        self.exit_code = _EXIT_REJECTED if code in _REJECTED else _EXIT_ABORTED
+        self.exit_code = EXIT_CODES[State.REJECTED if code in _REJECTED else State.ABORTED]
 
 
 class CannotWrite(RenderFailed):
-    """The file cannot be written; what was there before is as it was."""
+    """The file can't be written. A file that was there before is unchanged."""
 
-    def __init__(self, path: str, why: str) -> None:
-        super().__init__("cannot_write", f"{path} {why}")
+    def __init__(self, path: str, problem: str) -> None:
+        super().__init__("cannot_write", f"{path} {problem}")
         self.exit_code = EXIT_ERROR
 
 
@@ -72,41 +71,65 @@ def render(
     timeout: float | None = None,
     interrupt: Mapping[int, int] | None = None,
 ) -> float:
-    """Render the text into the file at `path` and return the seconds of audio; "-" is standard output.
+    """Render a text into a WAV file and return the seconds of audio.
 
-    The settings are those of a goal. `timeout`: seconds in which it must be done, else TimeoutError; `interrupt`: what
-    ends it with Interrupted, as in `connect.ready`. RenderFailed; BrokenPipeError where whoever reads standard output
-    is gone; UsageError for a driver that writes no file, or for a terminal.
+    Args:
+        text: the text, of any length.
+        path: the file to write; "-" for standard output.
+        rate: words per minute, 80 to 450.
+        volume: 0.0 to 1.0.
+        voice: id, name or language, or None for the default.
+        pitch: 0 to 100.
+        driver: name of a pyttsx3 driver, or None for the usual one.
+        timeout: limit in seconds, or None for no limit.
+        interrupt: descriptors that end the rendering, as in `polling.wait_ready`.
+
+    Raises:
+        RenderFailed: the text can't be spoken or the file can't be written.
+        UsageError: the driver can't write files, or standard output is a terminal.
+        TimeoutError: the text was not rendered in time.
+        Interrupted: one of the descriptors in `interrupt` became ready.
+        BrokenPipeError: the reader of standard output is gone.
     """
     deadline = time.monotonic() + (float("inf") if timeout is None else timeout)
     fault = texts.fault(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
-    # A file has time, and another voice in it would be no use.
-    asked = (each for each in enumerate(pieces(text), 1))
-    says = (protocol.Say(f"{n}", each, rate, volume, voice, pitch, voice_only=True) for n, each in asked)
-    if path not in STANDARD_OUTPUT and not _is_stream(path):
-        with _replacing(path) as hidden:
-            configure = protocol.Configure(os.getpid(), driver, f"file:{hidden}", None, None, list_voices=False)
-            return _speak_into(Conversation(configure, deadline=deadline, interrupt=interrupt), hidden, path, says)
-    with _stream(path, deadline, interrupt) as output:
-        configure = protocol.Configure(os.getpid(), driver, None, None, None, list_voices=False, output=output)
+    # A rendering can wait for its voice to load, and a file in another voice would be useless.
+    commands = (
+        protocol.Speak(f"{number}", piece, rate, volume, voice, pitch, voice_only=True)
+        for number, piece in enumerate(pieces(text), 1)
+    )
+    with contextlib.ExitStack() as stack:
+        player: str | None = None
+        output_fd: int | None = None
+        engine_path = protocol.OUTPUT_STREAM_NAME
+        if _is_stream(path):
+            output_fd = stack.enter_context(_stream(path, deadline, interrupt))
+        else:
+            engine_path = stack.enter_context(_replacing(path))
+            player = f"file:{engine_path}"
+        configure = protocol.Configure(os.getpid(), driver, player, None, None, list_voices=False, output_fd=output_fd)
         try:
-            conversation = Conversation(configure, deadline=deadline, interrupt=interrupt)
-            return _speak_into(conversation, WavStreamPlayer.name, _named(path), says)
+            with PrivateEngine(configure, deadline=deadline, interrupt=interrupt) as engine:
+                return _speak_all(engine, commands, engine_path, _display_name(path))
+        except EngineFailed as error:
+            raise _engine_failure(error, None) from error
+        except TimeoutError:
+            raise TimeoutError("the text was not rendered in time") from None
         except CannotWrite as error:
-            if path in STANDARD_OUTPUT and wait_ready({output: 0}, 0.0):
+            if output_fd is not None and path in STANDARD_OUTPUT and wait_ready({output_fd: 0}, 0.0):
                 raise BrokenPipeError(errno.EPIPE, "the reader of standard output is gone") from error
             raise
 
 
 def pieces(text: str) -> Iterator[str]:
-    """Cut a text into pieces that are not too long, and that are the text when they are joined."""
+    """Cut a text into pieces of at most `MAX_PIECE_CHARS`, at the end of a sentence or a word if possible."""
     start = 0
-    while len(text) - start > LONGEST_PIECE:
-        end = start + LONGEST_PIECE
-        for where in (_SENTENCE_END, _BLANK):
-            ends = [each.end() for each in where.finditer(text, start, end)]
+    while len(text) - start > MAX_PIECE_CHARS:
+        end = start + MAX_PIECE_CHARS
+        for boundary in (_SENTENCE_END, _BLANK):
+            ends = [match.end() for match in boundary.finditer(text, start, end)]
             if ends:
                 end = ends[-1]
                 break
@@ -115,12 +138,60 @@ def pieces(text: str) -> Iterator[str]:
     yield text[start:]
 
 
-def _named(path: str) -> str:
+def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine_path: str, path: str) -> float:
+    """Have all pieces spoken and return the seconds of audio. `engine_path` is how the engine calls the file `path`."""
+    ready = engine.wait_for(protocol.Ready)
+    if ready.player is None:
+        raise UsageError(f'the driver "{ready.driver}" cannot write a file: leave --driver out, on Linux')
+    seconds, silent_end = 0.0, None
+    for command in commands:
+        try:
+            engine.speak(command)
+            ended = engine.wait_for(protocol.Ended)
+        except EngineFailed as error:
+            raise _engine_failure(error, command.voice) from error
+        if ended.outcome == protocol.OUTCOME_COMPLETED and ended.duration is not None:
+            seconds += ended.duration
+        elif ended.reason == "nothing_to_say":  # one piece of a long text may consist of dots
+            silent_end = ended
+        else:
+            raise _goal_failure(ended, engine_path, path)
+    if silent_end and not seconds:
+        raise _goal_failure(silent_end, engine_path, path)
+    return seconds
+
+
+def _engine_failure(error: EngineFailed, voice: str | None) -> RenderFailed:
+    while_speaking = "" if voice is None else f' while it spoke with the voice "{voice}"'
+    if error.reason == "engine_crashed":
+        return RenderFailed(error.reason, f"the engine crashed{while_speaking}: {error}")
+    return RenderFailed(error.reason, f"{error}{while_speaking}")
+
+
+def _goal_failure(ended: protocol.Ended, engine_path: str, path: str) -> RenderFailed:
+    reason = ended.reason or "engine_failed"
+    message = (ended.message or "the engine did not complete the text").replace(engine_path, path)
+    if reason in _FILE_REASONS:
+        problem = message.removeprefix(path)
+        return CannotWrite(path, f"cannot be written{problem}" if problem.startswith(": ") else problem.strip())
+    return RenderFailed(reason, message)
+
+
+def _write_failure(path: str, error: OSError) -> CannotWrite:
+    return CannotWrite(path, f"cannot be written: {error.strerror}")
+
+
+def _display_name(path: str) -> str:
     return "standard output" if path in STANDARD_OUTPUT else path
 
 
+# -- output that is written as the sound is made
+
+
 def _is_stream(path: str) -> bool:
-    """Whether the path is that of a named pipe or of a device that takes characters, which nothing is renamed over."""
+    """Return whether the path is standard output, a named pipe or a character device."""
+    if path in STANDARD_OUTPUT:
+        return True
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
@@ -130,35 +201,69 @@ def _is_stream(path: str) -> bool:
 
 @contextlib.contextmanager
 def _stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
-    """Give a descriptor of standard output, a named pipe or a device, open for writing."""
-    output = os.dup(1) if path in STANDARD_OUTPUT else _open_stream(path, deadline, interrupt)
+    """Open standard output, a named pipe or a device for writing, and yield the descriptor."""
+    output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_stream(path, deadline, interrupt)
     try:
-        if os.isatty(output):
+        if os.isatty(output_fd):
             raise UsageError(
-                f"{_named(path)} is a terminal, and sound is no text: name a file, or a program that reads it, as in: "
-                "talk say -o - TEXT | aplay"
+                f"{_display_name(path)} is a terminal, and sound is no text: name a file, or a program that reads it, "
+                "as in: talk say -o - TEXT | aplay"
             )
-        yield output
+        yield output_fd
     finally:
-        os.close(output)
+        os.close(output_fd)
 
 
 def _open_stream(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
-    """Open a device, or a named pipe once somebody reads it."""
+    """Open a device, or a named pipe as soon as it has a reader."""
     while True:
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
         except OSError as error:
             if error.errno != errno.ENXIO or not stat.S_ISFIFO(os.stat(path).st_mode):
-                raise _unwritable(path, error) from error
-        left = min(_READER_LOOK, deadline - time.monotonic())
+                raise _write_failure(path, error) from error
+        left = min(_READER_CHECK_INTERVAL_S, deadline - time.monotonic())
         if left <= 0:
             raise TimeoutError(f"nobody has opened {path} to read it within the time")
         wait_ready({}, left, interrupt)
 
 
+# -- a file that is replaced at the end
+
+
+@contextlib.contextmanager
+def _replacing(path: str) -> Iterator[str]:
+    """Yield the path of a new hidden file, and rename it to `path` at the end. After an error, remove it."""
+    target = _target(path)
+    # A short name of its own, because the target's name may already be as long as a name can be.
+    hidden = os.path.join(os.path.dirname(target), f".talk-{os.urandom(8).hex()}.wav")
+    try:
+        try:
+            open(hidden, "xb").close()  # with the mode given by the umask
+        except OSError as error:
+            directory = os.path.dirname(hidden)
+            if not os.path.isdir(directory):
+                raise CannotWrite(path, f"cannot be written: there is no directory {directory}") from error
+            raise _write_failure(path, error) from error
+        yield hidden
+        try:
+            with open(hidden, "rb") as file:
+                os.fsync(file)  # protects from a power cut, and some file systems report a full disk only here
+            os.replace(hidden, target)
+        except OSError as error:
+            raise _write_failure(path, error) from error
+    finally:
+        # It may have been renamed or never created. If it can't be removed, the error that led here says why.
+        with contextlib.suppress(OSError):
+            os.unlink(hidden)
+
+
 def _target(path: str) -> str:
-    """Return the file to rename over, which is what a link points to; CannotWrite if it can't be one."""
+    """Return the file to replace: the one that a link points to.
+
+    Raises:
+        CannotWrite: the path can't be replaced by a file.
+    """
     if not path or path.endswith(os.sep) or "\0" in path:
         raise CannotWrite(repr(path), "is no name of a file: a rendering needs one, as in speech.wav")
     target = os.path.realpath(path)
@@ -167,92 +272,22 @@ def _target(path: str) -> str:
     except FileNotFoundError:
         return target
     except OSError as error:
-        raise _unwritable(path, error) from error
+        raise _write_failure(path, error) from error
     if stat.S_ISDIR(found.st_mode):
         raise CannotWrite(path, "is a directory: name a file in it")
-    # What is open without a name any more has a link, in /proc, but no place.
+    # A link in /proc/*/fd may point to a file that was deleted, so that nothing can be renamed to it.
     placed = os.path.exists(target) and os.path.samefile(path, target)
-    if not stat.S_ISREG(found.st_mode) or not placed or _is_our_output(found):
+    if not stat.S_ISREG(found.st_mode) or not placed or _is_own_output(found):
         raise CannotWrite(path, "is no file that can be replaced: name another, as in speech.wav")
     if not os.access(target, os.W_OK):
         raise CannotWrite(path, "cannot be written: it is write-protected")
     return target
 
 
-def _is_our_output(found: os.stat_result) -> bool:
-    """Tell whether the shell has it open for our output, under its own name: then it can be replaced by nobody."""
+def _is_own_output(found: os.stat_result) -> bool:
+    """Return whether this process's standard output or error goes to the file, which then can't be replaced."""
     for descriptor in (1, 2):
-        with contextlib.suppress(OSError):  # it is closed
+        with contextlib.suppress(OSError):  # the descriptor is closed
             if os.path.samestat(found, os.fstat(descriptor)):
                 return True
     return False
-
-
-@contextlib.contextmanager
-def _replacing(path: str) -> Iterator[str]:
-    """Give a new file, hidden, in the directory of the one to rename over; at a good end it is that one, else gone."""
-    target = _target(path)
-    # Its length doesn't depend on the target's, whose name may be as long as a name can be.
-    hidden = os.path.join(os.path.dirname(target), f".talk-{os.urandom(8).hex()}.wav")
-    try:
-        try:  # with the mode that the umask makes of it, and nobody else's file is written to
-            open(hidden, "xb").close()
-        except OSError as error:
-            directory = os.path.dirname(hidden)
-            if not os.path.isdir(directory):
-                raise CannotWrite(path, f"cannot be written: there is no directory {directory}") from error
-            raise _unwritable(path, error) from error
-        yield hidden
-        try:
-            with open(hidden, "rb") as file:
-                os.fsync(file)  # a power cut must not empty it; and some file systems tell only here of a full disk
-            os.replace(hidden, target)
-        except OSError as error:
-            raise _unwritable(path, error) from error
-    finally:
-        # Renamed by now, or never made; where it cannot be removed, why is in the error that brought us here.
-        with contextlib.suppress(OSError):
-            os.unlink(hidden)
-
-
-def _unwritable(path: str, error: OSError) -> CannotWrite:
-    return CannotWrite(path, f"cannot be written: {error.strerror}")
-
-
-def _speak_into(conversation: Conversation, name: str, path: str, says: Iterator[protocol.Say]) -> float:
-    """Speak all pieces, and return the seconds of audio. What the engine calls `name` is `path` to the user."""
-    seconds = 0.0
-    silent = None
-    by = ""
-    try:
-        with conversation as engine:
-            began = engine.until(protocol.Ready)
-            if began.player is None:
-                raise UsageError(f'the driver "{began.driver}" cannot write a file: leave --driver out, on Linux')
-            for say in says:
-                by = "" if say.voice is None else f' while it spoke with the voice "{say.voice}"'
-                engine.say(say)
-                ended = engine.until(protocol.Ended)
-                if ended.outcome == protocol.COMPLETED and ended.duration is not None:
-                    seconds += ended.duration
-                elif ended.reason == "nothing_to_say":  # a piece of a long text may be rows of dots
-                    silent = ended
-                else:
-                    raise _failure(ended, name, path)
-    except EngineFailed as error:
-        crashed = error.reason == "engine_crashed"
-        raise RenderFailed(error.reason, f"the engine crashed{by}: {error}" if crashed else f"{error}{by}") from error
-    except TimeoutError:
-        raise TimeoutError("the text was not rendered in time") from None
-    if silent and not seconds:
-        raise _failure(silent, name, path)
-    return seconds
-
-
-def _failure(ended: protocol.Ended, name: str, path: str) -> RenderFailed:
-    reason = ended.reason or "engine_failed"
-    message = (ended.message or "the engine did not complete the text").replace(name, path)
-    if reason in _FROM_FILE:
-        why = message.removeprefix(path)
-        return CannotWrite(path, f"cannot be written{why}" if why.startswith(": ") else why.strip())
-    return RenderFailed(reason, message)

@@ -1,230 +1,325 @@
-"""The engine thread: owns the engine process, sees to it that it has one goal at a time, and is its watchdog.
+"""The engine thread, which owns the engine process, hands it one goal at a time, and enforces its time limits.
 
-Who has a goal hands it in, in another thread, which sends it to the process by itself. Whatever the process does, a
-goal that was handed in ends with exactly one `Ended`, unless it was given up. The thread holds no lock while it
-waits, and everything it learns goes out through `post`. It knows no client and no queue.
+Another thread hands goals in, and sends them directly to the process if it can. Whatever the process does, each goal
+ends with exactly one `Ended`, unless it was given up. The thread reports everything through `post` and holds no lock
+while it waits. It knows neither clients nor the queue.
 """
 
 from __future__ import annotations
 
+import os
 import selectors
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from talkcli.daemon.quota import Quota
 from talkcli.engine import protocol
-from talkcli.engine.parent.inbox import NEVER, Inbox
 from talkcli.engine.parent.process import EngineProcess
-from talkcli.engine.protocol import HANG_AFTER, PAUSE_LIMIT, SILENCE_LIMIT, START_LIMIT, STOP_LIMIT
+from talkcli.engine.protocol import HANG_LIMIT_S, HOLD_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S, STOP_LIMIT_S
 from talkcli.frozen import frozen, replace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-#: Seconds before the next start, by the number of processes in a row that died before they were of use.
-BACK_OFF = (0.0, 0.1, 0.5, 2.0, 10.0)
-#: Lines of the process's standard error that are passed on in a while, and the seconds of that: a whole traceback, and
-#: no flood, as a driver of somebody else's may write a line for each word, for months.
-LINES, WHILE = 20, 60.0
-#: A ready process that dies sooner than this, and has had no goal, was of no use.
-SHORT_LIFE = 1.0
-#: Seconds without a ready process after which each start that fails costs a goal: nobody waits for ever.
-PATIENCE = 10.0
+#: Delay before the next start, by the number of processes in a row that didn't start or ended too soon.
+RESTART_DELAYS_S = (0.0, 0.1, 0.5, 2.0, 10.0)
+#: Lines of standard error passed on per period: enough for a traceback. A foreign driver may write one for each word.
+MAX_STDERR_LINES = 20
+STDERR_PERIOD_S = 60.0
+#: A process that was ready for less than this, and had no goal, ended too soon.
+MIN_LIFETIME_S = 1.0
+#: Time without a ready process after which each failed start ends a goal, so that no goal waits for ever.
+ENGINE_WAIT_LIMIT_S = 10.0
+NEVER = float("inf")
 
 
 @frozen
 class EngineDied:
-    """The engine process ended, or had to be ended; for the log."""
+    """The engine process ended or was killed. For the log."""
 
-    words: str
+    message: str
 
 
 @frozen
 class EngineMissing:
-    """There has been no ready engine process for long, and one more start failed: the next goal ends for it."""
+    """Another start failed after a long time without a ready process. The next goal ends for this reason."""
 
-    words: str
+    message: str
 
 
 @frozen
 class EngineSaid:
-    """A line that the engine process wrote to standard error; for the log. It may hold what a goal's text says."""
+    """A line that the engine process wrote to standard error, for the log. It may contain parts of a goal's text."""
 
-    words: str
+    line: str
 
 
 @frozen
 class ThreadDied:
-    """A bug ended the engine thread: nothing will be spoken any more."""
+    """A bug ended the engine thread. Nothing will be spoken any more."""
 
-    words: str
+    message: str
 
 
 Report = protocol.Event | EngineDied | EngineMissing | EngineSaid | ThreadDied
 
 
-class Restarts:
-    """When the next engine process may be started, and whether goals wait for it.
+class ActionQueue:
+    """Actions that other threads hand to a thread waiting for descriptors.
 
-    What may pass is waited out: no memory, no descriptors, a process that was killed in its start. What is known to
-    stay (no library, no such driver) ends each goal at once, until a process gets ready all the same. The time comes in
-    as an argument (monotonic seconds).
+    `call` may be used from any thread. The other methods belong to the thread that waits.
+    """
+
+    def __init__(self, nap_s: float) -> None:
+        """Create the queue.
+
+        Args:
+            nap_s: after any work, the waiting thread wakes up once by itself within this time. Actions that can wait
+                as long don't have to wake it.
+        """
+        self.selector = selectors.DefaultSelector()
+        self._actions: deque[Callable[[], None]] = deque()
+        self._closed = False
+        #: held by `call`, so that the wake-up descriptor isn't closed and reused in the meantime
+        self._calling = threading.Lock()
+        #: whether a wake-up is on its way, which serves all actions until it arrives
+        self._woken = False
+        #: monotonic time until which the thread sleeps if nothing wakes it; 0 while it is awake
+        self._sleeps_until = 0.0
+        self._nap_s = nap_s
+        self._nap_ends_at = 0.0
+        self._reader, self._writer = os.pipe()
+        os.set_blocking(self._reader, False)
+        os.set_blocking(self._writer, False)
+        self.selector.register(self._reader, selectors.EVENT_READ)
+
+    def call(self, action: Callable[[], None], by: float = 0.0) -> None:
+        """Have the waiting thread run an action. After `close`, do nothing.
+
+        Args:
+            action: the action.
+            by: monotonic time until which the action can wait for the thread to wake up by itself. Waking it, and
+                handing over the interpreter, costs about 50 µs, as much as a hundred lines of Python.
+        """
+        with self._calling:
+            if self._closed:
+                return
+            self._actions.append(action)
+            # The order matters, and `wait` does the opposite: either this sees the thread asleep, or `wait` sees the
+            # action.
+            if self._sleeps_until > by and not self._woken:
+                self._woken = True
+                os.write(self._writer, b"\0")
+
+    def wait(self, until: float) -> list[selectors.SelectorKey]:
+        """Wait for a registered descriptor, an action or a monotonic time.
+
+        Run the actions, and return the keys of the ready descriptors.
+        """
+        now = time.monotonic()
+        if now < self._nap_ends_at < until:
+            until = self._nap_ends_at
+        self._sleeps_until = until
+        timeout = 0.0 if self._actions else max(0.0, until - now)
+        ready = [key for key, _ in self.selector.select(None if timeout == NEVER else timeout)]
+        self._sleeps_until = 0.0
+        if ready:
+            self._nap_ends_at = time.monotonic() + self._nap_s
+        if any(key.fd == self._reader for key in ready):
+            os.read(self._reader, 4096)
+            self._woken = False  # before running the actions, so that a later `call` wakes the thread again
+        self.run()
+        return [key for key in ready if key.fd != self._reader]
+
+    def run(self) -> None:
+        """Run the waiting actions."""
+        while self._actions:
+            self._actions.popleft()()
+
+    def close(self) -> None:
+        """Accept no more actions and close the queue's own descriptors."""
+        with self._calling:
+            self._closed = True
+        self.selector.close()
+        os.close(self._reader)
+        os.close(self._writer)
+
+
+class RestartPolicy:
+    """The rule for when to start the next engine process, and whether goals wait for it.
+
+    Temporary causes are waited out: no memory, no descriptors, a process killed while it started. A permanent cause,
+    such as a missing library or an unknown driver, ends each goal at once until a process becomes ready after all.
+
+    Pure: the time is an argument, in monotonic seconds.
     """
 
     def __init__(self, now: float) -> None:
-        #: when the next process may be started
-        self.due_at = 0.0
-        #: why the last start failed, where that is known to stay: no goal waits for another one then
-        self.error: str | None = None
+        self.next_start_at = 0.0
+        #: why the last start failed, if the cause is permanent
+        self.permanent_error: str | None = None
         self._failures = 0
-        #: since when there has been no ready process
         self._missing_since = now
 
-    def died(self, now: float, *, age: float, had_goal: bool) -> None:
-        """Plan the start after a process that had been ready; one that has had a goal costs no wait."""
+    def process_died(self, now: float, *, age_s: float, had_goal: bool) -> None:
+        """Plan the next start after a process that was ready. There is no delay unless it ended too soon."""
         self._missing_since = now
-        if had_goal or age > SHORT_LIFE:
+        if had_goal or age_s > MIN_LIFETIME_S:
             self._failures = 0
-            self.due_at = now
+            self.next_start_at = now
         else:
-            self._wait_longer(now)
+            self._back_off(now)
 
-    def failed(self, now: float, began: float, lasting: str | None) -> bool:
-        """Plan the start after one that failed, begun at that time, and return whether it costs a goal.
+    def start_failed(self, now: float, started_at: float, permanent_error: str | None) -> bool:
+        """Plan the next start after a failed one, and return whether the failure ends a goal.
 
-        `lasting`: the cause in words, where it is known to stay.
+        Args:
+            now: the present time.
+            started_at: time of the failed start.
+            permanent_error: message about the cause if it is permanent, else None.
         """
-        self._wait_longer(now)
-        self.error = lasting
-        return lasting is None and began >= self._missing_since + PATIENCE
+        self._back_off(now)
+        self.permanent_error = permanent_error
+        return permanent_error is None and started_at >= self._missing_since + ENGINE_WAIT_LIMIT_S
 
-    def _wait_longer(self, now: float) -> None:
-        self.due_at = now + BACK_OFF[min(self._failures, len(BACK_OFF) - 1)]
+    def _back_off(self, now: float) -> None:
+        self.next_start_at = now + RESTART_DELAYS_S[min(self._failures, len(RESTART_DELAYS_S) - 1)]
         self._failures += 1
 
 
 @dataclass(slots=True, eq=False)
-class Handed:
-    """A goal from the moment it is handed in until its `Ended` is posted."""
+class SupervisedGoal:
+    """A goal from the time it is handed in until its `Ended` is posted."""
 
-    say: protocol.Say
-    #: when the process last gave a sign of life for it; None while it waits for a process
-    heard_at: float | None = None
-    #: whether the process said that it has begun with it
+    command: protocol.Speak
+    #: time of the last sign of life for this goal; None while it waits for a process
+    last_sign_at: float | None = None
+    #: whether the process has reported that it has begun
     started: bool = False
-    #: whether a process that had it died before it began with it
-    again: bool = False
-    #: when the process was told to stop it
-    stop_at: float | None = None
-    #: the number of the pause that it is to be held for, by the process that speaks it, else by the thread
-    pause: int | None = None
-    #: when a process was told of it, until it is confirmed
-    pause_at: float | None = None
-    #: how it ended, once the process that spoke it is known to be gone
-    verdict: protocol.Ended | None = None
-    #: … and that process
-    verdict_on: EngineProcess | None = None
+    #: whether the goal was already taken back from a process that died before it began
+    retried: bool = False
+    #: when the process was told to stop
+    stop_sent_at: float | None = None
+    #: number of the hold in force; None if the goal is not to be held
+    hold_number: int | None = None
+    #: when the process was told to hold, until it confirms
+    hold_sent_at: float | None = None
+    #: how the goal ended, to be posted once `lost_process` is gone
+    end: protocol.Ended | None = None
+    #: the killed process that spoke the goal
+    lost_process: EngineProcess | None = None
 
     @property
-    def spoken(self) -> bool:
-        """Whether a process has it."""
-        return self.heard_at is not None
+    def sent(self) -> bool:
+        """Whether a process has the goal."""
+        return self.last_sign_at is not None
 
 
 class Supervisor:
-    """Owns the engine process. `post` is called in its thread: with what the process says, an `Ended` for each goal."""
+    """The owner of the engine process and its thread."""
 
     def __init__(self, configure: protocol.Configure, post: Callable[[Report], None]) -> None:
-        # Held, not inherited from: a Thread has private names of its own, and others in each version of Python.
-        #: to be started, and with it the first engine process; joined after `close`
+        """Prepare the thread.
+
+        Args:
+            configure: settings of each engine process.
+            post: called in the engine thread with what the process reports, including one `Ended` for each goal.
+        """
+        # An attribute, not a base class, because Thread has private names that differ between versions of Python.
+        #: to be started by the owner, which also starts the first engine process, and joined after `close`
         self.thread = threading.Thread(target=self._run, name="engine", daemon=True)
         self._configure = configure
         self._post = post
-        self._inbox = Inbox(doze=HANG_AFTER)
-        self._selector = self._inbox.selector
+        self._actions = ActionQueue(nap_s=HANG_LIMIT_S)
+        self._selector = self._actions.selector
         self._process: EngineProcess | None = None
-        #: the process that takes the next goal, from whichever thread; None where only this thread may decide
-        self._open: EngineProcess | None = None
+        #: the process to which `say` sends goals directly; None if only the engine thread may decide
+        self._direct_process: EngineProcess | None = None
         self._started_at = 0.0
-        self._restarts = Restarts(time.monotonic())
-        self._goal: Handed | None = None
-        #: the neural voice that the process loads, and when it last gave a sign of life
+        self._restarts = RestartPolicy(time.monotonic())
+        self._goal: SupervisedGoal | None = None
+        #: the neural voice that the process is loading, and the last sign of life
         self._loading: str | None = None
-        self._load_heard_at = 0.0
-        #: the killed ones that are not known to be gone
+        self._last_sign_at = 0.0
+        #: killed processes that may still be there
         self._dying: list[EngineProcess] = []
-        self._complaints = Quota(LINES, WHILE)
+        self._stderr_quota = Quota(MAX_STDERR_LINES, STDERR_PERIOD_S)
         self._closing = False
 
-    # -- called from other threads
+    # -- methods for other threads
 
-    def say(self, goal: protocol.Say) -> None:
-        """Hand in a goal; the one before must have ended or been given up. Only one thread may call this.
+    def say(self, command: protocol.Speak) -> None:
+        """Hand in a goal, always from the same thread. The goal before must have ended or been given up.
 
-        The caller itself sends it where it can: to wake this thread took a tenth to a fifth of what a goal costs.
+        The caller's thread sends it to the process if possible, because waking the engine thread would take a tenth to
+        a fifth of the time that a goal costs.
         """
-        process, now = self._open, time.monotonic()
+        process, now = self._direct_process, time.monotonic()
         if process is None:
-            self._inbox.call(lambda: self._take(goal))
+            self._actions.call(lambda: self._take_goal(command))
             return
-        self._inbox.call(lambda: self._take(goal, process, now), by=now + HANG_AFTER)
-        if not process.send(goal):
-            self._inbox.call(lambda: self._not_taken(goal.id, process))
+        self._actions.call(lambda: self._take_goal(command, process, now), by=now + HANG_LIMIT_S)
+        if not process.send(command):
+            self._actions.call(lambda: self._goal_not_sent(command.id, process))
 
     def stop(self, goal_id: str) -> None:
-        """Make the goal end, silent."""
-        self._inbox.call(lambda: self._begin_stop(goal_id))
+        """Stop the goal."""
+        self._actions.call(lambda: self._stop_goal(goal_id))
 
     def pause(self, goal_id: str, number: int) -> None:
-        """Hold the goal where it is; `Paused` is posted when it is silent, and nothing once it is being stopped."""
-        self._inbox.call(lambda: self._hold(goal_id, number))
+        """Hold the goal. `Held` is posted once it is silent, unless it is being stopped."""
+        self._actions.call(lambda: self._hold_goal(goal_id, number))
 
     def resume(self, goal_id: str) -> None:
         """Let the goal go on."""
-        self._inbox.call(lambda: self._hold(goal_id, None))
+        self._actions.call(lambda: self._hold_goal(goal_id, None))
 
-    def follow(self, goal_id: str, followed: bool, by_neural: bool) -> None:
-        """Tell whether another goal waits, `by_neural` by a neural voice: the silence before it may be made shorter."""
-        process = self._open
+    def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
+        """Tell the process whether another goal waits behind this one, so that it can shorten the silence at its end.
+
+        The message is dropped if the process can't take it, which costs little.
+        """
+        process = self._direct_process
         if process:
-            # An engine that has no room for it at this moment is not hung for that, and little is lost.
-            process.send(protocol.Followed(goal_id, followed, by_neural))
+            process.send(protocol.NextGoal(goal_id, next_waits, next_is_neural))
 
     def load(self, voice: str, drop: tuple[str, ...] = ()) -> None:
-        """Have the process drop neural voices and load one; `Loaded` is posted if it lives so long."""
+        """Have the process drop some neural voices and load another, which posts `VoiceLoaded` unless it dies."""
         for each in drop:
             self.drop(each)
-        self._inbox.call(lambda: self._load(protocol.Load(voice)))
+        self._actions.call(lambda: self._send_voice_command(protocol.LoadVoice(voice)))
 
     def drop(self, voice: str) -> None:
-        """Have the process keep a neural voice no longer."""
-        self._inbox.call(lambda: self._order(protocol.Drop(voice)))
+        """Have the process remove a neural voice from memory."""
+        self._actions.call(lambda: self._send_voice_command(protocol.DropVoice(voice)))
 
     def give_up(self, goal_id: str) -> None:
-        """Let go of a goal that didn't end in time: its process is left behind, there will be no `Ended`."""
-        self._open = None
-        self._inbox.call(lambda: self._abandon(goal_id))
+        """Forget a goal that didn't end in time, and replace its process. No `Ended` is posted for it."""
+        self._direct_process = None
+        self._actions.call(lambda: self._give_up_goal(goal_id))
 
     def close(self) -> None:
-        """End the process and this thread."""
+        """End the process and the thread."""
         self._closing = True
-        self._inbox.call(lambda: None)
+        self._actions.call(lambda: None)
 
     # -- the loop
 
     def _run(self) -> None:
-        """Serve until `close`; a bug is reported, so that no goal waits for an engine that is not there."""
+        """Run until `close`. Report a bug, so that no goal waits for an engine that doesn't exist."""
         try:
             while not self._closing:
-                # Before it takes what has come: whoever stood still, machine or process, has heard nothing meanwhile.
+                # Taken before reading. If the machine or the process stood still, the messages are read before their
+                # absence counts.
                 now = time.monotonic()
-                for key in self._inbox.wait(self._next_deadline()):
-                    self._handle(key)
+                for key in self._actions.wait(self._next_deadline()):
+                    self._handle_ready(key)
                 if not self._closing:
-                    self._keep_limits(now)
-            self._inbox.run()  # what came before `close`, which takes no turn
+                    self._check_deadlines(now)
+            self._actions.run()  # actions that came before `close`
         except Exception as error:
             self._closing = True
             self._post(ThreadDied(f"a bug in the engine thread: {type(error).__name__}: {error}"))
@@ -233,258 +328,274 @@ class Supervisor:
             self._shut_down()
 
     def _next_deadline(self) -> float:
-        due = [limit for limit, _ in self._limits()] + [each.gone_by for each in self._dying]
-        return min([*due, NEVER] if self._process else [*due, self._restarts.due_at])
+        deadlines = [deadline for deadline, _ in self._deadlines()] + [each.gone_by for each in self._dying]
+        return min([*deadlines, NEVER if self._process else self._restarts.next_start_at])
 
-    def _limits(self) -> Iterator[tuple[float, str]]:
-        """Return until when the process may take for what is waited for, and what is said of one that takes longer."""
-        goal = self._goal
+    def _deadlines(self) -> Iterator[tuple[float, str]]:
+        """Yield each deadline of the process, with the message for missing it."""
+        goal, no_sign = self._goal, f"the engine gave no sign of life for {HANG_LIMIT_S:g} s"
         if self._process and not self._process.ready:
-            yield self._started_at + START_LIMIT, f"the engine was not ready after {START_LIMIT:g} s"
-        if goal and goal.stop_at is not None:
-            yield goal.stop_at + STOP_LIMIT, f"the engine did not confirm a stop within {STOP_LIMIT * 1000:.0f} ms"
-        if goal and goal.heard_at is not None:
-            yield goal.heard_at + HANG_AFTER, f"the engine gave no sign of life for {HANG_AFTER:g} s"
+            yield self._started_at + START_LIMIT_S, f"the engine was not ready after {START_LIMIT_S:g} s"
+        if goal and goal.stop_sent_at is not None:
+            yield (
+                goal.stop_sent_at + STOP_LIMIT_S,
+                f"the engine did not confirm a stop within {STOP_LIMIT_S * 1000:.0f} ms",
+            )
+        if goal and goal.last_sign_at is not None:
+            yield goal.last_sign_at + HANG_LIMIT_S, no_sign
         if self._loading is not None:
-            words = f"the engine gave no sign of life for {HANG_AFTER:g} s while it loaded {self._loading}"
-            yield self._load_heard_at + HANG_AFTER, words
-        if goal and goal.pause_at is not None:
-            yield goal.pause_at + PAUSE_LIMIT, f"the engine did not confirm a pause within {PAUSE_LIMIT:g} s"
+            yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while it loaded {self._loading}"
+        if goal and goal.hold_sent_at is not None:
+            yield goal.hold_sent_at + HOLD_LIMIT_S, f"the engine did not confirm a pause within {HOLD_LIMIT_S:g} s"
 
-    def _keep_limits(self, now: float) -> None:
-        late = next((words for limit, words in self._limits() if now >= limit), None)
-        if late:
-            self._lose_process(late, "engine_hung")
-        elif self._process is None and now >= self._restarts.due_at:
-            self._start()
+    def _check_deadlines(self, now: float) -> None:
+        missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
+        if missed:
+            self._lose_process(missed, "engine_hung")
+        elif self._process is None and now >= self._restarts.next_start_at:
+            self._start_process()
         for process in self._dying:
             if now < process.gone_by:
                 continue
-            process.gone_by = NEVER  # overdue once; it is kept, to be reaped when it goes
-            process.kill()  # what could not be found before, for want of a descriptor, may be found now
-            if self._goal and self._goal.verdict_on is process:
-                words = f"the player could not be ended within {SILENCE_LIMIT:g} s"
-                self._finish(protocol.Ended(self._goal.say.id, protocol.FAILED, "not_silent", words))
+            process.gone_by = NEVER  # checked once; it is reaped whenever it goes
+            process.kill()  # finds processes that the first kill may have missed for lack of a descriptor
+            if self._goal and self._goal.lost_process is process:
+                self._fail_goal(self._goal, "not_silent", f"the player could not be ended within {KILL_LIMIT_S:g} s")
 
-    def _handle(self, key: selectors.SelectorKey) -> None:
+    def _handle_ready(self, key: selectors.SelectorKey) -> None:
         if key.fd not in self._selector.get_map():
-            return  # closed by what was handled before it
+            return  # closed while an earlier key was handled
         process: EngineProcess = key.data
         if key.fd == process.liveness:
             if process is self._process:
-                self._hear(process)  # its last messages, before its end is acted upon
+                self._receive(process)  # its last messages, before its death is handled
             if process is self._process:
-                self._crashed(process)
-            if process.silent():
-                self._bury(process)
+                self._handle_crash(process)
+            if process.is_gone():
+                self._release_process(process)
         elif key.fd == process.stderr:
             if not process.read_stderr():
                 self._selector.unregister(process.stderr)
         elif process is self._process:
-            self._hear(process)
+            self._receive(process)
 
     # -- goals
 
-    def _in_hand(self, goal_id: str) -> Handed | None:
-        """Return the goal if it has not ended meanwhile."""
-        return self._goal if self._goal and self._goal.say.id == goal_id else None
+    def _current(self, goal_id: str) -> SupervisedGoal | None:
+        """Return the goal with this id; None if it has ended."""
+        return self._goal if self._goal and self._goal.command.id == goal_id else None
 
-    def _take(self, say: protocol.Say, sent: EngineProcess | None = None, at: float = 0.0) -> None:
-        """Take a goal in hand, one that was sent to a process already, or is to be: where that one is lost since."""
-        self._goal = Handed(say)
-        if sent is not None and sent is self._process:
-            self._goal.heard_at = at
-        elif self._restarts.error is not None:
-            self._finish(protocol.Ended(say.id, protocol.FAILED, "engine_failed", self._restarts.error))
+    def _take_goal(self, command: protocol.Speak, sent_to: EngineProcess | None = None, at: float = 0.0) -> None:
+        """Take charge of a goal. Send it to the process unless that was already done."""
+        self._goal = SupervisedGoal(command)
+        if sent_to is not None and sent_to is self._process:
+            self._goal.last_sign_at = at
+        elif self._restarts.permanent_error is not None:
+            self._fail_goal(self._goal, "engine_failed", self._restarts.permanent_error)
         else:
-            self._hand_over()
+            self._send_goal()
 
-    def _not_taken(self, goal_id: str, process: EngineProcess) -> None:
-        """Let a goal wait for the next process: this one doesn't have it."""
+    def _send_goal(self) -> None:
+        """Send the goal to the process if both are ready for it."""
+        goal, process = self._goal, self._process
+        waits = goal and not (goal.sent or goal.hold_number or goal.end)
+        if goal and waits and process and process.ready:
+            goal.last_sign_at = time.monotonic()
+            if not process.send(goal.command):
+                self._goal_not_sent(goal.command.id, process)
+
+    def _goal_not_sent(self, goal_id: str, process: EngineProcess) -> None:
+        """Let a goal that its process didn't take wait for the next process."""
         if process is self._process:
-            goal = self._in_hand(goal_id)
+            goal = self._current(goal_id)
             if goal:
-                goal.heard_at = None
-            self._refused(process)
+                goal.last_sign_at = None
+            self._handle_refusal(process)
 
-    def _load(self, load: protocol.Load) -> None:
-        if self._process and self._process.ready:  # else another will be, of which it is wanted anew
-            self._loading, self._load_heard_at = load.voice, time.monotonic()
-            self._order(load)
+    def _send_voice_command(self, command: protocol.LoadVoice | protocol.DropVoice) -> None:
+        """Load or drop a voice if a process is ready. The next process starts without voices and is told anew."""
+        process = self._process
+        if process and process.ready:
+            if isinstance(command, protocol.LoadVoice):
+                self._loading, self._last_sign_at = command.voice, time.monotonic()
+            if not process.send(command):
+                self._handle_refusal(process)
 
-    def _order(self, order: protocol.Load | protocol.Drop) -> None:
-        if self._process and self._process.ready and not self._process.send(order):
-            self._refused(self._process)
-
-    def _refused(self, process: EngineProcess) -> None:
-        self._hear(process)  # where it is dead, it is known how it died
+    def _handle_refusal(self, process: EngineProcess) -> None:
+        """Replace a process that takes no commands."""
+        self._receive(process)  # notices how it died if it is dead
         if process is self._process:
             self._lose_process("the engine takes no commands", "engine_hung")
 
-    def _hand_over(self) -> None:
-        goal, process = self._goal, self._process
-        waits = goal and not (goal.spoken or goal.pause or goal.verdict)
-        if goal and waits and process and process.ready:
-            goal.heard_at = time.monotonic()
-            if not process.send(goal.say):
-                self._not_taken(goal.say.id, process)
-
-    def _hold(self, goal_id: str, pause: int | None) -> None:
-        goal = self._in_hand(goal_id)
-        if goal is None or goal.stop_at is not None or goal.verdict or goal.pause is pause is None:
-            return  # it ended, or is about to, while this was on its way
-        goal.pause = pause
-        goal.pause_at = time.monotonic() if goal.spoken and pause is not None else None
-        if goal.spoken:
-            command = protocol.Resume(goal_id) if pause is None else protocol.Pause(goal_id, pause)
+    def _hold_goal(self, goal_id: str, number: int | None) -> None:
+        """Hold the goal for the pause with this number, or let it go on if there is no number."""
+        goal = self._current(goal_id)
+        if goal is None or goal.stop_sent_at is not None or goal.end or goal.hold_number is number is None:
+            return
+        goal.hold_number = number
+        goal.hold_sent_at = time.monotonic() if goal.sent and number is not None else None
+        if goal.sent:
+            command = protocol.Continue(goal_id) if number is None else protocol.Hold(goal_id, number)
             if self._process and not self._process.send(command):
-                self._refused(self._process)
-        elif pause is not None:
-            self._post(protocol.Paused(goal_id, pause))  # it waits for a process, and now for `resume` as well
+                self._handle_refusal(self._process)
+        elif number is not None:
+            self._post(protocol.Held(goal_id, number))  # no process has it, so it is silent
         else:
-            self._hand_over()
+            self._send_goal()
 
-    def _begin_stop(self, goal_id: str) -> None:
-        goal = self._in_hand(goal_id)
-        if goal is None or goal.stop_at is not None:
-            return  # it ended while the stop was on its way
-        if goal.verdict:
-            goal.verdict = protocol.Ended(goal_id, protocol.STOPPED)
-        elif not goal.spoken:
-            self._finish(protocol.Ended(goal_id, protocol.STOPPED))
+    def _stop_goal(self, goal_id: str) -> None:
+        goal = self._current(goal_id)
+        if goal is None or goal.stop_sent_at is not None:
+            return
+        stopped = protocol.Ended(goal_id, protocol.OUTCOME_STOPPED)
+        if goal.end:
+            goal.end = stopped
+        elif not goal.sent:
+            self._end_goal(stopped)
         elif self._process:
-            goal.stop_at = time.monotonic()
+            goal.stop_sent_at = time.monotonic()
             self._process.send(protocol.Stop(goal_id))
 
-    def _abandon(self, goal_id: str) -> None:
-        goal = self._in_hand(goal_id)
+    def _give_up_goal(self, goal_id: str) -> None:
+        goal = self._current(goal_id)
         if goal:
             self._goal = None
-            if goal.spoken:
+            if goal.sent:
                 self._lose_process("the engine could not be silenced", "not_silent")
-        self._open = self._process if self._process and self._process.ready else None
+        self._direct_process = self._process if self._process and self._process.ready else None
 
-    def _finish(self, ended: protocol.Ended) -> None:
+    def _fail_goal(self, goal: SupervisedGoal, reason: str, message: str) -> None:
+        self._end_goal(protocol.Ended(goal.command.id, protocol.OUTCOME_FAILED, reason, message))
+
+    def _end_goal(self, ended: protocol.Ended) -> None:
         self._goal = None
         self._post(ended)
 
     # -- the process
 
-    def _start(self) -> None:
+    def _start_process(self) -> None:
         self._started_at = time.monotonic()
         try:
-            process = EngineProcess(self._configure, self._complain)
+            process = EngineProcess(self._configure, self._report_stderr)
         except OSError as error:
-            words = f"the engine process cannot be started: {error.strerror or error}"
-            self._post(EngineDied(words))
-            self._start_failed(words)
+            message = f"the engine process cannot be started: {error.strerror or error}"
+            self._post(EngineDied(message))
+            self._plan_after_failed_start(message)
             return
         self._process = process
         for fd in (process.socket.fileno(), process.liveness, process.stderr):
             self._selector.register(fd, selectors.EVENT_READ, process)
 
-    def _hear(self, process: EngineProcess) -> None:
+    def _report_stderr(self, line: str) -> None:
+        omitted = self._stderr_quota.take(time.monotonic())
+        if omitted:
+            self._post(EngineSaid(f"({omitted} lines were left out)"))
+        if omitted is not None:
+            self._post(EngineSaid(line))
+
+    def _receive(self, process: EngineProcess) -> None:
+        """Handle the messages of the process that have arrived."""
         for event in process.receive():
-            self._inbox.run()  # what it answers to was left there before it was sent
+            self._actions.run()  # the command that this answers may still be waiting to be noted
             if process is not self._process:
                 return
             if event is None:
-                self._crashed(process)
+                self._handle_crash(process)
                 return
-            self._note(process, event)
+            self._handle_event(process, event)
 
-    def _crashed(self, process: EngineProcess) -> None:
-        self._open = None
-        self._lose_process(f"the engine crashed: {process.last_words()}", "engine_crashed")
+    def _handle_crash(self, process: EngineProcess) -> None:
+        self._direct_process = None
+        self._lose_process(f"the engine crashed: {process.describe_exit()}", "engine_crashed")
 
-    def _complain(self, words: str) -> None:
-        left_out = self._complaints.take(time.monotonic())
-        if left_out:
-            self._post(EngineSaid(f"({left_out} lines were left out)"))
-        if left_out is not None:
-            self._post(EngineSaid(words))
-
-    def _note(self, process: EngineProcess, event: protocol.Event) -> None:
-        self._load_heard_at = time.monotonic()
-        if isinstance(event, protocol.OF_A_GOAL):
-            if self._goal and self._goal.spoken and event.id == self._goal.say.id:  # else it has ended already
-                process.used = True
-                self._note_of(self._goal, event)
+    def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
+        self._last_sign_at = time.monotonic()
+        if isinstance(event, protocol.GoalEvent):
+            if self._goal and self._goal.sent and event.id == self._goal.command.id:  # else it has ended already
+                process.had_goal = True
+                self._handle_goal_event(self._goal, event)
             return
         if isinstance(event, protocol.Ready):
             process.ready = True
-            self._restarts.error = None
-            self._open = process
+            self._restarts.permanent_error = None
+            self._direct_process = process
         elif isinstance(event, protocol.StartFailed):
-            process.failed = event
-        elif isinstance(event, protocol.Loaded) and event.voice == self._loading:
+            process.start_failure = event
+        elif isinstance(event, protocol.VoiceLoaded) and event.voice == self._loading:
             self._loading = None
-        elif isinstance(event, protocol.Voices):
-            self._configure = replace(self._configure, list_voices=False)  # the next process need not
+        elif isinstance(event, protocol.VoiceList):
+            self._configure = replace(self._configure, list_voices=False)  # the next process doesn't have to send it
         self._post(event)
-        self._hand_over()
+        self._send_goal()
 
-    def _note_of(self, goal: Handed, event: protocol.Event) -> None:
-        goal.heard_at = time.monotonic()
+    def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
+        goal.last_sign_at = self._last_sign_at
         if isinstance(event, protocol.Started):
             goal.started = True
         elif isinstance(event, protocol.Ended):
-            self._finish(event)
-        elif isinstance(event, protocol.Word | protocol.Output | protocol.Speaks):
+            self._end_goal(event)
+        elif isinstance(event, protocol.Word | protocol.OutputChanged | protocol.VoiceChosen):
             self._post(event)
-        elif isinstance(event, protocol.Paused) and event.number == goal.pause:
-            goal.pause_at = None
+        elif isinstance(event, protocol.Held) and event.number == goal.hold_number:
+            goal.hold_sent_at = None
             self._post(event)
 
-    def _lose_process(self, words: str, reason: str) -> None:
-        """Kill the process, end its goal once it is silent, and plan the next start."""
+    def _lose_process(self, message: str, reason: str) -> None:
+        """Kill the process, let its goal end once it is silent, and plan the next start.
+
+        Args:
+            message: what happened, for people.
+            reason: the reason for the goal to end.
+        """
         process, now = self._process, time.monotonic()
         if process is None:
             return
-        self._process = self._open = self._loading = None
+        self._process = self._direct_process = self._loading = None
         process.kill()
         self._selector.unregister(process.socket.fileno())
-        process.gone_by = now + SILENCE_LIMIT
+        process.gone_by = now + KILL_LIMIT_S
         self._dying.append(process)
-        goal = self._goal if self._goal and self._goal.spoken else None
+        goal = self._goal if self._goal and self._goal.sent else None
         if goal:
-            self._take_back(goal, process, words, reason)
-        if not (self._closing or process.failed):
-            self._post(EngineDied(words))
+            self._handle_lost_goal(goal, process, message, reason)
+        if not (self._closing or process.start_failure):
+            self._post(EngineDied(message))
         if process.ready:
-            self._restarts.died(now, age=now - self._started_at, had_goal=goal is not None or process.used)
-        elif process.failed:
-            self._start_failed(process.failed.message, lasting=process.failed.lasting)
+            had_goal = goal is not None or process.had_goal
+            self._restarts.process_died(now, age_s=now - self._started_at, had_goal=had_goal)
+        elif process.start_failure:
+            self._plan_after_failed_start(process.start_failure.message, permanent=process.start_failure.permanent)
         else:
-            self._start_failed(words)
+            self._plan_after_failed_start(message)
 
-    def _take_back(self, goal: Handed, process: EngineProcess, words: str, reason: str) -> None:
-        """Decide what becomes of a goal whose process is lost.
+    def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: str) -> None:
+        """Decide how a goal ends whose process is lost.
 
-        One that died before it began with the goal, so that nothing of it was heard, leaves it to the next; not twice.
+        If the process crashed before it began with the goal, nothing was heard, and the next process gets the goal.
+        This happens only once per goal.
         """
-        if reason == "engine_crashed" and goal.stop_at is None and not (goal.started or goal.again):
-            goal.again = True
-            if goal.pause is not None:
-                self._post(protocol.Paused(goal.say.id, goal.pause))
+        if reason == "engine_crashed" and goal.stop_sent_at is None and not (goal.started or goal.retried):
+            goal.retried = True
+            if goal.hold_number is not None:
+                self._post(protocol.Held(goal.command.id, goal.hold_number))
         else:
-            failed = protocol.Ended(goal.say.id, protocol.FAILED, reason, words)
-            goal.verdict = failed if goal.stop_at is None else protocol.Ended(goal.say.id, protocol.STOPPED)
-            goal.verdict_on = process
-        goal.heard_at = goal.stop_at = goal.pause_at = None
+            goal.end = protocol.Ended(goal.command.id, protocol.OUTCOME_FAILED, reason, message)
+            if goal.stop_sent_at is not None:
+                goal.end = protocol.Ended(goal.command.id, protocol.OUTCOME_STOPPED)
+            goal.lost_process = process
+        goal.last_sign_at = goal.stop_sent_at = goal.hold_sent_at = None
 
-    def _start_failed(self, words: str, *, lasting: bool = False) -> None:
-        """Plan another start; where the one in hand need not wait for it, it ends."""
-        costs_a_goal = self._restarts.failed(time.monotonic(), self._started_at, words if lasting else None)
-        waits = self._goal if self._goal and not self._goal.verdict else None
-        if waits and (costs_a_goal or self._restarts.error is not None):
-            why = self._restarts.error or words
-            self._finish(protocol.Ended(waits.say.id, protocol.FAILED, "engine_failed", why))
-        elif costs_a_goal:
-            self._post(EngineMissing(words))
+    def _plan_after_failed_start(self, message: str, *, permanent: bool = False) -> None:
+        """Plan another start, and end the waiting goal if it shouldn't wait for that."""
+        ends_goal = self._restarts.start_failed(time.monotonic(), self._started_at, message if permanent else None)
+        waiting = self._goal if self._goal and not self._goal.end else None
+        if waiting and (ends_goal or permanent):
+            self._fail_goal(waiting, "engine_failed", message)
+        elif ends_goal:
+            self._post(EngineMissing(message))
 
-    def _bury(self, process: EngineProcess) -> None:
-        """Process and player are gone: what was being spoken is silent."""
+    def _release_process(self, process: EngineProcess) -> None:
+        """Release a process that is gone with its player, and post the end of its goal, which is silent now."""
         self._selector.unregister(process.liveness)
         if process.stderr in self._selector.get_map():
             process.read_stderr()
@@ -492,18 +603,16 @@ class Supervisor:
         process.close()
         self._dying.remove(process)
         goal = self._goal
-        if goal and goal.verdict and goal.verdict_on is process:
-            self._finish(goal.verdict)
-
-    # -- the end
+        if goal and goal.end and goal.lost_process is process:
+            self._end_goal(goal.end)
 
     def _shut_down(self) -> None:
-        """Leave no process behind; one that cannot be ended within the limit is left to the system."""
+        """End the process. If it can't be ended within the limit, leave it to the system."""
         self._lose_process("the server ends", "shutdown")
-        limit = time.monotonic() + SILENCE_LIMIT / 4
-        while self._dying and time.monotonic() < limit:
-            for key in self._inbox.wait(limit):
-                self._handle(key)
+        deadline = time.monotonic() + KILL_LIMIT_S / 4
+        while self._dying and time.monotonic() < deadline:
+            for key in self._actions.wait(deadline):
+                self._handle_ready(key)
         for process in self._dying:
             process.close()
-        self._inbox.close()
+        self._actions.close()

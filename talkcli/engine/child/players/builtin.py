@@ -11,6 +11,7 @@ import time
 
 from talkcli.engine.child.players.base import CannotSpeak, Player
 from talkcli.engine.players import FILE_PREFIX, SAMPLE_BYTES
+from talkcli.engine.protocol import OUTPUT_STREAM_NAME
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -171,7 +172,7 @@ class WavStreamPlayer(BuiltInPlayer):
     """
 
     real_time = False
-    name = "the output"
+    name = OUTPUT_STREAM_NAME
 
     def __init__(self, output: int, rate: int, *, first: bool) -> None:
         """Initialize the player.

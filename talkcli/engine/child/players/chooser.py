@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from talkcli.engine.child.players.base import Player
-    from talkcli.engine.protocol import Configure, Say
+    from talkcli.engine.protocol import Configure, Speak
     from talkcli.goals.goal import Output
 
 #: The automatic players that are not programs; they are tried first.
@@ -96,7 +96,7 @@ class PlayerChooser:
         self._inherited = inherited
         self._open_fixed = self._fixed_player()
         #: whether playing takes as long as the sound lasts; only files are faster
-        self.takes_time = configure.output is None and not (configure.player or "").startswith(FILE_PREFIX)
+        self.takes_time = configure.output_fd is None and not (configure.player or "").startswith(FILE_PREFIX)
         self._automatic = _AUTOMATIC if configure.player is configure.device is None else []
         self._streaming = False
         self.handovers = HandoverTimes()
@@ -107,7 +107,7 @@ class PlayerChooser:
         #: whether the current sentence fails if the output is muted
         self._audible = configure.audible
         #: the name of the player that last played a sentence to its end
-        self.worked = configure.worked
+        self.worked = configure.last_player
         #: the name of the player that plays the current sentence, if the choice is automatic
         self.chosen: str | None = None
         self._last_used_at: float | None = None
@@ -128,12 +128,12 @@ class PlayerChooser:
             return
         yield from (partial(ProgramPlayer, command, self._inherited) for command in found)
 
-    def begin(self, say: Say) -> None:
+    def begin(self, say: Speak) -> None:
         """Prepare for a new sentence."""
         self._own_lead_in = say.lead_in
         self._audible = self._configure.audible if say.audible is None else say.audible
         self.output = self.chosen = None
-        self.handovers.followed, self.handovers.by_neural = say.followed, say.by_neural
+        self.handovers.followed, self.handovers.by_neural = say.next_waits, say.next_is_neural
 
     def update_output(self, player: Player) -> None:
         """Record where the current sentence is played; once it was muted, it counts as muted to its end."""
@@ -165,7 +165,7 @@ class PlayerChooser:
 
     def first_player(self) -> str | None:
         """Return the name of the player that is tried first, for people; None if there is no player."""
-        if self._configure.output is not None:
+        if self._configure.output_fd is not None:
             return WavStreamPlayer.name
         if self._configure.player is not None:
             return self._configure.player
@@ -180,7 +180,7 @@ class PlayerChooser:
 
     def _fixed_player(self) -> Callable[[int], Player] | None:
         """Return the function that opens the configured player for a sample rate; None if programs play."""
-        player, output = self._configure.player or "", self._configure.output
+        player, output = self._configure.player or "", self._configure.output_fd
         if output is not None:
             return partial(self._open_stream, output)
         if player.startswith(FILE_PREFIX):

@@ -18,7 +18,7 @@ from talkcli.frozen import TYPE_CHECKING, replace
 if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.base import SampleSink, Synthesizer
     from talkcli.engine.child.synthesizers.piper import Piper
-    from talkcli.engine.protocol import Drop, Grown, Load, Loaded, Unloaded, Voice
+    from talkcli.engine.protocol import DropVoice, LoadVoice, Voice, VoiceLoaded, VoiceMemory, VoiceUnloaded
 
 
 class CombinedSynthesizer:
@@ -77,15 +77,15 @@ class CombinedSynthesizer:
         """The monotonic time at which the load in progress is given up."""
         return self._piper().loader.deadline
 
-    def carry_out(self, command: Load | Drop) -> None:
+    def carry_out(self, command: LoadVoice | DropVoice) -> None:
         """Start to load a neural voice in the background, or drop one."""
         loader = self._piper().loader
-        if isinstance(command, protocol.Drop):
+        if isinstance(command, protocol.DropVoice):
             loader.drop(command.voice)
         else:
             loader.start(command.voice)
 
-    def load_events(self) -> list[Loaded | Unloaded | Grown]:
+    def load_events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
         """Return what has happened to neural voices since the last call."""
         return self._neural.loader.events() if self._neural else []
 

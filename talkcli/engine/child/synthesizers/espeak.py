@@ -17,7 +17,7 @@ from talkcli import install
 from talkcli.engine.child.players.base import CannotSpeak, Stopped
 from talkcli.engine.child.synthesizers import guard
 from talkcli.engine.child.synthesizers.base import NotInstalled
-from talkcli.engine.child.words import letters
+from talkcli.engine.child.words import count_letters
 from talkcli.engine.players import SAMPLE_BYTES, on_path
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import VARIANT, UnknownVoice, find_voice
@@ -371,7 +371,7 @@ class Spelling:
 def _place(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
     """Return where in the text the word of an event is, and its length there; None if there is none."""
     start = event.text_position - 1
-    length = event.length if event.length > 0 else letters(text, start)
+    length = event.length if event.length > 0 else count_letters(text, start)
     return (start, length) if length else None
 
 

@@ -19,7 +19,7 @@ from talkcli.engine.child.synthesizers.cache import Cache
 from talkcli.engine.child.synthesizers.inference import Model, load_libraries
 from talkcli.engine.child.synthesizers.work import Work
 from talkcli.engine.models import BadFile
-from talkcli.engine.protocol import LOAD_LIMIT, Grown, Loaded, Unloaded
+from talkcli.engine.protocol import LOAD_LIMIT_S, VoiceLoaded, VoiceMemory, VoiceUnloaded
 from talkcli.engine.voices import NEURAL
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.paths import cache_directory
@@ -55,7 +55,7 @@ class Loader:
         self._suspect: set[str] = set()
         #: why the last attempt to load a voice failed
         self._errors: dict[str, str] = {}
-        self._news: list[Loaded | Unloaded | Grown] = []
+        self._news: list[VoiceLoaded | VoiceUnloaded | VoiceMemory] = []
         #: the process's own bytes before the first load, and by how many it had grown when that was told last
         self._at_first: int | None = None
         self._grown = 0
@@ -70,7 +70,7 @@ class Loader:
     @property
     def deadline(self) -> float:
         """The monotonic time at which what is being loaded is given up."""
-        return self._began + LOAD_LIMIT
+        return self._began + LOAD_LIMIT_S
 
     def drop(self, voice: str) -> None:
         """Keep a voice no longer; one that speaks is there until it has spoken."""
@@ -81,7 +81,7 @@ class Loader:
     def start(self, voice: str) -> None:
         """Have a voice loaded, unless it is, or is about to be; what was wrong with it is forgotten."""
         if voice in self._models:
-            self._news.append(Loaded(voice, 0.0))
+            self._news.append(VoiceLoaded(voice, 0.0))
         elif voice not in self._waiting and not (self._work and voice == self._voice):
             self._errors.pop(voice, None)
             self._waiting.append(voice)
@@ -93,7 +93,7 @@ class Loader:
         found = self._models.get(voice)
         if found and voice in self._suspect and found.stamps != _stamps(found.model.path):
             self.drop(voice)
-            self._news.append(Unloaded(voice))
+            self._news.append(VoiceUnloaded(voice))
             return None
         return found.model if found else None
 
@@ -112,7 +112,7 @@ class Loader:
         elif self._unmeasured is None:
             self._unmeasured = voice
 
-    def events(self) -> list[Loaded | Unloaded | Grown]:
+    def events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
         """Return what became of voices since this was asked last."""
         self._look()
         if self._unmeasured is not None:
@@ -130,7 +130,7 @@ class Loader:
                 if time.monotonic() < self.deadline:
                     return
                 # Whatever its thread hangs in, a file of a server that is gone, may hang for ever.
-                raise BadFile(f"{voice} was not loaded within {LOAD_LIMIT:g} s: are its files on a slow disk?")
+                raise BadFile(f"{voice} was not loaded within {LOAD_LIMIT_S:g} s: are its files on a slow disk?")
             made = work.take()
             assert made is not None
         except BadFile as error:
@@ -141,7 +141,7 @@ class Loader:
         else:
             self._models[voice] = made
             self._measure(voice)
-            self._news.append(Loaded(voice, self._took()))
+            self._news.append(VoiceLoaded(voice, self._took()))
         work.close()
         self._work = None
         self._go_on()
@@ -154,14 +154,14 @@ class Loader:
             return
         memory.give_back()
         self._grown = max(0, (memory.own_bytes() or now) - before)
-        self._news.append(Grown(voice, self._grown))
+        self._news.append(VoiceMemory(voice, self._grown))
 
     def _took(self) -> float:
         return round(time.monotonic() - self._began, 3)
 
     def _end(self, voice: str, seconds: float, why: str) -> None:
         self._errors[voice] = why
-        self._news.append(Loaded(voice, seconds, why))
+        self._news.append(VoiceLoaded(voice, seconds, why))
 
     def _go_on(self) -> None:
         """Load the next, one at a time: each takes twice its memory, and a processor, meanwhile."""
