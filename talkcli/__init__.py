@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from talkcli.client.client import Client
     from talkcli.client.goal import GoalHandle
     from talkcli.fleet.api import Fleet
-    from talkcli.fleet.desk.outcome import Outcome
+    from talkcli.fleet.desk.request import Outcome
     from talkcli.fleet.presence import Presence
     from talkcli.goals.goal import Goal
     from talkcli.goals.states import State
@@ -44,9 +44,9 @@ def __getattr__(name: str) -> object:
         return getattr(client, name)
     if name in {"Fleet", "Outcome", "Presence"}:
         from talkcli.fleet import api, presence
-        from talkcli.fleet.desk import outcome
+        from talkcli.fleet.desk import request
 
-        return {"Fleet": api.Fleet, "Outcome": outcome.Outcome, "Presence": presence.Presence}[name]
+        return {"Fleet": api.Fleet, "Outcome": request.Outcome, "Presence": presence.Presence}[name]
     if name in {"Goal", "State"}:
         from talkcli.goals import goal
 

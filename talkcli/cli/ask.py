@@ -165,7 +165,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
 
 def _examination(
     options: CommonOptions, interrupt: Mapping[int, int], *, silent: bool
-) -> examine.Examination | broker.Examination:
+) -> examine.Examination | broker.BrokerExamination:
     """Return the examination of this machine, or of the way to a robot in a fleet."""
     robot = named_robot(options.robot, options.socket)
     if robot is None:
@@ -177,7 +177,7 @@ def _examination(
     need_client()
     from talkcli.doctor import broker
 
-    return broker.Examination(robot, os.environ, insecure=options.insecure, interrupt=interrupt)
+    return broker.BrokerExamination(robot, os.environ, insecure=options.insecure, interrupt=interrupt)
 
 
 def _show_canceled(done: Canceled, options: CommonOptions) -> None:

@@ -117,12 +117,12 @@ class Command:
         """Return what is wrong with naming a robot or waiting for a server, or None."""
         is_local, is_several = not self.uses_server or given.get("output") is not None, False
         if robot is not None:
-            from talkcli.fleet.desk.selection import Selection, several
+            from talkcli.fleet.desk.request import Selection, selects_several
 
             if is_local:
                 what = f"{self.name} --output" if self.uses_server else self.name
                 return f"'talk {what}' is of this machine alone: leave out --robot"
-            is_several = several(robot)
+            is_several = selects_several(robot)
             single = [f"--{each}" for each in _SINGLE_ROBOT_OPTIONS if given.get(each)]
             if is_several and (single or not self.fleet_function):
                 what = " ".join([self.name, *single])
@@ -148,9 +148,9 @@ class Command:
             # The robot can also come from the environment, so it is checked again.
             if fault := self._connection_fault(given, robot, options.connect_timeout):
                 raise UsageError(fault)
-            from talkcli.fleet.desk.selection import several
+            from talkcli.fleet.desk.request import selects_several
 
-            if several(robot):
+            if selects_several(robot):
                 function = self.fleet_function
                 given = {name: value for name, value in given.items() if name not in _SINGLE_ROBOT_OPTIONS}
         module, _, name = function.partition(":")

@@ -473,7 +473,7 @@ _ROWS = (
         TALK_BROKER names the broker: mqtts://HOST, or mqtt://HOST without TLS. Beside it are TALK_MQTT_USER and
         TALK_MQTT_PASSWORD_FILE, and for certificates TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY, all three files.
         """,
-        function="bridge:bridge",
+        function="fleet:bridge",
         plain=False,
         uses_server=False,
         examples="""

@@ -214,9 +214,9 @@ def robots(context: click.Context, _: click.Parameter, incomplete: str) -> Items
     try:
         broker = options.broker()
         from talkcli.fleet import topics
-        from talkcli.fleet.desk.roster import roster
+        from talkcli.fleet.desk.watch import read_presences
 
-        found = roster(broker, COMPLETION_TIMEOUT_S)
+        found = read_presences(broker, COMPLETION_TIMEOUT_S)
     except (TalkError, OSError, ValueError):
         return []
     online = [each for _, each in sorted(found.items()) if each.online]

@@ -1,4 +1,4 @@
-"""`talk fleet`: all robots of a broker, at one look or as it happens; what that takes is imported for it alone."""
+"""The commands for fleets: `talk bridge`, which a robot runs, and `talk fleet`, which shows all robots."""
 
 from __future__ import annotations
 
@@ -6,125 +6,174 @@ import time
 from typing import TYPE_CHECKING
 
 from talkcli import paths
-from talkcli.cli.show import note, screen, show_result
+from talkcli.cli import units
+from talkcli.cli.command import nearest
+from talkcli.cli.show import note, screen, show, show_result
 from talkcli.client.connect import ANSWER_LIMIT
-from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable
-from talkcli.fleet.desk.selection import Selection
-from talkcli.fleet.desk.sighting import Away, Back, Begun, Changed, Happened, Missed
+from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable, UsageError
+from talkcli.fleet import topics
+from talkcli.fleet.bridge.policy import ASKABLE
+from talkcli.fleet.desk.request import Selection
 from talkcli.frozen import replace
-from talkcli.terminal.fleet import FleetTranscript, Robot, robot_lines
+from talkcli.terminal.fleet import FleetTranscript, RobotRow, robot_lines
+from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Sequence
+    from typing import Any
 
     from talkcli.cli.show import CommonOptions
     from talkcli.fleet.broker import Broker
-    from talkcli.fleet.desk.sighting import Sighting
+    from talkcli.fleet.desk.watch import FleetEvent
     from talkcli.fleet.presence import Presence
     from talkcli.fleet.status import Standing
     from talkcli.goals.goal import JsonObject
 
 
+def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
+    """Run the bridge, or print its systemd unit or the broker's access rules. Return the exit code."""
+    _check_names("--name", [] if given["name"] is None else [given["name"]])
+    if print_acl:
+        show(topics.access(homeassistant=given["homeassistant"], name=given["name"]))
+        return 0
+    groups, allow = _split_list(given["group"]), _split_list(given["allow"])
+    _check_names("--group", groups)
+    for each in allow:
+        if each not in ASKABLE:
+            near = nearest(each, ASKABLE)
+            hint = f"did you mean '{near}'?" if near else f"there are {', '.join(ASKABLE)}"
+            raise UsageError(f"--allow: no request is called '{printable(each)}': {hint}")
+    if print_unit:
+        units.print_bridge_unit(options, print_unit, given)
+        return 0
+    broker = options.broker()
+    from talkcli.fleet.bridge.main import Settings
+    from talkcli.fleet.bridge.run import bridge
+
+    settings = Settings(
+        given["name"],
+        broker,
+        tuple(allow),
+        tuple(groups),
+        options.socket,
+        with_text=not given["no_text"],
+        homeassistant=given["homeassistant"],
+    )
+    return bridge(settings, options.broker)
+
+
+def _split_list(value: str | None) -> list[str]:
+    """Split a comma-separated list."""
+    return [] if value is None else [each.strip() for each in value.split(",")]
+
+
+def _check_names(option: str, names: Sequence[str]) -> None:
+    for each in names:
+        fault = topics.fault(each)
+        if fault:
+            raise UsageError(f"{option}: the name '{printable(each)}' can't be in a topic, it {fault}")
+
+
 def fleet(options: CommonOptions, what: str) -> int | None:
-    """Show the robots of a fleet, as they stand or as it happens; return the exit code, None for 0."""
+    """Show the state of the robots, or watch them. Return the exit code, None for 0."""
     broker = options.broker()
     text = paths.named_robot(options.robot, options.socket)
     selection = None if text is None else Selection(text)
     if what == "watch":
         return _watch(options, broker, selection)
-    _status(options, broker, selection)
+    _show_robots(options, broker, selection)
     return None
 
 
-def _status(options: CommonOptions, broker: Broker, selection: Selection | None) -> None:
-    """Show how each robot stands."""
-    from talkcli.fleet.desk.roster import standings
+def _show_robots(options: CommonOptions, broker: Broker, selection: Selection | None) -> None:
+    """Show the state of each robot."""
+    from talkcli.fleet.desk.watch import read_standings
 
-    found = standings(broker, ANSWER_LIMIT, selection.only if selection else None)
-    picked = [each for _, each in sorted(found.items()) if selection is None or selection.picks(each.presence)]
-    if not picked:
-        raise _nobody(broker, selection)
-
+    found = read_standings(broker, ANSWER_LIMIT, selection.name if selection else None)
+    selected = [each for _, each in sorted(found.items()) if selection is None or selection.includes(each.presence)]
+    if not selected:
+        raise _no_robot(broker, selection)
     show_result(
         options,
-        (each.to_json() for each in picked),
-        lambda: robot_lines([_shown(each) for each in picked], screen(), time.time()),
+        (each.to_json() for each in selected),
+        lambda: robot_lines([_table_row(each) for each in selected], screen(), time.time()),
     )
 
 
+def _no_robot(broker: Broker, selection: Selection | None) -> ServerUnavailable:
+    """Return the error for a selection without any robot."""
+    if selection is None:
+        return ServerUnavailable(f"no robot is known at {broker.url}; on each robot: talk bridge --name NAME")
+    if selection.group is not None:
+        words = f"no robot of the group '{selection.group}' is known at {broker.url}"
+        return ServerUnavailable(f"{words}; on a robot of it: talk bridge --group {selection.group}")
+    return ServerUnavailable(f"no robot '{selection.text}' is known at {broker.url}: 'talk fleet status' lists all")
+
+
 def _watch(options: CommonOptions, broker: Broker, selection: Selection | None) -> int:
-    """Show what happens, and which robots come and go; return the exit code."""
+    """Show events until the command is interrupted, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
-    from talkcli.fleet.desk.lookout import Lookout
+    from talkcli.fleet.desk.watch import FleetWatch
 
     if not has_reader():
         return EXIT_SIGPIPE
-    teller = _Teller(options, broker, FleetTranscript(full=screen().width is None))
-    # The reader of its output, too, ends it: the next event may be far.
+    transcript = FleetTranscript(full=screen().width is None)
+    # Without watching the output, a reader that is gone would be noticed only at the next event.
     with Interrupts(output=True) as interrupts:
-        for seen in Lookout(broker, selection).follow(interrupts.watched):
-            teller.tell(seen)
+        for event in FleetWatch(broker, selection).events(interrupts.watched):
+            _show_event(options, broker, transcript, event)
     return interrupts.exit_code
 
 
-class _Teller:
-    """Shows what happens to a fleet, for people or for programs."""
+def _show_event(options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent) -> None:
+    """Show an event. Events of the broker itself are shown as notes on standard error."""
+    from talkcli.fleet.desk.watch import BrokerAway, EventsMissed, FleetSnapshot, RobotChanged, RobotEvent
 
-    def __init__(self, options: CommonOptions, broker: Broker, transcript: FleetTranscript) -> None:
-        self._options, self._broker, self._transcript = options, broker, transcript
-
-    def tell(self, seen: Sighting) -> None:
-        """Show what has happened; what the broker itself does is said on standard error."""
-        if not isinstance(seen, Away | Back):
-            show_result(self._options, _objects(seen), lambda: self._lines(seen))
-        elif self._options.quiet:
-            return
-        elif isinstance(seen, Away):
-            note(f"{seen.why}; it is tried again for {seen.limit:g} s")
-        else:
-            note(f"the broker at {self._broker.url} is back, after {seen.after:.1f} s")
-
-    def _lines(self, seen: Begun | Changed | Happened | Missed) -> list[str]:
-        transcript, now = self._transcript, time.time()
-        if isinstance(seen, Begun):
-            robots = [_shown(each) for each in seen.standings]
-            return transcript.begin(robots, self._broker.url, screen(), now)
-        if isinstance(seen, Changed):
-            robot = Robot(seen.name, online=False) if seen.now is None else _there(seen.now)
-            same = seen.before is not None and seen.now is not None and seen.before.session == seen.now.session
-            return transcript.change(_there(seen.before) if seen.before and same else None, robot, screen(), now)
-        if isinstance(seen, Happened):
-            return transcript.lines(seen.name, seen.event, screen(), now)
-        name = seen.standing.presence.name
-        return [line for each in seen.events for line in transcript.lines(name, each, screen(), now)]
-
-
-def _objects(seen: Begun | Changed | Happened | Missed) -> Iterator[JsonObject]:
-    """Make the objects that programs are shown."""
-    if isinstance(seen, Begun | Missed):
-        for each in seen.standings if isinstance(seen, Begun) else [seen.standing]:
-            yield {"robot": each.presence.name, "event": "snapshot", **each.to_json()}
-    elif isinstance(seen, Changed):
-        presence = None if seen.now is None else seen.now.to_json()
-        yield {"robot": seen.name, "event": "presence", "presence": presence}
+    now = time.time()
+    if isinstance(event, FleetSnapshot):
+        rows = [_table_row(each) for each in event.robots]
+        objects = (_snapshot_object(each) for each in event.robots)
+        show_result(options, objects, lambda: transcript.begin(rows, broker.url, screen(), now))
+    elif isinstance(event, RobotChanged):
+        presence = None if event.now is None else event.now.to_json()
+        message: JsonObject = {"robot": event.name, "event": "presence", "presence": presence}
+        robot = RobotRow(event.name, online=False) if event.now is None else _row_without_goals(event.now)
+        same = event.before is not None and event.now is not None and event.before.session == event.now.session
+        before = _row_without_goals(event.before) if event.before and same else None
+        show_result(options, [message], lambda: transcript.change(before, robot, screen(), now))
+    elif isinstance(event, RobotEvent):
+        message = {"robot": event.name, **event.message}
+        show_result(options, [message], lambda: transcript.lines(event.name, event.event, screen(), now))
+    elif isinstance(event, EventsMissed):
+        name = event.standing.presence.name
+        lines = (line for each in event.events for line in transcript.lines(name, each, screen(), now))
+        show_result(options, [_snapshot_object(event.standing)], lambda: lines)
+    elif options.quiet:
+        pass
+    elif isinstance(event, BrokerAway):
+        note(f"{event.why}; it is tried again for {event.limit:g} s")
     else:
-        yield {"robot": seen.name, **seen.message}
+        note(f"the broker at {broker.url} is back, after {event.after:.1f} s")
 
 
-def _there(presence: Presence) -> Robot:
-    """Return a robot as it is shown, of whose goals nothing is known."""
+def _snapshot_object(standing: Standing) -> JsonObject:
+    return {"robot": standing.presence.name, "event": "snapshot", **standing.to_json()}
+
+
+def _row_without_goals(presence: Presence) -> RobotRow:
+    """Return a table row for a robot whose goals are unknown."""
     server = None if presence.server is None else str(presence.server.get("version") or "?")
-    return Robot(presence.name, presence.online, server, since=presence.since)
+    return RobotRow(presence.name, presence.online, server, since=presence.since)
 
 
-def _shown(standing: Standing) -> Robot:
-    """Return a robot as the table shows it."""
-    there, status = _there(standing.presence), standing.status
+def _table_row(standing: Standing) -> RobotRow:
+    """Return the table row of a robot."""
+    row, status = _row_without_goals(standing.presence), standing.status
     if status is None:
-        return there
+        return row
     last = status.last
     return replace(
-        there,
+        row,
         active=status.active,
         text=status.text,
         pending=status.pending,
@@ -132,13 +181,3 @@ def _shown(standing: Standing) -> Robot:
         last=None if last is None else last.state,
         last_at=None if last is None else last.at,
     )
-
-
-def _nobody(broker: Broker, selection: Selection | None) -> ServerUnavailable:
-    """Return the error that says that no robot is meant."""
-    if selection is None:
-        return ServerUnavailable(f"no robot is known at {broker.url}; on each robot: talk bridge --name NAME")
-    if selection.group is not None:
-        words = f"no robot of the group '{selection.group}' is known at {broker.url}"
-        return ServerUnavailable(f"{words}; on a robot of it: talk bridge --group {selection.group}")
-    return ServerUnavailable(f"no robot '{selection.text}' is known at {broker.url}: 'talk fleet status' lists all")

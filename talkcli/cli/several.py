@@ -1,7 +1,7 @@
-"""The commands that may be asked of several robots by `--robot`: say, wait, cancel, status, set, pause, resume.
+"""The commands that `--robot` can send to several robots: say, wait, cancel, status, set, pause and resume.
 
-What becomes of it is a line a robot, `ROBOT ID STATE CODE`, as it comes; how many did as they were asked is told last.
-What a robot alone is asked is in `say`, `wait` and `ask`. They know no click, and are imported for this alone.
+Each robot's outcome is a line `ROBOT ID STATE CODE`, shown as soon as it is known. The last line counts the robots that
+did as asked. The same commands for one server are in `say`, `wait` and `ask`. Click is not used here.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
+from talkcli import paths
 from talkcli.cli.command import replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
 from talkcli.cli.show import (
@@ -22,6 +23,7 @@ from talkcli.cli.show import (
     show_json,
 )
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, seconds_left, timeout_error
+from talkcli.client.connect import ANSWER_LIMIT
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError, UsageError
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.polling import Interrupted
@@ -33,12 +35,12 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.cli.show import CommonOptions
-    from talkcli.fleet.desk.crowd import Round
-    from talkcli.fleet.desk.outcome import Outcome
+    from talkcli.fleet.desk.request import Outcome
+    from talkcli.fleet.desk.several import FleetRequest
     from talkcli.protocol.requests import Request
 
-#: Names of robots in one note, and notes of those that did not do it: all of them are on standard output.
-_NAMES, _NOTES = 5, 10
+#: Limits for notes about failures: names in a note, and number of notes. Standard output has all of them.
+_MAX_NAMES, _MAX_NOTES = 5, 10
 
 
 def say(
@@ -49,7 +51,7 @@ def say(
     name: str | None,
     **chosen: Any,
 ) -> int:
-    """Have all of them speak a text, and return the exit code; the arguments are as those of `say.say`."""
+    """Speak a text at each robot, and return the exit code. The arguments are those of `say.say`."""
     end = None if timeout is None else options.started_at + timeout
     discard_unread_output()
     sentence = " ".join(text)
@@ -70,128 +72,143 @@ def say(
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:
-    """Wait until these goals have ended on all of them, or all of theirs; return the exit code."""
+    """Wait until these goals, or all goals, have ended at each robot. Return the exit code."""
     discard_unread_output()
     return _ask(options, Wait(ids or None), timeout)
 
 
 def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
-    """Cancel on all of them what these select, or everything; return the exit code."""
+    """Cancel the selected goals, or all goals, at each robot. Return the exit code."""
     return _ask(options, Cancel(ids or None, current, before, key))
 
 
 def status(options: CommonOptions, goal_id: str | None) -> int:
-    """Show how each stands, or one goal on each; return the exit code."""
+    """Show the state of each robot, or of one goal at each robot. Return the exit code."""
     return _ask(options, Status(goal_id))
 
 
 def change(options: CommonOptions, **settings: Any) -> int:
-    """Change those settings of all of them that aren't None, or show them; return the exit code."""
+    """Change the settings that aren't None at each robot; if all are None, show them. Return the exit code."""
     return _ask(options, Set(**settings))
 
 
 def pause(options: CommonOptions) -> int:
-    """Hold speech on all of them; return the exit code."""
+    """Hold speech at each robot, and return the exit code."""
     return _ask(options, Pause())
 
 
 def resume(options: CommonOptions) -> int:
-    """Go on where speech is held on any of them; return the exit code."""
+    """Continue held speech at each robot, and return the exit code."""
     return _ask(options, Resume())
 
 
 def _ask(options: CommonOptions, request: Request, timeout: float | None = None, name: str | None = None) -> int:
-    """Ask all of them, show what becomes of it, and return the exit code; `timeout`: seconds for all of it."""
-    owns = isinstance(request, Say) and request.wait
+    """Send a request to the robots, show the outcomes, and return the exit code.
+
+    Args:
+        options: the options of every command.
+        request: the request.
+        timeout: seconds for all of it; None for no limit.
+        name: what the sender calls itself.
+    """
+    owns_goals = isinstance(request, Say) and request.wait
     end = None if timeout is None else options.started_at + timeout
-    found = _Tally(options, request)
-    with (
-        Interrupts(output=owns or isinstance(request, Wait)) as interrupts,
-        options.connect_robots(timeout, name=name, interrupt=interrupts.watched) as crowd,
-    ):
-        asked = crowd.ask(request)
-        late = False
-        try:
-            found.take(asked, seconds_left(end))
-        except TimeoutError:
-            late = True
-        except (Interrupted, OSError) as error:
-            if isinstance(error, OSError):
-                if not reader_is_gone(error):
-                    raise
-                interrupts.reader_gone = True
-            interrupts.check_reader()
-        if not (late or interrupts.reader_gone or interrupts.signal_number is not None):
-            return found.end(asked)
-        if interrupts.reader_gone:
-            discard_output()
-        if owns:
-            _cancel(asked, interrupts, found)
-        if late:
-            show_error(timeout_error(timeout), json=options.json)
-        found.end(asked, "not known to be silent" if owns else "not done")
-        return EXIT_TIMEOUT if late else interrupts.exit_code
+    printer = _OutcomePrinter(options, request)
+    with Interrupts(output=owns_goals or isinstance(request, Wait)) as interrupts:
+        broker = options.broker()
+        from talkcli.fleet.desk.request import Selection
+        from talkcli.fleet.desk.several import FleetRequest
+
+        selection = Selection(paths.named_robot(options.robot, options.socket) or "")
+        patience = min(ANSWER_LIMIT, timeout or ANSWER_LIMIT)
+        with FleetRequest(
+            broker, selection, request, name=name, interrupt=interrupts.watched, patience=patience
+        ) as asked:
+            is_late = False
+            try:
+                printer.show_outcomes(asked, seconds_left(end))
+            except TimeoutError:
+                is_late = True
+            except (Interrupted, OSError) as error:
+                if isinstance(error, OSError):
+                    if not reader_is_gone(error):
+                        raise
+                    interrupts.reader_gone = True
+                interrupts.check_reader()
+            if not (is_late or interrupts.reader_gone or interrupts.signal_number is not None):
+                return printer.summarize(asked)
+            if interrupts.reader_gone:
+                discard_output()
+            if owns_goals:
+                _cancel(asked, interrupts, printer)
+            if is_late:
+                show_error(timeout_error(timeout), json=options.json)
+            printer.summarize(asked, "not known to be silent" if owns_goals else "not done")
+            return EXIT_TIMEOUT if is_late else interrupts.exit_code
     return interrupts.exit_code
 
 
-def _cancel(asked: Round, interrupts: Interrupts, found: _Tally) -> None:
-    """Cancel it wherever it has not ended, and wait a moment for silence."""
+def _cancel(asked: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinter) -> None:
+    """Cancel the goals that have not ended, and wait a moment for silence."""
     interrupts.reset()
     try:
         if asked.open:
             asked.cancel()
-        retry_without_output(found.take, asked, CANCEL_TIMEOUT_S)
+        retry_without_output(printer.show_outcomes, asked, CANCEL_TIMEOUT_S)
     except (Interrupted, TimeoutError):
-        pass  # where it is not known, `end` tells
+        pass  # the summary names the robots without an outcome
     except TalkError as error:
         note(f"could not be cancelled: {error}")
 
 
-class _Tally:
-    """Shows what becomes of it, and counts."""
+class _OutcomePrinter:
+    """Shows outcomes as they come, and a summary at the end."""
 
     def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
-        #: what has become of it at each robot, by its name; the first that is no success, where there are several
-        self._found: dict[str, Outcome] = {}
-        #: the robots that have more to tell
-        self._going: set[str] = set()
-        self._count = _Count(shown=not options.quiet)
+        #: the outcome that counts for each robot: its first failure, or else its last outcome
+        self._outcomes: dict[str, Outcome] = {}
+        #: robots that have more outcomes to come
+        self._open: set[str] = set()
+        shows_count = not options.quiet and sys.stderr is not None and sys.stderr.isatty()
+        self._terminal = sys.stderr if shows_count else None
 
-    def take(self, asked: Round, timeout: float | None) -> None:
-        """Show what has become of it, as it comes, until all are done; what `Round.results` raises."""
+    def show_outcomes(self, asked: FleetRequest, timeout: float | None) -> None:
+        """Show all outcomes as they come. The errors are those of `FleetRequest.results`."""
         try:
-            self._count.show(len(self._found) - len(self._going), len(asked))
+            self._show_count(asked)
             for each in asked.results(timeout):
-                self._note(each)
-                self._count.clear()
+                self._add(each)
+                self._clear_count()
                 self._show(each)
-                self._count.show(len(self._found) - len(self._going), len(asked))
+                self._show_count(asked)
         finally:
-            self._count.clear()
+            self._clear_count()
 
-    def _note(self, outcome: Outcome) -> None:
-        # One that was taken for absent, and then has answered, begins anew.
+    def _add(self, outcome: Outcome) -> None:
+        # The answer of a robot that seemed to be absent replaces its failure.
         robot = outcome.robot
-        if robot not in self._going or not self._found[robot].exit_code:
-            self._found[robot] = outcome
+        if robot not in self._open or not self._outcomes[robot].exit_code:
+            self._outcomes[robot] = outcome
         if outcome.last:
-            self._going.discard(robot)
+            self._open.discard(robot)
         else:
-            self._going.add(robot)
+            self._open.add(robot)
 
-    def end(self, asked: Round, unknown: str = "not done") -> int:
-        """Tell how many did as they were asked, and why the others did not; return the exit code.
+    def summarize(self, asked: FleetRequest, unknown: str = "not done") -> int:
+        """Show how many robots did as asked and why others failed. Return the exit code.
 
-        `unknown`: what is said of those of which not all is known.
+        Args:
+            asked: the request.
+            unknown: how to describe robots that have more outcomes to come.
         """
-        failures = [each for each in self._found.values() if each.exit_code]
-        done = [robot for robot, each in self._found.items() if not each.exit_code and robot not in self._going]
+        failures = [each for each in self._outcomes.values() if each.exit_code]
+        done = [robot for robot, each in self._outcomes.items() if not each.exit_code and robot not in self._open]
         if not self._options.quiet:
-            for words in _reasons(failures)[:_NOTES]:
+            for words in _failure_notes(failures)[:_MAX_NOTES]:
                 note(words)
             if asked.open:
-                note(f"{unknown}: {_some(asked.open)}{f': {asked.away}' if asked.away else ''}")
+                note(f"{unknown}: {_listed(asked.open)}{f': {asked.away}' if asked.away else ''}")
             note(f"{len(done)} of {len(asked)} as asked")
         codes = {each.exit_code for each in failures}
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
@@ -207,51 +224,36 @@ class _Tally:
             goal = printable(outcome.goal.id) if outcome.goal and outcome.goal.id else "-"
             show_if_possible(show, f"{outcome.robot} {goal} {outcome.state} {outcome.exit_code}")
 
+    def _show_count(self, asked: FleetRequest) -> None:
+        """Show how many robots are done, if standard error is a terminal."""
+        if self._terminal:
+            self._terminal.write(f"\r{len(self._outcomes) - len(self._open)} of {len(asked)}")
+            self._terminal.flush()
 
-def _reasons(failures: list[Outcome]) -> list[str]:
-    """Return a note for each way in which it came to nothing, with some of the robots, and the words of one."""
+    def _clear_count(self) -> None:
+        if self._terminal:
+            self._terminal.write("\r\x1b[2K")
+            self._terminal.flush()
+
+
+def _failure_notes(failures: list[Outcome]) -> list[str]:
+    """Return a note for each kind of failure, with names of robots and the reason that one of them gave."""
     alike: dict[tuple[str, int], list[Outcome]] = {}
     for each in failures:
         alike.setdefault((each.state, each.exit_code), []).append(each)
-    found = []
-    for (state, _), some in alike.items():
-        found.append(f"{state}: {_some([each.robot for each in some])}: {_why(some[0])}")
-    return found
+    return [
+        f"{state}: {_listed([each.robot for each in some])}: {_reason(some[0])}" for (state, _), some in alike.items()
+    ]
 
 
-def _some(names: list[str]) -> str:
-    """Return the first of these names, and how many more there are."""
-    more = f" and {len(names) - _NAMES} more" if len(names) > _NAMES else ""
-    return ", ".join(names[:_NAMES]) + more
+def _listed(names: list[str]) -> str:
+    """Return the first few names, and the number of the others."""
+    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return ", ".join(names[:_MAX_NAMES]) + more
 
 
-def _why(outcome: Outcome) -> str:
-    """Return in words why a robot did not do it."""
+def _reason(outcome: Outcome) -> str:
+    """Return the reason for a failure, for people."""
     if outcome.error is not None:
-        return outcome.error.message.removeprefix(f"{outcome.robot}: ")  # who it is stands before it
+        return outcome.error.message.removeprefix(f"{outcome.robot}: ")  # the note names it already
     return describe_end(outcome.goal) if outcome.goal else outcome.state
-
-
-class _Count:
-    """How many are done, on a terminal's last line, while it goes on."""
-
-    def __init__(self, *, shown: bool) -> None:
-        self._stream = sys.stderr if shown and sys.stderr is not None and sys.stderr.isatty() else None
-        self._there = False
-
-    def show(self, done: int, asked: int) -> None:
-        """Show it."""
-        if self._stream:
-            self._write(f"\r{done} of {asked}")
-            self._there = True
-
-    def clear(self) -> None:
-        """Leave the line empty."""
-        if self._there:
-            self._write("\r\x1b[2K")
-            self._there = False
-
-    def _write(self, text: str) -> None:
-        assert self._stream
-        self._stream.write(text)
-        self._stream.flush()

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from talkcli.client.connect import Begun
     from talkcli.client.connection import Connection
     from talkcli.fleet.broker import Broker
-    from talkcli.fleet.desk.crowd import Crowd
     from talkcli.goals.goal import Goal, JsonObject
     from talkcli.protocol.events import Event
     from talkcli.terminal.text import Screen
@@ -100,22 +99,6 @@ class CommonOptions:
                 raise TimeoutError(words) from None
             raise ServerUnavailable(words) from None
 
-    def connect_robots(self, timeout: float | None = None, **options: Any) -> Crowd:
-        """Connect to the broker, and return the robots that --robot selects.
-
-        Args:
-            timeout: seconds that the whole command may take. This also limits the wait for each answer.
-            options: further arguments of `Crowd`.
-        """
-        from talkcli.client.connect import ANSWER_LIMIT
-        from talkcli.fleet.desk.selection import Selection
-
-        broker = self.broker()
-        from talkcli.fleet.desk.crowd import Crowd
-
-        to = Selection(paths.named_robot(self.robot, self.socket) or "")
-        return Crowd(broker, to, patience=min(ANSWER_LIMIT, timeout or ANSWER_LIMIT), **options)
-
     def broker(self) -> Broker:
         """Return the address and login of the broker; UsageError if a setting or paho-mqtt is missing."""
         from talkcli.fleet.broker import from_environment, need_client
@@ -130,10 +113,10 @@ class CommonOptions:
 
             return SocketConnection(self.socket, begun=self.early, **{"urgent": self.urgent, **options})
         broker = self.broker()
-        from talkcli.fleet.desk.robot import reach
+        from talkcli.fleet.desk.robot import connect_robot
 
         options.pop("urgent", None)  # there is no client limit over a broker
-        return reach(robot, broker, **options)
+        return connect_robot(robot, broker, **options)
 
 
 def run_command(command: Callable[[], object], options: CommonOptions) -> int:

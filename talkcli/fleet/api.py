@@ -1,10 +1,10 @@
-"""The library for a fleet: who is there, one robot as a client, several at once.
+"""The library for a fleet: list its robots, use one robot as a client, or send a request to several at once.
 
 from talkcli import Fleet
 
 fleet = Fleet("mqtts://broker.example")
-for each in fleet.say("@warehouse", "the shift is over"):
-    print(each.robot, each.state)
+for outcome in fleet.say("@warehouse", "the shift is over"):
+    print(outcome.robot, outcome.state)
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from talkcli.client.client import Client
 from talkcli.client.connect import ANSWER_LIMIT
 from talkcli.fleet.broker import URL, from_environment, need_client
-from talkcli.fleet.desk.selection import Selection
+from talkcli.fleet.desk.request import Selection
 from talkcli.goals.options import Cancel, Say, Set
 from talkcli.protocol.requests import Pause, Resume, Status, Wait
 
@@ -23,30 +23,39 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from typing import Any
 
-    from talkcli.fleet.desk.crowd import Round
+    from talkcli.fleet.desk.several import FleetRequest
     from talkcli.fleet.presence import Presence
     from talkcli.protocol.requests import Request
 
 
 class Fleet:
-    """The robots of a broker.
+    """The robots that use one broker.
 
-    Whom a method means, its `to`, is a robot's name, a glob over the names of those that are there (`wh-*`), or a
-    group, `@warehouse`; `@all` is everybody. What it returns is iterated over: an Outcome for each robot as it comes,
-    or for each goal of its that this is about. A robot that is offline is among them, with exit code 3: nothing is
-    kept for it.
+    The argument `to` of most methods selects robots. It is a robot's name, a glob that matches names (`wh-*`), or a
+    group (`@warehouse`). The group `@all` contains every robot.
 
-    Each call has a connection of its own, which ends with its last outcome, with `with`, or by `close` of what was
-    returned. One of these it needs: what is dropped without may never reach a robot. One thread uses what was returned;
-    several may use the fleet.
+    These methods return a FleetRequest. Iterate over it to get the robots' outcomes as they come: one from each robot,
+    or one for each goal if the request is about several. The outcome of an offline robot has exit code 3, and the
+    request is not kept for it.
+
+    Every request has its own connection to the broker, which ends with the last outcome. To end it earlier, use the
+    FleetRequest in a `with` block or call its `close`. Always exhaust or close it, or the request may not be sent.
+
+    Several threads may use the same Fleet. Only one thread may use a FleetRequest.
     """
 
     def __init__(self, broker: str | None = None, *, name: str | None = None, insecure: bool = False) -> None:
-        """`broker`: its URL, mqtts://HOST or mqtt://HOST, default TALK_BROKER; who logs in there, and by which
-        certificates, the variables beside that one say. `name`: what the sender calls itself, default TALK_NAME;
-        `insecure`: whether a password may go to another machine without TLS. Nothing is connected yet.
+        """Read the settings. No connection is made yet.
 
-        UsageError if a setting is wrong or missing, or if paho-mqtt is not installed.
+        The login and the certificates come from the environment variables TALK_MQTT_*.
+
+        Args:
+            broker: URL of the broker, mqtts://HOST or mqtt://HOST; default TALK_BROKER.
+            name: what the sender calls itself; default TALK_NAME.
+            insecure: whether a password may be sent to another machine without TLS.
+
+        Raises:
+            UsageError: A setting is wrong or missing, or paho-mqtt is not installed.
         """
         need_client()
         environment = dict(os.environ) if broker is None else {**os.environ, URL: broker}
@@ -54,29 +63,39 @@ class Fleet:
         self._name = name
 
     def robots(self) -> list[Presence]:
-        """Return all robots that the broker knows, by name, those among them that are offline.
+        """Return all robots that the broker knows, also those that are offline, sorted by name.
 
-        ServerUnavailable where there is no broker, AccessDenied where it doesn't let this user in, or ask.
+        Raises:
+            ServerUnavailable: There is no broker.
+            AccessDenied: The broker doesn't let this user log in, or ask.
         """
-        from talkcli.fleet.desk.roster import roster
+        from talkcli.fleet.desk.watch import read_presences
 
-        return sorted(roster(self._broker, ANSWER_LIMIT).values(), key=lambda each: each.name)
+        return sorted(read_presences(self._broker, ANSWER_LIMIT).values(), key=lambda each: each.name)
 
     def robot(self, name: str) -> Client:
-        """Return a client of this robot's server, as one of a server on this machine.
+        """Return a client of one robot's server, which is used like a client of a local server.
 
-        ServerUnavailable where there is no broker, no such robot, or that has no server; AccessDenied as of `robots`.
+        Raises:
+            ServerUnavailable: There is no broker or no such robot, or the robot is offline or has no server.
+            AccessDenied: The broker doesn't let this user log in, or ask.
         """
-        from talkcli.fleet.desk.robot import reach
+        from talkcli.fleet.desk.robot import connect_robot
 
-        return Client.over(reach(name, self._broker, name=self._name))
+        return Client.over(connect_robot(name, self._broker, name=self._name))
 
-    def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> Round:
-        """Have them speak: one goal at each, all with one id. The options are those of `Client.say`, but `follow`.
+    def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> FleetRequest:
+        """Speak a text at each robot. All robots' goals have the same id.
 
-        `wait`: an outcome is how the goal ended, else how it was accepted; `ttl`: seconds in which it must have begun
-        on each, None is 10, 0 is no limit. `cancel` of what is returned cancels it wherever it has not ended, until the
-        last outcome was taken; then `Fleet.cancel` does, by the goal's id.
+        To cancel the goals, call `cancel` of the returned FleetRequest. After its last outcome, use `Fleet.cancel` with
+        the id instead.
+
+        Args:
+            to: the robots.
+            text: the text.
+            wait: whether to wait for the end of each goal. Without it, outcomes tell whether the goal was accepted.
+            ttl: seconds in which each robot must start to speak, 0 for no limit; default 10.
+            options: the other options of `Client.say`, except `follow`.
         """
         return self._ask(to, Say(text, wait=wait, ttl=ttl, **options))
 
@@ -88,36 +107,34 @@ class Fleet:
         current: bool = False,
         before: str | None = None,
         key: str | None = None,
-    ) -> Round:
-        """Cancel what these select, as of `Client.cancel`, or everything; an outcome comes once the robot is silent."""
+    ) -> FleetRequest:
+        """Cancel the goals that the arguments select, as in `Client.cancel`. Without arguments, cancel all goals.
+
+        A robot's outcome comes when the robot is silent.
+        """
         return self._ask(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
-    def wait(self, to: str, ids: Iterable[str] | None = None) -> Round:
-        """Wait until these goals have ended, or all that have not."""
+    def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
+        """Wait until these goals have ended. Without ids, wait for all present goals."""
         return self._ask(to, Wait(None if ids is None else tuple(ids)))
 
-    def status(self, to: str) -> Round:
-        """Ask how each stands: `said["status"]` of an outcome has all of it."""
+    def status(self, to: str) -> FleetRequest:
+        """Ask for the status of each robot's server. `said["status"]` of an outcome has all details."""
         return self._ask(to, Status())
 
-    def pause(self, to: str) -> Round:
-        """Hold speech, until `resume`."""
+    def pause(self, to: str) -> FleetRequest:
+        """Hold speech until `resume`."""
         return self._ask(to, Pause())
 
-    def resume(self, to: str) -> Round:
-        """Go on where speech was held."""
+    def resume(self, to: str) -> FleetRequest:
+        """Continue held speech."""
         return self._ask(to, Resume())
 
-    def set(self, to: str, **settings: Any) -> Round:
-        """Change settings, those of `Client.set`, where the robots' bridges allow it."""
+    def set(self, to: str, **settings: Any) -> FleetRequest:
+        """Change settings, as in `Client.set`, if the robots' bridges allow it."""
         return self._ask(to, Set(**settings))
 
-    def _ask(self, to: str, request: Request) -> Round:
-        from talkcli.fleet.desk.crowd import Crowd
+    def _ask(self, to: str, request: Request) -> FleetRequest:
+        from talkcli.fleet.desk.several import FleetRequest
 
-        crowd = Crowd(self._broker, Selection(to), name=self._name)
-        try:
-            return crowd.ask(request)
-        except BaseException:
-            crowd.close()
-            raise
+        return FleetRequest(self._broker, Selection(to), request, name=self._name)

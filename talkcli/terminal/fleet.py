@@ -1,6 +1,6 @@
-"""The robots of a fleet: as a table, `talk fleet status`, and what happens to all of them in lines, `talk fleet watch`.
+"""The robots of a fleet as a table, and what happens to them as lines. Pure.
 
-Pure, as all that shows something: how wide the terminal is, and what time it is, its caller says.
+The caller passes the time and the properties of the terminal.
 """
 
 from __future__ import annotations
@@ -16,92 +16,104 @@ if TYPE_CHECKING:
 
     from talkcli.protocol.events import Event
 
-    #: What stands in a column, and the state in whose colour; None for none.
+    #: The text of a cell, and the state that has the text's colour; None for no colour.
     Cell = tuple[str, State | None]
 
-#: The columns; and those that are left out, the first of them first, where a terminal has no room beside them for so
-#: many characters of the texts, or for the whole of shorter ones.
-HEADS = ("ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE")
-_ROBOT, _ONLINE, _SERVER, _SPEAKING, _QUEUE, _LAST, _SINCE = HEADS
-_LEAST_TEXT = 12
-_LEFT_OUT = (_SINCE, _LAST, _SERVER, _QUEUE)
-#: Columns of a text, at most, by which what follows lines up where nothing has to fit.
-_USUAL_TEXT = 40
-#: Characters of a server's version.
-_MAX_VERSION = 12
-#: Stands for nothing, and for what is not known.
-_NOTHING: Cell = ("-", None)
+COLUMN_NAMES = ("ROBOT", "ONLINE", "SERVER", "SPEAKING", "QUEUE", "LAST", "SINCE")
+#: ColumnWidths to omit, one after the other, if the texts of sentences would have less room than this.
+_OPTIONAL_COLUMNS = ("SINCE", "LAST", "SERVER", "QUEUE")
+_MIN_TEXT_CHARS = 12
+#: Width of the texts' column if the output is no terminal. Longer texts are not cut.
+_USUAL_TEXT_CHARS = 40
+_MAX_VERSION_CHARS = 12
+#: The cell for nothing, and for what is not known.
+_EMPTY_CELL: Cell = ("-", None)
 
 
 @frozen
-class Robot:
-    """A robot as the table shows it."""
+class RobotRow:
+    """A robot as the table shows it.
+
+    Attributes:
+        name: the robot's name.
+        online: whether the robot is online.
+        server: the version of its server; None if it has none.
+        active: the id of the goal that is spoken; None if there is none.
+        text: the goal's text; None if the robot doesn't publish texts.
+        pending: the number of waiting goals.
+        paused: whether speech is paused.
+        last: the state of the goal that ended last; None if unknown.
+        last_at: when that goal ended, in seconds since 1970.
+        since: since when the robot is online, in seconds since 1970.
+    """
 
     name: str
     online: bool
-    #: the version of its server; None where there is none
     server: str | None = None
-    #: the goal that is spoken, None where none is; and its text, None where that is not told
     active: str | None = None
     text: str | None = None
     pending: int = 0
     paused: bool = False
-    #: how the last goal ended, and when; since when the robot is there: both times in seconds since 1970
     last: State | None = None
     last_at: float | None = None
     since: float | None = None
 
 
-def robot_lines(robots: Sequence[Robot], screen: Screen, now: float) -> list[str]:
-    """Return a head, and a line for each robot; `now`: seconds since 1970, for how long ago something was.
+def robot_lines(robots: Sequence[RobotRow], screen: Screen, now: float) -> list[str]:
+    """Return the lines of the table, with a heading.
 
-    On a terminal none is wider than that: first the texts are cut, then columns are left out.
+    To fit a terminal, the texts of sentences are shorten first, then columns are omitted.
+
+    Args:
+        robots: the rows.
+        screen: the properties of the terminal.
+        now: seconds since 1970, to show ages.
     """
     rows = [_cells(each, screen, now) for each in robots]
-    widths = {head: max(map(width, (head, *(cells[place][0] for cells in rows)))) for place, head in enumerate(HEADS)}
+    widths = {name: max(map(width, (name, *(cells[name][0] for cells in rows)))) for name in COLUMN_NAMES}
     _fit(widths, screen.columns_left(0))
-    lines = [screen.coloured(_line({head: (head, None) for head in HEADS}, widths, Screen()), None)]
-    return lines + [_line(dict(zip(HEADS, cells, strict=True)), widths, screen) for cells in rows]
+    heading = _line({name: (name, None) for name in COLUMN_NAMES}, widths, Screen())
+    return [screen.coloured(heading, None), *(_line(cells, widths, screen) for cells in rows)]
 
 
-def _cells(robot: Robot, screen: Screen, now: float) -> list[Cell]:
-    """Return what stands in the columns of a robot's line."""
-    serving = robot.online and robot.server is not None
-    return [
-        (cut(printable(robot.name), max_id_columns(screen)), None),
-        ("yes", None) if robot.online else ("OFFLINE", State.LOST),
-        _server(robot),
-        _speaking(robot) if serving else _NOTHING,
-        (str(robot.pending), None) if serving else _NOTHING,
-        _last(robot, now),
-        _NOTHING if robot.since is None or not robot.online else (_age(now - robot.since), None),
-    ]
+def _cells(robot: RobotRow, screen: Screen, now: float) -> dict[str, Cell]:
+    """Return the cells of a row, by column."""
+    has_server = robot.online and robot.server is not None
+    return {
+        "ROBOT": (cut(printable(robot.name), max_id_columns(screen)), None),
+        "ONLINE": ("yes", None) if robot.online else ("OFFLINE", State.LOST),
+        "SERVER": _server_cell(robot),
+        "SPEAKING": _speaking_cell(robot) if has_server else _EMPTY_CELL,
+        "QUEUE": (str(robot.pending), None) if has_server else _EMPTY_CELL,
+        "LAST": _last_cell(robot, now),
+        "SINCE": _EMPTY_CELL if robot.since is None or not robot.online else (_age(now - robot.since), None),
+    }
 
 
-def _server(robot: Robot) -> Cell:
+def _server_cell(robot: RobotRow) -> Cell:
     if not robot.online:
-        return _NOTHING
-    return ("none", State.LOST) if robot.server is None else (printable(robot.server, _MAX_VERSION), None)
+        return _EMPTY_CELL
+    return ("none", State.LOST) if robot.server is None else (printable(robot.server, _MAX_VERSION_CHARS), None)
 
 
-def _speaking(robot: Robot) -> Cell:
-    said = _NOTHING[0]
+def _speaking_cell(robot: RobotRow) -> Cell:
+    words = _EMPTY_CELL[0]
     if robot.active is not None:
-        said = printable(robot.active) if robot.text is None else f'"{printable(robot.text)}"'
+        words = printable(robot.active) if robot.text is None else f'"{printable(robot.text)}"'
     if robot.paused:
-        return ("PAUSED" if robot.active is None else f"PAUSED {said}"), State.PREEMPTING
-    return said, None if robot.active is None else State.ACTIVE
+        return ("PAUSED" if robot.active is None else f"PAUSED {words}"), State.PREEMPTING
+    return words, None if robot.active is None else State.ACTIVE
 
 
-def _last(robot: Robot, now: float) -> Cell:
+def _last_cell(robot: RobotRow, now: float) -> Cell:
     if robot.last is None:
-        return _NOTHING
+        return _EMPTY_CELL
     age = "" if robot.last_at is None else f" {_age(now - robot.last_at)}"
     return f"{robot.last.name}{age}", robot.last
 
 
 def _age(seconds: float) -> str:
-    """Return a length of time in its largest unit. The robot's clock may be ahead of this one."""
+    """Return a duration in its largest unit; 0 s if it is negative, because the robot's clock may be ahead."""
     whole = max(0, int(seconds))
     for size, name in ((86400, "d"), (3600, "h"), (60, "min")):
         if whole >= size:
@@ -110,25 +122,25 @@ def _age(seconds: float) -> str:
 
 
 def _fit(widths: dict[str, int], room: int | None) -> None:
-    """Make the column of the texts narrower, and leave others out, so that a line has no more than `room`."""
-    longest = widths[_SPEAKING]
+    """Narrow the column of texts, and remove other columns, until a line fits into `room` characters."""
+    longest = widths["SPEAKING"]
     if room is None:
-        widths[_SPEAKING] = min(longest, _USUAL_TEXT)
+        widths["SPEAKING"] = min(longest, _USUAL_TEXT_CHARS)
         return
-    for head in (None, *_LEFT_OUT):
-        if head is not None:
-            del widths[head]
-        left = room - len(COLUMN_GAP) * (len(widths) - 1) - (sum(widths.values()) - widths[_SPEAKING])
-        widths[_SPEAKING] = max(0, min(longest, left))
-        if left >= min(longest, _LEAST_TEXT):
+    for omitted in (None, *_OPTIONAL_COLUMNS):
+        if omitted is not None:
+            del widths[omitted]
+        left = room - len(COLUMN_GAP) * (len(widths) - 1) - (sum(widths.values()) - widths["SPEAKING"])
+        widths["SPEAKING"] = max(0, min(longest, left))
+        if left >= min(longest, _MIN_TEXT_CHARS):
             return
 
 
 def _line(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str:
     shown = []
-    for head, columns in widths.items():
-        text, state = cells[head]
-        if head == _SPEAKING and screen.width is not None:
+    for name, columns in widths.items():
+        text, state = cells[name]
+        if name == "SPEAKING" and screen.width is not None:
             text = shorten(text, columns)
         text = pad(text, columns)
         shown.append(text if state is None else screen.coloured(text, state))
@@ -136,38 +148,42 @@ def _line(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str
 
 
 class FleetTranscript:
-    """Turns what robots tell into lines, as a transcript does for each, with the robot's name behind the time."""
+    """Turns events of robots into lines, each with the robot's name after the time."""
 
     def __init__(self, *, full: bool) -> None:
-        """`full`: as of `Transcript`."""
+        """Create a transcript; `full` is that of `Transcript`."""
         self._full = full
         self._columns = ColumnWidths()
         self._transcripts: dict[str, Transcript] = {}
 
-    def begin(self, robots: Sequence[Robot], where: str, screen: Screen, now: float) -> list[str]:
-        """Return what is said of all robots in the beginning; `where`: of which broker they are."""
+    def begin(self, robots: Sequence[RobotRow], broker: str, screen: Screen, now: float) -> list[str]:
+        """Return the first line, which counts the robots at this broker."""
         for each in robots:
-            self._columns.robot(each.name, screen)  # so that all lines line up
-        gone = sum(not each.online for each in robots)
-        alone = sum(each.online and each.server is None for each in robots)
+            self._columns.robot(each.name, screen)  # so that all lines are aligned
+        offline = sum(not each.online for each in robots)
+        serverless = sum(each.online and each.server is None for each in robots)
         parts = [f"{len(robots)} robot{'' if len(robots) == 1 else 's'}"]
-        parts += [f"{gone} OFFLINE"] if gone else []
-        parts += [f"{alone} without a server"] if alone else []
-        return [cut(f"{clock_time(now)}{COLUMN_GAP}{', '.join(parts)}; {printable(where)}", screen.columns_left(0))]
+        parts += [f"{offline} OFFLINE"] if offline else []
+        parts += [f"{serverless} without a server"] if serverless else []
+        return [cut(f"{clock_time(now)}{COLUMN_GAP}{', '.join(parts)}; {printable(broker)}", screen.columns_left(0))]
 
     def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
-        """Return what is to be shown of an event of a robot's; `now`: as of `Transcript.lines`."""
+        """Return the lines for an event of a robot, see `Transcript.lines`."""
         if name not in self._transcripts:
             self._transcripts[name] = Transcript(full=self._full, words=False, robot=name, widths=self._columns)
         return self._transcripts[name].lines(event, screen, now)
 
-    def change(self, before: Robot | None, robot: Robot, screen: Screen, now: float) -> list[str]:
-        """Return what is to be shown of a robot that has come or gone, or its server has; of its goals none is left.
+    def change(self, before: RobotRow | None, robot: RobotRow, screen: Screen, now: float) -> list[str]:
+        """Return the line for a robot that has come or gone, or whose server has; forget the robot's goals.
 
-        `before`: how the same bridge of it stood, None where it is another one's, or there was none.
+        Args:
+            before: the robot before the change; None if it was not known, or had another bridge.
+            robot: the robot now.
+            screen: the properties of the terminal.
+            now: seconds since 1970.
         """
         self._transcripts.pop(robot.name, None)
-        server = "no server" if robot.server is None else f"talk {printable(robot.server, _MAX_VERSION)}"
+        server = "no server" if robot.server is None else f"talk {printable(robot.server, _MAX_VERSION_CHARS)}"
         if not robot.online:
             word, state, more = "OFFLINE", State.LOST, ""
         elif before is None or not before.online:

@@ -140,7 +140,7 @@ def fleet_of(broker: Broker, monkeypatch: pytest.MonkeyPatch, *, grace: float = 
     needs_packages("paho")
     from talkcli.fleet.desk import desk
 
-    monkeypatch.setattr(desk, "GRACE", grace)  # mosquitto tells at once all that it keeps
+    monkeypatch.setattr(desk, "RETAINED_GRACE_S", grace)  # mosquitto tells at once all that it keeps
     for each in [name for name in os.environ if name.startswith("TALK_") and not name.startswith("TALK_TEST_")]:
         monkeypatch.delenv(each)
     if user:

@@ -13,7 +13,7 @@ from talkcli import __version__
 from talkcli.cli.ask import _examination
 from talkcli.cli.show import CommonOptions
 from talkcli.doctor import broker as judging
-from talkcli.doctor.broker import Allowed, Way
+from talkcli.doctor.broker import AccessRights, BrokerConnection
 from talkcli.errors import UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import Broker as Named
@@ -105,9 +105,9 @@ def test_a_bridge_is_not_disturbed_if_its_own_user_runs_the_doctor(robot: Robot)
 def test_a_variable_names_the_robot_as_the_option_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TALK_ROBOT", "anna")
     options = CommonOptions()
-    assert isinstance(_examination(options, {}, silent=False), judging.Examination)
+    assert isinstance(_examination(options, {}, silent=False), judging.BrokerExamination)
     options.socket = "/nowhere"
-    assert not isinstance(_examination(options, {}, silent=False), judging.Examination)
+    assert not isinstance(_examination(options, {}, silent=False), judging.BrokerExamination)
 
 
 @pytest.mark.slow
@@ -194,7 +194,7 @@ def test_topics_that_a_robot_may_not_write_or_read_are_named() -> None:
     ],
 )
 def test_variables_that_name_no_broker_are_told(changed: dict[str, str], words: str, step: str) -> None:
-    (found,) = judging.Examination("anna", {"TALK_BROKER": f"mqtt://{HOST}", **changed}).findings()
+    (found,) = judging.BrokerExamination("anna", {"TALK_BROKER": f"mqtt://{HOST}", **changed}).findings()
     assert (found.check, found.state) == ("broker", "failed")
     assert words in found.message
     assert str(found.next).startswith(step)
@@ -202,7 +202,7 @@ def test_variables_that_name_no_broker_are_told(changed: dict[str, str], words: 
 
 def test_a_refused_connection_is_named() -> None:
     with Port() as port:
-        (found,) = judging.Examination("anna", {"TALK_BROKER": f"mqtt://{HOST}:{port.number}"}).findings()
+        (found,) = judging.BrokerExamination("anna", {"TALK_BROKER": f"mqtt://{HOST}:{port.number}"}).findings()
     assert (found.check, found.message) == ("broker", f"mqtt://{HOST}:{port.number}: connection refused")
     assert f"'listener {port.number}'" in str(found.next)
 
@@ -210,7 +210,9 @@ def test_a_refused_connection_is_named() -> None:
 @pytest.mark.slow
 def test_a_silent_port_is_no_broker() -> None:
     with socket.create_server((HOST, 0)) as mute:
-        found = list(judging.Examination("anna", {"TALK_BROKER": f"mqtt://{HOST}:{mute.getsockname()[1]}"}).findings())
+        found = list(
+            judging.BrokerExamination("anna", {"TALK_BROKER": f"mqtt://{HOST}:{mute.getsockname()[1]}"}).findings()
+        )
     assert [each.check for each in found] == ["broker", "login"]
     assert found[-1].message.endswith("does not answer: nothing in 5 s")
 
@@ -269,26 +271,33 @@ def test_an_interrupt_ends_it_while_it_waits() -> None:
 
 def test_a_name_that_no_robot_can_have_is_a_usage_error() -> None:
     with pytest.raises(UsageError, match="no robot can be called 'a/b'"):
-        judging.Examination("a/b", {})
+        judging.BrokerExamination("a/b", {})
 
 
 PLAIN = Named("broker.example", 1883, tls=False)
 
 
 @pytest.mark.parametrize(
-    ("broker", "way", "near", "state", "words", "step"),
+    ("broker", "connection", "near", "state", "words", "step"),
     [
-        (TLS, Way(until=1e9 + 13 * 86400), False, "warning", "the system's CAs", "renew the certificate"),
-        (TLS, Way(until=1e9 + 15 * 86400), False, "ok", "the system's CAs", "None"),
-        (TLS, Way(untrusted="Hostname mismatch", fault=62), False, "failed", "mismatch", "name the host in TALK_BROK"),
-        (PLAIN, Way(), False, "warning", "none: ", "give the broker a certificate"),
-        (PLAIN, Way(), True, None, "", ""),
+        (TLS, BrokerConnection(until=1e9 + 13 * 86400), False, "warning", "the system's CAs", "renew the certificate"),
+        (TLS, BrokerConnection(until=1e9 + 15 * 86400), False, "ok", "the system's CAs", "None"),
+        (
+            TLS,
+            BrokerConnection(untrusted="Hostname mismatch", fault=62),
+            False,
+            "failed",
+            "mismatch",
+            "name the host in TALK_BROK",
+        ),
+        (PLAIN, BrokerConnection(), False, "warning", "none: ", "give the broker a certificate"),
+        (PLAIN, BrokerConnection(), True, None, "", ""),
     ],
 )
 def test_a_certificate_is_judged_by_its_end_its_name_and_the_distance(
-    broker: Named, way: Way, near: bool, state: str | None, words: str, step: str
+    broker: Named, connection: BrokerConnection, near: bool, state: str | None, words: str, step: str
 ) -> None:
-    found = judging.judge_certificate(broker, way, 1e9, near=near)
+    found = judging.judge_certificate(broker, connection, 1e9, near=near)
     assert [each.state for each in found] == ([] if state is None else [state])
     for each in found:
         assert words in each.message
@@ -296,7 +305,7 @@ def test_a_certificate_is_judged_by_its_end_its_name_and_the_distance(
 
 
 def test_a_broker_that_hangs_up_on_a_forbidden_topic_is_told_from_one_that_refuses_it() -> None:
-    found = judging.judge_rights("olga", Allowed(None, (), ("talk/reply/olga/1/_",), "the broker went away"))
+    found = judging.judge_rights("olga", AccessRights(None, (), ("talk/reply/olga/1/_",), "the broker went away"))
     assert (found.state, found.message) == ("failed", "what 'olga' may do can't be found out: the broker went away")
 
 

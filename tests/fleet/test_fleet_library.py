@@ -100,7 +100,7 @@ def test_without_wait_an_outcome_is_that_the_goal_was_accepted(fleet: Fleet, pai
     assert pair["wh-1"].talk.goal("accepted")["ttl"] is None
 
 
-def test_a_round_that_is_closed_leaves_its_sentence_to_be_spoken(fleet: Fleet, pair: RealRobots) -> None:
+def test_a_request_that_is_closed_leaves_its_sentence_to_be_spoken(fleet: Fleet, pair: RealRobots) -> None:
     outcomes = fleet.say("wh-*", "length=0.3 go on", id="left")
     pair.each(lambda each: each.talk.watcher.wait_for("left", "ACTIVE"))
     outcomes.close()
@@ -154,7 +154,7 @@ def test_no_request_leaves_anything_open(fleet: Fleet) -> None:
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("to", BOTH)
-def test_a_round_that_is_dropped_leaves_nothing_open(fleet: Fleet, to: str) -> None:
+def test_a_request_that_is_dropped_leaves_nothing_open(fleet: Fleet, to: str) -> None:
     list(fleet.status(to))
     gc.collect()
     before = descriptors()

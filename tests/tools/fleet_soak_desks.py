@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from talkcli import Client
 from talkcli.errors import Lost, RequestRefused, ServerUnavailable, UnknownGoal
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.desk.robot import reach
+from talkcli.fleet.desk.robot import connect_robot
 from talkcli.protocol.events import Result
 from tests.support.bridge import Desk
 from tests.tools.soak_clients import PATIENCE_S, Workers
@@ -77,7 +77,7 @@ class Ledger:
 
 def connect(broker: Broker, robot: str, user: str) -> Connection:
     """Return a connection of this user to a robot."""
-    return reach(robot, from_environment(broker.env(user, password=False)), name="soak")
+    return connect_robot(robot, from_environment(broker.env(user, password=False)), name="soak")
 
 
 class Desks:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -18,9 +18,14 @@ from talkcli.errors import (
     UnknownGoal,
     UsageError,
 )
-from talkcli.fleet.desk.outcome import IDLE, NO_SERVER, OFFLINE, PAUSED, SET, Outcome, failed
+from talkcli.fleet.desk.request import Outcome, cancel_outcomes, failure_outcome, reply_outcomes
 from talkcli.goals.goal import Goal
+from talkcli.goals.options import Cancel, Say, Set
 from talkcli.goals.states import State
+from talkcli.protocol.requests import Pause, Resume, Status, Wait
+
+if TYPE_CHECKING:
+    from talkcli.protocol.requests import Request
 
 GOAL = Goal("a", State.PREEMPTED, "hello", reason="canceled")
 
@@ -32,8 +37,8 @@ GOAL = Goal("a", State.PREEMPTED, "hello", reason="canceled")
         (Lost("it was sent"), None, "LOST", 12, "lost"),
         (AccessDenied("not allowed"), None, "REFUSED", 10, "permission_denied"),
         (ServerUnavailable("no answer"), None, "UNREACHABLE", 3, "no_server"),
-        (ServerUnavailable("nothing was sent"), OFFLINE, OFFLINE, 3, "no_server"),
-        (ServerUnavailable("nothing was sent"), NO_SERVER, NO_SERVER, 3, "no_server"),
+        (ServerUnavailable("nothing was sent"), "OFFLINE", "OFFLINE", 3, "no_server"),
+        (ServerUnavailable("nothing was sent"), "NO_SERVER", "NO_SERVER", 3, "no_server"),
         (Busy("too many"), None, "REFUSED", 5, "busy"),
         (BadOption("no such voice", "unknown_voice"), None, "REFUSED", 2, "unknown_voice"),
         (RequestRefused("a line is too long", "too_long"), None, "REFUSED", 1, "too_long"),
@@ -45,7 +50,7 @@ GOAL = Goal("a", State.PREEMPTED, "hello", reason="canceled")
 def test_an_error_is_a_state_and_an_exit_code(
     error: TalkError, named: str | None, state: str, exit_code: int, code: str
 ) -> None:
-    outcome = failed("anna", error, named)
+    outcome = failure_outcome("anna", error, named)
     assert (outcome.error, outcome.goal, outcome.said, outcome.last) == (error, None, None, True)
     told = {"code": code, "message": str(error)}
     assert outcome.to_json() == {"robot": "anna", "state": state, "exit_code": exit_code, "error": told}
@@ -55,13 +60,52 @@ def test_an_error_is_a_state_and_an_exit_code(
     ("outcome", "told"),
     [
         (Outcome("anna", "PREEMPTED", 7, GOAL), {"state": "PREEMPTED", "exit_code": 7, "goal": GOAL.to_json()}),
-        (Outcome("anna", SET, said={"settings": {"rate": 150}}), {"state": "SET", "settings": {"rate": 150}}),
+        (Outcome("anna", "SET", said={"settings": {"rate": 150}}), {"state": "SET", "settings": {"rate": 150}}),
         (
-            Outcome("anna", PAUSED, goal=GOAL, said={"paused": True}),
+            Outcome("anna", "PAUSED", goal=GOAL, said={"paused": True}),
             {"state": "PAUSED", "paused": True, "goal": GOAL.to_json()},
         ),
-        (Outcome("anna", IDLE), {"state": "IDLE"}),
+        (Outcome("anna", "IDLE"), {"state": "IDLE"}),
     ],
 )
 def test_an_outcome_has_its_goal_and_the_answer_of_the_robot(outcome: Outcome, told: dict[str, Any]) -> None:
     assert outcome.to_json() == {"robot": "anna", "exit_code": 0, **told}
+
+
+ENDED, SPOKEN = GOAL.to_json(), Goal("b", State.ACTIVE, "hello").to_json()
+SERVER: dict[str, Any] = {"server": {"paused": False}, "active": None}
+
+
+@pytest.mark.parametrize(
+    ("request_", "reply", "items", "outcomes"),
+    [
+        (Say("hello", wait=False), {"goal": SPOKEN}, [], [("ACTIVE", 0, "b")]),
+        (Say("hello", wait=False), {"goal": ENDED}, [], [("PREEMPTED", 7, "a")]),
+        (Wait(), {}, [], [("IDLE", 0, None)]),
+        (Cancel(), {}, [], [("IDLE", 0, None)]),
+        (Cancel(), {}, [{"canceled": ENDED}, {"ended": SPOKEN}], [("PREEMPTED", 0, "a"), ("ACTIVE", 0, "b")]),
+        (Status("a"), {"goal": ENDED}, [], [("PREEMPTED", 0, "a")]),
+        (Status(), SERVER, [], [("IDLE", 0, None)]),
+        (Status(), {**SERVER, "active": SPOKEN}, [], [("ACTIVE", 0, "b")]),
+        (Status(), {"server": {"paused": True}, "active": SPOKEN}, [], [("PAUSED", 0, "b")]),
+        (Pause(), {"goal": SPOKEN}, [], [("PAUSED", 0, "b")]),
+        (Resume(), {"goal": None}, [], [("RESUMED", 0, None)]),
+        (Set(), {"settings": {"rate": 150}}, [], [("SET", 0, None)]),
+    ],
+)
+def test_a_reply_is_an_outcome_for_each_goal_or_one(
+    request_: Request, reply: dict[str, Any], items: list[dict[str, Any]], outcomes: list[tuple[str, int, str | None]]
+) -> None:
+    found = reply_outcomes("anna", request_, {"ok": True, **reply}, items)
+    assert [(each.state, each.exit_code, each.goal and each.goal.id) for each in found] == outcomes
+    assert [each.last for each in found] == [False] * (len(found) - 1) + [True]
+    assert {each.robot for each in found} == {"anna"}
+
+
+def test_the_answer_to_a_status_of_a_goal_has_the_goal() -> None:
+    with pytest.raises(ValueError, match="goal"):
+        reply_outcomes("anna", Status("a"), {"ok": True}, [])
+
+
+def test_the_goals_of_a_refused_cancel_are_not_the_last_outcomes() -> None:
+    assert [each.last for each in cancel_outcomes("anna", [{"canceled": ENDED}], last=False)] == [False]

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from talkcli.fleet import topics
-from talkcli.fleet.desk.selection import Selection, several
+from talkcli.fleet.desk.request import Selection, selects_several
 from talkcli.fleet.presence import Presence, rank
 from talkcli.fleet.status import LastGoal, Status
 from talkcli.goals.states import State
@@ -141,8 +141,8 @@ FLEET.append(robot("wh-12"))
 )
 def test_a_selection_picks_by_name_by_glob_and_by_group(text: str, picked: str) -> None:
     selection = Selection(text)
-    assert (selection.fault, selection.only) == (None, None if several(text) else text)
-    assert [each.name for each in FLEET if selection.picks(each)] == picked.split()
+    assert (selection.fault, selection.name) == (None, None if selects_several(text) else text)
+    assert [each.name for each in FLEET if selection.includes(each)] == picked.split()
     assert selection.group == (text[1:] if text[0] == "@" else None)
 
 
@@ -154,7 +154,7 @@ def test_a_selection_picks_by_name_by_glob_and_by_group(text: str, picked: str) 
     ],
 )
 def test_a_glob_or_a_group_may_mean_several(text: str, found: bool) -> None:
-    assert several(text) == found
+    assert selects_several(text) == found
 
 
 @pytest.mark.parametrize(

@@ -14,41 +14,41 @@ from talkcli.fleet.status import Status
 from talkcli.frozen import replace
 from talkcli.goals.states import State
 from talkcli.protocol.events import StateChanged, from_json
-from talkcli.terminal.fleet import HEADS, FleetTranscript, Robot, robot_lines
+from talkcli.terminal.fleet import COLUMN_NAMES, FleetTranscript, RobotRow, robot_lines
 from talkcli.terminal.text import MIN_COLUMNS, Screen, printable, width
 
 NOW = 1_000_000.0
-ANNA = Robot(
+ANNA = RobotRow(
     "anna", online=True, server="0.1.0", active="a-1", text="please step back, the doors are closing now", pending=2,
     last=State.SUCCEEDED, last_at=NOW - 10, since=NOW - 900,
 )  # fmt: skip
-GONE = Robot(
+GONE = RobotRow(
     "bert", online=False, active="b-1", text="said long ago", pending=3, last=State.ABORTED, last_at=NOW - 7200
 )
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), max_size=60)
 TIMES = st.none() | st.floats(-1e9, 2 * NOW)
 ROBOTS = st.builds(
-    Robot, st.text("abcXYZ019._-", min_size=1, max_size=59), online=st.booleans(), server=st.none() | TEXTS,
+    RobotRow, st.text("abcXYZ019._-", min_size=1, max_size=59), online=st.booleans(), server=st.none() | TEXTS,
     active=st.none() | TEXTS, text=st.none() | TEXTS, pending=st.integers(0, 10_000), paused=st.booleans(),
     last=st.none() | st.sampled_from(State), last_at=TIMES, since=TIMES,
 )  # fmt: skip
 
 
-def cells(robot: Robot) -> list[str]:
+def cells(robot: RobotRow) -> list[str]:
     """Return a robot's line, cut at the heads; it has all the room that it needs."""
     head, line = robot_lines([robot], Screen(), NOW)
-    places = [*(head.index(each) for each in HEADS), None]
+    places = [*(head.index(each) for each in COLUMN_NAMES), None]
     return [line[start:end].strip() for start, end in pairwise(places)]
 
 
 @given(st.lists(ROBOTS, max_size=3), st.integers(1, 200), st.booleans())
-def test_no_line_is_wider_than_its_terminal(robots: list[Robot], columns: int, colour: bool) -> None:
+def test_no_line_is_wider_than_its_terminal(robots: list[RobotRow], columns: int, colour: bool) -> None:
     lines = robot_lines(robots, Screen(columns, colour), NOW)
     assert len(lines) == len(robots) + 1
     assert max(map(width, lines)) <= max(columns, MIN_COLUMNS)
     head, *lines = robot_lines(robots, Screen(), NOW)  # in a pipe nothing is cut
-    assert head.split() == list(HEADS)
+    assert head.split() == list(COLUMN_NAMES)
     for robot, line in zip(robots, lines, strict=True):
         assert line.startswith(f"{robot.name} ")
         if robot.online and robot.server is not None and robot.active is not None and robot.text is not None:
@@ -63,7 +63,7 @@ def test_no_line_is_wider_than_its_terminal(robots: list[Robot], columns: int, c
         (replace(ANNA, server=None, last=None), ["anna", "yes", "none", "-", "-", "-", "15 min"]),
     ],
 )
-def test_a_robot_is_shown_with_all_that_is_known_of_it(robot: Robot, shown: list[str]) -> None:
+def test_a_robot_is_shown_with_all_that_is_known_of_it(robot: RobotRow, shown: list[str]) -> None:
     assert cells(robot) == shown
 
 
@@ -77,7 +77,7 @@ def test_a_robot_is_shown_with_all_that_is_known_of_it(robot: Robot, shown: list
         (replace(ANNA, text="\x1b[2J\n\u202e"), r'"\x1b[2J\n\u202e"'),
     ],
 )
-def test_the_speaking_column_has_the_text_or_the_id_and_pauses(robot: Robot, shown: str) -> None:
+def test_the_speaking_column_has_the_text_or_the_id_and_pauses(robot: RobotRow, shown: str) -> None:
     assert cells(robot)[3] == shown
 
 
@@ -93,10 +93,10 @@ def test_a_time_is_shown_by_its_age(seconds: float, shown: str) -> None:
 @pytest.mark.parametrize(
     ("columns", "heads"),
     [
-        (120, HEADS),
-        (80, HEADS),
-        (64, HEADS[:-1]),
-        (48, HEADS[:-2]),
+        (120, COLUMN_NAMES),
+        (80, COLUMN_NAMES),
+        (64, COLUMN_NAMES[:-1]),
+        (48, COLUMN_NAMES[:-2]),
         (40, ("ROBOT", "ONLINE", "SPEAKING", "QUEUE")),
     ],
 )

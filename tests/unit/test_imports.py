@@ -36,7 +36,7 @@ PURE = [
     *("engine.child.synthesizers.phonemes", "engine.child.synthesizers.vits"),
     *(f"fleet.{each}" for each in ("message", "presence", "status", "topics")),
     *("fleet.bridge.homeassistant", "fleet.bridge.policy"),
-    *(f"fleet.desk.{each}" for each in ("outcome", "selection", "sighting")),
+    "fleet.desk.request",
 ]
 IMPURE = {
     *("asyncio", "threading", "_thread", "socket", "_socket", "select", "selectors", "signal", "time", "datetime"),
@@ -220,7 +220,7 @@ def test_only_a_server_asks_platformdirs_for_its_path() -> None:
 
 
 #: The modules of commands and doctor that are for fleets alone: no other module pays for their imports.
-OF_THE_FLEET = {"cli.bridge", "cli.fleet", "cli.several", "doctor.broker"}
+OF_THE_FLEET = {"cli.fleet", "cli.several", "doctor.broker"}
 
 
 def test_server_doctor_and_fleet_are_imported_only_if_they_are_asked_for() -> None:

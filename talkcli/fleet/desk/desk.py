@@ -1,7 +1,7 @@
-"""A desk's way to the broker: one user's connection, made anew wherever it breaks, until the desk goes home.
+"""The desk's connection to the broker, which reconnects after every break.
 
-Who has one waits in `serve`, and is told by that of what has come. Nothing is kept while the broker is away. Nothing
-here knows what is asked of whom.
+It knows nothing about robots or requests. A handler subscribes to topics and processes the messages. Nothing is queued
+while the broker is unreachable.
 """
 
 from __future__ import annotations
@@ -26,199 +26,217 @@ if TYPE_CHECKING:
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.message import Message
 
-#: Seconds after which a broker or a robot that went away counts as gone, and what was waited for as lost: bridges are
-#: back within 15 s of their broker, and systemd starts one again after two.
-ABSENCE_LIMIT = 30.0
-#: Seconds for which what the broker keeps is awaited: some send it a moment after the rest.
-GRACE = 0.3
-#: Seconds between two tries to reach a broker that went away: any time up to the first, doubled up to the second.
-_FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
+#: A broker or a robot that is absent for this long counts as gone, and open requests as lost. Bridges come back within
+#: 15 s after their broker, and systemd restarts a bridge after two.
+ABSENCE_LIMIT_S = 30.0
+#: Time allowed for late retained messages: some brokers send them a moment after the others.
+RETAINED_GRACE_S = 0.3
+#: Bounds of the pause before the next attempt to connect. The pause is random, and doubles on average each time.
+_FIRST_RECONNECT_PAUSE_S, _MAX_RECONNECT_PAUSE_S = 0.5, 10.0
 
 
-class Visitor(Protocol):
-    """Whoever has a desk, and is told by it, in `Desk.serve`, of what happens."""
+class DeskHandler(Protocol):
+    """The receiver of a desk's messages. `DeskLink.poll` calls its methods."""
 
-    def came_up(self, link: Link) -> None:
-        """Subscribe to what is wanted, on a connection that has just been made."""
+    def on_connected(self, link: Link) -> None:
+        """Subscribe to topics on a new connection."""
 
-    def went_down(self, why: str) -> None:
-        """Take note that there is no connection any more."""
+    def on_disconnected(self, why: str) -> None:
+        """Called when the connection breaks and whenever an attempt to connect fails."""
 
-    def hear(self, message: Message) -> None:
-        """Take what has come."""
+    def on_message(self, message: Message) -> None:
+        """Process a message from the broker."""
 
 
-class Desk:
-    """A connection to the broker that comes back. `serve` is called by one thread at a time, the rest by any."""
+class DeskLink:
+    """A connection to the broker that reconnects after every break.
 
-    #: who is told; to be there before `serve`
-    visitor: Visitor
+    Only one thread at a time may call `poll`. Any thread may call the other methods.
+    """
+
+    #: must be set before the first `poll`
+    handler: DeskHandler
 
     def __init__(self, broker: Broker) -> None:
-        """UsageError where the user's name can't be in a topic. It connects in `serve`."""
+        """Prepare the connection. `poll` will open it.
+
+        Raises:
+            UsageError: The user's name can't be part of a topic.
+        """
         self.broker, self.user = broker, user(broker)
-        #: by which the broker and the bridges tell this desk from others of the user's
+        #: part of this desk's topics, to tell it from the user's other desks
         self.session = os.urandom(8).hex()
-        #: the connection; None while there is none
+        #: the current MQTT connection; None while disconnected
         self.link: Link | None = None
-        #: why the broker was not to be had, the last time; or what it refuses
+        #: why the last attempt to connect failed, or what the broker refused
         self.failure: TalkError | None = None
-        #: when what this desk had sent itself came back on this connection, behind all that the broker keeps
-        self.marked_at: float | None = None
+        #: when the marker came back, which the broker sends after its retained messages; None if it hasn't
+        self.marker_at: float | None = None
         self._inbox: deque[Message] = deque()
         self._opening: Opening | None = None
-        self._tries = 0
-        self._next_try = self._served_at = time.monotonic()
-        # Sockets, and no pipe: where nobody has this any more, they are closed.
-        self._wake, self._write = socket.socketpair()
-        for each in (self._wake, self._write):
+        self._failed_attempts = 0
+        self._next_attempt_at = self._polled_at = time.monotonic()
+        # Unlike a pipe, sockets are closed by the garbage collector if nobody calls `close`.
+        self._wake_reader, self._wake_writer = socket.socketpair()
+        for each in (self._wake_reader, self._wake_writer):
             each.setblocking(False)
 
     @property
-    def told(self) -> bool:
-        """Whether the broker has had the time to tell all that it keeps."""
-        return self.marked_at is not None and time.monotonic() > self.marked_at + GRACE
+    def has_retained(self) -> bool:
+        """Whether the broker has had time to send all its retained messages."""
+        return self.marker_at is not None and time.monotonic() > self.marker_at + RETAINED_GRACE_S
 
-    def answers(self, robot: str) -> str:
-        """Return the topic on which this desk is answered by a robot."""
+    def reply_topic(self, robot: str) -> str:
+        """Return the topic for a robot's replies to this desk."""
         return topics.reply(self.user, self.session, robot)
 
-    def serve(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
-        """Wait so many seconds at most until something happens, tell of it, and return whether something was heard;
-        Interrupted as of `connect.ready`.
+    def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
+        """Wait until something happens, pass new messages to the handler, and return whether there were any.
+
+        Args:
+            timeout: seconds to wait at most.
+            interrupt: descriptors that end the wait with Interrupted, see `wait_ready`.
         """
         link = self.link
         now = time.monotonic()
-        if link is not None and (link.ended or now - self._served_at > 2 * KEEPALIVE):
-            self._lose(link)
+        if link is not None and (link.ended or now - self._polled_at > 2 * KEEPALIVE):
+            self._disconnect(link)
             link = None
-        due = self._see_to(link, now)
-        wake = self._wake.fileno()
+        due = self._maintain(link, now)
+        wake = self._wake_reader.fileno()
         watched = {wake: select.POLLIN}
         descriptor = -1 if link is None else link.fileno()
-        if link is not None and descriptor >= 0:  # another thread may have found out that it has ended
+        if link is not None and descriptor >= 0:  # it is -1 if another thread has closed the link
             watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
-        found = wait_ready(watched, min(timeout, due), interrupt)
-        if wake in found:
-            self._wake.recv(4096)
-        self._served_at = time.monotonic()
-        if link is not None and descriptor in found:
+        ready = wait_ready(watched, min(timeout, due), interrupt)
+        if wake in ready:
+            self._wake_reader.recv(4096)
+        self._polled_at = time.monotonic()
+        if link is not None and descriptor in ready:
             link.read()
-        heard = bool(self._inbox)
+        received = bool(self._inbox)
         while self._inbox:
             message = self._inbox.popleft()
-            if message.topic == self.answers(topics.MARKER):
-                self.marked_at = time.monotonic()
+            if message.topic == self.reply_topic(topics.MARKER):
+                self.marker_at = time.monotonic()
             else:
-                self.visitor.hear(message)
-        return heard
+                self.handler.on_message(message)
+        return received
 
-    def await_kept(
-        self, patience: float, enough: Callable[[], bool] = lambda: True, interrupt: Mapping[int, int] | None = None
+    def wait_for_retained(
+        self, timeout: float, is_enough: Callable[[], bool] = lambda: True, interrupt: Mapping[int, int] | None = None
     ) -> None:
-        """Wait until the broker has told what it keeps, and a moment longer where that is not yet `enough`.
+        """Wait for the broker's retained messages.
 
-        ServerUnavailable where it does not within `patience` seconds, AccessDenied where it doesn't let this user ask;
-        Interrupted as of `serve`.
+        Args:
+            timeout: seconds to wait at most.
+            is_enough: if this returns true, there is no wait for late retained messages.
+            interrupt: as in `poll`.
+
+        Raises:
+            ServerUnavailable: The broker can't be reached, or doesn't answer in time.
+            AccessDenied: The broker doesn't let this user log in, or read its own replies.
         """
-        end = time.monotonic() + patience
-        while not (self.told or (self.marked_at is not None and enough())):
+        end = time.monotonic() + timeout
+        while not (self.has_retained or (self.marker_at is not None and is_enough())):
             if self.failure is not None:
                 raise self.failure
             left = end - time.monotonic()
             if left <= 0:
-                raise self.unanswered(patience)
-            self.serve(left, interrupt)
+                raise self.no_answer(timeout)
+            self.poll(left, interrupt)
 
     def wake(self) -> None:
-        """Have the thread that waits look around, from any thread."""
+        """Wake the thread that waits in `poll`."""
         try:
-            self._write.send(b"\0")
+            self._wake_writer.send(b"\0")
         except OSError:
-            pass  # it is awake, or this is closed
+            pass  # already awake, or closed
 
-    def flush(self, patience: float) -> None:
-        """Wait until the broker has taken what was sent, so many seconds at most."""
-        end = time.monotonic() + patience
+    def flush(self, timeout: float) -> None:
+        """Wait until the broker has acknowledged everything that was sent."""
+        end = time.monotonic() + timeout
         while self.link is not None and self.link.outstanding and (left := end - time.monotonic()) > 0:
-            self.serve(left)
+            self.poll(left)
 
     def close(self) -> None:
-        """End it."""
+        """Disconnect for good."""
         if self._opening is not None:
             self._opening.give_up()
         if self.link is not None:
             self.link.close()
-        self._close_descriptors()
+        self._close_wake_sockets()
 
     def drop(self) -> None:
-        """Close this process's copies of the descriptors, as a child does: the connection is its parent's."""
+        """Close a forked child's copies of the descriptors. The parent's connection goes on."""
         if self.link is not None:
             self.link.drop()
-        self._close_descriptors()
+        self._close_wake_sockets()
 
-    def refused(self, code: int, what: str) -> TalkError:
-        """Return the error for a reason of the broker's for which it has taken nothing; `what`: what it was to let."""
+    def publish_error(self, code: int, action: str) -> TalkError:
+        """Return the error for a message that the broker has refused.
+
+        Args:
+            code: the reason code of the broker's acknowledgement.
+            action: what the user is not allowed to do, for people.
+        """
         if code == NOT_AUTHORIZED:
-            return self.forbidden(what)
+            return self._access_error(action)
         return ServerUnavailable(f"nothing was sent: the broker at {self.broker.url} refuses it, reason 0x{code:02x}")
 
-    def forbidden(self, what: str) -> AccessDenied:
-        """Return the error for what the broker's rules don't let this user do."""
-        words = f"the broker at {self.broker.url} does not let '{self.user}' {what}"
+    def no_answer(self, timeout: float) -> TalkError:
+        """Return the error for a broker that has sent no retained messages within `timeout` seconds."""
+        if self.link is None or self.marker_at is not None:
+            return ServerUnavailable(f"the broker at {self.broker.url} does not answer within {timeout:g} s")
+        return self._access_error(f"read {topics.reply(self.user, '+', '+')}")
+
+    def _access_error(self, action: str) -> AccessDenied:
+        words = f"the broker at {self.broker.url} does not let '{self.user}' {action}"
         return AccessDenied(f"{words}: its ACL needs the lines of an operator, see 'talk bridge --print-acl'")
 
-    def unanswered(self, patience: float) -> TalkError:
-        """Return what is wrong where the broker has told nothing in so many seconds."""
-        if self.link is None or self.marked_at is not None:
-            return ServerUnavailable(f"the broker at {self.broker.url} does not answer within {patience:g} s")
-        return self.forbidden(f"read {topics.reply(self.user, '+', '+')}")
+    def _maintain(self, link: Link | None, now: float) -> float:
+        """Connect, or keep the connection alive. Return the seconds until the next call is due."""
+        if link is not None:
+            link.tick()
+            return TICK if self.marker_at is None or self.has_retained else self.marker_at + RETAINED_GRACE_S - now
+        if self._opening is not None and self._opening.done:
+            self._end_attempt(self._opening)
+            return 0.0
+        if self._opening is None and now >= self._next_attempt_at:
+            # A thousand robots may answer at once.
+            name = f"talk-desk-{self.user}-{self.session}"
+            new = Link(self.broker, name, self._inbox.append, at_once=MANY_AT_ONCE)
+            self._opening = Opening(new, self.wake)
+        return TICK if self._opening else max(0.0, self._next_attempt_at - now)
 
-    def _see_to(self, link: Link | None, now: float) -> float:
-        """Do what is due without anybody's word, and return the seconds until more is."""
-        if link is None:
-            opening = self._opening
-            if opening is None and now >= self._next_try:
-                self._opening = Opening(self._new_link(), self.wake)
-            elif opening is not None and opening.done:
-                self._opened(opening)
-                return 0.0
-            return TICK if self._opening else max(0.0, self._next_try - now)
-        link.tick()
-        return TICK if self.marked_at is None or self.told else self.marked_at + GRACE - now
-
-    def _new_link(self) -> Link:
-        name = f"talk-desk-{self.user}-{self.session}"
-        return Link(self.broker, name, self._inbox.append, at_once=MANY_AT_ONCE)  # a thousand robots may answer at once
-
-    def _opened(self, opening: Opening) -> None:
-        """Take over the connection to the broker, or try again after a while."""
+    def _end_attempt(self, opening: Opening) -> None:
+        """Start to use the new connection. If the attempt failed, schedule the next one."""
         self._opening = None
         if opening.error is not None:
-            self._tries += 1
-            longest = min(_LONGEST_PAUSE, _FIRST_PAUSE * 2**self._tries)
-            self._next_try = time.monotonic() + random.uniform(0, longest)
+            self._failed_attempts += 1
+            longest = min(_MAX_RECONNECT_PAUSE_S, _FIRST_RECONNECT_PAUSE_S * 2**self._failed_attempts)
+            self._next_attempt_at = time.monotonic() + random.uniform(0, longest)
             self.failure = opening.error
-            self.visitor.went_down(str(opening.error))
+            self.handler.on_disconnected(str(opening.error))
             return
-        link, self._tries, self._served_at = opening.link, 0, time.monotonic()
+        link, self._failed_attempts, self._polled_at = opening.link, 0, time.monotonic()
         self.link = link
         self._inbox.clear()
-        link.subscribe(self.answers(topics.MARKER), retained=False)
-        self.visitor.came_up(link)
-        # It comes back behind all that the broker keeps.
-        link.publish(self.answers(topics.MARKER), b"\n", acknowledged=self._marker_taken)
+        link.subscribe(self.reply_topic(topics.MARKER), retained=False)
+        self.handler.on_connected(link)
+        # The marker comes back after all retained messages.
+        link.publish(self.reply_topic(topics.MARKER), b"\n", acknowledged=self._on_marker_acknowledged)
 
-    def _marker_taken(self, code: int) -> None:
+    def _on_marker_acknowledged(self, code: int) -> None:
         if code >= REFUSED:
-            self.failure = self.refused(code, f"write to {topics.reply(self.user, '+', '+')}")
+            self.failure = self.publish_error(code, f"write to {topics.reply(self.user, '+', '+')}")
 
-    def _lose(self, link: Link) -> None:
+    def _disconnect(self, link: Link) -> None:
         link.close()
-        self.link, self.marked_at = None, None
-        self._next_try = time.monotonic() + random.uniform(0, _FIRST_PAUSE)
-        self.visitor.went_down(f"the broker at {self.broker.url} went away")
+        self.link, self.marker_at = None, None
+        self._next_attempt_at = time.monotonic() + random.uniform(0, _FIRST_RECONNECT_PAUSE_S)
+        self.handler.on_disconnected(f"the broker at {self.broker.url} went away")
 
-    def _close_descriptors(self) -> None:
-        self._wake.close()
-        self._write.close()
+    def _close_wake_sockets(self) -> None:
+        self._wake_reader.close()
+        self._wake_writer.close()

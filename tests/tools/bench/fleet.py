@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from talkcli import Client, State
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.desk.robot import reach
+from talkcli.fleet.desk.robot import connect_robot
 from talkcli.protocol.events import StateChanged
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
@@ -89,7 +89,7 @@ def _robot(*, secure: bool = False) -> Iterator[tuple[Talk, Bridge, dict[str, st
 
 
 def _reach(env: dict[str, str]) -> Client:
-    return Client.over(reach(_ROBOT, from_environment(env), name="bench"))
+    return Client.over(connect_robot(_ROBOT, from_environment(env), name="bench"))
 
 
 def _accepted(client: Client) -> float:

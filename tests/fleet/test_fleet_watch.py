@@ -1,4 +1,4 @@
-"""`Lookout` sees robots and their goals, also after the broker was away. A publisher speaks for the robots."""
+"""`FleetWatch` sees robots and their goals, also after the broker was away. A publisher speaks for the robots."""
 
 from __future__ import annotations
 
@@ -13,8 +13,17 @@ import pytest
 
 from talkcli.errors import Lost
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.desk.selection import Selection
-from talkcli.fleet.desk.sighting import Away, Back, Begun, Changed, Happened, Missed
+from talkcli.fleet.desk import desk, watch
+from talkcli.fleet.desk.request import Selection
+from talkcli.fleet.desk.watch import (
+    BrokerAway,
+    BrokerBack,
+    EventsMissed,
+    FleetSnapshot,
+    FleetWatch,
+    RobotChanged,
+    RobotEvent,
+)
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
 from talkcli.protocol.events import StateChanged
@@ -25,26 +34,24 @@ from tests.support.mqtt import Listener
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from talkcli.fleet.desk.sighting import Sighting
+    from talkcli.fleet.desk.watch import FleetEvent
     from tests.support.broker import Broker
 
 
 class Looking(contextlib.AbstractContextManager["Looking"]):
-    """A lookout in a thread of its own, which `with` starts and ends."""
+    """A watch in a thread of its own, which `with` starts and ends."""
 
     def __init__(self, broker: Broker, selection: str | None = None) -> None:
-        from talkcli.fleet.desk.lookout import Lookout  # which needs paho
-
-        self._lookout = Lookout(from_environment(broker.env()), Selection(selection) if selection else None)
-        self._queue: queue.SimpleQueue[Sighting | Exception] = queue.SimpleQueue()
+        self._watch = FleetWatch(from_environment(broker.env()), Selection(selection) if selection else None)
+        self._queue: queue.SimpleQueue[FleetEvent | Exception] = queue.SimpleQueue()
         self._wake, self._write = os.pipe()
         self._thread = threading.Thread(target=self._look, daemon=True)
-        #: all sightings after the first, as far as `find` has looked
-        self.seen: list[Sighting] = []
+        #: all events after the first, as far as `find` has looked
+        self.seen: list[FleetEvent] = []
 
     def __enter__(self) -> Looking:
         self._thread.start()
-        self.begun = self.find(Begun)
+        self.begun = self.find(FleetSnapshot)
         self.seen.clear()
         return self
 
@@ -56,7 +63,7 @@ class Looking(contextlib.AbstractContextManager["Looking"]):
         os.close(self._write)
 
     def find(self, kind: type[Any], wanted: Callable[[Any], bool] = lambda _: True) -> Any:
-        """Wait for the first sighting of a kind, and return it; raise the error that has ended the lookout."""
+        """Wait for the first event of a kind, and return it; raise the error that has ended the watch."""
         found = [each for each in self.seen if isinstance(each, kind) and wanted(each)]
         while not found:
             each = self._queue.get(timeout=PATIENCE)
@@ -68,7 +75,7 @@ class Looking(contextlib.AbstractContextManager["Looking"]):
 
     def _look(self) -> None:
         try:
-            for each in self._lookout.follow({self._wake: select.POLLIN}):
+            for each in self._watch.events({self._wake: select.POLLIN}):
                 self._queue.put(each)
         except Interrupted:
             pass
@@ -86,25 +93,23 @@ def robots(broker: Broker) -> Iterator[Listener]:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A desk that reconnects soon after its broker is back."""
-    from talkcli.fleet.desk import desk
-
-    monkeypatch.setattr(desk, "_LONGEST_PAUSE", 0.1)
+    monkeypatch.setattr(desk, "_MAX_RECONNECT_PAUSE_S", 0.1)
 
 
-def names(sightings: list[Sighting]) -> list[str]:
-    return [each.name for each in sightings if isinstance(each, Changed | Happened)]
+def names(events: list[FleetEvent]) -> list[str]:
+    return [each.name for each in events if isinstance(each, RobotChanged | RobotEvent)]
 
 
 def test_it_begins_with_the_standing_of_each_robot(broker: Broker, robots: Listener) -> None:
     with Looking(broker) as looking:
-        assert looking.begun.standings == ()
+        assert looking.begun.robots == ()
         told.presence(robots, "anna")
-        change = looking.find(Changed)
+        change = looking.find(RobotChanged)
         assert (change.name, change.before, change.now.online) == ("anna", None, True)
     told.presence(robots, "bert", online=False)
     told.status(robots, "anna", active="a-2", text="hello", last="a-1")
     with Looking(broker) as looking:
-        anna, bert = looking.begun.standings
+        anna, bert = looking.begun.robots
         assert (anna.presence.name, anna.presence.online, anna.status.text) == ("anna", True, "hello")
         assert (bert.presence.name, bert.presence.online, bert.status) == ("bert", False, None)
 
@@ -118,8 +123,8 @@ def test_it_sees_robots_and_servers_come_and_go_but_not_a_renewed_presence(broke
         told.presence(robots, "anna", online=False)
         robots.publish("talk/robot/anna/presence", "", retain=True)  # cleared: it is gone already
         told.presence(robots, "anna", session="6666")
-        looking.find(Changed, lambda each: each.now and each.now.session == "6666")
-        changes = [each.now for each in looking.seen if isinstance(each, Changed)]
+        looking.find(RobotChanged, lambda each: each.now and each.now.session == "6666")
+        changes = [each.now for each in looking.seen if isinstance(each, RobotChanged)]
         assert [(each and each.online, bool(each and each.server)) for each in changes] == [
             (True, False), (True, True), (False, False), (True, True),
         ]  # fmt: skip
@@ -135,9 +140,9 @@ def test_it_sees_each_event_and_leaves_malformed_ones_out(broker: Broker, robots
         told.event(robots, "anna", "a-1", "PENDING", "hello")
         told.event(robots, "anna", "a-1", "ACTIVE")
         told.event(robots, "anna", "a-1", "SUCCEEDED", "hello")
-        ended = looking.find(Happened, lambda each: each.event.state.terminal)
+        ended = looking.find(RobotEvent, lambda each: each.event.state.terminal)
         assert (ended.name, ended.event.id, ended.message["goal"]["text"]) == ("anna", "a-1", "hello")
-        events = [each.event for each in looking.seen if isinstance(each, Happened)]
+        events = [each.event for each in looking.seen if isinstance(each, RobotEvent)]
         states = [each.state for each in events if isinstance(each, StateChanged)]
         assert (len(looking.seen), states) == (3, [State.PENDING, State.ACTIVE, State.SUCCEEDED])
 
@@ -150,7 +155,7 @@ def test_it_sees_the_robots_that_are_picked(broker: Broker, robots: Listener, te
         told.presence(robots, "wh-1", groups=["night"])
         for name in ("bert", "anna", "wh-1"):
             told.event(robots, name, "a-1", "ACTIVE")
-        looking.find(Happened, lambda each: each.name == picked[-1])
+        looking.find(RobotEvent, lambda each: each.name == picked[-1])
         assert {*names(looking.seen)} == {*picked}
 
 
@@ -161,9 +166,9 @@ def test_after_a_break_it_tells_what_has_changed_and_nothing_twice(broker: Broke
         told.status(robots, name, last=f"{name}-1")
     with Looking(broker) as looking:
         told.event(robots, "bert", "bert-2", "SUCCEEDED", "heard of")
-        looking.find(Happened)
+        looking.find(RobotEvent)
         broker.kill()
-        away = looking.find(Away)
+        away = looking.find(BrokerAway)
         assert "went away" in away.why
         broker.start()
         with Listener(broker) as again:
@@ -174,15 +179,15 @@ def test_after_a_break_it_tells_what_has_changed_and_nothing_twice(broker: Broke
             told.presence(again, "dora")
             told.status(again, "dora", last="dora-1")
             told.presence(again, "carl", online=False)
-            looking.find(Changed, lambda each: each.name == "carl" and not each.now.online)
-            looking.find(Missed)
+            looking.find(RobotChanged, lambda each: each.name == "carl" and not each.now.online)
+            looking.find(EventsMissed)
             told.event(again, "dora", "dora-2", "ACTIVE")
-            looking.find(Happened, lambda each: each.name == "dora")
-        missed = [each for each in looking.seen if isinstance(each, Missed)]
+            looking.find(RobotEvent, lambda each: each.name == "dora")
+        missed = [each for each in looking.seen if isinstance(each, EventsMissed)]
         (events,) = ([(one.id, one.state.name) for one in each.events] for each in missed)
         assert events == [("anna-2", "SUCCEEDED"), ("anna-3", "ACTIVE")]
-        assert looking.find(Back).after > 0
-        changes = [each for each in looking.seen if isinstance(each, Changed)]
+        assert looking.find(BrokerBack).after > 0
+        changes = [each for each in looking.seen if isinstance(each, RobotChanged)]
         assert sorted(each.name for each in changes) == ["bert", "carl"]
 
 
@@ -190,19 +195,17 @@ def test_after_a_break_it_tells_what_has_changed_and_nothing_twice(broker: Broke
 def test_a_robot_that_does_not_come_back_with_its_broker_is_gone(
     broker: Broker, robots: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from talkcli.fleet.desk import lookout
-
-    monkeypatch.setattr(lookout, "BACK_WITHIN", 0.5)
+    monkeypatch.setattr(watch, "BRIDGES_BACK_LIMIT_S", 0.5)
     told.presence(robots, "anna")
     told.presence(robots, "bert", online=False)
     with Looking(broker) as looking:
         broker.kill()
         broker.start()
-        gone = looking.find(Changed)
+        gone = looking.find(RobotChanged)
         assert (gone.name, gone.before.online, gone.now) == ("anna", True, None)
         with Listener(broker) as again:
             told.presence(again, "anna")
-            assert looking.find(Changed, lambda each: each.now).before is None
+            assert looking.find(RobotChanged, lambda each: each.now).before is None
         assert names(looking.seen) == ["anna", "anna"]
 
 
@@ -213,23 +216,21 @@ def test_a_robot_that_was_away_tells_what_it_has_spoken_meanwhile(broker: Broker
         told.presence(robots, "anna", online=False)
         told.presence(robots, "anna")
         told.status(robots, "anna", last="a-2", state="ABORTED")
-        missed = looking.find(Missed)
+        missed = looking.find(EventsMissed)
         assert [(each.id, each.state) for each in missed.events] == [("a-2", State.ABORTED)]
         told.event(robots, "anna", "a-3", "ACTIVE")
         told.status(robots, "anna", last="a-2", active="a-3")
         told.event(robots, "anna", "a-3", "SUCCEEDED", "hello")
-        looking.find(Happened, lambda each: each.event.state.terminal)
-        assert sum(isinstance(each, Missed) for each in looking.seen) == 1
+        looking.find(RobotEvent, lambda each: each.event.state.terminal)
+        assert sum(isinstance(each, EventsMissed) for each in looking.seen) == 1
 
 
 @pytest.mark.usefixtures("quick")
 def test_a_broker_that_stays_away_is_lost(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
-    from talkcli.fleet.desk import lookout
-
-    monkeypatch.setattr(lookout, "ABSENCE_LIMIT", 0.5)
+    monkeypatch.setattr(watch, "ABSENCE_LIMIT_S", 0.5)
     with Looking(broker) as looking:
         broker.kill()
         # The second if a busy machine has not tried once by then.
         with pytest.raises(Lost, match=r"was away for 0\.5 s: (no broker at .*refused|the broker at .* went away)$"):
-            looking.find(Back)
-        assert looking.find(Away).limit == 0.5
+            looking.find(BrokerBack)
+        assert looking.find(BrokerAway).limit == 0.5

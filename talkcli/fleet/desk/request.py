@@ -1,0 +1,141 @@
+"""The robots that a request is for, and its outcome at each of them. Pure."""
+
+from __future__ import annotations
+
+import re
+from fnmatch import translate
+
+from talkcli.errors import EXIT_OK, AccessDenied, Lost, ServerUnavailable, TalkError, UnknownGoal
+from talkcli.fleet import topics
+from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.goals.goal import Goal
+from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.states import State
+from talkcli.protocol.events import Canceled, ServerStatus, goal_in
+from talkcli.protocol.requests import Pause, Resume, Status
+
+if TYPE_CHECKING:
+    from talkcli.fleet.presence import Presence
+    from talkcli.goals.goal import JsonObject
+    from talkcli.protocol.requests import Request
+
+_GROUP_PREFIX, _WILDCARDS = "@", "*?["
+#: Characters of globs that can match a robot's name.
+_GLOB = re.compile(r"[A-Za-z0-9._*?\[\]!-]+")
+
+
+def selects_several(text: str) -> bool:
+    """Return whether this value of `--robot` is a glob or a group."""
+    return text.startswith(_GROUP_PREFIX) or any(each in text for each in _WILDCARDS)
+
+
+class Selection:
+    """The robots that `--robot` selects: one by its name, all that match a glob, or a group.
+
+    Attributes:
+        text: the value of `--robot`: a name, a glob (`*`, `?` and `[abc]`, as in a shell), or `@GROUP`.
+        group: the group's name; None if the value is not a group. All robots are in the group `all`.
+        name: the robot's name; None if the value may select several robots.
+    """
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.group = text.removeprefix(_GROUP_PREFIX) if text.startswith(_GROUP_PREFIX) else None
+        self.name = None if selects_several(text) else text
+        self._glob = re.compile(translate(text)) if self.group is None and self.name is None else None
+
+    @property
+    def fault(self) -> str | None:
+        """The reason why no robot can match, for people; None if one can."""
+        for kind, name in (("group", self.group), ("robot", self.name)):
+            if name is not None:
+                fault = topics.fault(name)
+                return fault and f"no {kind} can be called '{name}': a name {fault}"
+        # An unclosed bracket would match a bracket, which no name has.
+        if not _GLOB.fullmatch(self.text) or "[" in re.sub(r"\[!?[^]]+\]", "", self.text):
+            return f"the glob '{self.text}' matches no robot's name: it has A-Z a-z 0-9 . _ - with *, ? and [ ] alone"
+        return None
+
+    def includes(self, presence: Presence) -> bool:
+        """Return whether a robot is selected, online or not."""
+        if self.group is not None:
+            return self.group == topics.EVERYBODY or self.group in presence.groups
+        if self._glob is not None:
+            return self._glob.match(presence.name) is not None
+        return self.text == presence.name
+
+
+@frozen
+class Outcome:
+    """The outcome of a request at one robot.
+
+    A robot has an outcome for each goal of the request, and always at least one.
+
+    Attributes:
+        robot: the robot's name.
+        state: the name of the goal's state. Without a goal, one of IDLE, PAUSED, RESUMED and SET, or the reason for a
+            failure: OFFLINE, NO_SERVER, UNREACHABLE, UNKNOWN (no such goal), REFUSED or LOST.
+        exit_code: 0 if the robot did as requested, else the exit code that `talk` has for this failure.
+        goal: the goal; None if the request was not about one.
+        error: why the request failed; None if it didn't.
+        said: the rest of the server's reply: `status`, `settings` or `paused`; None if there is none.
+        last: whether this is the robot's last outcome.
+    """
+
+    robot: str
+    state: str
+    exit_code: int = 0
+    goal: Goal | None = None
+    error: TalkError | None = None
+    said: JsonObject | None = None
+    last: bool = True
+
+    def to_json(self) -> JsonObject:
+        """Return the outcome as a JSON object."""
+        found: JsonObject = {"robot": self.robot, "state": self.state, "exit_code": self.exit_code}
+        if self.error is not None:
+            return {**found, "error": {"code": self.error.code, "message": self.error.message}}
+        return {**found, **({} if self.goal is None else {"goal": self.goal.to_json()}), **(self.said or {})}
+
+
+def failure_outcome(robot: str, error: TalkError, state: str | None = None) -> Outcome:
+    """Return the outcome of a failed request. By default, its state follows from the error."""
+    states = {UnknownGoal: "UNKNOWN", Lost: State.LOST.name, AccessDenied: "REFUSED", ServerUnavailable: "UNREACHABLE"}
+    default = next((name for kind, name in states.items() if isinstance(error, kind)), "REFUSED")
+    return Outcome(robot, state or default, error.exit_code, error=error)
+
+
+def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[JsonObject]) -> list[Outcome]:
+    """Return the outcomes that a reply stands for.
+
+    Args:
+        robot: the robot's name.
+        request: the request, which has no goals left to wait for.
+        reply: the server's reply.
+        items: the lines of the reply's list.
+    """
+    if isinstance(request, Cancel):
+        return cancel_outcomes(robot, items) or [Outcome(robot, "IDLE")]
+    if isinstance(request, Set):
+        return [Outcome(robot, "SET", said={"settings": reply.get("settings")})]
+    goal = goal_in(reply)
+    if isinstance(request, Pause | Resume):
+        paused = isinstance(request, Pause)
+        return [Outcome(robot, "PAUSED" if paused else "RESUMED", goal=goal, said={"paused": paused})]
+    if isinstance(request, Status) and request.id is None:
+        status = ServerStatus.from_reply(reply, items)
+        goal = status.active
+        state = "PAUSED" if status.server.get("paused") is True else goal.state.name if goal else "IDLE"
+        return [Outcome(robot, state, goal=goal, said={"status": status.to_json()})]
+    if isinstance(request, Status):
+        goal = Goal.from_json(reply.get("goal"))  # a reply without it is malformed
+    if goal is None:
+        return [Outcome(robot, "IDLE")]
+    return [Outcome(robot, goal.state.name, (isinstance(request, Say) and goal.exit_code) or EXIT_OK, goal)]
+
+
+def cancel_outcomes(robot: str, items: list[JsonObject], *, last: bool = True) -> list[Outcome]:
+    """Return the outcome of each goal in the answer to a cancel; `last` is false if other outcomes follow."""
+    done = Canceled.from_items(items)
+    goals = (*done.canceled, *done.ended)
+    return [Outcome(robot, each.state.name, EXIT_OK, each, last=last and each is goals[-1]) for each in goals]

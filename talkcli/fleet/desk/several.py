@@ -1,0 +1,478 @@
+"""A request to several robots at once, and its outcome at each of them.
+
+Robots that a glob selects are sent one request each. A group is sent a single message, which the broker delivers to all
+its members. The members are known from their presence, or because they answer. An outcome is a success only if the
+robot itself has said so.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from typing import TYPE_CHECKING
+
+from talkcli.client.client import batches, check, check_id, too_long
+from talkcli.client.connect import ANSWER_LIMIT, FIRST
+from talkcli.client.connection import Exchange
+from talkcli.client.goal import GoalHandle
+from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
+from talkcli.fleet import topics
+from talkcli.fleet.desk.desk import DeskLink
+from talkcli.fleet.desk.request import Outcome, cancel_outcomes, failure_outcome, reply_outcomes
+from talkcli.fleet.desk.robot import REQUEST_EXPIRY_S, RobotConnection, new_goal_id
+from talkcli.fleet.link import REFUSED, boottime
+from talkcli.fleet.presence import Presence
+from talkcli.frozen import replace
+from talkcli.goals.goal import Goal
+from talkcli.goals.options import Cancel, Say, Set, bad_key
+from talkcli.goals.states import State
+from talkcli.protocol.events import goals
+from talkcli.protocol.lines import request_line, write_request
+from talkcli.protocol.requests import Pause, Status, Wait
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from talkcli.fleet.broker import Broker
+    from talkcli.fleet.desk.request import Selection
+    from talkcli.fleet.link import Link
+    from talkcli.fleet.message import Message
+    from talkcli.goals.goal import JsonObject
+    from talkcli.protocol.requests import Request
+
+#: Default of a sentence's ttl. The last robot should not say what was true a minute ago.
+DEFAULT_TTL_S = 10.0
+#: Interval of the checks for robots that have not answered in time.
+_CHECK_INTERVAL_S = 0.25
+#: Messages to process before such a check. They may have arrived while this process was stopped.
+_MAX_MESSAGES_PER_CHECK = 5000
+#: Time for the broker to acknowledge the request if the caller closes it early.
+_FLUSH_LIMIT_S = 1.0
+
+
+class FleetRequest:
+    """A request to several robots. Iterate over it to get the robots' outcomes as they come.
+
+    The connection to the broker ends with the last outcome, with `close`, or at the end of a `with` block. The robots
+    carry the request out in any case. Only one thread may use this object.
+    """
+
+    def __init__(
+        self,
+        broker: Broker,
+        selection: Selection,
+        request: Request,
+        *,
+        name: str | None = None,
+        interrupt: Mapping[int, int] | None = None,
+        patience: float = ANSWER_LIMIT,
+    ) -> None:
+        """Connect to the broker, and send the request.
+
+        Args:
+            broker: the broker of the fleet.
+            selection: the robots.
+            request: the request. It must not name goals by their numbers, which differ from robot to robot.
+            name: what the sender calls itself; default TALK_NAME.
+            interrupt: descriptors that end any wait with Interrupted, see `wait_ready`.
+            patience: seconds in which the broker and each robot must answer.
+
+        Raises:
+            UsageError: The selection or the request is not valid.
+            UnknownGoal: The request has an id that no goal can have.
+            ServerUnavailable: There is no broker.
+            AccessDenied: The broker doesn't let this user in, or ask.
+        """
+        if selection.fault:
+            raise UsageError(selection.fault)
+        _check_request(request)
+        self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience
+        self._presences: dict[str, Presence] = {}
+        self._connections: dict[str, RobotConnection] = {}
+        #: the robots that the request is for, by name
+        self._robots: dict[str, RobotRequest] = {}
+        #: names of the robots that have more outcomes to come
+        self._open: set[str] = set()
+        self._outcomes: deque[Outcome] = deque()
+        self._numbers = itertools.count(FIRST)
+        self._number = next(self._numbers)
+        #: why the broker has refused the message to the group
+        self._refused: TalkError | None = None
+        #: whether the request was sent; whether no more robots can join; whether it was cancelled; whether it is closed
+        self._began = self._complete = self._canceled = self._closed = False
+        self._desk = DeskLink(broker)
+        self._desk.handler = self
+        try:
+            if isinstance(request, Say):
+                ttl = DEFAULT_TTL_S if request.ttl is None else request.ttl
+                request = replace(request, id=request.id or new_goal_id(self._desk), ttl=ttl)
+            self.request = request
+            #: the goal that every server would make of a text that is too long for a request
+            self._rejected = too_long(request) if isinstance(request, Say) else None
+            self._desk.wait_for_retained(patience, interrupt=interrupt)
+            self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
+            self._begin()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> FleetRequest:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Outcome]:
+        return self.results()
+
+    def __len__(self) -> int:
+        """Return the number of selected robots that are known by now, also of those that can't be asked."""
+        return len(self._robots)
+
+    @property
+    def open(self) -> list[str]:
+        """The names of the robots that have more outcomes to come, sorted."""
+        return sorted(self._open)
+
+    @property
+    def away(self) -> str | None:
+        """The reason why nothing can be sent now; None if the broker is connected."""
+        return None if self._desk.link else f"the broker at {self._desk.broker.url} went away"
+
+    def results(self, timeout: float | None = None) -> Iterator[Outcome]:
+        """Yield outcomes as they come. After a TimeoutError or Interrupted, call this again for the others.
+
+        Args:
+            timeout: seconds for all outcomes; None for no limit.
+
+        Raises:
+            TimeoutError: Not all robots have answered in time.
+            Interrupted: One of the `interrupt` descriptors is ready.
+            ServerUnavailable: No robot is selected.
+            AccessDenied: The broker doesn't let this user ask the group.
+        """
+        end = None if timeout is None else time.monotonic() + timeout
+        next_check = time.monotonic() + _CHECK_INTERVAL_S
+        while True:
+            while self._outcomes:
+                yield self._outcomes.popleft()
+            if self._closed:
+                return
+            if self._refused is not None:
+                self.close()
+                raise self._refused
+            self._complete = self._complete or self._desk.has_retained
+            if self._complete and not self._open:
+                self.close()
+                break
+            now = time.monotonic()
+            if end is not None and now >= end:
+                done = len(self) - len(self._open)
+                raise TimeoutError(f"{done} of {len(self)} robots are done after {round(timeout or 0.0, 1):g} s")
+            self._desk.poll(min(next_check, end or next_check) - now, self._interrupt)
+            if time.monotonic() >= next_check:
+                self._check_all()
+                next_check = time.monotonic() + _CHECK_INTERVAL_S
+        if not self._robots:
+            raise self._nobody()
+
+    def cancel(self) -> None:
+        """Cancel the sentence at every robot where it has not ended, also at absent robots when they come back.
+
+        The outcomes tell how it ended. Requests other than sentences are not affected.
+
+        Raises:
+            UsageError: All outcomes have been returned. Cancel the goal by its id instead.
+        """
+        if not isinstance(self.request, Say):
+            return
+        if self._closed:
+            raise UsageError("all outcomes have been taken: cancel the goal by its id")
+        self._canceled = True
+        in_group = self._selection.group is not None
+        if in_group and self._desk.link is not None:
+            self._publish(Cancel((str(self.request.id),)), next(self._numbers))
+        for name in self._open:
+            # A robot that has left the group doesn't receive the message to the group.
+            is_sent = in_group and name in self._presences and self._selection.includes(self._presences[name])
+            self._robots[name].connection.cancel_lastingly(str(self.request.id), is_sent=is_sent)
+
+    def close(self) -> None:
+        """End the connection to the broker. The robots carry the request out all the same."""
+        began, self._began, self._closed = self._began, False, True
+        if began:
+            self._desk.flush(_FLUSH_LIMIT_S)
+            self._end_sessions()
+        self._desk.close()
+
+    def _begin(self) -> None:
+        """Send the request to the robots that are known to be online."""
+        self._began = True
+        if self._selection.group is not None and self._rejected is None:
+            self._publish(self.request, self._number)
+        for each in list(self._presences.values()):
+            if self._selection.includes(each):
+                self._on_presence(each)
+
+    def _publish(self, request: Request, number: int) -> None:
+        """Send a request to the group."""
+        desk, group = self._desk, self._selection.group
+        assert group is not None
+        if desk.link is None:
+            raise ServerUnavailable(f"the broker at {desk.broker.url} went away: nothing was sent")
+
+        def on_acknowledged(code: int) -> None:
+            if code >= REFUSED:
+                self._refused = desk.publish_error(code, f"ask the group {group} for anything")
+
+        line = request_line({"seq": number, **write_request(request)})
+        if (refused := desk.link.too_long(line, request.kind)) is not None:
+            raise refused
+        expiry = (request.ttl or None) if isinstance(request, Say) else REQUEST_EXPIRY_S
+        topic, response = topics.group(group, topics.REQUEST, desk.user), topics.reply(desk.user, desk.session)
+        desk.link.publish(topic, line, expiry=expiry, response=response, acknowledged=on_acknowledged)
+
+    def _end_sessions(self) -> None:
+        """Tell the bridges to end the sessions of this desk."""
+        desk, group = self._desk, self._selection.group
+        if desk.link is not None and group is not None:
+            topic = topics.group(group, topics.REQUEST, desk.user)
+            desk.link.publish(topic, b"", 0, response=topics.reply(desk.user, desk.session))
+        elif group is None:
+            for each in self._robots.values():
+                if each.was_asked:
+                    each.connection.end_session()
+
+    def _check_all(self) -> None:
+        """Process the messages that have arrived, then fail the robots that have not answered in time."""
+        for _ in range(_MAX_MESSAGES_PER_CHECK):
+            if not self._desk.poll(0.0, self._interrupt):
+                break
+        for name in list(self._open):
+            self._update(name, check_time=True)
+
+    def _nobody(self) -> TalkError:
+        """Return the error for a selection without any robot."""
+        selection, url = self._selection, self._desk.broker.url
+        if selection.group is not None and self.away:
+            words = f"{self.request.kind} was sent to the group '{selection.group}', but {self.away}"
+            return Lost(f"{words}; it may be carried out")
+        group = selection.group
+        which = f"is in the group '{group}'" if group is not None else f"matches '{selection.text}'"
+        return ServerUnavailable(f"no robot {which} at {url}: nothing was sent; 'talk fleet status' lists all")
+
+    # -- messages from the broker
+
+    def on_connected(self, link: Link) -> None:
+        """Subscribe to all replies to this desk, and to the presence of all robots."""
+        link.subscribe(topics.reply(self._desk.user, self._desk.session, topics.ANY), retained=False)
+        link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
+
+    def on_disconnected(self, why: str) -> None:
+        """Treat all robots as absent, and accept no more: the broker may be back too late to tell of them."""
+        self._complete = self._complete or self._began
+        for each in self._connections.values():
+            each.on_disconnected(why)
+
+    def on_message(self, message: Message) -> None:
+        """Process a robot's presence, or lines from its server."""
+        _, kind, *_, name, last = message.topic.split("/")
+        if kind != topics.ROBOT:
+            self._on_reply(last, message)
+            return
+        presence = Presence.read(name, message.payload)
+        if presence is None:
+            return  # cleared or malformed
+        self._presences[name] = presence
+        if name in self._connections or self._selection.includes(presence):
+            self._connection(name).on_message(message)
+            if self._began:
+                self._on_presence(presence)
+
+    def _on_presence(self, presence: Presence) -> None:
+        """Send the request to a robot that has just become known, if that is possible.
+
+        Once the retained messages are there, other robots are ignored: they came online too late. Before that, each
+        member of a group is expected to answer, even if it came online after the request was sent. It can't be told
+        from the others, because some brokers send all retained messages late.
+        """
+        name = presence.name
+        if name in self._robots:
+            self._update(name)
+            return
+        if self._complete:
+            return
+        robot = self._add(name)
+        if (goal := self._rejected) is not None:
+            self._take([Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal)])
+        elif not presence.online:
+            self._take([failure_outcome(name, ServerUnavailable(f"{name} is offline: nothing was sent"), "OFFLINE")])
+        elif self._selection.group is not None:
+            robot.expect(self._number, self._latest)
+        elif presence.server is None:
+            words = f"{name} has no talk server at this moment: nothing was sent"
+            self._take([failure_outcome(name, ServerUnavailable(words), "NO_SERVER")])
+        else:
+            self._take(robot.send())
+
+    def _on_reply(self, name: str, message: Message) -> None:
+        """Process a robot's lines. A robot that answers a group's request is a member, even if it seemed absent."""
+        if topics.fault(name) or not self._began:
+            return
+        robot = self._robots.get(name)
+        if self._selection.group is not None and not (robot and robot.was_asked):
+            robot = self._add(name)
+            robot.expect(self._number, self._latest)
+            if self._canceled and isinstance(self.request, Say):
+                robot.connection.cancel_lastingly(str(self.request.id), is_sent=False)
+        if robot:
+            robot.connection.on_message(message)
+            robot.connection.hand_out()
+            self._update(name)
+
+    def _connection(self, name: str) -> RobotConnection:
+        """Return the connection to a robot. The first call creates it."""
+        if name not in self._connections:
+            self._connections[name] = RobotConnection(
+                name, self._desk, name=self._name, patience=self._patience, numbers=self._numbers
+            )
+        return self._connections[name]
+
+    def _add(self, name: str) -> RobotRequest:
+        """Add a robot that the request is for."""
+        robot = self._robots[name] = RobotRequest(self._connection(name), name, self.request)
+        self._open.add(name)
+        return robot
+
+    def _update(self, name: str, *, check_time: bool = False) -> None:
+        """Collect a robot's new outcomes."""
+        if name in self._open:
+            self._take(self._robots[name].new_outcomes(check_time=check_time))
+
+    def _take(self, outcomes: list[Outcome]) -> None:
+        self._outcomes += outcomes
+        self._open -= {each.robot for each in outcomes if each.last}
+
+
+class RobotRequest:
+    """The part of a `FleetRequest` that is for one robot."""
+
+    def __init__(self, connection: RobotConnection, name: str, request: Request) -> None:
+        self.connection = connection
+        self._name, self._request = name, request
+        self._exchange: Exchange | None = None
+        #: the goals to wait for, since when, and how many of them have an outcome
+        self._handles: list[GoalHandle] = []
+        self._since = time.monotonic()
+        self._ended_count = 0
+
+    @property
+    def was_asked(self) -> bool:
+        """Whether the request has been sent to the robot."""
+        return self._exchange is not None
+
+    def send(self) -> list[Outcome]:
+        """Send the request to this robot alone. If that is impossible, return the failure."""
+        try:
+            self.connection.check_online()
+            self._exchange = self.connection.begin(self._request, self._on_reply)
+        except TalkError as error:
+            return [failure_outcome(self._name, error)]
+        return []
+
+    def expect(self, number: int, latest: float | None) -> None:
+        """Expect an answer to the request that was sent to the robot's group.
+
+        Args:
+            number: the number of that request.
+            latest: time by `boottime` after which a sentence must not be sent again; None for no limit.
+        """
+        self._exchange = Exchange(number, self._request, self._on_reply)
+        self._exchange.latest = latest
+        self.connection.expect(self._exchange)
+
+    def new_outcomes(self, *, check_time: bool) -> list[Outcome]:
+        """Return the outcomes since the last call.
+
+        Args:
+            check_time: whether to fail if the robot has not answered in time.
+        """
+        exchange, connection = self._exchange, self.connection
+        assert exchange is not None
+        connection.keep_alive()
+        now = time.monotonic()
+        if not self._handles:
+            request = self._request
+            is_slow = isinstance(request, Pause) or (isinstance(request, Say) and request.patient)
+            limit = connection.silent_by(self._since)[0] if is_slow else connection.answer_by(exchange)
+            if not (exchange.over or connection.ended is not None or (check_time and now > limit)):
+                return []
+            connection.forget(exchange)
+            try:
+                outcomes = self._replied(exchange)
+                if outcomes:
+                    return outcomes
+            except TalkError as error:
+                refused = (exchange.reply or {}).get("error")
+                has_no_server = isinstance(refused, dict) and refused.get("code") == ServerUnavailable.code
+                return [failure_outcome(self._name, error, "NO_SERVER" if has_no_server else None)]
+        silent_at, why = connection.silent_by(self._since)
+        if check_time and now > silent_at:
+            connection.ended = connection.ended or why
+        return self._ended()
+
+    def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
+        """Follow the goals that have to be waited for."""
+        request = self._request
+        if isinstance(request, Say):
+            found = [Goal.from_json(reply.get("goal"))]  # a reply without it is malformed
+            if not request.wait:
+                return
+        elif isinstance(request, Wait):
+            found = list(goals(items, "goal"))
+        else:
+            return
+        self._since = time.monotonic()
+        self._handles = [GoalHandle(self.connection, each) for each in found]
+        for each in self._handles:
+            each._listen(feedback=False)
+
+    def _replied(self, exchange: Exchange) -> list[Outcome]:
+        """Return the outcomes that are known from the reply; none if its goals have to be waited for."""
+        try:
+            reply, items = self.connection.answer(exchange)
+        except UnknownGoal as error:
+            return [*cancel_outcomes(self._name, error.items, last=False), failure_outcome(self._name, error)]
+        return [] if self._handles else reply_outcomes(self._name, self._request, reply, items)
+
+    def _ended(self) -> list[Outcome]:
+        """Return the outcomes of goals that have ended since the last call, in the order of the goals."""
+        found = []
+        while self._ended_count < len(self._handles):
+            handle = self._handles[self._ended_count]
+            if not (handle.state.terminal or handle._lose()):
+                break
+            self._ended_count += 1
+            # A wait without ids succeeds however the goals end.
+            any_end = isinstance(self._request, Wait) and self._request.ids is None and handle.state is not State.LOST
+            code = EXIT_OK if any_end else handle.goal.exit_code or EXIT_OK
+            last = self._ended_count == len(self._handles)
+            found.append(Outcome(self._name, handle.state.name, code, handle.goal, last=last))
+        return found
+
+
+def _check_request(request: Request) -> None:
+    """Raise UsageError or UnknownGoal if this request can't be sent to several robots."""
+    ids = (request.ids if isinstance(request, Cancel | Wait) else None) or ()
+    other = request.before if isinstance(request, Cancel) else request.id if isinstance(request, Status) else None
+    for each in (*ids, *(() if other is None else (other,))):
+        check_id(each)
+        if each.isdecimal():
+            raise UsageError("a number is a goal of one server: to several robots name the goal by its whole id")
+    if len(batches(ids)) > 1:
+        raise UsageError(f"{len(ids):,} ids do not fit into one request: to several robots name fewer, or none for all")
+    if isinstance(request, Cancel) and request.key is not None and (fault := bad_key(request.key)):
+        raise UsageError(fault)
+    if isinstance(request, Say | Set):
+        check(request)
