@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -172,7 +173,7 @@ class Ready:
 class StartFailed:
     """The engine can't start. The process ends after this message."""
 
-    reason: str  # "engine_failed" or "unknown_voice"
+    reason: Reason  # ENGINE_FAILED or UNKNOWN_VOICE
     message: str  # names what is missing and what to install
     permanent: bool = True  # whether the next start will fail too unless somebody changes something
     usage_error: bool = False  # whether an option asked for something that doesn't exist
@@ -265,7 +266,7 @@ class Ended:
 
     id: str
     outcome: str  # OUTCOME_COMPLETED, OUTCOME_STOPPED or OUTCOME_FAILED
-    reason: str | None = None  # of a failure: audio_device, audio_lost, audio_stalled, no_player, nothing_to_say, …
+    reason: Reason | None = None  # of a failure
     message: str | None = None  # of a failure: the message of the player or the engine
     duration: float | None = None  # seconds of audio; None if part of it wasn't synthesized
     gaps: int = 0  # number of silences within it because its sound was not made in time
@@ -303,6 +304,8 @@ def decode(line: bytes, classes: Mapping[str, type[_M]]) -> _M:
     if not isinstance(content, dict):
         raise TypeError("a message is a JSON object")
     message_class = classes[content.pop("kind")]
+    if content.get("reason") is not None:
+        content["reason"] = Reason(content["reason"])
     if message_class is VoiceList:
         content["voices"] = tuple(Voice(**each) for each in content["voices"])
     return message_class(**content)

@@ -17,6 +17,7 @@ from talkcli.goals.states import State, follow
 if TYPE_CHECKING:
     from talkcli.goals.goal import Output, Sender
     from talkcli.goals.options import Say
+    from talkcli.goals.reasons import Reason
 
 
 @dataclass(slots=True, eq=False)
@@ -42,7 +43,7 @@ class Record:
     state: State = State.PENDING
     #: its place among the pending goals of its priority; the queue's business alone
     turn: int = 0
-    reason: str | None = None
+    reason: Reason | None = None
     by: By | None = None
     message: str | None = None
     #: offset after the last word that was heard

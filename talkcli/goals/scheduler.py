@@ -23,6 +23,7 @@ from talkcli.goals.loading import Loading
 from talkcli.goals.option import figure, is_clients_id
 from talkcli.goals.options import INITIAL, MAX_CHARACTERS, bad_option
 from talkcli.goals.queue import Queue
+from talkcli.goals.reasons import Reason, Refusal
 from talkcli.goals.record import Record
 from talkcli.goals.states import IllegalTransition, State
 
@@ -138,7 +139,7 @@ class Scheduler:
         """Return a goal that is active, pending, or still remembered."""
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
-    def lacks_room(self, say: Say, now: Now, fault: tuple[str, str] | None = None) -> bool:
+    def lacks_room(self, say: Say, now: Now, fault: Refusal | None = None) -> bool:
         """Whether this goal would be REJECTED only because the queue is full; `fault` as in `submit`."""
         early = self._early.find(say.id, now.monotonic)
         return not (early or self.has_room(say)) and self._refuse(say, fault, None) is None
@@ -159,7 +160,7 @@ class Scheduler:
         say: Say,
         sender: Sender,
         now: Now,
-        fault: tuple[str, str] | None = None,
+        fault: Refusal | None = None,
         canceled: By | None = None,
         waited: float = 0.0,
     ) -> Submitted:
@@ -186,7 +187,7 @@ class Scheduler:
         expired = expires_at is not None and expires_at <= now.monotonic
         way = self._way(say)
         if way is None and not (by or refused or expired):
-            refused = "queue_full", f"{len(self._queue)} goals are waiting already (`talk serve --max-queue`)"
+            refused = Reason.QUEUE_FULL, f"{len(self._queue)} goals are waiting already (`talk serve --max-queue`)"
         if refused:
             record.reason, words = refused
             record.state, record.message, record.ended_at = State.REJECTED, f"Talk rejected: {words}", now.wall
@@ -197,9 +198,9 @@ class Scheduler:
         effects: list[Effect] = [Changed(record, State.PENDING)]
         if by:
             words = "canceled before it was spoken" if canceled else "canceled before it arrived"
-            return Submitted(record, effects + self._recalled(record, "canceled", words, by, now))
+            return Submitted(record, effects + self._recalled(record, Reason.CANCELED, words, by, now))
         if expired:
-            return Submitted(record, effects + self._recalled(record, "expired", _expired(record), None, now))
+            return Submitted(record, effects + self._recalled(record, Reason.EXPIRED, _expired(record), None, now))
         effects += self._make_way(record, way or [], now)
         return Submitted(record, effects + self._start_next(now))
 
@@ -217,10 +218,10 @@ class Scheduler:
             self._early.note(goal_id, by, now.monotonic)
         for record in chosen:
             if record.state is State.PENDING:
-                done.effects += self._recall(record, "canceled", "canceled before it was spoken", by, now)
+                done.effects += self._recall(record, Reason.CANCELED, "canceled before it was spoken", by, now)
                 done.recalled.append(record)
             else:
-                done.effects += self._stop(record, "canceled", by, now)
+                done.effects += self._stop(record, Reason.CANCELED, by, now)
                 done.stopping = record
         return done
 
@@ -229,9 +230,9 @@ class Scheduler:
         self.closing = True
         effects: list[Effect] = []
         for record in list(self._queue):
-            effects += self._recall(record, "shutdown", "the server was stopped", None, now)
+            effects += self._recall(record, Reason.SHUTDOWN, "the server was stopped", None, now)
         if self.active:
-            effects += self._stop(self.active, "shutdown", None, now)
+            effects += self._stop(self.active, Reason.SHUTDOWN, None, now)
         return effects
 
     def pause(self) -> list[Effect]:
@@ -273,7 +274,7 @@ class Scheduler:
             return []
         self.loading.clear()  # there is nothing that would load a voice
         record, effects = self._activate_next(now)
-        return effects + self.failed(record.id, "engine_failed", words, None, now) if record else effects
+        return effects + self.failed(record.id, Reason.ENGINE_FAILED, words, None, now) if record else effects
 
     def heard(self, goal_id: str, end: int) -> Record:
         """Note that the word that ends at this offset of the text is being heard."""
@@ -303,14 +304,14 @@ class Scheduler:
         # A stop that came too late ended nothing: its reason goes.
         return self._end(record, State.SUCCEEDED, None, words, None, now)
 
-    def failed(self, goal_id: str, reason: str, words: str, duration: float | None, now: Now) -> list[Effect]:
+    def failed(self, goal_id: str, reason: Reason, words: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal: engine or audio failed.
 
         One that was being stopped is silent now, so it is PREEMPTED, unless the silence is what failed (not_silent).
         """
         record = self._spoken(goal_id)
         record.duration = duration
-        if record.state is State.PREEMPTING and reason != "not_silent":
+        if record.state is State.PREEMPTING and reason is not Reason.NOT_SILENT:
             return self.stopped(goal_id, now)
         return self._end(record, State.ABORTED, reason, f"Talk aborted: {words}", record.by, now)
 
@@ -332,11 +333,11 @@ class Scheduler:
         record, deadline = self.active, self._active_deadline()
         if record is not None and deadline is not None and now.monotonic >= deadline:
             if record.stop_since is None:
-                effects = self._stop(record, "expired", None, now)
+                effects = self._stop(record, Reason.EXPIRED, None, now)
             else:
                 words = f"Talk aborted: silence could not be confirmed within {SILENCE_LIMIT:g} s"
                 effects = [Ordered(record, Order.GIVE_UP)]
-                effects += self._end(record, State.ABORTED, "not_silent", words, record.by, now)
+                effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
         return effects + self._expire(now) + self._start_next(now)
 
     # -- inside
@@ -366,17 +367,17 @@ class Scheduler:
         # The active one last: another must not start, even for the length of this step, and be stopped again.
         return sorted(once, key=lambda each: (each is self.active, each.number))
 
-    def _refuse(self, say: Say, fault: tuple[str, str] | None, first: Record | None) -> tuple[str, str] | None:
+    def _refuse(self, say: Say, fault: Refusal | None, first: Record | None) -> Refusal | None:
         """Return reason and words why a goal can't be had, whatever else is being said."""
         if self.closing:
-            return "shutdown", "the server is being stopped"
+            return Reason.SHUTDOWN, "the server is being stopped"
         if words := bad_option(say):
-            return "bad_option", words
+            return Reason.BAD_OPTION, words
         if first is not None:
-            return "id_conflict", f"the id {say.id} is that of another text already"
+            return Reason.ID_CONFLICT, f"the id {say.id} is that of another text already"
         return texts.fault(say.text, self.max_text) or fault
 
-    def _throttle(self, say: Say, record: Record, now: Now) -> tuple[str, str] | None:
+    def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
         """Return reason and words where the same is being said, waits, or was said just now; note which goal it is."""
         if say.throttle is None:
             return None
@@ -392,9 +393,9 @@ class Scheduler:
                 return None
             first, words = last, f"was said less than {figure(say.throttle)} s ago"
         record.by = By(goal=first)
-        return "throttled", f"the same {words}"
+        return Reason.THROTTLED, f"the same {words}"
 
-    def _way(self, say: Say) -> list[tuple[Record, str]] | None:
+    def _way(self, say: Say) -> list[tuple[Record, Reason]] | None:
         """Return the pending goals that this one recalls, and the reason; None if it has no room even so."""
         replaced = self._queue.with_key(say.key)
         preempted: list[Record] = []
@@ -402,37 +403,37 @@ class Scheduler:
             preempted = self._queue.up_to(say.priority)
         elif self._preempts(say):
             preempted = self._queue.preempting_up_to(say.priority)
-        way = [(replaced, "replaced")] if replaced else []
-        way += [(each, "preempted") for each in preempted if each is not replaced]
+        way = [(replaced, Reason.REPLACED)] if replaced else []
+        way += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]
         # There never are more goals in the queue than may be: one that will be recalled makes room enough.
         if way or len(self._queue) < self.max_queue:
             return way
         last = self._queue.newest_of_lowest()
         # A goal that brings `preempt` displaces its own priority, too. Any preempting goal there is in `way` already.
         limit = say.priority if say.preempt else say.priority - 1
-        return [(last, "displaced")] if last and last.priority <= limit else None
+        return [(last, Reason.DISPLACED)] if last and last.priority <= limit else None
 
     def _preempts(self, say: Say) -> bool:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
-    def _make_way(self, record: Record, ended: list[tuple[Record, str]], now: Now) -> list[Effect]:
+    def _make_way(self, record: Record, ended: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
         """Queue a goal that was accepted, and end what it replaces, preempts or displaces."""
         by = By(goal=record.id)
         effects: list[Effect] = []
         instead = None
         for each, reason in ended:
-            if reason == "replaced" and each.priority == record.priority and not record.preempt:
+            if reason is Reason.REPLACED and each.priority == record.priority and not record.preempt:
                 instead = each
             effects += self._recall(each, reason, f"{reason} by {record.id}", by, now)
         if record.preempt and self.active and self.active.priority <= record.priority:
-            effects += self._stop(self.active, "preempted", by, now)
+            effects += self._stop(self.active, Reason.PREEMPTED, by, now)
         self._queue.add(record, instead)
         return effects
 
     def _expire(self, now: Now) -> list[Effect]:
         effects: list[Effect] = []
         for record in self._queue.expired(now.monotonic):
-            effects += self._recall(record, "expired", _expired(record), None, now)
+            effects += self._recall(record, Reason.EXPIRED, _expired(record), None, now)
         return effects
 
     def _active_deadline(self) -> float | None:
@@ -477,15 +478,15 @@ class Scheduler:
             return record, [*effects, Changed(record, State.ACTIVE)]
         return None, effects
 
-    def _recall(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
+    def _recall(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
         self._queue.remove(record)
         return self._recalled(record, reason, words, by, now)
 
-    def _recalled(self, record: Record, reason: str, words: str, by: By | None, now: Now) -> list[Effect]:
+    def _recalled(self, record: Record, reason: Reason, words: str, by: By | None, now: Now) -> list[Effect]:
         record.become(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"Talk recalled: {words}", by, now)
 
-    def _stop(self, record: Record, reason: str, by: By | None, now: Now) -> list[Effect]:
+    def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
         if record.state is State.PREEMPTING:
             return []  # the first stop gives the reason, later ones join it
         record.become(State.PREEMPTING)
@@ -499,7 +500,7 @@ class Scheduler:
         return self.active
 
     def _end(
-        self, record: Record, state: State, reason: str | None, message: str, by: By | None, now: Now
+        self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
         """End a goal for ever, and start the next if it was the active one."""
         record.become(state)

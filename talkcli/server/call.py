@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine, Generator, Iterable
 
     from talkcli.goals.goal import By, JsonObject
+    from talkcli.goals.reasons import Refusal
     from talkcli.goals.record import Record
     from talkcli.protocol.requests import Request
     from talkcli.server.connection import Connection
@@ -43,7 +44,7 @@ class Call:
         #: bytes that it is counted with
         self.size = 0
         #: of a goal: reason and words why it can't wait, where it would have to
-        self.fault: tuple[str, str] | None = None
+        self.fault: Refusal | None = None
         #: of a goal: who cancelled it while it waited, and what became of it by that
         self.by: By | None = None
         self.ended: Record | None = None

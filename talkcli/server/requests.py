@@ -19,6 +19,7 @@ from talkcli.frozen import fields, replace
 from talkcli.goals.goal import By
 from talkcli.goals.option import figure
 from talkcli.goals.options import INITIAL, Cancel, Say, Set, as_shown, bad_option, given
+from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.goals.goal import JsonObject
+    from talkcli.goals.reasons import Refusal
     from talkcli.goals.record import Record
     from talkcli.server.call import Place
     from talkcli.server.connection import Connection
@@ -154,9 +156,9 @@ class Requests:
             return True  # it has waited for something else already
         size = EACH + sum(map(_bytes_of, fields(call.request).values()))
         if len(self._waiting(call.connection)) > MAX_WAITING:  # it is one of them
-            call.fault = "queue_full", f"{MAX_WAITING:,} requests of this connection are waiting already"
+            call.fault = Reason.QUEUE_FULL, f"{MAX_WAITING:,} requests of this connection are waiting already"
         elif self._size + size > ALL_WAITING:
-            call.fault = "queue_full", f"{ALL_WAITING >> 20} MiB of requests are waiting already"
+            call.fault = Reason.QUEUE_FULL, f"{ALL_WAITING >> 20} MiB of requests are waiting already"
         else:
             call.size = size
             self._size += size
@@ -306,7 +308,7 @@ class Requests:
         active = self._scheduler.active
         if active and active is not speech.silent and not await call.wait(speech.for_silence(active), PAUSE_LIMIT):
             words = f"speech is paused, but {active.id} was not known to be silent within {PAUSE_LIMIT:g} s"
-            raise RequestRefused(words, "not_silent")
+            raise RequestRefused(words, Reason.NOT_SILENT)
         self._report_pause(call, active)
 
     async def _resume(self, call: Call, _: Resume) -> None:
@@ -342,7 +344,7 @@ class Requests:
             words = f"the engine can't list its voices now: it is {self._speech.engine_words}"
             if self._scheduler.active:
                 words += ", and busy with its first sentence: ask again after that"
-            raise RequestRefused(words, "engine_failed")
+            raise RequestRefused(words, Reason.ENGINE_FAILED)
         call.answer(({"voice": fields(each)} for each in voices), count=len(voices))
 
     async def _log(self, call: Call, request: Log) -> None:
@@ -352,7 +354,7 @@ class Requests:
     async def _set(self, call: Call, request: Set) -> None:
         words = bad_option(request)
         if words:
-            raise RequestRefused(words, "bad_option")
+            raise RequestRefused(words, Reason.BAD_OPTION)
         voices = self._speech.voices
         fault = voices.fault(request.voice)
         if fault:
@@ -379,11 +381,12 @@ def _unknown(*ids: str) -> str:
     return f"no goal {', '.join(map(repr, ids))} is known: see `talk status`"
 
 
-def _unpitched(say: Say) -> tuple[str, str] | None:
+def _unpitched(say: Say) -> Refusal | None:
     """Return reason and words why a goal can't be had that wants a pitch of a voice that has none but its own."""
     if say.pitch in {None, INITIAL.pitch} or not is_neural(say.voice or ""):
         return None
-    return "bad_option", f"the voice {say.voice} has no pitch but its own: leave the pitch out, or take one of espeak's"
+    words = f"the voice {say.voice} has no pitch but its own: leave the pitch out, or take one of espeak's"
+    return Reason.BAD_OPTION, words
 
 
 def _listed(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:

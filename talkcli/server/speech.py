@@ -22,6 +22,7 @@ from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals.goal import Output
 from talkcli.goals.options import INITIAL, for_engine, model_of
+from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Changed, Effect, Now, Order
 from talkcli.goals.states import State
 from talkcli.server import log as server_log
@@ -322,7 +323,7 @@ class Speech:
             chosen["voice_only"] = False
         elif chosen["voice_only"]:
             if why := self.voices.failure(model_of(chosen["voice"])):
-                self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, "voice_failed", why))
+                self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, Reason.VOICE_FAILED, why))
                 return
             chosen["pitch"] = INITIAL.pitch  # another is for voices that have one
         self.engine.say(
@@ -435,7 +436,7 @@ class Speech:
         self.lost(TalkError(died.message))
         if self.scheduler.active:
             self.apply(
-                self.scheduler.failed(self.scheduler.active.id, "engine_failed", died.message, None, self._now())
+                self.scheduler.failed(self.scheduler.active.id, Reason.ENGINE_FAILED, died.message, None, self._now())
             )
 
     def _ended(self, ended: protocol.Ended) -> None:
@@ -450,7 +451,7 @@ class Speech:
         elif ended.outcome == protocol.OUTCOME_STOPPED and active.stop_since is not None:
             effects = self.scheduler.stopped(ended.id, now)
         else:
-            reason, words = ended.reason or "engine_failed", ended.message or "the engine stopped by itself"
+            reason, words = ended.reason or Reason.ENGINE_FAILED, ended.message or "the engine stopped by itself"
             effects = self.scheduler.failed(ended.id, reason, words, ended.duration, now)
         self.apply(effects)
 

@@ -21,12 +21,14 @@ from talkcli.engine.voices import (
     unknown_voice,
 )
 from talkcli.goals.options import DEFAULT_VOICE, SPEAKER
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
     from talkcli.engine.protocol import Voice
     from talkcli.goals.goal import JsonObject
+    from talkcli.goals.reasons import Refusal
 
 #: Seconds after which a voice that failed may be loaded again, where a goal asks for it: twice as long each time, up to
 #: an hour, as one that can't be loaded costs a second of the processor, and one that kills the engine a sentence.
@@ -88,7 +90,7 @@ class Voices:
         #: the one that the engine is loading
         self._loading: str | None = None
 
-    def fault(self, voice: str | None, usual: str | None = None) -> tuple[str, str] | None:
+    def fault(self, voice: str | None, usual: str | None = None) -> Refusal | None:
         """Return reason and words why a voice can't be had; None also where that is not known.
 
         `usual`: the one that the server speaks with, where a goal is looked at.
@@ -97,9 +99,9 @@ class Voices:
             return None
         found = self._find(voice, usual)
         if found is None:
-            return "unknown_voice", unknown_voice(voice, self._known(voice), self._foreign)
+            return Reason.UNKNOWN_VOICE, unknown_voice(voice, self._known(voice), self._foreign)
         lacking = self._lacking(found.id) if is_neural(found.id) else None
-        return ("unknown_voice", f"the voice {voice[:60]} cannot be spoken: {lacking}") if lacking else None
+        return (Reason.UNKNOWN_VOICE, f"the voice {voice[:60]} cannot be spoken: {lacking}") if lacking else None
 
     def meant(self, voice: str | None, usual: str | None = None) -> str | None:
         """Return a voice as it was asked for, a neural one by its id; `usual`: the one that the server speaks with."""

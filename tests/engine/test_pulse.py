@@ -18,6 +18,7 @@ from talkcli.engine.child.players import libpulse
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.pulse import PulsePlayer
 from talkcli.engine.players import DUMMY_SINK, PIECE_S, SAMPLE_BYTES
+from talkcli.goals.reasons import Reason
 from tests.support.pipewire import PipeWire
 from tests.support.relay import Relay
 from tests.support.surroundings import short_directory
@@ -65,7 +66,7 @@ class Rig:
                 return
             self.pass_on(player, (end if until is None else min(until, end)) - now)
         if self.limit is not None:
-            raise CannotSpeak("silent", "nothing came any more")
+            raise CannotSpeak(Reason.ENGINE_HUNG, "nothing came any more")
         raise AssertionError(f"nothing has woken it in {PATIENCE:g} s")
 
     def pass_on(self, player: PulsePlayer, seconds: float) -> None:
@@ -197,7 +198,7 @@ def test_a_connection_that_ends_anywhere_is_the_end_in_words(rig: MakeRig, hush:
                 behind.relay.cut_at = at
             end = behind.end()
             assert end is not None, f"it ended well with {at} of {whole} bytes"
-            assert end.reason in {"audio_device", "audio_lost", "silent"}
+            assert end.reason in {"audio_device", "audio_lost", "engine_hung"}
 
 
 def test_a_move_told_together_with_the_end_is_seen(rig: MakeRig, sink: Sink) -> None:

@@ -39,6 +39,7 @@ from talkcli.engine.parent.supervisor import (
     Supervisor,
 )
 from talkcli.engine.protocol import KILL_LIMIT_S, OUTCOME_COMPLETED, OUTCOME_FAILED, OUTCOME_STOPPED
+from talkcli.goals.reasons import Reason
 from talkcli.polling import wait_ready
 from tests.engine.threads import CONFIGURE, PATIENCE, Thread, answering
 
@@ -197,13 +198,15 @@ def answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callabl
 
 @pytest.mark.parametrize("followed", [True, False])
 def test_the_process_is_told_whether_a_goal_follows(answers: Callable[..., Thread], followed: bool) -> None:
-    told = 'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, f"{command.next_waits} {command.next_is_neural}")'
+    told = (
+        'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, None, f"{command.next_waits} {command.next_is_neural}")'
+    )
     thread = answers("tell(protocol.Started(command.id))", f"tell({told})")
     thread.engine.announce_next("g1", followed, next_is_neural=True)  # there is none yet that could be told
     thread.until(protocol.Ready)
     thread.say("battery low")
     thread.engine.announce_next("g1", followed, next_is_neural=True)
-    assert thread.until(protocol.Ended) == protocol.Ended("g1", OUTCOME_COMPLETED, f"{followed} True")
+    assert thread.until(protocol.Ended) == protocol.Ended("g1", OUTCOME_COMPLETED, None, f"{followed} True")
 
 
 def test_a_goal_behind_another_wakes_the_thread_once(
@@ -387,7 +390,7 @@ def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_wh
     thread = start(START_LIMIT_S=0.3, ENGINE_WAIT_LIMIT_S=0.5, RESTART_DELAYS_S=(0.0,))
     began = time.monotonic()
     words = "the engine was not ready after 0.3 s"
-    assert thread.spoken("battery low") == protocol.Ended("g1", OUTCOME_FAILED, "engine_failed", words)
+    assert thread.spoken("battery low") == protocol.Ended("g1", OUTCOME_FAILED, Reason.ENGINE_FAILED, words)
     assert time.monotonic() - began >= 3 * 0.3, "only a start that began after the time of patience costs a goal"
     assert thread.until(EngineMissing) == EngineMissing(words), "no goal is in hand: who hands them in has to end one"
     thread.say("coming home", "g2")
@@ -435,7 +438,7 @@ def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool
         engine._handle_event(process, SPOKEN)
     engine._handle_event(process, protocol.Alive(""))  # as one does that loads a voice
     before = time.monotonic()
-    engine._lose_process("it is killed", "engine_crashed")
+    engine._lose_process("it is killed", Reason.ENGINE_CRASHED)
     assert (engine._restarts.next_start_at - before < RESTART_DELAYS_S[1]) == spoken
     engine._release_process(process)
     engine._actions.close()
@@ -449,7 +452,7 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pyt
     engine = _watching(process, posted)
     monkeypatch.setattr(engine, "_start_process", lambda: None)
     engine._goal = SupervisedGoal(YES, last_sign_at=0.0, started=True)
-    engine._lose_process("it hangs", "engine_hung")
+    engine._lose_process("it hangs", Reason.ENGINE_HUNG)
     due = process.gone_by
     engine._check_deadlines(due - KILL_LIMIT_S / 2)
     assert [type(each).__name__ for each in posted] == ["EngineDied"]

@@ -27,6 +27,7 @@ from talkcli.engine.models import NEEDED
 from talkcli.engine.players import SAMPLE_BYTES
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import UnknownVoice
+from talkcli.goals.reasons import Reason
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_VOICE, real_voice, silence_noise
 from tests.support.surroundings import needs_packages
@@ -415,9 +416,9 @@ def test_a_sentence_ends_where_libespeak_makes_a_pause(language: str, text: str,
     ("at", "after", "fails"),
     [
         ("begin", 0, Stopped()),
-        ("word", 0, CannotSpeak("audio_lost", "unplugged")),
+        ("word", 0, CannotSpeak(Reason.AUDIO_LOST, "unplugged")),
         ("word", 3, Stopped()),
-        ("write", 0, CannotSpeak("audio_lost", "unplugged")),
+        ("write", 0, CannotSpeak(Reason.AUDIO_LOST, "unplugged")),
         ("write", 5, Stopped()),
     ],
 )

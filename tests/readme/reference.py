@@ -1,4 +1,4 @@
-"""The documents' tables of options and requests, made from the rows: `python -m tests.readme.reference` writes them.
+"""Tables of the documents, made from the code: `python -m tests.readme.reference` writes options, requests, reasons.
 
 A test shows that the documents have them as they are now.
 """
@@ -14,6 +14,7 @@ from talkcli.cli.click_app import talk
 from talkcli.cli.commands import COMMANDS
 from talkcli.goals.option import IDS, SECONDS, Option
 from talkcli.goals.options import Set
+from talkcli.goals.reasons import Reason
 from talkcli.protocol.requests import KINDS
 from tests.support.documents import COMMAND_LINE, WIRE
 
@@ -46,6 +47,12 @@ def requests() -> str:
     return "".join(lines)
 
 
+def reasons() -> str:
+    """Return the table of the reasons why goals end."""
+    rows = (f"| `{each}` | {', '.join(map(str, each.states))} | {each.meaning} |\n" for each in Reason)
+    return "".join(["| reason | state | why |\n| --- | --- | --- |\n", *rows])
+
+
 def _field(option: Option, *, changes: bool) -> str:
     """Return the row of a field; `changes`: of a request that changes settings, where what isn't given stays."""
     null = "null" if option.default is None else json.dumps(option.default)
@@ -66,7 +73,7 @@ def _values(option: Option) -> str:
 
 
 #: What is made: by the name that stands around it, the document where that is, and how.
-MADE = {"options": (COMMAND_LINE, options), "requests": (WIRE, requests)}
+MADE = {"options": (COMMAND_LINE, options), "requests": (WIRE, requests), "reasons": (WIRE, reasons)}
 
 
 def current(name: str) -> str:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 sys.path.insert(1, os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
 
 from talkcli.engine import protocol
+from talkcli.goals.reasons import Reason
 from tests.support import script
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ class Engine:
     def _start(self, voices: bool) -> None:
         what, value = script.start()
         if what == "fail":
-            self._send(protocol.StartFailed(value or "engine_failed", "scripted start failure"))
+            self._send(protocol.StartFailed(Reason(value or Reason.ENGINE_FAILED), "scripted start failure"))
             sys.exit(1)
         elif what == "slow":
             time.sleep(float(value or 0.5))
@@ -134,7 +135,7 @@ class Engine:
             self._send(protocol.Started(goal.id))
         self._report(goal)
         if "muted" in asked and say.audible:
-            self._send(protocol.Ended(goal.id, protocol.OUTCOME_FAILED, "muted", "the output is muted: card"))
+            self._send(protocol.Ended(goal.id, protocol.OUTCOME_FAILED, Reason.MUTED, "the output is muted: card"))
             self._goal = None
             return
         spans = [] if "silent-start" in asked else asked.spans[: int(asked.number("words", len(asked.spans)))]
@@ -201,7 +202,7 @@ class Engine:
         goal, self._goal, self._unconfirmed = self._goal, None, None
         assert goal
         if outcome == protocol.OUTCOME_FAILED:
-            reason = goal.script.text("fail") or "engine_failed"
+            reason = Reason(goal.script.text("fail") or Reason.ENGINE_FAILED)
             message = goal.script.text("message").replace("_", " ") or f"scripted {reason}"
             self._send(protocol.Ended(goal.id, outcome, reason, message))
         else:

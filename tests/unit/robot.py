@@ -24,6 +24,7 @@ import pytest
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import INITIAL, Cancel, Say
+from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Cancelled, Changed, Effect, Now, Scheduler, Submitted
 
 if TYPE_CHECKING:
@@ -98,9 +99,9 @@ class Robot:
             case "completed":
                 self.see(self.scheduler.completed(goal_id, 1.5, self.now))
             case "failed":
-                self.see(self.scheduler.failed(goal_id, "audio_lost", "device is gone", 1.5, self.now))
+                self.see(self.scheduler.failed(goal_id, Reason.AUDIO_LOST, "device is gone", 1.5, self.now))
             case "deaf":
-                self.see(self.scheduler.failed(goal_id, "not_silent", "it does not end", None, self.now))
+                self.see(self.scheduler.failed(goal_id, Reason.NOT_SILENT, "it does not end", None, self.now))
             case "stopped":
                 self.see(self.scheduler.stopped(goal_id, self.now))
             case _:

@@ -10,6 +10,7 @@ from talkcli.goals import history as module
 from talkcli.goals.goal import Sender
 from talkcli.goals.history import History
 from talkcli.goals.options import Say
+from talkcli.goals.reasons import Reason
 from talkcli.goals.record import Record
 from talkcli.goals.states import State
 
@@ -17,7 +18,7 @@ from talkcli.goals.states import State
 def ended(number: int, state: State = State.SUCCEEDED, text: str = "door open") -> Record:
     record = Record(f"4k7f-{number}", number, Say(text), Sender(), 1.0)
     record.state = state
-    record.reason = "canceled"
+    record.reason = Reason.CANCELED
     return record
 
 

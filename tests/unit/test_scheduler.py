@@ -8,6 +8,7 @@ from talkcli.goals import history
 from talkcli.goals.goal import By, Output
 from talkcli.goals.history import EARLY_CANCEL, MAX_EARLY_CANCELS, MAX_SAID
 from talkcli.goals.options import Cancel, Say
+from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import SILENCE_LIMIT, Cancelled, Now
 from talkcli.goals.states import State
 from tests.unit.robot import ARM, DOOR, Robot, play
@@ -229,7 +230,7 @@ def test_a_goal_lacks_room_if_nothing_else_is_wrong_with_it() -> None:
     for lacks, says in cases.items():
         for say in says:
             assert robot.scheduler.lacks_room(say, robot.now) is lacks, say
-    assert not robot.scheduler.lacks_room(Say("x"), robot.now, ("unknown_voice", "no such voice"))
+    assert not robot.scheduler.lacks_room(Say("x"), robot.now, (Reason.UNKNOWN_VOICE, "no such voice"))
     robot.play("cancel early")
     assert not robot.scheduler.lacks_room(Say("x", id="early"), robot.now), "it is RECALLED at once"
     robot.play("cancel mine")

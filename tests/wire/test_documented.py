@@ -32,18 +32,17 @@ ERRORS, LIMITS = tables(WIRE.section("Errors and limits"))
 
 
 def test_states_and_replies_are_in_the_tables() -> None:
-    states, found = tables(WIRE.section("States"))[:2]
+    states = tables(WIRE.section("States"))[0]
     documented = {words(row[0])[0]: (int(row[1]), row[3] == "yes") for row in states[1:]}
     assert documented == {each.name: (int(each), each.terminal) for each in State}
-    assert all(State[state].terminal for row in found[1:] for state in row[1].split(", "))
     answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in words(row[0])[:1]}
     assert answered == set(KINDS)
 
 
-def test_keys_reasons_and_error_codes_of_the_tables_are_those_of_the_code() -> None:
+def test_keys_and_error_codes_of_the_tables_are_those_of_the_code() -> None:
     """`tests/golden` and the tests of each fault have the codes themselves."""
     assert first_column(tables(WIRE.section("The goal"))[0]) == list(Goal("", State.PENDING).to_json())
-    reasons, codes = first_column(tables(WIRE.section("States"))[1]), first_column(ERRORS)
+    codes = first_column(ERRORS)
     refused: list[type[errors.RequestRefused]] = [
         errors.UnknownGoal,
         errors.BadRequest,
@@ -51,7 +50,7 @@ def test_keys_reasons_and_error_codes_of_the_tables_are_those_of_the_code() -> N
     ]
     assert {each.code for each in refused} <= set(codes)
     sources = "".join(each.read_text(encoding="utf-8") for each in (ROOT / "talkcli").rglob("*.py"))
-    for each in (*reasons, *codes, *first_column(tables(FLEET.section("What is refused"))[0])):
+    for each in (*codes, *first_column(tables(FLEET.section("What is refused"))[0])):
         assert f'"{each}"' in sources, each
 
 

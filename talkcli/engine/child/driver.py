@@ -21,6 +21,7 @@ from talkcli.engine.protocol import Ready, StartFailed
 from talkcli.engine.voices import SYNTHESIZERS, UnknownVoice, is_neural, is_own_driver
 from talkcli.frozen import TYPE_CHECKING, fields, replace
 from talkcli.goals.options import model_of
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -39,7 +40,7 @@ _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
 class CannotStart(Exception):
     """The engine can't start. `failure` is the message for the server; it says what to install or to change."""
 
-    def __init__(self, message: str, reason: str = "engine_failed", **more: bool) -> None:
+    def __init__(self, message: str, reason: Reason = Reason.ENGINE_FAILED, **more: bool) -> None:
         """Build the message for the server. `more` are further fields of `StartFailed`."""
         super().__init__(message)
         self.failure = StartFailed(reason, message, **more)
@@ -65,7 +66,7 @@ def start(configure: Configure, runner: GoalRunner) -> Ready:
         properties.set_voice(configure.voice)
         voice = properties.voice_id(configure.voice) if configure.voice else ""
     except CannotSpeak as error:
-        unknown = error.reason == "unknown_voice"
+        unknown = error.reason == Reason.UNKNOWN_VOICE
         raise CannotStart(str(error), error.reason, permanent=unknown, usage_error=unknown) from error
     runner.attach_engine(engine, properties.apply, None if own else _pump(name), synthesizer)
     return Ready(
@@ -214,7 +215,7 @@ class DriverProperties:
             found = voices.find_voice(wanted, self._voices)
         if found is None:
             foreign = None if is_own_driver(self._driver) else self._driver
-            raise CannotSpeak("unknown_voice", voices.unknown_voice(wanted, self._voices, foreign))
+            raise CannotSpeak(Reason.UNKNOWN_VOICE, voices.unknown_voice(wanted, self._voices, foreign))
         return found.id
 
     def _set(self, name: str, value: Any, shown: str) -> None:
@@ -224,10 +225,10 @@ class DriverProperties:
         error, self._error = self._error, None
         if isinstance(error, UnknownVoice):
             message = f"the voice {value} is listed, but it cannot be loaded: {error}"
-            raise CannotSpeak("unknown_voice", message) from error
+            raise CannotSpeak(Reason.UNKNOWN_VOICE, message) from error
         if error is not None:
             why = str(error.args[0] if error.args else error) or type(error).__name__
-            raise CannotSpeak("bad_option", f"the driver {self._driver} cannot set {shown}: {why}") from error
+            raise CannotSpeak(Reason.BAD_OPTION, f"the driver {self._driver} cannot set {shown}: {why}") from error
 
     def _note_error(self, exception: Exception, **_: object) -> None:
         self._error = exception

@@ -14,6 +14,7 @@ from talkcli.engine.child.players.base import CannotEnd, CannotSpeak, Stopped
 from talkcli.engine.child.words import TimedWord, WordClock
 from talkcli.engine.players import PIECE_S, SAMPLE_BYTES
 from talkcli.frozen import TYPE_CHECKING, replace
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -161,7 +162,7 @@ class Playback:
     def finish(self) -> float:
         """Play to the end and return the length in seconds. It only returns if everything was heard."""
         if not self._samples.audible:
-            raise CannotSpeak("nothing_to_say", "nothing in the text can be spoken")
+            raise CannotSpeak(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
         self._complete = self._start_known = True
         self._with_player(self._drain)
         self._report_words(self._clock.take_rest())
@@ -232,10 +233,10 @@ class Playback:
             self._rewind(feed)  # the held sentence goes on with another player later, and fails then if there is none
             return
         first = self._first_error
-        if first is None or first.reason == "no_player":  # a player that fails says more than a missing one
+        if first is None or first.reason == Reason.NO_PLAYER:  # a player that fails says more than a missing one
             first = self._first_error = error
         proven = feed is not None and feed.player.proven
-        lost = proven or error.final or (feed is not None and error.reason == "audio_stalled")
+        lost = proven or error.final or (feed is not None and error.reason == Reason.AUDIO_STALLED)
         others = list(self._untried or ())
         self._untried = iter(others) if others else None
         if lost or not (others or self._is_busy(first)):
@@ -248,7 +249,7 @@ class Playback:
 
     def _is_busy(self, error: CannotSpeak) -> bool:
         """Return whether another program holds the device, and has not held it for long."""
-        if error.reason != "audio_device" or "busy" not in str(error).lower():
+        if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
         self._busy_until = self._busy_until or time.monotonic() + BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
@@ -286,7 +287,7 @@ class Playback:
             due = feed.progress_at + limit if feed.player.real_time else None  # the reader of a file may take any time
             self._wait_for(feed, due)
             if due and time.monotonic() >= due and not self._runner.hold_number and not self._offer(feed):
-                raise CannotSpeak("audio_stalled", f"{feed.player.name} took no sound for {limit:g} s")
+                raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} took no sound for {limit:g} s")
 
     def _await_samples(self, feed: PlayerFeed, more: Interest) -> None:
         """Wait once for more samples, while the player plays what it has."""
@@ -313,11 +314,13 @@ class Playback:
                 self._rewind(feed)
                 raise _PlayerReleased
             if now >= deadline:
-                raise CannotSpeak("audio_stalled", f"{player.name} did not end {DRAIN_LIMIT_S:g} s after the sound")
+                raise CannotSpeak(
+                    Reason.AUDIO_STALLED, f"{player.name} did not end {DRAIN_LIMIT_S:g} s after the sound"
+                )
             self._wait_for(feed, deadline)
         missing = feed.missing(time.monotonic())
         if player.real_time and missing > EARLY_END_LIMIT_S - self._seconds(self._samples.end - self._sent):
-            raise CannotSpeak("audio_lost", f"{player.name} ended {missing:.1f} s before the sound did")
+            raise CannotSpeak(Reason.AUDIO_LOST, f"{player.name} ended {missing:.1f} s before the sound did")
 
     # -- samples
 

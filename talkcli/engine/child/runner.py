@@ -22,6 +22,7 @@ from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.words import WordFinder
 from talkcli.engine.voices import list_voices
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.reasons import Reason
 from talkcli.protocol.lines import LineSplitter
 
 if TYPE_CHECKING:
@@ -283,7 +284,7 @@ class GoalRunner:
             if self._goal is not None:
                 self._fail(error.reason, str(error))
         if self._goal is not None and self._pump is not None and command.lead_in:
-            self._fail("bad_option", "this driver plays by itself: it can't be given a lead-in")
+            self._fail(Reason.BAD_OPTION, "this driver plays by itself: it can't be given a lead-in")
         goal.error = None
         while self._goal is not None:
             if goal.with_driver:
@@ -302,7 +303,7 @@ class GoalRunner:
         goal.offset = goal.last_word
         goal.with_driver, goal.interrupted, goal.silent_at = True, False, None
         if self._engine.say(goal.command.text[goal.offset :], goal.id) is not None:
-            self._fail("nothing_to_say", "nothing in the text can be spoken")
+            self._fail(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
     def _step_driver(self, goal: ActiveGoal) -> None:
         """Let the driver go on. `talk`'s own speaks to the end in one step; a foreign one needs many steps."""
@@ -310,7 +311,7 @@ class GoalRunner:
         if self._goal is None:
             return
         if self._pump is None:
-            self._fail("engine_failed", "the driver lost the sentence")
+            self._fail(Reason.ENGINE_FAILED, "the driver lost the sentence")
         elif goal.error is not None:  # a driver whose `say` raises never reports that it is finished
             self._engine.stop()
             self._engine.proxy.setBusy(False)  # otherwise pyttsx3 would not pass on the next sentence
@@ -349,15 +350,15 @@ class GoalRunner:
         elif goal.stop_requested:
             self._end(protocol.OUTCOME_STOPPED)
         elif error is None:
-            self._fail("engine_failed", "the driver did not complete the sentence")
+            self._fail(Reason.ENGINE_FAILED, "the driver did not complete the sentence")
         else:
             traceback.print_exception(error)  # for the server's log
-            self._fail("engine_failed", f"{type(error).__name__}: {error}")
+            self._fail(Reason.ENGINE_FAILED, f"{type(error).__name__}: {error}")
 
-    def _fail(self, reason: str, message: str) -> None:
+    def _fail(self, reason: Reason, message: str) -> None:
         self._end(protocol.OUTCOME_FAILED, reason, message)
 
-    def _end(self, outcome: str, reason: str | None = None, message: str | None = None) -> None:
+    def _end(self, outcome: str, reason: Reason | None = None, message: str | None = None) -> None:
         assert self._goal is not None
         self._report_output()
         goal, self._goal = self._goal, None

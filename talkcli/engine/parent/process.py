@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 from talkcli import peers
 from talkcli.engine import protocol
 from talkcli.engine.protocol import HANG_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S
+from talkcli.goals.reasons import Reason
 from talkcli.polling import wait_ready
 from talkcli.processes import close, kill, kill_holders, open_pipes, processes, signal_name
 from talkcli.protocol.lines import LineSplitter
@@ -209,7 +210,7 @@ class EngineFailed(Exception):
         silent_s: how many seconds the process has been silent if that is the failure, else None.
     """
 
-    def __init__(self, reason: str, message: str, silent_s: float | None = None) -> None:
+    def __init__(self, reason: Reason, message: str, silent_s: float | None = None) -> None:
         super().__init__(message)
         self.reason = reason
         self.silent_s = silent_s
@@ -244,7 +245,7 @@ class PrivateEngine:
         try:
             self._process = EngineProcess(configure, env=env)
         except OSError as error:
-            raise EngineFailed("engine_failed", f"the engine process cannot be started: {error}") from error
+            raise EngineFailed(Reason.ENGINE_FAILED, f"the engine process cannot be started: {error}") from error
         self._deadline = deadline
         self._interrupt = interrupt
         self._last_event_at = time.monotonic()
@@ -266,7 +267,7 @@ class PrivateEngine:
         if not self._process.send(command):
             for _ in self._read_events():
                 pass  # raises a better error if the process is dead
-            raise EngineFailed("engine_hung", "the engine takes no commands")
+            raise EngineFailed(Reason.ENGINE_HUNG, "the engine takes no commands")
 
     def wait_for(self, event_class: type[_E]) -> _E:
         """Return the next event of this class.
@@ -296,14 +297,14 @@ class PrivateEngine:
             if now < self._last_event_at + limit:
                 continue
             if process.ready:
-                raise EngineFailed("engine_hung", f"the engine gave no sign of life for {limit:g} s", limit)
-            raise EngineFailed("engine_failed", f"the engine was not ready after {limit:g} s", limit)
+                raise EngineFailed(Reason.ENGINE_HUNG, f"the engine gave no sign of life for {limit:g} s", limit)
+            raise EngineFailed(Reason.ENGINE_FAILED, f"the engine was not ready after {limit:g} s", limit)
 
     def _read_events(self) -> Iterator[protocol.Event]:
         for event in self._process.receive():
             self._last_event_at = time.monotonic()
             if event is None:
-                raise EngineFailed("engine_crashed", self._process.describe_exit())
+                raise EngineFailed(Reason.ENGINE_CRASHED, self._process.describe_exit())
             if isinstance(event, protocol.StartFailed):
                 raise EngineFailed(event.reason, event.message)
             if isinstance(event, protocol.Ready):

@@ -21,6 +21,7 @@ from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals import text as texts
 from talkcli.goals.options import MAX_CHARACTERS
+from talkcli.goals.reasons import Reason
 from talkcli.goals.states import EXIT_CODES, State
 from talkcli.polling import wait_ready
 
@@ -28,9 +29,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 #: Reasons with the exit code of a rejected goal. All others have that of an aborted one.
-_REJECTED = frozenset({"invalid_text", "unknown_voice", "bad_option"})
+_REJECTED = frozenset({Reason.INVALID_TEXT, Reason.UNKNOWN_VOICE, Reason.BAD_OPTION})
 #: Reasons that come from the player. The only player here is the file.
-_FILE_REASONS = frozenset({"audio_device", "audio_lost"})
+_FILE_REASONS = frozenset({Reason.AUDIO_DEVICE, Reason.AUDIO_LOST})
 #: Paths that mean standard output. It is used as the shell has opened it.
 STANDARD_OUTPUT = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
 #: Interval for checking whether a named pipe has a reader, because no event reports that.
@@ -152,7 +153,7 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
             raise _engine_failure(error, command.voice) from error
         if ended.outcome == protocol.OUTCOME_COMPLETED and ended.duration is not None:
             seconds += ended.duration
-        elif ended.reason == "nothing_to_say":  # one piece of a long text may consist of dots
+        elif ended.reason == Reason.NOTHING_TO_SAY:  # one piece of a long text may consist of dots
             silent_end = ended
         else:
             raise _goal_failure(ended, engine_path, path)
@@ -163,13 +164,13 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
 
 def _engine_failure(error: EngineFailed, voice: str | None) -> RenderFailed:
     while_speaking = "" if voice is None else f' while it spoke with the voice "{voice}"'
-    if error.reason == "engine_crashed":
+    if error.reason == Reason.ENGINE_CRASHED:
         return RenderFailed(error.reason, f"the engine crashed{while_speaking}: {error}")
     return RenderFailed(error.reason, f"{error}{while_speaking}")
 
 
 def _goal_failure(ended: protocol.Ended, engine_path: str, path: str) -> RenderFailed:
-    reason = ended.reason or "engine_failed"
+    reason = ended.reason or Reason.ENGINE_FAILED
     message = (ended.message or "the engine did not complete the text").replace(engine_path, path)
     if reason in _FILE_REASONS:
         problem = message.removeprefix(path)

@@ -20,6 +20,7 @@ from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineProcess
 from talkcli.engine.protocol import HANG_LIMIT_S, HOLD_LIMIT_S, KILL_LIMIT_S, START_LIMIT_S, STOP_LIMIT_S
 from talkcli.frozen import frozen, replace
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -351,7 +352,7 @@ class Supervisor:
     def _check_deadlines(self, now: float) -> None:
         missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
         if missed:
-            self._lose_process(missed, "engine_hung")
+            self._lose_process(missed, Reason.ENGINE_HUNG)
         elif self._process is None and now >= self._restarts.next_start_at:
             self._start_process()
         for process in self._dying:
@@ -360,7 +361,9 @@ class Supervisor:
             process.gone_by = NEVER  # checked once; it is reaped whenever it goes
             process.kill()  # finds processes that the first kill may have missed for lack of a descriptor
             if self._goal and self._goal.lost_process is process:
-                self._fail_goal(self._goal, "not_silent", f"the player could not be ended within {KILL_LIMIT_S:g} s")
+                self._fail_goal(
+                    self._goal, Reason.NOT_SILENT, f"the player could not be ended within {KILL_LIMIT_S:g} s"
+                )
 
     def _handle_ready(self, key: selectors.SelectorKey) -> None:
         if key.fd not in self._selector.get_map():
@@ -391,7 +394,7 @@ class Supervisor:
         if sent_to is not None and sent_to is self._process:
             self._goal.last_sign_at = at
         elif self._restarts.permanent_error is not None:
-            self._fail_goal(self._goal, "engine_failed", self._restarts.permanent_error)
+            self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
         else:
             self._send_goal()
 
@@ -425,7 +428,7 @@ class Supervisor:
         """Replace a process that takes no commands."""
         self._receive(process)  # notices how it died if it is dead
         if process is self._process:
-            self._lose_process("the engine takes no commands", "engine_hung")
+            self._lose_process("the engine takes no commands", Reason.ENGINE_HUNG)
 
     def _hold_goal(self, goal_id: str, number: int | None) -> None:
         """Hold the goal for the pause with this number, or let it go on if there is no number."""
@@ -461,10 +464,10 @@ class Supervisor:
         if goal:
             self._goal = None
             if goal.sent:
-                self._lose_process("the engine could not be silenced", "not_silent")
+                self._lose_process("the engine could not be silenced", Reason.NOT_SILENT)
         self._direct_process = self._process if self._process and self._process.ready else None
 
-    def _fail_goal(self, goal: SupervisedGoal, reason: str, message: str) -> None:
+    def _fail_goal(self, goal: SupervisedGoal, reason: Reason, message: str) -> None:
         self._end_goal(protocol.Ended(goal.command.id, protocol.OUTCOME_FAILED, reason, message))
 
     def _end_goal(self, ended: protocol.Ended) -> None:
@@ -506,7 +509,7 @@ class Supervisor:
 
     def _handle_crash(self, process: EngineProcess) -> None:
         self._direct_process = None
-        self._lose_process(f"the engine crashed: {process.describe_exit()}", "engine_crashed")
+        self._lose_process(f"the engine crashed: {process.describe_exit()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
         self._last_sign_at = time.monotonic()
@@ -540,7 +543,7 @@ class Supervisor:
             goal.hold_sent_at = None
             self._post(event)
 
-    def _lose_process(self, message: str, reason: str) -> None:
+    def _lose_process(self, message: str, reason: Reason) -> None:
         """Kill the process, let its goal end once it is silent, and plan the next start.
 
         Args:
@@ -568,13 +571,13 @@ class Supervisor:
         else:
             self._plan_after_failed_start(message)
 
-    def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: str) -> None:
+    def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: Reason) -> None:
         """Decide how a goal ends whose process is lost.
 
         If the process crashed before it began with the goal, nothing was heard, and the next process gets the goal.
         This happens only once per goal.
         """
-        if reason == "engine_crashed" and goal.stop_sent_at is None and not (goal.started or goal.retried):
+        if reason == Reason.ENGINE_CRASHED and goal.stop_sent_at is None and not (goal.started or goal.retried):
             goal.retried = True
             if goal.hold_number is not None:
                 self._post(protocol.Held(goal.command.id, goal.hold_number))
@@ -590,7 +593,7 @@ class Supervisor:
         ends_goal = self._restarts.start_failed(time.monotonic(), self._started_at, message if permanent else None)
         waiting = self._goal if self._goal and not self._goal.end else None
         if waiting and (ends_goal or permanent):
-            self._fail_goal(waiting, "engine_failed", message)
+            self._fail_goal(waiting, Reason.ENGINE_FAILED, message)
         elif ends_goal:
             self._post(EngineMissing(message))
 
@@ -608,7 +611,7 @@ class Supervisor:
 
     def _shut_down(self) -> None:
         """End the process. If it can't be ended within the limit, leave it to the system."""
-        self._lose_process("the server ends", "shutdown")
+        self._lose_process("the server ends", Reason.SHUTDOWN)
         deadline = time.monotonic() + KILL_LIMIT_S / 4
         while self._dying and time.monotonic() < deadline:
             for key in self._actions.wait(deadline):

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from typing import Protocol
 
     from talkcli.goals.goal import Output
+    from talkcli.goals.reasons import Reason
 else:
     Protocol = object
 
@@ -22,7 +23,7 @@ Interest = tuple[int, int]
 class CannotSpeak(Exception):
     """The sentence can't be spoken, or its rest can't."""
 
-    def __init__(self, reason: str, message: str, *, final: bool = False) -> None:
+    def __init__(self, reason: Reason, message: str, *, final: bool = False) -> None:
         """Initialize the exception.
 
         Args:

@@ -12,6 +12,7 @@ import time
 from talkcli.engine.child.players.base import CannotSpeak, Player
 from talkcli.engine.players import FILE_PREFIX, SAMPLE_BYTES
 from talkcli.engine.protocol import OUTPUT_STREAM_NAME
+from talkcli.goals.reasons import Reason
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ class WavPlayer(BuiltInPlayer):
         self.name = f"{FILE_PREFIX}{path}"
         self._path = path
         self._rate = rate
-        with _os_errors("audio_device", f"{path} cannot be written"), contextlib.ExitStack() as opened:
+        with _os_errors(Reason.AUDIO_DEVICE, f"{path} cannot be written"), contextlib.ExitStack() as opened:
             self._file = _open_regular(path)
             opened.callback(os.close, self._file)
             self._start = _sample_bytes(self._file, path, rate)
@@ -139,8 +140,8 @@ class WavPlayer(BuiltInPlayer):
             return 0
         end = self._start + self._taken
         if end + len(data) > _MAX_WAV_BYTES:
-            raise CannotSpeak("audio_lost", f"{self._path} is full: a WAV file holds 4 GiB")
-        with _os_errors("audio_lost", self._path):
+            raise CannotSpeak(Reason.AUDIO_LOST, f"{self._path} is full: a WAV file holds 4 GiB")
+        with _os_errors(Reason.AUDIO_LOST, self._path):
             taken = os.pwrite(self._file, data, _WAV_HEADER.size + end)
         self._taken += taken
         return taken
@@ -149,7 +150,7 @@ class WavPlayer(BuiltInPlayer):
         if self._closed:
             return
         self._closed = True
-        with _os_errors("audio_lost", self._path):
+        with _os_errors(Reason.AUDIO_LOST, self._path):
             try:
                 self._write_header()
             finally:
@@ -196,7 +197,7 @@ class WavStreamPlayer(BuiltInPlayer):
         except BlockingIOError:
             return 0
         except OSError as error:
-            raise CannotSpeak("audio_lost", f"{self.name}: {error.strerror}") from error
+            raise CannotSpeak(Reason.AUDIO_LOST, f"{self.name}: {error.strerror}") from error
         header = min(written, len(self._header))
         self._header = self._header[header:]
         self._taken += written - header
@@ -210,7 +211,7 @@ class WavStreamPlayer(BuiltInPlayer):
 
 
 @contextlib.contextmanager
-def _os_errors(reason: str, subject: str) -> Iterator[None]:
+def _os_errors(reason: Reason, subject: str) -> Iterator[None]:
     """Turn an OSError into CannotSpeak."""
     try:
         yield
@@ -220,11 +221,11 @@ def _os_errors(reason: str, subject: str) -> Iterator[None]:
 
 def _open_regular(path: str) -> int:
     if not path:
-        raise CannotSpeak("audio_device", "the player file: needs a path, as in file:speech.wav")
+        raise CannotSpeak(Reason.AUDIO_DEVICE, "the player file: needs a path, as in file:speech.wav")
     file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, 0o666)
     if not stat.S_ISREG(os.fstat(file).st_mode):
         os.close(file)
-        raise CannotSpeak("audio_device", f"{path} is no regular file")
+        raise CannotSpeak(Reason.AUDIO_DEVICE, f"{path} is no regular file")
     return file
 
 
@@ -254,4 +255,4 @@ def _sample_bytes(file: int, path: str, rate: int) -> int:
         fault = "is shorter than its header says"
     else:
         return length
-    raise CannotSpeak("audio_device", f"{path} {fault}: use another file")
+    raise CannotSpeak(Reason.AUDIO_DEVICE, f"{path} {fault}: use another file")

@@ -16,6 +16,7 @@ from talkcli.engine.child.players.builtin import WavPlayer, WavStreamPlayer
 from talkcli.engine.child.players.program import ProgramPlayer
 from talkcli.engine.players import FILE_PREFIX, PLAYERS, PlayerMissing, player_commands
 from talkcli.frozen import TYPE_CHECKING, replace
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -124,7 +125,7 @@ class PlayerChooser:
         try:
             found = player_commands(self._configure.player, self._configure.device, rate, self.worked)
         except PlayerMissing as error:
-            yield partial(_fail, CannotSpeak("no_player", str(error)))
+            yield partial(_fail, CannotSpeak(Reason.NO_PLAYER, str(error)))
             return
         yield from (partial(ProgramPlayer, command, self._inherited) for command in found)
 

@@ -32,6 +32,7 @@ import time
 
 from talkcli.engine.child.players.base import CannotSpeak, Player
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.reasons import Reason
 from talkcli.processes import close, is_held, kill, kill_holders, open_pipes, signal_name
 from talkcli.protocol.lines import LineSplitter
 
@@ -253,7 +254,7 @@ class ProgramPlayer(Player):
             self._process = PlayerProcess(command.argv, inherited)
         except OSError as error:
             text = error.strerror or str(error)
-            raise CannotSpeak("no_player", f"{self.name} cannot be started: {text}") from error
+            raise CannotSpeak(Reason.NO_PLAYER, f"{self.name} cannot be started: {text}") from error
         self._overhead = len(command.preamble)
         self._written = 0
         self._consumed = 0
@@ -295,7 +296,7 @@ class ProgramPlayer(Player):
         if status is None:
             if self._broken_at is not None and time.monotonic() - self._broken_at >= ERROR_GRACE_S:
                 line = self._errors.line()
-                raise CannotSpeak("audio_lost", line or f"{self.name} closed its input before the sound was over")
+                raise CannotSpeak(Reason.AUDIO_LOST, line or f"{self.name} closed its input before the sound was over")
             return False
         self._read_stderr()
         if status == 0 and self._closed:
@@ -343,10 +344,10 @@ class ProgramPlayer(Player):
         self.consumed()
         line = self._errors.line()
         if status < 0:
-            return CannotSpeak("audio_lost", f"{self.name} was killed by {signal_name(-status)}")
+            return CannotSpeak(Reason.AUDIO_LOST, f"{self.name} was killed by {signal_name(-status)}")
         if status == 0:
-            return CannotSpeak("audio_lost", line or f"{self.name} ended before the sound did")
-        reason = "audio_lost" if self.proven else "audio_device"
+            return CannotSpeak(Reason.AUDIO_LOST, line or f"{self.name} ended before the sound did")
+        reason = Reason.AUDIO_LOST if self.proven else Reason.AUDIO_DEVICE
         return CannotSpeak(reason, line or f"{self.name} exited with status {status}")
 
     def _read_stderr(self) -> None:

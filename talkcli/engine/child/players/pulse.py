@@ -15,6 +15,7 @@ from talkcli.engine.child.players.base import CannotSpeak, Player
 from talkcli.engine.players import DUMMY_SINK, SAMPLE_BYTES
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Output
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from typing import Any
@@ -95,7 +96,7 @@ class PulsePlayer(Player):
         try:
             self._lib = libpulse.load()
         except OSError as error:
-            raise CannotSpeak("no_player", f"libpulse cannot be loaded: {error}") from error
+            raise CannotSpeak(Reason.NO_PLAYER, f"libpulse cannot be loaded: {error}") from error
         self._on_started = libpulse.Notice(self._started)
         self._on_dry = libpulse.Notice(self._ran_dry)
         self._on_time = libpulse.Notice(self._time_told)
@@ -107,7 +108,7 @@ class PulsePlayer(Player):
         self._context = self._lib.context_new(self._loop.api, b"talk")
         if self._context is None:
             self._loop.free()
-            raise CannotSpeak("no_player", "libpulse makes no connection: is there enough memory?")
+            raise CannotSpeak(Reason.NO_PLAYER, "libpulse makes no connection: is there enough memory?")
         self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)  # its state tells how that went
         self._go_on()
         if self._failed is not None:
@@ -123,7 +124,7 @@ class PulsePlayer(Player):
         if length == 0:
             return 0
         if self._lib.stream_write(self._stream, bytes(data[:length]), length, None, 0, 0) < 0:
-            self._fail("audio_lost")
+            self._fail(Reason.AUDIO_LOST)
             self._check()
         self._written += length
         self._go_on()
@@ -188,7 +189,7 @@ class PulsePlayer(Player):
         self._lib.context_unref(self._context)
         self._loop.free()
         self._loop = self._stream = None
-        self._failed = self._failed or CannotSpeak("audio_lost", "the stream was ended")
+        self._failed = self._failed or CannotSpeak(Reason.AUDIO_LOST, "the stream was ended")
 
     def gone(self) -> bool:
         """Return True once the connection is closed."""
@@ -223,16 +224,18 @@ class PulsePlayer(Player):
             return False
         state = self._lib.context_get_state(self._context)
         if state in (libpulse.CONTEXT_FAILED, libpulse.CONTEXT_TERMINATED):
-            self._fail("audio_device" if self._written == 0 else "audio_lost")
+            self._fail(Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST)
             return False
         if self._index == libpulse.NONE and time.monotonic() >= self._ready_by:
-            self._failed = CannotSpeak("audio_device", f"the sound server does not answer within {READY_WITHIN:g} s")
+            self._failed = CannotSpeak(
+                Reason.AUDIO_DEVICE, f"the sound server does not answer within {READY_WITHIN:g} s"
+            )
             return False
         if self._stream is None:
             return state == libpulse.CONTEXT_READY and self._open()
         state = self._lib.stream_get_state(self._stream)
         if state in (libpulse.STREAM_FAILED, libpulse.STREAM_TERMINATED):
-            self._fail("audio_device" if self._written == 0 else "audio_lost")
+            self._fail(Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST)
         elif state == libpulse.STREAM_READY:
             asked = self._look_at_sink() or self._ask_time()
             return asked or (self._closed and not self._draining and self._failed is None and self._drain())
@@ -244,7 +247,7 @@ class PulsePlayer(Player):
         spec = libpulse.SampleSpec(libpulse.S16LE, self._rate, 1)
         self._stream = self._lib.stream_new(self._context, b"talk", byref(spec), None)
         if self._stream is None:
-            self._fail("audio_device")
+            self._fail(Reason.AUDIO_DEVICE)
             return False
         self._lib.stream_set_started_callback(self._stream, self._on_started, None)
         self._lib.stream_set_underflow_callback(self._stream, self._on_dry, None)
@@ -252,7 +255,7 @@ class PulsePlayer(Player):
         flags = libpulse.ADJUST_LATENCY | libpulse.AUTO_TIMING_UPDATE
         wanted = None if self._wanted is None else self._wanted.encode()
         if self._lib.stream_connect_playback(self._stream, wanted, byref(sizes), flags, None, None) < 0:
-            self._fail("audio_device")
+            self._fail(Reason.AUDIO_DEVICE)
         return True
 
     def _look_at_sink(self) -> bool:
@@ -280,7 +283,7 @@ class PulsePlayer(Player):
         now = time.monotonic()
         self._suspended_at = self._suspended_at or now
         if now >= self._suspended_at + SUSPENDED_FOR:
-            self._failed = CannotSpeak("audio_stalled", f"the sound server has suspended {self.device}")
+            self._failed = CannotSpeak(Reason.AUDIO_STALLED, f"the sound server has suspended {self.device}")
         return asks
 
     def _ask_time(self) -> bool:
@@ -342,12 +345,12 @@ class PulsePlayer(Player):
             return
         self._muted = True
         if self._audible and self._failed is None:
-            self._failed = CannotSpeak("muted", f"the output is muted: {self.device}", final=True)
+            self._failed = CannotSpeak(Reason.MUTED, f"the output is muted: {self.device}", final=True)
 
     def _drain(self) -> bool:
         operation = self._lib.stream_drain(self._stream, self._on_drained, None)
         if operation is None:
-            self._fail("audio_lost")
+            self._fail(Reason.AUDIO_LOST)
             return False
         self._draining = True
         self._lib.operation_unref(operation)
@@ -387,16 +390,16 @@ class PulsePlayer(Player):
             self._judge()
             self._drained = self.proven = self._failed is None
         else:
-            self._fail("audio_lost")
+            self._fail(Reason.AUDIO_LOST)
 
-    def _fail(self, reason: str) -> None:
+    def _fail(self, reason: Reason) -> None:
         """Take note that it has failed, for the reason that libpulse knows."""
         if self._failed is not None:
             return
         number = self._lib.context_errno(self._context)
         words = self._lib.strerror(number).decode("utf-8", "replace")
         if self._stream is None and number in (libpulse.CONNECTION_REFUSED, libpulse.INVALID_SERVER):
-            self._failed = CannotSpeak("no_player", f"no sound server answers: {words}")
+            self._failed = CannotSpeak(Reason.NO_PLAYER, f"no sound server answers: {words}")
         elif self._stream is None:
             self._failed = CannotSpeak(reason, f"the sound server lets nobody in: {words}")
         elif self._index != libpulse.NONE:  # the number may be of a question about a sink that is gone
@@ -414,5 +417,5 @@ class PulsePlayer(Player):
 def _dummy(begins: bool) -> CannotSpeak:
     """Return what is wrong where nobody can hear the stream (any more), and no other player would be heard."""
     if begins:
-        return CannotSpeak("audio_device", "the sound server has only a dummy output", final=True)
-    return CannotSpeak("audio_lost", "the sound server has only a dummy output left", final=True)
+        return CannotSpeak(Reason.AUDIO_DEVICE, "the sound server has only a dummy output", final=True)
+    return CannotSpeak(Reason.AUDIO_LOST, "the sound server has only a dummy output left", final=True)

@@ -14,6 +14,7 @@ from talkcli.engine.child.synthesizers.base import SpeechSettings
 from talkcli.engine.child.synthesizers.espeak import Espeak
 from talkcli.engine.voices import is_neural
 from talkcli.frozen import TYPE_CHECKING, replace
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.base import SampleSink, Synthesizer
@@ -54,7 +55,7 @@ class CombinedSynthesizer:
             except Stopped:
                 raise
             except CannotSpeak as error:
-                if error.reason != "voice_failed" or watched.used:
+                if error.reason != Reason.VOICE_FAILED or watched.used:
                     raise
                 why = str(error)
             except Exception as error:

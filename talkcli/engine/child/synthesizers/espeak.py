@@ -21,6 +21,7 @@ from talkcli.engine.child.words import count_letters
 from talkcli.engine.players import SAMPLE_BYTES, on_path
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import VARIANT, UnknownVoice, find_voice
+from talkcli.goals.reasons import Reason
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -206,7 +207,7 @@ class Espeak:
         if raised is not None:
             raise raised
         if status != espeak.EE_OK:
-            raise CannotSpeak("engine_failed", f"espeak_Synth failed with {status}")
+            raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
     def load_language(self, language: str) -> None:
         """Take a voice of this language, "de-at", or else of its first part, or else English."""

@@ -21,6 +21,7 @@ from talkcli.engine.players import SAMPLE_BYTES
 from talkcli.engine.voices import NEURAL, UnknownVoice, language_of, speaker_number
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.options import SPEAKER
+from talkcli.goals.reasons import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -129,26 +130,26 @@ class Piper:
         """
         if sound.pitch != _PITCH:
             words = f"the voice {self.voice} has no pitch but its own: leave --pitch out, or choose one of espeak's"
-            raise CannotSpeak("bad_option", words)
+            raise CannotSpeak(Reason.BAD_OPTION, words)
         voice = self._model_id
         model = self._loaded(voice, output)
         try:
             speaker = _number(model.description, self._speaker)
         except UnknownVoice as error:
-            raise CannotSpeak("unknown_voice", f"{self.voice}: {error}") from error
+            raise CannotSpeak(Reason.UNKNOWN_VOICE, f"{self.voice}: {error}") from error
         try:
             output.begin(model.description.rate, self.voice)
             with self._espeak.spelling(model.description.speller) as speller:
                 self._write(model, speaker, pieces(speller, text), sound, output)
         except BadFile as error:
             self.loader.suspect(voice)
-            raise CannotSpeak("voice_failed", str(error)) from error
+            raise CannotSpeak(Reason.VOICE_FAILED, str(error)) from error
         except MemoryError as error:
             words = f"{self._path} cannot be spoken with: there is no memory for it; end another program"
-            raise CannotSpeak("voice_failed", words) from error
+            raise CannotSpeak(Reason.VOICE_FAILED, words) from error
         except UnknownVoice as error:
             self.loader.suspect(voice)
-            raise CannotSpeak("voice_failed", f"{model.path}.json: {error}: get the voice anew") from error
+            raise CannotSpeak(Reason.VOICE_FAILED, f"{model.path}.json: {error}: get the voice anew") from error
 
     def _loaded(self, voice: str, output: SampleSink) -> Model:
         """Return the model of a voice, as soon as it is loaded."""
@@ -158,7 +159,7 @@ class Piper:
         while (model := loader.model(voice)) is None:
             why = loader.error(voice)
             if why is not None:
-                raise CannotSpeak("voice_failed", why)
+                raise CannotSpeak(Reason.VOICE_FAILED, why)
             assert loader.descriptor is not None
             output.wait(loader.descriptor)
         return model

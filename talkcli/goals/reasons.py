@@ -1,0 +1,87 @@
+"""The reasons why a goal was refused or has ended without success.
+
+A new reason needs a member here and nothing else. The table in the wire's document is made from the members.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from talkcli.goals.states import State
+
+_RECALLED, _PREEMPTED = State.RECALLED, State.PREEMPTED
+_REJECTED, _ABORTED, _LOST = State.REJECTED, State.ABORTED, State.LOST
+
+
+class Reason(str, Enum):
+    """A reason as programs read it: a string that never changes its meaning.
+
+    A client may get a reason that it doesn't know from a newer server, so `Goal.reason` is a plain string.
+    """
+
+    #: the states in which a goal may have this reason
+    states: tuple[State, ...]
+    #: what the reason means, for people, in Markdown
+    meaning: str
+
+    def __new__(cls, code: str, states: tuple[State, ...] = (), meaning: str = "") -> Reason:
+        reason = str.__new__(cls, code)
+        reason._value_, reason.states, reason.meaning = code, states, meaning
+        return reason
+
+    CANCELED = "canceled", (_RECALLED, _PREEMPTED), "`cancel`"
+    PREEMPTED = "preempted", (_RECALLED, _PREEMPTED), "a goal with `preempt` or `flush`"
+    REPLACED = "replaced", (_RECALLED,), "a newer goal with its key"
+    EXPIRED = (
+        "expired",
+        (_RECALLED,),
+        "it had not begun when its `ttl` was over; PREEMPTED where an engine had died over it before it began",
+    )
+    DISPLACED = (
+        "displaced",
+        (_RECALLED,),
+        "the queue was full, and a goal of a higher priority came, or a goal of the same priority with `preempt`. "
+        "The newest goal of the lowest priority is displaced",
+    )
+    SHUTDOWN = "shutdown", (_RECALLED, _PREEMPTED, _REJECTED), "the server is ending"
+    THROTTLED = "throttled", (_REJECTED,), "the same was said, or is waiting: `throttle`"
+    QUEUE_FULL = "queue_full", (_REJECTED,), "the queue was full, and the goal could displace none"
+    INVALID_TEXT = "invalid_text", (_REJECTED,), "empty, no valid Unicode, or nothing in it that can be seen"
+    TEXT_TOO_LONG = "text_too_long", (_REJECTED,), "more than 10,000 characters (`--max-text`) or 40,000 bytes"
+    BAD_OPTION = "bad_option", (_REJECTED, _ABORTED), "an option out of its range, or one that the driver refuses"
+    UNKNOWN_VOICE = (
+        "unknown_voice",
+        (_REJECTED, _ABORTED),
+        "the engine has no such voice, or lacks what it takes: the message says what to install",
+    )
+    ID_CONFLICT = "id_conflict", (_REJECTED,), "another text has this id already"
+    NO_PLAYER = "no_player", (_ABORTED,), "no program to play with, and no sound server that answers"
+    AUDIO_DEVICE = (
+        "audio_device",
+        (_ABORTED,),
+        "the player could not begin, or the sound server has only a dummy output",
+    )
+    AUDIO_LOST = "audio_lost", (_ABORTED,), "the player ended before the sound did, or only a dummy output was left"
+    AUDIO_STALLED = "audio_stalled", (_ABORTED,), "the player took no sound any more, or its device was suspended"
+    MUTED = "muted", (_ABORTED,), "its output is muted, and it was to be `audible`"
+    VOICE_FAILED = (
+        "voice_failed",
+        (_ABORTED,),
+        "a neural voice's files are not as they should be: the message names the file, and what to do",
+    )
+    ENGINE_FAILED = "engine_failed", (_ABORTED,), "the engine cannot start, or the synthesiser reported an error"
+    ENGINE_CRASHED = "engine_crashed", (_ABORTED,), "the engine process died"
+    ENGINE_HUNG = "engine_hung", (_ABORTED,), "the engine process said nothing any more"
+    NOTHING_TO_SAY = "nothing_to_say", (_ABORTED,), "nothing in the text can be spoken"
+    NOT_SILENT = "not_silent", (_ABORTED,), "it was stopped, and silence was not confirmed within 2 s"
+    # These two only a client gives.
+    NOT_SENT = "not_sent", (_REJECTED,), "the client could not send it: it never reached a server"
+    LOST = "lost", (_LOST,), "the connection ended first"
+
+    # Shown and formatted as the string that it is, in every version of Python.
+    __str__ = str.__str__
+    __repr__ = str.__repr__
+
+
+#: Why a goal is refused: the reason, and a message for people that gives the particulars.
+Refusal = tuple[Reason, str]
